@@ -1,0 +1,55 @@
+# Everything happens in .venv; a stamp file per set of packages remembers what is installed.
+VENV := .venv
+BIN := $(VENV)/bin
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.14 python3; do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PYTEST_ARGS ?=
+
+.PHONY: help demo test lint format docs bench clean
+
+help:
+	@echo "make demo    plan on a synthetic patient, results in demo-output/"
+	@echo "make test    lint, types and the default tests (import rules among them)"
+	@echo "make lint    ruff and mypy only"
+	@echo "make format  let ruff rewrite the code"
+	@echo "make docs    build the documentation into site/"
+	@echo "make bench   run the benchmarks"
+	@echo "make clean   remove everything that was built, but not .venv"
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer was not found; name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed-run: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) -e '.[$*]'
+	@touch $@
+
+demo: $(VENV)/.installed-run
+	$(BIN)/lungaccess demo --out demo-output
+
+lint: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-test
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+test: lint
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+docs: $(VENV)/.installed-docs
+	$(BIN)/mkdocs build --strict
+
+bench: $(VENV)/.installed-dev
+	cd benchmarks && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr
+
+clean:
+	rm -rf site build dist demo-output *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .asv
+	find anatomy stages lungaccess tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,27 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+_CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+# No test may depend on the speed of the machine.
+settings.register_profile("lungaccess", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("lungaccess")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Return the folder of real anatomy, or skip the test where there is none."""
+    stated = os.environ.get("LUNGACCESS_DATA")
+    folder = Path(stated) if stated else _CHECKOUT.parent / "shared" / "data"
+    if not folder.is_dir():
+        how = "LUNGACCESS_DATA names" if stated else "LUNGACCESS_DATA is not set and the default is"
+        pytest.skip(f"no real anatomy: {how} {folder}, which is not a folder")
+    return folder

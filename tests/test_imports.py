@@ -1,0 +1,75 @@
+"""The direction of imports, who may use which library, and what stays out of start-up."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+import grimp
+import pytest
+from importlinter import cli
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+OURS = ("anatomy", "stages", "lungaccess")
+KERNELS_MAY_USE = {"__future__", "collections", "math", "numba", "numpy", "typing"}
+CHECK_MAY_USE = ("anatomy.*", "stages.*.device", "lungaccess.plan*", "lungaccess.system", "lungaccess.check*")
+NOT_AT_START_UP = (
+    "SimpleITK", "casadi", "edt", "fcl", "matplotlib", "networkx", "ompl", "pydicom", "skimage", "trimesh",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def graph() -> grimp.ImportGraph:
+    return grimp.build_graph(*OURS, include_external_packages=True, cache_dir=None)
+
+
+def is_kernel(module: str) -> bool:
+    return "kernels" in module.split(".")
+
+
+def kernel_room(module: str) -> str:
+    """Return the kernels module or package that `module` belongs to."""
+    return module.partition(".kernels")[0] + ".kernels"
+
+
+def test_contracts_of_the_design_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(CHECKOUT)
+    assert cli.lint_imports(no_cache=True) == cli.EXIT_STATUS_SUCCESS
+
+
+def test_kernels_use_only_numpy_numba_and_the_kernels_of_anatomy(graph: grimp.ImportGraph) -> None:
+    kernels = [module for module in graph.modules if is_kernel(module)]
+    wrong = [
+        (module, used)
+        for module in kernels
+        for used in graph.find_modules_directly_imported_by(module)
+        if used.split(".")[0] not in KERNELS_MAY_USE
+        and kernel_room(used) not in {"anatomy.kernels", kernel_room(module)}
+    ]
+    assert kernels
+    assert not wrong
+
+
+def test_check_uses_only_data_types_and_anatomy(graph: grimp.ImportGraph) -> None:
+    rooms = {"lungaccess.check"} | graph.find_descendants("lungaccess.check")
+    used = set().union(*(graph.find_modules_directly_imported_by(module) for module in rooms))
+    ours = {module for module in used if module.split(".")[0] in OURS}
+    assert ours
+    assert not {module for module in ours if not any(fnmatch(module, may) for may in CHECK_MAY_USE)}
+    assert not {module for module in ours if is_kernel(module)}
+
+
+def test_nothing_that_check_uses_leads_to_a_planner(graph: grimp.ImportGraph) -> None:
+    reached = graph.find_upstream_modules("lungaccess.check", as_package=True)
+    stages = {module for module in reached if module.startswith("stages.")}
+    assert stages
+    assert not {module for module in stages if not fnmatch(module, "stages.*.device")}
+
+
+@pytest.mark.parametrize("statement", ["import lungaccess", "import lungaccess.system"])
+def test_heavy_libraries_are_imported_only_where_they_are_used(statement: str) -> None:
+    script = f"{statement}\nimport sys\nprint(' '.join(set(sys.modules) & set({NOT_AT_START_UP!r})))"
+    loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    assert loaded.stdout.split() == []

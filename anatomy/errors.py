@@ -1,0 +1,58 @@
+"""The typed errors of every layer: what was found, what was expected, what to do."""
+
+from __future__ import annotations
+
+
+class LungaccessError(Exception):
+    """Base of all errors that a user can cause and mend.
+
+    The message states what was found, what was expected and what to do about it.
+
+    Parameters
+    ----------
+    found : str
+        What the input holds.
+    expected : str
+        What it should hold.
+    remedy : str
+        What the user can do.
+    """
+
+    def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
+        parts = [found.rstrip(".") + "."]
+        if expected:
+            parts.append(f"Expected: {expected.rstrip('.')}.")
+        if remedy:
+            parts.append(f"{remedy.rstrip('.')}.")
+        super().__init__(" ".join(parts))
+
+
+class FrameError(LungaccessError):
+    """A coordinate frame is missing, ambiguous or not a rigid right-handed frame."""
+
+
+class GridMismatchError(FrameError):
+    """Two images that must share one voxel grid do not."""
+
+
+class AnatomyError(LungaccessError):
+    """The anatomy cannot be what it claims: empty mask, no trachea, no lung."""
+
+
+class FileError(LungaccessError):
+    """A file or folder cannot be read or written, or is truncated or of another kind."""
+
+
+class SettingsError(LungaccessError):
+    """A device or planning setting is unknown, not finite or physically impossible."""
+
+
+class TargetError(LungaccessError):
+    """The target is not where a target can be: outside the lung, or inside an obstacle."""
+
+
+class PlanFileError(LungaccessError):
+    """A stored plan is damaged, of an unknown version or does not belong to this patient."""

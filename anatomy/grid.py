@@ -1,0 +1,172 @@
+"""Voxel grids and volumes in LPS millimetres, indexed `[i, j, k]`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import FrameError, GridMismatchError
+
+Float = NDArray[np.float64]
+
+ORTHONORMAL_TOLERANCE = 1e-4
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of `array` that cannot be written through."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def transform_points(target_from_source: ArrayLike, points: ArrayLike) -> Float:
+    """Map points `(..., 3)` through a 4x4 homogeneous matrix."""
+    matrix = np.asarray(target_from_source, dtype=np.float64)
+    return np.asarray(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grid:
+    """A rectilinear voxel grid; integer `ijk` are voxel CENTRES.
+
+    Parameters
+    ----------
+    shape : (3,) int
+        Number of voxels along i, j, k.
+    lps_from_ijk : (4, 4) float64
+        Maps voxel indices to LPS mm.  Its columns must be orthogonal, right-handed and non-zero.
+
+    Raises
+    ------
+    FrameError
+        If the matrix is not finite, sheared, mirrored or of zero size.
+    """
+
+    shape: tuple[int, int, int]
+    lps_from_ijk: Float
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.lps_from_ijk, dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise FrameError(
+                "A grid matrix is not a finite 4x4 matrix",
+                expected="lps_from_ijk, which maps voxel indices to LPS mm",
+                remedy="Check the image header",
+            )
+        columns = matrix[:3, :3]
+        spacing = np.linalg.norm(columns, axis=0)
+        if (spacing <= 0).any():
+            raise FrameError(
+                f"A grid has the voxel size {spacing.tolist()} mm",
+                expected="three positive lengths",
+                remedy="Check the spacing in the image header",
+            )
+        direction = columns / spacing
+        if np.abs(direction.T @ direction - np.eye(3)).max() > ORTHONORMAL_TOLERANCE:
+            raise FrameError(
+                f"The axes of an image are not orthonormal: {np.round(direction, 4).tolist()}",
+                expected="three perpendicular unit axes (no shear or gantry tilt)",
+                remedy="Resample the image onto an orthogonal grid",
+            )
+        if np.linalg.det(direction) < 0:
+            raise FrameError(
+                "The axes of an image form a left-handed frame (determinant < 0)",
+                expected="a right-handed frame",
+                remedy="The image is mirrored: re-export it, or flip one axis of data and header",
+            )
+        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        object.__setattr__(self, "lps_from_ijk", read_only(matrix))
+
+    @classmethod
+    def from_spacing(cls, shape: ArrayLike, spacing_mm: ArrayLike, origin_lps: ArrayLike) -> Self:
+        """Make a grid whose axes are the LPS axes; `origin_lps` is the centre of voxel 0, 0, 0."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.diag(np.asarray(spacing_mm, dtype=np.float64))
+        matrix[:3, 3] = origin_lps
+        ni, nj, nk = (int(n) for n in np.asarray(shape))
+        return cls(shape=(ni, nj, nk), lps_from_ijk=matrix)
+
+    @property
+    def spacing_mm(self) -> Float:
+        """Voxel size along i, j, k, `(3,)` mm."""
+        return np.asarray(np.linalg.norm(self.lps_from_ijk[:3, :3], axis=0))
+
+    @property
+    def ijk_from_lps(self) -> Float:
+        """The inverse of `lps_from_ijk`, `(4, 4)`."""
+        return np.asarray(np.linalg.inv(self.lps_from_ijk))
+
+    @property
+    def voxel_volume_mm3(self) -> float:
+        """Volume of one voxel."""
+        return float(np.prod(self.spacing_mm))
+
+    def lps(self, ijk: ArrayLike) -> Float:
+        """Map indices `(..., 3)` (fractions allowed) to LPS mm."""
+        return transform_points(self.lps_from_ijk, ijk)
+
+    def ijk(self, lps: ArrayLike) -> Float:
+        """Map LPS mm `(..., 3)` to fractional indices."""
+        return transform_points(self.ijk_from_lps, lps)
+
+    def contains(self, lps: ArrayLike) -> NDArray[np.bool_]:
+        """Tell which points `(..., 3)` lie in a voxel of the grid."""
+        ijk = np.floor(self.ijk(lps) + 0.5)
+        return np.asarray(((ijk >= 0) & (ijk < np.asarray(self.shape))).all(axis=-1))
+
+    def crop(self, start: ArrayLike, stop: ArrayLike) -> Grid:
+        """Return the grid of voxels `start <= ijk < stop`; it may reach beyond this grid."""
+        start = np.asarray(start, dtype=np.int64)
+        shape = np.asarray(stop, dtype=np.int64) - start
+        matrix = self.lps_from_ijk.copy()
+        matrix[:3, 3] = self.lps(start)
+        return Grid(shape=(int(shape[0]), int(shape[1]), int(shape[2])), lps_from_ijk=matrix)
+
+    def is_close(self, other: Grid, tolerance_mm: float = 1e-2) -> bool:
+        """Tell whether every voxel of the two grids agrees to `tolerance_mm`."""
+        if self.shape != other.shape:
+            return False
+        corners = np.stack(np.meshgrid(*[(0, n - 1) for n in self.shape]), axis=-1).reshape(-1, 3)
+        return bool(np.abs(self.lps(corners) - other.lps(corners)).max() <= tolerance_mm)
+
+    def require_same(self, other: Grid, name: str) -> None:
+        """Raise `GridMismatchError` unless `other`, the grid of `name`, is this grid."""
+        if not self.is_close(other):
+            raise GridMismatchError(
+                f"The grid of {name} differs: {other.describe()}",
+                expected=f"the grid of the other masks: {self.describe()}",
+                remedy="Resample all masks of a patient onto one grid",
+            )
+
+    def describe(self) -> str:
+        """Say shape, voxel size and the position of the first voxel in one line."""
+        size = " x ".join(f"{s:.3f}" for s in self.spacing_mm)
+        first = ", ".join(f"{x:.1f}" for x in self.lps_from_ijk[:3, 3])
+        return f"{'x'.join(map(str, self.shape))} voxels of {size} mm, first at LPS ({first})"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Volume:
+    """An image on a grid; `array[i, j, k]` lies Fortran-contiguous (i fastest) in memory.
+
+    Parameters
+    ----------
+    grid : Grid
+    array : (ni, nj, nk) array of any dtype
+        Masks are bool.  Made read-only and Fortran-contiguous (copied only if it is not).
+    """
+
+    grid: Grid
+    array: NDArray[Any]
+
+    def __post_init__(self) -> None:
+        if self.array.shape != self.grid.shape:
+            raise GridMismatchError(
+                f"An array of shape {self.array.shape} was given for a grid of {self.grid.shape}",
+                expected="equal shapes",
+                remedy="Index arrays as [i, j, k]",
+            )
+        object.__setattr__(self, "array", read_only(np.asfortranarray(self.array)))

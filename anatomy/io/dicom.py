@@ -1,0 +1,235 @@
+"""CT series in DICOM as Hounsfield units on a grid in LPS, with every slice accounted for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anatomy.errors import FileError, FrameError
+from anatomy.grid import Float, Grid, Volume
+from anatomy.io.nifti_header import named_grid
+
+if TYPE_CHECKING:
+    from pydicom.dataset import FileDataset
+
+_SPACING_TOLERANCE_MM = 0.05
+_TILT_TOLERANCE_MM = 0.1
+_MISSING_FACTOR = 1.5
+_UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept")
+_NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEYS)
+_SERIES_KEYS = ("SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeriesInfo:
+    """One series of a folder: what a person needs to choose it, and its files (unsorted)."""
+
+    uid: str
+    number: int | None
+    description: str
+    modality: str
+    paths: tuple[Path, ...]
+
+    def describe(self) -> str:
+        """Say what the series is in one line."""
+        number = "-" if self.number is None else self.number
+        return f"{self.uid} (number {number}, {self.modality}, {self.description!r}, {len(self.paths)} files)"
+
+
+def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
+    """List the DICOM series of a folder and its subfolders, ordered by UID.
+
+    Raises
+    ------
+    FileError
+        If there is no folder, or no DICOM image in it.
+    """
+    by_uid = _headers_by_series(Path(folder))
+    return tuple(_info(uid, files) for uid, files in sorted(by_uid.items()))
+
+
+def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
+    """Read a CT series in Hounsfield units.
+
+    Parameters
+    ----------
+    folder : path
+    series_uid : str, optional
+        Which series to read; it must be given when the folder holds more than one.
+
+    Returns
+    -------
+    Volume
+        Hounsfield units, (ni, nj, nk); k runs along the normal of the slices.
+
+    Raises
+    ------
+    FileError
+        If the choice of series is open, slices are missing, doubled or unevenly spaced, or the
+        files do not state Hounsfield units.
+    FrameError
+        If the gantry was tilted, so that the voxels do not form a rectangular grid.
+    """
+    by_uid = _headers_by_series(Path(folder))
+    headers = by_uid[_choose(by_uid, series_uid, folder)]
+    where = f"Series {headers[0][1].SeriesInstanceUID} of {folder}"
+    _require_uniform([header for _, header in headers], where)
+    paths, grid = _geometry(headers, where)
+    return Volume(grid=grid, array=_pixels(paths, grid, where))
+
+
+def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]]:
+    import pydicom
+    from pydicom.errors import InvalidDicomError
+
+    if not folder.is_dir():
+        raise FileError(f"There is no folder {folder}", expected="a folder of DICOM files")
+    by_uid: dict[str, list[tuple[Path, FileDataset]]] = {}
+    tags: list[Any] = [*_SERIES_KEYS, *_NEEDED_KEYS]
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR"):
+        try:
+            header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
+        except InvalidDicomError:
+            continue
+        if "SeriesInstanceUID" in header and "Rows" in header:
+            by_uid.setdefault(str(header.SeriesInstanceUID), []).append((path, header))
+    if not by_uid:
+        raise FileError(f"{folder} holds no DICOM images", expected="a folder of DICOM files")
+    return by_uid
+
+
+def _info(uid: str, files: Sequence[tuple[Path, FileDataset]]) -> SeriesInfo:
+    first = files[0][1]
+    number = first.get("SeriesNumber")
+    return SeriesInfo(
+        uid=uid,
+        number=None if number is None else int(number),
+        description=str(first.get("SeriesDescription", "")),
+        modality=str(first.get("Modality", "?")),
+        paths=tuple(path for path, _ in files),
+    )
+
+
+def _choose(by_uid: dict[str, list[tuple[Path, Any]]], series_uid: str | None, folder: str | Path) -> str:
+    if series_uid is None and len(by_uid) == 1:
+        return next(iter(by_uid))
+    if series_uid in by_uid:
+        return str(series_uid)
+    found = "; ".join(_info(uid, files).describe() for uid, files in sorted(by_uid.items()))
+    asked = "" if series_uid is None else f", none of which is {series_uid}"
+    raise FileError(
+        f"{folder} holds {len(by_uid)} series{asked}: {found}",
+        expected="an explicit choice of one series",
+        remedy="Give the UID of the series",
+    )
+
+
+def _require_uniform(headers: Iterable[FileDataset], where: str) -> None:
+    headers = list(headers)
+    first = headers[0]
+    if first.get("Modality") != "CT":
+        raise FileError(f"{where} is of modality {first.get('Modality')}", expected="CT in Hounsfield units")
+    if int(first.get("NumberOfFrames") or 1) > 1:
+        raise FileError(
+            f"{where} keeps many slices in one file (enhanced DICOM)",
+            expected="one slice a file",
+            remedy="Convert the series to NIfTI, for instance with dcm2niix",
+        )
+    for header in headers:
+        missing = [key for key in _NEEDED_KEYS if header.get(key) is None]
+        if missing:
+            raise FileError(f"{where} has a slice without {', '.join(missing)}", expected="a CT series")
+        for key in _UNIFORM_KEYS:
+            if header.get(key) != first.get(key):
+                raise FileError(
+                    f"{where} has slices whose {key} differ: {first.get(key)} and {header.get(key)}",
+                    expected="one size and scale for all slices",
+                    remedy="Export the reconstruction as a series of its own",
+                )
+
+
+def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[list[Path], Grid]:
+    """Sort the slices along their normal and prove that they form a rectangular grid."""
+    first = headers[0][1]
+    orientation = np.array([h.ImageOrientationPatient for _, h in headers], dtype=np.float64)
+    if np.abs(orientation - orientation[0]).max() > 1e-4:
+        raise FrameError(f"{where} has slices of different orientation", expected="parallel slices")
+    along_i, along_j = orientation[0, :3], orientation[0, 3:]
+    normal = np.cross(along_i, along_j)
+    positions = np.array([h.ImagePositionPatient for _, h in headers], dtype=np.float64)
+    order = np.argsort(positions @ normal, kind="stable")
+    positions = positions[order]
+    spacing_k_mm = _slice_spacing(positions @ normal, where)
+    _require_no_tilt(positions, normal, where)
+    spacing_j_mm, spacing_i_mm = (float(s) for s in first.PixelSpacing)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([along_i * spacing_i_mm, along_j * spacing_j_mm, normal * spacing_k_mm], axis=1)
+    matrix[:3, 3] = positions[0]
+    shape = (int(first.Columns), int(first.Rows), len(headers))
+    return [headers[n][0] for n in order], named_grid(shape, matrix, Path(where))
+
+
+def _slice_spacing(heights_mm: Float, where: str) -> float:
+    """Return the distance of neighbouring slices; the sorted heights must be evenly spaced."""
+    if len(heights_mm) < 2:
+        raise FileError(f"{where} has a single slice", expected="a volume of two or more slices")
+    gaps = np.diff(heights_mm)
+    spacing_mm = float(np.median(gaps))
+    if gaps.min() < _SPACING_TOLERANCE_MM:
+        raise FileError(
+            f"{where} has two slices at the height {heights_mm[int(gaps.argmin())]:.2f} mm",
+            expected="one slice at each position",
+            remedy="Keep one acquisition (phase, time or reconstruction) a series",
+        )
+    if gaps.max() > _MISSING_FACTOR * spacing_mm:
+        at = int(gaps.argmax())
+        raise FileError(
+            f"{where} misses slices between the heights {heights_mm[at]:.2f} and {heights_mm[at + 1]:.2f} mm",
+            expected=f"a slice every {spacing_mm:.3f} mm",
+            remedy="Export the complete series again",
+        )
+    even = heights_mm[0] + (heights_mm[-1] - heights_mm[0]) / (len(gaps)) * np.arange(len(heights_mm))
+    if np.abs(heights_mm - even).max() > _SPACING_TOLERANCE_MM:
+        raise FileError(
+            f"{where} has slices spaced {gaps.min():.3f} to {gaps.max():.3f} mm apart",
+            expected="one distance between all slices",
+            remedy="Resample the series to even spacing",
+        )
+    return float((heights_mm[-1] - heights_mm[0]) / len(gaps))
+
+
+def _require_no_tilt(positions: Float, normal: Float, where: str) -> None:
+    travel = positions - positions[0]
+    sideways_mm = np.linalg.norm(travel - np.outer(travel @ normal, normal), axis=1)
+    if sideways_mm.max() > _TILT_TOLERANCE_MM:
+        degrees = float(np.degrees(np.arctan2(sideways_mm[-1], travel[-1] @ normal)))
+        raise FrameError(
+            f"{where} was taken with the gantry tilted by {degrees:.2f} degrees",
+            expected="slices stacked along their normal",
+            remedy="Correct the tilt by resampling, for instance with dcm2niix",
+        )
+
+
+def _pixels(paths: Sequence[Path], grid: Grid, where: str) -> Any:
+    """Read the slices in order; the reader applies slope and intercept of each file."""
+    import SimpleITK
+
+    values: Any = None
+    for k, path in enumerate(paths):
+        try:
+            plane = SimpleITK.GetArrayViewFromImage(image := SimpleITK.ReadImage(str(path)))
+        except RuntimeError as error:
+            raise FileError(
+                f"{path} of {where} cannot be read: {str(error).strip().splitlines()[-1]}",
+                expected="a complete DICOM file",
+                remedy="Export the series again",
+            ) from error
+        if values is None:
+            values = np.zeros(grid.shape, dtype=plane.dtype, order="F")
+        values[:, :, k] = plane.reshape(plane.shape[-2:]).T
+        del plane, image
+    return values

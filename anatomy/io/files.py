@@ -1,0 +1,114 @@
+"""Hashes of inputs, and writing that leaves either the old file or the whole new one."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from anatomy.errors import FileError
+
+
+def sha256(path: str | Path) -> str:
+    """Return the SHA-256 of the bytes of a file as hex digits.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def require_file(path: str | Path) -> Path:
+    """Return `path` as a Path, or raise `FileError` if it is not an existing file."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileError(
+            f"There is no file {path}", expected="an existing file", remedy="Check the name and the folder"
+        )
+    return path
+
+
+def read_text(path: str | Path) -> str:
+    """Read a UTF-8 text file, or raise `FileError`."""
+    path = require_file(path)
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: str | Path, error: Exception) -> FileError:
+    """Make the error for a file that exists but cannot be read."""
+    return FileError(
+        f"{path} cannot be read: {error}",
+        expected="a readable, complete file",
+        remedy="Copy or export the file again",
+    )
+
+
+def require_writable_folder(folder: str | Path) -> Path:
+    """Make `folder` if needed and prove that files can be written into it.
+
+    Raises
+    ------
+    FileError
+        If the folder cannot be made or written to.
+    """
+    folder = Path(folder)
+    probe = folder / f".{secrets.token_hex(6)}.probe"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch(exist_ok=False)
+        probe.unlink()
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    return folder
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """Give a temporary name beside `path`, and rename it to `path` when the block succeeds.
+
+    The temporary name ends like `path`, because writers choose the format by the ending.  When the
+    block raises, `path` keeps its old contents and the temporary file is removed.
+
+    Raises
+    ------
+    FileError
+        If the folder is missing or not writable, or the disk is full.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> with atomic_write(folder / "plan.json") as temporary:
+    ...     _ = temporary.write_text("{}")
+    >>> (folder / "plan.json").read_text()
+    '{}'
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{secrets.token_hex(6)}-{path.name}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    finally:
+        temporary.unlink(missing_ok=True) if path.parent.is_dir() else None
+
+
+def _unwritable(path: Path, error: OSError) -> FileError:
+    return FileError(
+        f"{path} cannot be written: {error.strerror or error}",
+        expected="an existing folder that may be written to, with room on the disk",
+        remedy="Choose another folder, or change its permissions",
+    )

@@ -1,0 +1,129 @@
+"""Points and poses from text, flipped to LPS millimetres at this border only."""
+
+from __future__ import annotations
+
+from io import StringIO
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import FileError, FrameError
+from anatomy.grid import ORTHONORMAL_TOLERANCE, Float, read_only, transform_points
+from anatomy.io.files import read_text
+
+Frame = Literal["ras", "lps"]
+
+LPS_FROM_RAS: Float = read_only(np.diag([-1.0, -1.0, 1.0, 1.0]))
+LPS_FROM: dict[str, Float] = {"lps": read_only(np.eye(4)), "ras": LPS_FROM_RAS}
+
+
+def parse_point(text: str) -> Float:
+    """Read a point with a stated frame, `ras:x,y,z` or `lps:x,y,z`, in mm.
+
+    Returns
+    -------
+    (3,) float64, LPS mm
+
+    Raises
+    ------
+    FrameError
+        If the frame is missing or unknown, or there are not three finite numbers.
+
+    Examples
+    --------
+    >>> parse_point("ras:10,-20,30").tolist()
+    [-10.0, 20.0, 30.0]
+    """
+    frame, separator, numbers = text.strip().partition(":")
+    frame = frame.strip().lower()
+    if not separator or frame not in LPS_FROM:
+        raise _point_error(text, "does not state its frame" if not separator else "has an unknown frame")
+    try:
+        values = [float(number) for number in numbers.split(",")]
+    except ValueError as error:
+        raise _point_error(text, "does not hold three numbers") from error
+    if len(values) != 3 or not np.isfinite(values).all():
+        raise _point_error(text, "does not hold three finite numbers")
+    return transform_points(LPS_FROM[frame], values)
+
+
+def _point_error(text: str, problem: str) -> FrameError:
+    return FrameError(
+        f"The point {text!r} {problem}",
+        expected="ras:x,y,z or lps:x,y,z in millimetres",
+        remedy="3D Slicer shows RAS coordinates, DICOM and ITK use LPS",
+    )
+
+
+def read_pose(path: str | Path, frame: Frame) -> Float:
+    """Read a 4x4 pose whose +z column is the direction of insertion.
+
+    Parameters
+    ----------
+    path : path of a text file of 16 numbers
+    frame : "ras" or "lps"
+        The frame of the numbers, because the file cannot state it.
+
+    Returns
+    -------
+    lps_from_tip : (4, 4) float64, LPS mm
+
+    Raises
+    ------
+    FileError
+        If the file does not hold 4x4 finite numbers.
+    FrameError
+        If the matrix is not a right-handed rigid pose.
+    """
+    matrix = _numbers(path)
+    if matrix.shape != (4, 4):
+        raise FileError(
+            f"{path} holds an array of shape {matrix.shape}",
+            expected="a 4x4 pose",
+            remedy="Write four lines of four numbers",
+        )
+    _require_rigid(matrix, path)
+    return np.asarray(LPS_FROM[frame] @ matrix)
+
+
+def read_points(path: str | Path, frame: Frame) -> Float:
+    """Read points from a text file of three numbers a point; return `(N, 3)` float64, LPS mm.
+
+    Raises
+    ------
+    FileError
+        If the file does not hold a multiple of three finite numbers.
+    """
+    values = _numbers(path).ravel()
+    if values.size == 0 or values.size % 3:
+        raise FileError(
+            f"{path} holds {values.size} numbers",
+            expected="three numbers (x, y, z in mm) for each point",
+            remedy="Write one point a line",
+        )
+    return transform_points(LPS_FROM[frame], values.reshape(-1, 3))
+
+
+def _numbers(path: str | Path) -> NDArray[np.float64]:
+    text = read_text(path)
+    try:
+        values = np.loadtxt(StringIO(text), dtype=np.float64, ndmin=2) if text.strip() else np.zeros((0, 3))
+    except ValueError as error:
+        raise FileError(f"{path} does not hold a table of numbers: {error}") from error
+    if not np.isfinite(values).all():
+        raise FileError(f"{path} holds numbers that are not finite", expected="finite numbers in mm")
+    return values
+
+
+def _require_rigid(matrix: Float, path: str | Path) -> None:
+    rotation = matrix[:3, :3]
+    skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    last_row = np.abs(matrix[3] - [0, 0, 0, 1]).max()
+    if max(skew, last_row) > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise FrameError(
+            f"{path} does not hold a right-handed rigid pose (off by {max(skew, last_row):.2g})",
+            expected="a rotation with determinant +1, and 0 0 0 1 as the last row",
+            remedy="Check that the matrix is neither transposed, scaled nor mirrored",
+        )

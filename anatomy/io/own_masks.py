@@ -1,0 +1,128 @@
+"""A folder of masks from any source, described by a `patient.toml`."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from anatomy.errors import AnatomyError, SettingsError
+from anatomy.io.files import read_text, require_file, sha256
+from anatomy.io.frames import Frame, parse_point
+from anatomy.io.images import read_volume
+from anatomy.io.label_names import stored_names
+from anatomy.io.masks import MaskSource, assemble, read_masks, require_cost
+from anatomy.patient import PatientImages
+from anatomy.settings import parse, settings
+
+DESCRIPTION = "patient.toml"
+_ROLES = {
+    "lumen": "lumen",
+    "wall": "wall",
+    "vessels": "vessels",
+    "lung": "lung",
+    "fissures": "fissures",
+    "nodule": "nodules",
+}
+_Files = str | tuple[str, ...]
+
+
+def _key(meaning: str) -> Any:
+    return Field(description=meaning)
+
+
+@settings
+class PatientFile:
+    """The keys of a `patient.toml`."""
+
+    lumen: Annotated[_Files, _key("Airway lumen")]
+    vessels: Annotated[_Files, _key("Arteries and veins")]
+    lung: Annotated[_Files, _key("Both lungs, filled")]
+    wall: Annotated[_Files, _key("Airway wall")] = ()
+    fissures: Annotated[_Files, _key("Fissures between lobes")] = ()
+    nodule: Annotated[_Files, _key("Nodules")] = ()
+    cost: Annotated[str, _key("Cost map with values in [0, 1] or infinity")] = ""
+    name: Annotated[str, _key("How reports call the patient")] = ""
+    frame: Annotated[Literal["", "ras", "lps"], _key("Frame of image files that state none")] = ""
+    breath_hold: Annotated[
+        Literal["", "inspiration", "expiration", "free-breathing"], _key("State of breathing")
+    ] = ""
+    targets: Annotated[tuple[str, ...], _key("Points with their frame")] = ()
+
+
+def load_own_masks(description: Path) -> PatientImages:
+    """Read the masks that a `patient.toml` names; paths are relative to its folder.
+
+    `file#label` takes one label of a label map, by its value or its stored name.
+
+    Raises
+    ------
+    SettingsError
+        If the file is no TOML, a key is unknown or missing, or a value is not allowed.
+    AnatomyError, FileError, FrameError, GridMismatchError
+        As `load_patient`.
+    """
+    keys = _read_description(description)
+    folder = description.parent
+    frame: Frame | None = keys.frame or None
+    targets = tuple(parse_point(point) for point in keys.targets)
+    masks = read_masks(list(_sources(keys, folder)), frame)
+    hashes = {description.name: sha256(description)}
+    cost = None
+    if keys.cost:
+        cost_path = require_file(folder / keys.cost)
+        cost = require_cost(read_volume(cost_path, frame=frame), masks.grid, cost_path)
+        hashes[keys.cost] = sha256(cost_path)
+    return assemble(
+        masks,
+        name=keys.name or folder.resolve().name,
+        kind="masks",
+        where=folder,
+        cost=cost,
+        targets_lps=targets,
+        breath_hold=keys.breath_hold or None,
+        sources=hashes,
+    )
+
+
+def _read_description(path: Path) -> PatientFile:
+    try:
+        content = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(
+            f"{path} is not TOML: {error}", expected='lines such as lumen = "airway.nii.gz"'
+        ) from error
+    try:
+        return parse(PatientFile, content, path.name)
+    except SettingsError as error:
+        raise SettingsError(
+            error.found, expected=error.expected, remedy="docs/patients.md explains every key"
+        ) from error
+
+
+def _sources(keys: PatientFile, folder: Path) -> Iterator[MaskSource]:
+    for key, role in _ROLES.items():
+        entries = getattr(keys, key)
+        for entry in (entries,) if isinstance(entries, str) else entries:
+            yield _source(role, entry, folder)
+
+
+def _source(role: str, entry: str, folder: Path) -> MaskSource:
+    name, separator, label = entry.rpartition("#")
+    if not separator or (folder / entry).is_file():
+        return MaskSource(role=role, path=require_file(folder / entry))
+    path = require_file(folder / name)
+    if label.isdigit():
+        return MaskSource(role=role, path=path, labels=(int(label),))
+    names = stored_names(path)
+    values = tuple(value for value, stored in names.items() if stored == label)
+    if not values:
+        raise AnatomyError(
+            f"{path} has no label named {label!r}",
+            expected=f"one of {sorted(names.values())}" if names else "a file that names its labels",
+            remedy=f"Write the label's value instead, as in {name}#1",
+        )
+    return MaskSource(role=role, path=path, labels=values)

@@ -1,0 +1,101 @@
+"""Everything that was read from disk for one patient, on one voxel grid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float, Grid, Volume, read_only
+
+MASKS = ("lumen", "wall", "vessels", "lung", "fissures", "nodules")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PatientImages:
+    """Masks, poses and points of one patient.
+
+    Parameters
+    ----------
+    name : str
+        How the patient is called in reports.
+    kind : str
+        Where the images come from: "med-rad", "totalsegmentator", "masks" or "phantom".
+    grid : Grid
+        The voxel grid that all volumes share.
+    lumen, vessels, lung : Volume
+        Bool masks: the airway lumen, the union of arteries and veins, both lungs filled.
+    wall, fissures, nodules : Volume or None
+        Bool masks; None when the patient has none.
+    cost : Volume or None
+        float32 cost of passing a voxel, in [0, 1], or infinity where passing is forbidden.
+    starts : tuple of (4, 4) float64
+        Poses `lps_from_tip` of needle starts, +z in the direction of insertion, LPS mm.
+    targets_lps : tuple of (3,) float64
+        Target points, LPS mm.
+    breath_hold : str or None
+        In which state of breathing the image was taken, if that is stated.
+    sources : mapping of str to str
+        File name to the SHA-256 of its bytes.
+    warnings : tuple of str
+        What was unusual about the input but did not prevent reading it.
+
+    Raises
+    ------
+    AnatomyError
+        If a mask is not bool, or the cost is not in [0, 1] or infinite.
+    GridMismatchError
+        If a volume lies on another grid.
+    """
+
+    name: str
+    kind: str
+    grid: Grid
+    lumen: Volume
+    vessels: Volume
+    lung: Volume
+    wall: Volume | None = None
+    fissures: Volume | None = None
+    nodules: Volume | None = None
+    cost: Volume | None = None
+    starts: tuple[Float, ...] = ()
+    targets_lps: tuple[Float, ...] = ()
+    breath_hold: str | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for role in MASKS:
+            _require_mask(getattr(self, role), role, self.grid)
+        if self.cost is not None:
+            _require_cost(self.cost, self.grid)
+        object.__setattr__(self, "starts", tuple(read_only(np.array(p, float)) for p in self.starts))
+        points = tuple(read_only(np.array(p, float)) for p in self.targets_lps)
+        object.__setattr__(self, "targets_lps", points)
+        object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
+
+
+def _require_mask(volume: Volume | None, role: str, grid: Grid) -> None:
+    if volume is None:
+        return
+    grid.require_same(volume.grid, f"the mask {role}")
+    if volume.array.dtype != np.bool_:
+        raise AnatomyError(f"The mask {role} has the type {volume.array.dtype}", expected="bool voxels")
+
+
+def _require_cost(cost: Volume, grid: Grid) -> None:
+    grid.require_same(cost.grid, "the cost map")
+    values = cost.array
+    if values.dtype != np.float32:
+        raise AnatomyError(f"The cost map has the type {values.dtype}", expected="float32 voxels")
+    allowed = ((values >= 0) & (values <= 1)) | np.isposinf(values)
+    if not allowed.all():
+        n_wrong, first = np.count_nonzero(~allowed), values[~allowed][0]
+        raise AnatomyError(
+            f"The cost map holds {n_wrong} voxels that are not allowed, such as {first:g}",
+            expected="costs in [0, 1], or infinity where passing is forbidden",
+            remedy="Scale the cost map to [0, 1]",
+        )

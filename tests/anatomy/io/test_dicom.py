@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
+from scipy.spatial.transform import Rotation
+
+from anatomy.errors import FileError, FrameError
+from anatomy.grid import Grid, Volume
+from anatomy.io import list_series, read_dicom
+
+
+def write_series(folder: Path, volume: Volume, number: int = 1, **changes: object) -> str:
+    """Write stored = HU + 1024, slices in shuffled order of file names; return the series UID."""
+    folder.mkdir(exist_ok=True)
+    uid, matrix, spacing = generate_uid(), volume.grid.lps_from_ijk, volume.grid.spacing_mm
+    direction = matrix[:3, :3] / spacing
+    for k in range(volume.grid.shape[2]):
+        slice_ = Dataset()
+        slice_.file_meta = FileMetaDataset()
+        slice_.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        slice_.file_meta.MediaStorageSOPClassUID = slice_.SOPClassUID = CTImageStorage
+        slice_.file_meta.MediaStorageSOPInstanceUID = slice_.SOPInstanceUID = generate_uid()
+        slice_.SeriesInstanceUID, slice_.SeriesNumber, slice_.SeriesDescription = uid, number, "Lung 1.0"
+        slice_.Modality = "CT"
+        slice_.Columns, slice_.Rows = volume.grid.shape[:2]
+        slice_.PixelSpacing = [float(spacing[1]), float(spacing[0])]
+        slice_.SliceThickness = float(spacing[2])
+        slice_.ImageOrientationPatient = [*direction[:, 0].tolist(), *direction[:, 1].tolist()]
+        slice_.ImagePositionPatient = volume.grid.lps([0, 0, k]).tolist()
+        slice_.SamplesPerPixel, slice_.PhotometricInterpretation = 1, "MONOCHROME2"
+        slice_.BitsAllocated, slice_.BitsStored, slice_.HighBit, slice_.PixelRepresentation = 16, 16, 15, 0
+        slice_.RescaleSlope, slice_.RescaleIntercept = 1, -1024
+        for key, value in changes.items():
+            setattr(slice_, key, value)
+        slice_.PixelData = (volume.array[:, :, k].T + 1024).astype("<u2").tobytes()
+        slice_.save_as(folder / f"{number}-{(k * 5) % 8}.dcm", enforce_file_format=True)
+    return uid
+
+
+def edit_slices(folder: Path, edit) -> None:
+    for path in sorted(folder.glob("*.dcm")):
+        header = pydicom.dcmread(path)
+        edit(header)
+        header.save_as(path)
+
+
+def test_left_stays_left_and_values_are_hounsfield_units(tmp_path, landmark, require_landmark):
+    write_series(tmp_path, landmark)
+    volume = read_dicom(tmp_path)
+    require_landmark(volume)
+    assert (volume.array == landmark.array).all()
+    assert volume.grid.is_close(landmark.grid, 1e-6)
+
+
+def test_an_oblique_feet_first_series_keeps_its_place(tmp_path, landmark):
+    matrix = landmark.grid.lps_from_ijk.copy()
+    turn = Rotation.from_euler("xyz", [180, 10, 25], degrees=True).as_matrix()
+    matrix[:3, :3] = turn @ matrix[:3, :3]
+    turned = Volume(grid=Grid(shape=landmark.grid.shape, lps_from_ijk=matrix), array=landmark.array)
+    write_series(tmp_path, turned)
+    volume = read_dicom(tmp_path)
+    marked = np.argwhere(volume.array == 700)[0]
+    expected = turned.grid.lps(np.argwhere(landmark.array == 700)[0])
+    assert volume.grid.lps(marked) == pytest.approx(expected, abs=1e-6)
+
+
+def test_two_series_need_a_choice(tmp_path, landmark, require_landmark):
+    first = write_series(tmp_path, landmark, 1)
+    second = write_series(tmp_path, Volume(grid=landmark.grid, array=landmark.array * 2), 2)
+    assert {info.uid for info in list_series(tmp_path)} == {first, second}
+    assert [len(info.paths) for info in list_series(tmp_path)] == [8, 8]
+    with pytest.raises(FileError, match="holds 2 series") as caught:
+        read_dicom(tmp_path)
+    assert first in str(caught.value) and second in str(caught.value)
+    require_landmark(read_dicom(tmp_path, first))
+    assert read_dicom(tmp_path, second).array.max() == 1400
+    with pytest.raises(FileError, match=r"none of which is 1\.2\.3"):
+        read_dicom(tmp_path, "1.2.3")
+
+
+def test_a_missing_slice_is_noticed(tmp_path, landmark):
+    write_series(tmp_path, landmark)
+    heights = {float(pydicom.dcmread(p).ImagePositionPatient[2]): p for p in tmp_path.glob("*.dcm")}
+    sorted(heights.items())[3][1].unlink()
+    with pytest.raises(FileError, match=r"misses slices between the heights 27\.00 and 31\.00"):
+        read_dicom(tmp_path)
+
+
+def test_a_doubled_slice_is_noticed(tmp_path, landmark):
+    write_series(tmp_path, landmark)
+    twin = pydicom.dcmread(tmp_path / "1-0.dcm")
+    twin.SOPInstanceUID = twin.file_meta.MediaStorageSOPInstanceUID = generate_uid()
+    twin.save_as(tmp_path / "twin.dcm")
+    with pytest.raises(FileError, match="two slices at the height"):
+        read_dicom(tmp_path)
+
+
+def test_uneven_spacing_is_noticed(tmp_path, landmark):
+    write_series(tmp_path, landmark)
+
+    def stretch(header):
+        x, y, z = (float(v) for v in header.ImagePositionPatient)
+        header.ImagePositionPatient = [x, y, z + 0.02 * (z - 23) ** 2]
+
+    edit_slices(tmp_path, stretch)
+    with pytest.raises(FileError, match="mm apart"):
+        read_dicom(tmp_path)
+
+
+def test_a_tilted_gantry_is_noticed(tmp_path, landmark):
+    write_series(tmp_path, landmark)
+
+    def tilt(header):
+        x, y, z = (float(v) for v in header.ImagePositionPatient)
+        header.ImagePositionPatient = [x, y + np.tan(np.radians(12)) * (z - 23), z]
+
+    edit_slices(tmp_path, tilt)
+    with pytest.raises(FrameError, match=r"tilted by 12\.00 degrees"):
+        read_dicom(tmp_path)
+
+
+def test_rounded_positions_are_accepted(tmp_path, landmark, require_landmark):
+    write_series(tmp_path, landmark)
+    jitter = iter([0.004, -0.003, 0.002, -0.004, 0.003, 0.0, -0.002, 0.001])
+
+    def rounded(header):
+        x, y, z = (float(v) for v in header.ImagePositionPatient)
+        header.ImagePositionPatient = [x, y, z + next(jitter)]
+
+    edit_slices(tmp_path, rounded)
+    require_landmark(read_dicom(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"Modality": "MR"}, "modality MR"),
+        ({"RescaleIntercept": None}, "without RescaleIntercept"),
+        ({"NumberOfFrames": 8}, "enhanced"),
+    ],
+)
+def test_what_is_no_ct_in_hounsfield_units_is_refused(tmp_path, landmark, change, problem):
+    write_series(tmp_path, landmark, **change)
+    with pytest.raises(FileError, match=problem):
+        read_dicom(tmp_path)
+
+
+def test_slices_of_two_scales_are_refused(tmp_path, landmark):
+    write_series(tmp_path, landmark)
+    header = pydicom.dcmread(tmp_path / "1-3.dcm")
+    header.RescaleSlope = 2
+    header.save_as(tmp_path / "1-3.dcm")
+    with pytest.raises(FileError, match="RescaleSlope differ"):
+        read_dicom(tmp_path)
+
+
+def test_a_truncated_slice_is_refused(tmp_path, landmark):
+    write_series(tmp_path, landmark)
+    path = tmp_path / "1-3.dcm"
+    path.write_bytes(path.read_bytes()[:-60])
+    with pytest.raises(FileError, match=r"1-3\.dcm"):
+        read_dicom(tmp_path)
+
+
+def test_folders_without_dicom_are_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("no image")
+    with pytest.raises(FileError, match="no DICOM images"):
+        read_dicom(tmp_path)
+    with pytest.raises(FileError, match="no folder"):
+        read_dicom(tmp_path / "missing")

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import hashlib
+
+import pytest
+
+from anatomy.errors import FileError
+from anatomy.io import atomic_write, require_writable_folder, sha256
+
+
+def test_hash_is_of_the_bytes(tmp_path):
+    (tmp_path / "a").write_bytes(b"lung")
+    assert sha256(tmp_path / "a") == hashlib.sha256(b"lung").hexdigest()
+    with pytest.raises(FileError, match="missing"):
+        sha256(tmp_path / "missing")
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "plan.json"
+    path.write_text("old")
+    with pytest.raises(KeyError), atomic_write(path) as temporary:
+        temporary.write_text("half")
+        raise KeyError
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.json"]
+
+
+def test_the_temporary_file_lies_beside_and_ends_alike(tmp_path):
+    path = tmp_path / "a.nii.gz"
+    with atomic_write(path) as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.name.endswith(".nii.gz")
+        assert temporary != path
+        temporary.write_text("new")
+        assert not path.exists()
+    assert path.read_text() == "new"
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(FileError, match="cannot be written"):
+        require_writable_folder(tmp_path / "file" / "out")
+    nowhere = tmp_path / "missing" / "a.txt"
+    with pytest.raises(FileError, match="cannot be written"), atomic_write(nowhere) as temporary:
+        temporary.write_text("")
+
+
+def test_a_folder_is_made_and_left_clean(tmp_path):
+    folder = require_writable_folder(tmp_path / "a" / "b")
+    assert folder.is_dir()
+    assert list(folder.iterdir()) == []

@@ -1,0 +1,40 @@
+"""The distances kept from the masks on top of a device's own radius."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from anatomy.settings import quantity, settings
+
+
+@settings
+class Margins:
+    """Margins around every device, one for each reason why a mask is not the patient.
+
+    Clearance is proved against the masks. The border of a mask is wrong by some fraction of a voxel and
+    more (segmentation), and the patient on the table does not lie where the image says (registration).
+
+    Parameters
+    ----------
+    segmentation_margin_mm : float
+        Allowance for the border of the masks, mm.
+    registration_margin_mm : float
+        Allowance for the alignment of image and patient, mm.
+
+    Raises
+    ------
+    SettingsError
+        If a margin is negative, not finite or absurd.
+    """
+
+    segmentation_margin_mm: Annotated[
+        float, quantity("allowance for the border of the masks", at_least=0.0, at_most=20.0)
+    ] = 0.5
+    registration_margin_mm: Annotated[
+        float, quantity("allowance for the alignment of image and patient", at_least=0.0, at_most=20.0)
+    ] = 0.0
+
+    @property
+    def total_mm(self) -> float:
+        """Sum of the margins, mm: what a device keeps beyond its radius."""
+        return self.segmentation_margin_mm + self.registration_margin_mm

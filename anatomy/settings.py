@@ -1,0 +1,265 @@
+"""Validated settings: one frozen class serves the TOML file, the command line and the stored record."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar, cast, dataclass_transform
+
+import annotated_types
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from anatomy.errors import SettingsError
+
+T = TypeVar("T")
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+_REMEDY = "docs/devices.md explains every key"
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))
+def settings(cls: type[T]) -> type[T]:
+    """Make a class of annotated fields an immutable settings class that cannot hold a wrong value.
+
+    The class is a frozen, keyword-only dataclass. Whatever creates an instance (the constructor,
+    `dataclasses.replace`, `parse`) checks it, and every fault becomes a `SettingsError`.
+
+    Parameters
+    ----------
+    cls : type
+        Class whose fields are annotated with `quantity` or `text` and whose `__post_init__`, if any, raises
+        what `impossible` returns when two fields contradict each other.
+
+    Returns
+    -------
+    type
+        The settings class.
+    """
+    made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
+    validated_init = made.__init__
+
+    @functools.wraps(validated_init)
+    def checked_init(self: Any, *args: Any, **values: Any) -> None:
+        try:
+            validated_init(self, *args, **values)
+        except ValidationError as error:
+            raise _settings_error(made, error, made.__name__) from None
+
+    setattr(made, "__init__", checked_init)  # noqa: B010 -- mypy forbids the plain assignment
+    return cast(type[T], made)
+
+
+def quantity(
+    description: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+) -> Any:
+    """Annotate a finite number with its meaning and the range outside which it is absurd.
+
+    Parameters
+    ----------
+    description : str
+        Meaning and effect; the unit is in the name of the field.
+    above, at_least, below, at_most : float, optional
+        Exclusive and inclusive ends of the allowed range.
+
+    Returns
+    -------
+    pydantic.fields.FieldInfo
+        For use in `Annotated[float, quantity(...)]`. An integer is accepted, text and booleans are not.
+    """
+    return Field(
+        description=description, strict=True, allow_inf_nan=False, gt=above, ge=at_least, lt=below, le=at_most
+    )
+
+
+def text(description: str, *, may_be_empty: bool = False) -> Any:
+    """Annotate a text with its meaning, for use in `Annotated[str, text(...)]`."""
+    return Field(description=description, strict=True, min_length=0 if may_be_empty else 1)
+
+
+def switch(description: str) -> Any:
+    """Annotate a truth value with its meaning, for use in `Annotated[bool, switch(...)]`."""
+    return Field(description=description, strict=True)
+
+
+def impossible(key: str, value: object, allowed: str) -> PydanticCustomError:
+    """Return the error to raise from `__post_init__` when fields contradict each other.
+
+    Parameters
+    ----------
+    key : str
+        Dotted path of the offending field, from the class that raises.
+    value : object
+        What the field holds.
+    allowed : str
+        What it may hold, with the numbers that follow from the other fields.
+
+    Returns
+    -------
+    pydantic_core.PydanticCustomError
+        Becomes a `SettingsError` with the whole key path.
+    """
+    return PydanticCustomError(
+        "impossible", "{key} = {value}: {allowed}", {"key": key, "value": repr(value), "allowed": allowed}
+    )
+
+
+def parse(cls: type[T], mapping: Mapping[str, object], where: str) -> T:
+    """Build settings from plain values, as read from TOML or JSON.
+
+    Parameters
+    ----------
+    cls : type
+        A class made by `settings`.
+    mapping : mapping of str to object
+        Values by key; nested settings are nested mappings.
+    where : str
+        Where the values come from (a file name), for the message.
+
+    Returns
+    -------
+    instance of `cls`
+
+    Raises
+    ------
+    SettingsError
+        For a missing or unknown key, a wrong type, a number that is not finite or outside its range, or
+        values that contradict each other. The message names the key path, the value and what is allowed.
+    """
+    try:
+        return TypeAdapter(cls).validate_python(mapping)
+    except ValidationError as error:
+        raise _settings_error(cls, error, where) from None
+
+
+def to_mapping(values: object) -> dict[str, Any]:
+    """Return settings as plain JSON types, from which `parse` restores them without loss."""
+    fields = dataclasses.fields(cast(Any, values))
+    return {field.name: _plain(getattr(values, field.name)) for field in fields}
+
+
+def override(values: T, changes: Mapping[str, object], where: str = "overrides") -> T:
+    """Return settings with some values replaced, all checked together.
+
+    Parameters
+    ----------
+    values : settings
+        What to start from.
+    changes : mapping of str to object
+        New values by dotted key path, e.g. ``{"needle.diameter_mm": 0.8}``.
+    where : str, optional
+        Where the changes come from, for the message.
+
+    Returns
+    -------
+    settings of the same class
+
+    Raises
+    ------
+    SettingsError
+        As `parse`.
+    """
+    mapping = to_mapping(values)
+    for path, value in changes.items():
+        *parents, key = path.split(".")
+        inner = mapping
+        for parent in parents:
+            step = inner.setdefault(parent, {})
+            if not isinstance(step, dict):
+                raise SettingsError(f"{where}: {path} is not a setting", remedy=_REMEDY)
+            inner = step
+        inner[key] = value
+    return parse(type(values), mapping, where)
+
+
+def _plain(value: object) -> object:
+    if dataclasses.is_dataclass(value):
+        return to_mapping(value)
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value + 0.0  # -0.0 and 0.0 are equal settings, so they must be written alike
+    return value
+
+
+def _settings_error(cls: type, error: ValidationError, where: str) -> SettingsError:
+    faults = [_explain(cls, detail) for detail in error.errors(include_url=False)]
+    return SettingsError(
+        f"{where}: " + "; ".join(found for found, _ in faults),
+        expected="; ".join(dict.fromkeys(allowed for _, allowed in faults)),
+        remedy=_REMEDY,
+    )
+
+
+def _explain(cls: type, detail: ErrorDetails) -> tuple[str, str]:
+    """Return what was found and what is allowed for one fault."""
+    kind, path = detail["type"], ".".join(str(part) for part in detail["loc"])
+    if kind == "impossible":
+        context = detail["ctx"]
+        path = ".".join(filter(None, (path, context["key"])))
+        return f"{path} = {context['value']}", f"{path}: {context['allowed']}"
+    if kind == "unexpected_keyword_argument":
+        return f"{path} is not a setting", _known_keys(cls, detail["loc"])
+    allowed = f"{path}: {_allowed(cls, detail['loc']) or detail['msg']}"
+    return (f"{path} is missing" if kind == "missing" else f"{path} = {detail['input']!r}"), allowed
+
+
+def _known_keys(cls: type, loc: Sequence[int | str]) -> str:
+    owner, unknown = _class_at(cls, loc[:-1]), str(loc[-1])
+    names = list(_fields(owner))
+    close = difflib.get_close_matches(unknown, names, n=1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    return f"one of {', '.join(names)}{hint}"
+
+
+def _allowed(cls: type, loc: Sequence[int | str]) -> str:
+    """Describe what the field at `loc` may hold, from its annotation."""
+    keys = [part for part in loc if isinstance(part, str)]
+    field = _fields(_class_at(cls, keys[:-1])).get(keys[-1]) if keys else None
+    if field is None:
+        return ""
+    bounds = [
+        f"{word} {getattr(item, attribute):g}"
+        for kind, attribute, word in _BOUND_WORDS
+        for item in field.metadata
+        if isinstance(item, kind)
+    ]
+    meaning = f" ({field.description})" if field.description else ""
+    return f"{_NOUNS.get(field.annotation, 'a table')} {' and '.join(bounds)}".strip() + meaning
+
+
+_BOUND_WORDS: tuple[tuple[type, str, str], ...] = (
+    (annotated_types.Gt, "gt", "above"),
+    (annotated_types.Ge, "ge", "at least"),
+    (annotated_types.Lt, "lt", "below"),
+    (annotated_types.Le, "le", "at most"),
+)
+
+
+_NOUNS: dict[object, str] = {
+    float: "a finite number",
+    str: "a text that is not empty",
+    bool: "true or false",
+    tuple[str, ...]: "a list of texts",
+}
+
+
+def _class_at(cls: type, keys: Sequence[int | str]) -> type | None:
+    """Return the settings class that owns the keys below `keys`."""
+    owner: Any = cls
+    for key in keys:
+        field = _fields(owner).get(str(key))
+        owner = field.annotation if field is not None else None
+    return cast(type | None, owner)
+
+
+def _fields(cls: type | None) -> Mapping[str, FieldInfo]:
+    return getattr(cls, "__pydantic_fields__", {})

@@ -1,0 +1,1 @@
+"""The devices, one package each: bronchoscope, concentric tubes and steerable needle."""

@@ -1,0 +1,64 @@
+"""What the planner has to know of a steerable needle."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from anatomy.settings import quantity, settings
+
+
+@settings
+class Needle:
+    """A bevel-tip or flexure-tip needle that follows arcs of bounded curvature.
+
+    Parameters
+    ----------
+    diameter_mm : float
+        Outer diameter, mm.
+    max_curvature_per_mm : float
+        Curvature of the tightest arc that the needle follows in lung tissue, 1/mm.
+    max_length_mm : float
+        Longest path from the start of the needle, mm.
+    max_angle_from_start_deg : float
+        Largest angle between the tip and its direction at the start, degrees [Kuntz2015]_.
+    max_accumulated_turn_deg : float
+        Largest sum of the angles of all arcs, degrees.
+    exit_exemption_mm : float
+        First length of the needle that may lie in the wall of the branch which the tube pierced, mm.
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite, negative or absurd.
+
+    References
+    ----------
+    .. [Kuntz2015] docs/bibliography.md
+    """
+
+    diameter_mm: Annotated[float, quantity("outer diameter of the needle", above=0.0, at_most=5.0)]
+    max_curvature_per_mm: Annotated[
+        float, quantity("curvature of the tightest arc in lung tissue", above=0.0, at_most=0.2)
+    ]
+    max_length_mm: Annotated[
+        float, quantity("longest path from the start of the needle", above=0.0, at_most=500.0)
+    ] = 150.0
+    max_angle_from_start_deg: Annotated[
+        float, quantity("largest angle between tip and start direction", above=0.0, at_most=180.0)
+    ] = 90.0
+    max_accumulated_turn_deg: Annotated[
+        float, quantity("largest sum of the angles of all arcs", above=0.0, at_most=1080.0)
+    ] = 180.0
+    exit_exemption_mm: Annotated[
+        float, quantity("needle length that may lie in the pierced wall", at_least=0.0, at_most=30.0)
+    ] = 5.0
+
+    @property
+    def radius_mm(self) -> float:
+        """Outer radius, mm."""
+        return 0.5 * self.diameter_mm
+
+    @property
+    def min_radius_of_curvature_mm(self) -> float:
+        """Radius of the tightest arc, mm."""
+        return 1.0 / self.max_curvature_per_mm

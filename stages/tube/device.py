@@ -1,0 +1,172 @@
+"""What the planner has to know of a pair of concentric tubes."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from anatomy.settings import impossible, quantity, settings
+
+
+@settings
+class Tube:
+    """One superelastic tube: straight, with a curved distal part of constant precurvature.
+
+    Parameters
+    ----------
+    outer_diameter_mm, inner_diameter_mm : float
+        Diameters, mm.
+    length_mm : float
+        Whole length, mm.
+    curved_length_mm : float
+        Length of the precurved distal part, mm; 0 for a straight tube.
+    precurvature_per_mm : float
+        Curvature of that part at rest, 1/mm; 0 for a straight tube.
+    youngs_modulus_gpa : float
+        Young's modulus, GPa.
+    poisson_ratio : float
+        Poisson's ratio.
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite or absurd, the tube has no wall, or the curved part contradicts itself.
+
+    References
+    ----------
+    .. [Rucker2010] docs/bibliography.md
+    """
+
+    outer_diameter_mm: Annotated[float, quantity("outer diameter of the tube", above=0.0, at_most=10.0)]
+    inner_diameter_mm: Annotated[float, quantity("inner diameter of the tube", above=0.0, at_most=10.0)]
+    length_mm: Annotated[float, quantity("whole length of the tube", above=0.0, at_most=2000.0)]
+    curved_length_mm: Annotated[
+        float, quantity("length of the precurved distal part, 0 if straight", at_least=0.0, at_most=500.0)
+    ] = 0.0
+    precurvature_per_mm: Annotated[
+        float, quantity("curvature of the distal part at rest, 0 if straight", at_least=0.0, at_most=1.0)
+    ] = 0.0
+    youngs_modulus_gpa: Annotated[float, quantity("Young's modulus", above=0.0, at_most=1000.0)] = 60.0
+    poisson_ratio: Annotated[float, quantity("Poisson's ratio", at_least=0.0, below=0.5)] = 0.3
+
+    def __post_init__(self) -> None:
+        if self.inner_diameter_mm >= self.outer_diameter_mm:
+            raise impossible(
+                "inner_diameter_mm",
+                self.inner_diameter_mm,
+                f"less than outer_diameter_mm = {self.outer_diameter_mm:g}",
+            )
+        if self.curved_length_mm > self.length_mm:
+            raise impossible(
+                "curved_length_mm",
+                self.curved_length_mm,
+                f"at most length_mm = {self.length_mm:g}",
+            )
+        if (self.curved_length_mm > 0.0) != (self.precurvature_per_mm > 0.0):
+            raise impossible(
+                "precurvature_per_mm",
+                self.precurvature_per_mm,
+                "above 0 if curved_length_mm is (curved tube), 0 if that is 0 (straight tube); "
+                f"curved_length_mm = {self.curved_length_mm:g}",
+            )
+
+    @property
+    def radius_mm(self) -> float:
+        """Outer radius, mm."""
+        return 0.5 * self.outer_diameter_mm
+
+    @property
+    def second_moment_mm4(self) -> float:
+        """Second moment of area of the cross-section, mm^4."""
+        return math.pi / 64.0 * (self.outer_diameter_mm**4 - self.inner_diameter_mm**4)
+
+    @property
+    def bending_stiffness_n_mm2(self) -> float:
+        """Bending stiffness E I, N mm^2 [Rucker2010]_."""
+        return 1e3 * self.youngs_modulus_gpa * self.second_moment_mm4
+
+    @property
+    def rest_strain(self) -> float:
+        """Largest strain when the precurved part is held straight (dimensionless)."""
+        return self.precurvature_per_mm * self.radius_mm
+
+
+@settings
+class ConcentricTubes:
+    """A straight outer tube and a precurved inner tube, and the limits of their deployment.
+
+    Parameters
+    ----------
+    outer, inner : Tube
+        The two tubes.
+    max_lateral_sweep_mm : float
+        Largest sideways motion of any point of the tubes in tissue during deployment, mm.
+    min_wall_angle_deg : float
+        Smallest angle between tube and airway wall at the exit (90 is perpendicular), degrees.
+    max_extension_mm : float
+        Largest distance along the tubes from the tip of the scope to their own tip, mm.
+    max_strain : float
+        Largest strain of the tube material (dimensionless).
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite or absurd, the tubes do not nest, the outer tube is curved, or a tube held
+        straight exceeds `max_strain`.
+    """
+
+    outer: Tube
+    inner: Tube
+    max_lateral_sweep_mm: Annotated[
+        float, quantity("largest sideways motion of the tubes in tissue", at_least=0.0, at_most=20.0)
+    ] = 1.0
+    min_wall_angle_deg: Annotated[
+        float, quantity("smallest angle between tube and airway wall at the exit", at_least=0.0, at_most=90.0)
+    ] = 10.0
+    max_extension_mm: Annotated[
+        float, quantity("largest extension beyond the tip of the scope", above=0.0, at_most=300.0)
+    ] = 60.0
+    max_strain: Annotated[float, quantity("largest strain of the material", above=0.0, at_most=0.1)] = 0.04
+
+    def __post_init__(self) -> None:
+        self._check_nesting()
+        if self.outer.precurvature_per_mm > 0.0:
+            raise impossible(
+                "outer.precurvature_per_mm",
+                self.outer.precurvature_per_mm,
+                "0; only a straight outer tube is supported",
+            )
+        for name, tube in (("outer", self.outer), ("inner", self.inner)):
+            if tube.rest_strain > self.max_strain:
+                raise impossible(
+                    f"{name}.precurvature_per_mm",
+                    tube.precurvature_per_mm,
+                    f"at most 2 max_strain / outer_diameter_mm = "
+                    f"{self.max_strain / tube.radius_mm:.6g}; the strain is {tube.rest_strain:.4g}, "
+                    f"max_strain is {self.max_strain:g}",
+                )
+
+    def _check_nesting(self) -> None:
+        if self.inner.outer_diameter_mm >= self.outer.inner_diameter_mm:
+            raise impossible(
+                "inner.outer_diameter_mm",
+                self.inner.outer_diameter_mm,
+                f"less than outer.inner_diameter_mm = {self.outer.inner_diameter_mm:g}",
+            )
+        if self.inner.length_mm < self.outer.length_mm:
+            raise impossible(
+                "inner.length_mm",
+                self.inner.length_mm,
+                f"at least outer.length_mm = {self.outer.length_mm:g}",
+            )
+        if self.max_extension_mm > self.inner.length_mm:
+            raise impossible(
+                "max_extension_mm",
+                self.max_extension_mm,
+                f"at most inner.length_mm = {self.inner.length_mm:g}",
+            )
+
+    @property
+    def max_inner_protrusion_mm(self) -> float:
+        """Length of inner tube that can be ahead of the outer one, mm, the rear ends being in order."""
+        return self.inner.length_mm - self.outer.length_mm

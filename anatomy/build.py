@@ -1,0 +1,242 @@
+"""From images to a `Lung`: working grid, labels, airway tree, clearance fields."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy import structures
+from anatomy.airway_tree import AirwayTree
+from anatomy.errors import AnatomyError
+from anatomy.fields import DistanceField, UInt16, corner_geometry, distance_corners, distance_field
+from anatomy.grid import Grid, Volume
+from anatomy.lung import Lung
+from anatomy.patient import PatientImages
+from anatomy.sides import septum
+
+Mask = NDArray[np.bool_]
+Progress = Callable[[str], None]
+
+FORMAT = 1
+"""Version of the processing: raise it when the same images give another lung."""
+
+PAD_VOXELS = 2
+
+
+def lung_key(sources: Mapping[str, str]) -> str:
+    """Return the key of the lung made from input files with these hashes."""
+    text = json.dumps({"format": FORMAT, "sources": dict(sorted(sources.items()))})
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+class WorkingBox:
+    """The box of all tissue plus a border, and how to cut images to it."""
+
+    def __init__(self, images: PatientImages) -> None:
+        tissue = images.lung.array | images.lumen.array
+        low, high = _bounds(tissue)
+        self._start = low - PAD_VOXELS
+        self._stop = high + 1 + PAD_VOXELS
+        self.grid: Grid = images.grid.crop(self._start, self._stop)
+
+    def cut(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Copy the part of `array` in the box; 0 beyond the image."""
+        out = np.zeros(self.grid.shape, dtype=array.dtype, order="F")
+        source = tuple(
+            slice(max(a, 0), min(b, n)) for a, b, n in zip(self._start, self._stop, array.shape, strict=True)
+        )
+        target = tuple(slice(s.start - a, s.stop - a) for s, a in zip(source, self._start, strict=True))
+        out[target] = array[source]
+        return out
+
+
+def _bounds(mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the lowest and highest index of a True voxel along each axis."""
+    low, high = [], []
+    for axis in range(3):
+        others = tuple(a for a in range(3) if a != axis)
+        hits = np.flatnonzero(mask.any(axis=others))
+        low.append(hits[0])
+        high.append(hits[-1])
+    return np.asarray(low), np.asarray(high)
+
+
+def build_lung(
+    images: PatientImages,
+    *,
+    key: str | None = None,
+    keep: Callable[[str, NDArray[Any]], NDArray[Any]] | None = None,
+    progress: Progress | None = None,
+) -> Lung:
+    """Make the `Lung` of a patient.
+
+    Parameters
+    ----------
+    images : PatientImages
+    key : str, optional
+        Key of the inputs; made from `images.sources` if None.
+    keep : callable, optional
+        Takes the name and values of each large array as soon as it is made and returns the array to
+        use, for instance the same values mapped from a file.
+    progress : callable, optional
+        Told each step as it begins.
+
+    Raises
+    ------
+    AnatomyError
+        If lung or airway are empty, or the airway has no trachea.
+    """
+    from anatomy.tree import tree_from_mask
+
+    keep = keep or (lambda _name, array: array)
+    tell = progress or (lambda _step: None)
+    warnings = list(images.warnings)
+    _require_tissue(images)
+    tell("airway tree")
+    tree = tree_from_mask(images.lumen)
+    tell("labels")
+    box = WorkingBox(images)
+    labels = keep("labels", _labels(images, box, tree, warnings))
+    fields: dict[str, DistanceField] = {}
+    geometry = corner_geometry(box.grid)
+    for name, corners in _field_arrays(labels, box.grid, images.fissures is not None, tell):
+        stored = keep(name, corners)
+        fields[name] = DistanceField(name=name, corners=stored, geometry=geometry)
+    return Lung(
+        name=images.name,
+        kind=images.kind,
+        key=key or lung_key(images.sources),
+        grid=box.grid,
+        labels=labels,
+        fields=fields,
+        lumen_depth=_lumen_depth(images.lumen, keep),
+        tree=tree,
+        nodules=_cut_volume(images.nodules, box, "nodules", keep),
+        cost=_cut_volume(images.cost, box, "cost", keep),
+        starts=images.starts,
+        targets_lps=images.targets_lps,
+        breath_hold=images.breath_hold,
+        sources=images.sources,
+        warnings=tuple(warnings),
+    )
+
+
+def _require_tissue(images: PatientImages) -> None:
+    for name, volume in (("lung", images.lung), ("airway lumen", images.lumen)):
+        if not volume.array.any():
+            raise AnatomyError(
+                f"The {name} mask of {images.name} is empty",
+                expected="at least one voxel",
+                remedy="Check that the file holds the structure and was written with labels above 0",
+            )
+
+
+def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: list[str]) -> UInt16:
+    """Set the bits of every structure and the branch of airway voxels."""
+    lumen = box.cut(images.lumen.array)
+    airway = lumen if images.wall is None else lumen | box.cut(images.wall.array)
+    if images.wall is None:
+        warnings.append("No airway wall mask: the wall is covered by the margins alone.")
+    vessels = box.cut(images.vessels.array)
+    overlap = int((vessels & lumen).sum())
+    if overlap:
+        warnings.append(f"{overlap} voxels were both airway lumen and vessel; they are kept as lumen.")
+        vessels &= ~lumen
+    lung = box.cut(images.lung.array)
+    inside = lung | airway | vessels
+    if images.nodules is not None:
+        inside |= box.cut(images.nodules.array)
+    labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
+    labels[~inside] = structures.OUTSIDE
+    labels[_septum(lung, airway, box.grid, warnings)] |= structures.OUTSIDE
+    labels[vessels] |= structures.VESSEL
+    if images.fissures is not None:
+        fissures = box.cut(images.fissures.array) & ~airway
+        labels[fissures] |= structures.FISSURE
+    _label_airway(labels, airway, lumen, tree, box.grid)
+    return labels
+
+
+def _septum(lung: Mask, airway: Mask, grid: Grid, warnings: list[str]) -> Mask:
+    """Return the border between the lungs, empty with a warning if they cannot be told apart."""
+    border = septum(lung, airway, grid)
+    if border is None:
+        warnings.append("The mask could not be split into two lungs: taken as one lung.")
+        return np.zeros(lung.shape, dtype=bool)
+    count = int(border.sum())
+    if count:
+        warnings.append(
+            f"Left and right lung touch in the mask: a septum of {count} voxels keeps them apart."
+        )
+    return border
+
+
+def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> None:
+    """Set AIRWAY, LUMEN and the branch whose surface is nearest."""
+    from scipy.spatial import cKDTree
+
+    if tree.n_branches > structures.MAX_BRANCHES:
+        raise AnatomyError(
+            f"The airway tree has {tree.n_branches} branches",
+            expected=f"at most {structures.MAX_BRANCHES}",
+            remedy="Remove noise from the airway mask",
+        )
+    voxels = np.argwhere(airway)
+    neighbours = min(8, tree.n_points)
+    distance, index = cKDTree(tree.points_lps).query(grid.lps(voxels), k=neighbours)
+    distance, index = distance.reshape(len(voxels), -1), index.reshape(len(voxels), -1)
+    nearest = np.argmin(distance - tree.radius_mm[index], axis=1)
+    branch = tree.branch_of_point[index[np.arange(len(voxels)), nearest]]
+    at = tuple(voxels.T)
+    code = structures.AIRWAY | ((branch + 1) << structures.BRANCH_SHIFT)
+    labels[at] |= code.astype(np.uint16)
+    labels[lumen] |= structures.LUMEN
+
+
+def _field_arrays(
+    labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress
+) -> Iterator[tuple[str, UInt16]]:
+    """Yield the clearance fields one after the other; the unions are minima of the parts."""
+    union: UInt16 | None = None
+    names = ["airway", "vessel", "pleura"]
+    for name in names:
+        tell(f"clearance to {name}")
+        corners = distance_corners((labels & structures.FIELD_BITS[name]) != 0, grid.spacing_mm)
+        union = corners.copy(order="F") if union is None else np.minimum(union, corners, out=union)
+        yield name, corners
+    if union is None:
+        return
+    yield "obstacle", union
+    if has_fissures:
+        tell("clearance to fissure")
+        corners = distance_corners((labels & structures.FISSURE) != 0, grid.spacing_mm)
+        yield "fissure", corners
+        yield "obstacle_fissure", np.minimum(union, corners)
+
+
+def _lumen_depth(
+    lumen: Volume, keep: Callable[[str, NDArray[Any]], NDArray[Any]]
+) -> DistanceField:
+    """Make the field of the depth inside the lumen, on the lumen's own box."""
+    low, high = _bounds(lumen.array)
+    grid = lumen.grid.crop(low - 1, high + 2)
+    solid = np.ones(grid.shape, dtype=bool, order="F")
+    window = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
+    solid[1:-1, 1:-1, 1:-1] = ~lumen.array[window]
+    field = distance_field("lumen_depth", solid, grid)
+    stored = keep("lumen_depth", field.corners)
+    return DistanceField(name=field.name, corners=stored, geometry=field.geometry)
+
+
+def _cut_volume(
+    volume: Volume | None,
+    box: WorkingBox,
+    name: str,
+    keep: Callable[[str, NDArray[Any]], NDArray[Any]],
+) -> Volume | None:
+    return None if volume is None else Volume(grid=box.grid, array=keep(name, box.cut(volume.array)))

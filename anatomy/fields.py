@@ -1,0 +1,96 @@
+"""Clearance fields: the distance to a structure, exact at voxel corners and bounded in between.
+
+The corner of a voxel lattice nearest to a box of voxels is a corner of that box, so the distance
+from every corner to a union of solid voxel boxes is the Euclidean distance transform of the set of
+corners that touch the structure: exact, with voxels as solid boxes and any voxel size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.grid import Float, Grid, read_only
+from anatomy.kernels import field as kernel
+
+UInt16 = NDArray[np.uint16]
+MAX_STORED = np.iinfo(np.uint16).max
+
+
+def corner_geometry(grid: Grid) -> Float:
+    """Return the `(3, 5)` array that kernels use to find a point in the corner lattice of `grid`."""
+    geometry = np.zeros((3, 5))
+    geometry[:, :4] = grid.ijk_from_lps[:3]
+    geometry[:, 3] += 0.5
+    geometry[:, 4] = grid.spacing_mm**2
+    return read_only(geometry)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DistanceField:
+    """The distance to a structure whose voxels are solid boxes.
+
+    Parameters
+    ----------
+    name : str
+    corners : (ni + 1, nj + 1, nk + 1) uint16, Fortran-contiguous
+        Distance at each voxel corner in 1/256 mm, rounded down, at most 255.99 mm.
+    geometry : (3, 5) float64
+        See `corner_geometry`.
+    """
+
+    name: str
+    corners: UInt16
+    geometry: Float
+
+    def __post_init__(self) -> None:
+        # One array type, memory-mapped or not, so that kernels are compiled once.
+        object.__setattr__(self, "corners", read_only(np.asarray(self.corners)))
+        object.__setattr__(self, "geometry", read_only(np.asarray(self.geometry)))
+
+    def lower_bound_mm(self, points_lps: ArrayLike) -> Float:
+        """Return `(N,)` distances in mm that the true ones are never below, for `(N, 3)` LPS mm points.
+
+        The bound and its derivation stand in `anatomy.kernels.field`.  Outside the grid it is 0.
+        """
+        points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
+        out = np.zeros(len(points))
+        kernel.bounds_at(self.corners, self.geometry, points, out)
+        return out
+
+
+def touched_corners(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the `(ni + 1, nj + 1, nk + 1)` corners that touch a voxel of `mask`."""
+    shape = tuple(n + 1 for n in mask.shape)
+    corners: NDArray[np.bool_] = np.zeros(shape, dtype=bool, order="F")
+    ni, nj, nk = mask.shape
+    for di in (0, 1):
+        for dj in (0, 1):
+            for dk in (0, 1):
+                corners[di : di + ni, dj : dj + nj, dk : dk + nk] |= mask
+    return corners
+
+
+def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike) -> UInt16:
+    """Return the distance from every voxel corner to the voxels of `mask`, in 1/256 mm rounded down."""
+    import edt
+
+    spacing = tuple(float(s) for s in np.asarray(spacing_mm))
+    free = touched_corners(mask)
+    if not free.any():
+        return np.asfortranarray(np.full(free.shape, MAX_STORED, dtype=np.uint16))
+    np.logical_not(free, out=free)
+    distance: NDArray[Any] = edt.edt(free, anisotropy=spacing, order="F", black_border=False, parallel=2)
+    distance -= kernel.ROUNDING_MM
+    distance *= kernel.UNITS_PER_MM
+    np.clip(distance, 0, MAX_STORED, out=distance)
+    return distance.astype(np.uint16, order="F")
+
+
+def distance_field(name: str, mask: NDArray[np.bool_], grid: Grid) -> DistanceField:
+    """Make the field of the distance to `mask`, a bool array on `grid`."""
+    corners = distance_corners(mask, grid.spacing_mm)
+    return DistanceField(name=name, corners=corners, geometry=corner_geometry(grid))

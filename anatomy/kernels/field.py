@@ -1,0 +1,163 @@
+"""Distance lookups with a proved error: clearance fields at voxel corners, and exact local search.
+
+A clearance field holds, at every voxel corner, the distance to the nearest obstacle voxel taken as a
+solid box, rounded down to 1/256 mm.  The coordinates `u, v, w` below count corners: voxel `i` spans
+`i <= u <= i + 1`.
+
+Lower bound.  Let `p` lie in a cell, `t` be its true distance, and `B` the nearest box.  Trilinear
+weights are the probabilities of a random corner `X` with mean `p` and independent coordinates, of
+variance `f (1 - f) s**2` along an axis with fraction `f` and voxel size `s`.  On the cell every gap
+between `X` and `B` along an axis is either 0 throughout or affine, so
+
+    E[d(X)**2] <= E[d_B(X)**2] <= t**2 + sum of f (1 - f) s**2,
+
+hence `t >= sqrt(interpolated squared distance - sum of f (1 - f) s**2)`.  Equality holds when one
+box corner is nearest from all eight corners of the cell, so little is lost.
+
+`geometry` is `(3, 5)` float64: rows of the affine map from LPS mm to corner coordinates, and the
+squared voxel size of the axis in the last column.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+UNITS_PER_MM = 256.0
+ROUNDING_MM = 2e-5
+AIRWAY_BIT = 1
+OUTSIDE_BIT = 4
+BRANCH_SHIFT = 5
+
+
+@numba.njit(cache=True, inline="never")
+def interpolate_squared(field, geometry, x, y, z):
+    """Return the interpolated squared distance and the variance term, in mm^2; (0, 0) off the grid."""
+    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
+    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
+    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    if not (u >= 0.0 and v >= 0.0 and w >= 0.0):
+        return 0.0, 0.0
+    i = int(u)
+    j = int(v)
+    k = int(w)
+    if i >= field.shape[0] - 1 or j >= field.shape[1] - 1 or k >= field.shape[2] - 1:
+        return 0.0, 0.0
+    fu = u - i
+    fv = v - j
+    fw = w - k
+    total = 0.0
+    for c in range(2):
+        wc = fw if c == 1 else 1.0 - fw
+        for b in range(2):
+            wb = fv if b == 1 else 1.0 - fv
+            low = np.float64(field[i, j + b, k + c])
+            high = np.float64(field[i + 1, j + b, k + c])
+            total += wc * wb * ((1.0 - fu) * low * low + fu * high * high)
+    total /= UNITS_PER_MM * UNITS_PER_MM
+    spread = (
+        fu * (1.0 - fu) * geometry[0, 4] + fv * (1.0 - fv) * geometry[1, 4] + fw * (1.0 - fw) * geometry[2, 4]
+    )
+    return total, spread
+
+
+@numba.njit(cache=True)
+def distance_bound(field, geometry, x, y, z):
+    """Return a distance in mm that the true distance is never below; 0 outside the grid."""
+    total, spread = interpolate_squared(field, geometry, x, y, z)
+    return math.sqrt(max(total - spread, 0.0))
+
+
+@numba.njit(cache=True)
+def distance_estimate(field, geometry, x, y, z):
+    """Return a smooth estimate of the distance in mm, within half a voxel diagonal; no bound."""
+    total, spread = interpolate_squared(field, geometry, x, y, z)
+    return math.sqrt(max(total - 0.5 * spread, 0.0))
+
+
+@numba.njit(cache=True)
+def label_at(labels, geometry, x, y, z):
+    """Return the label of the voxel that holds a point; OUTSIDE beyond the grid."""
+    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
+    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
+    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    if not (u >= 0.0 and v >= 0.0 and w >= 0.0):
+        return OUTSIDE_BIT
+    i = int(u)
+    j = int(v)
+    k = int(w)
+    if i >= labels.shape[0] or j >= labels.shape[1] or k >= labels.shape[2]:
+        return OUTSIDE_BIT
+    return int(labels[i, j, k])
+
+
+@numba.njit(cache=True)
+def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
+    """Search the voxels around a point for the nearest one with any of `bits`, as a solid box.
+
+    Airway voxels of `exempt_branch` count only for their other structures (-1 exempts nothing).
+    Space beyond the grid is OUTSIDE.  Returns the distance in mm, at most `cap`, and the label of the
+    nearest voxel, 0 if none lies within `cap`.
+    """
+    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
+    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
+    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    ni, nj, nk = labels.shape
+    best = cap * cap
+    nearest = 0
+    su = math.sqrt(geometry[0, 4])
+    sv = math.sqrt(geometry[1, 4])
+    sw = math.sqrt(geometry[2, 4])
+    if not (0.0 <= u <= ni and 0.0 <= v <= nj and 0.0 <= w <= nk):
+        return (0.0, OUTSIDE_BIT) if bits & OUTSIDE_BIT else (cap, 0)
+    if bits & OUTSIDE_BIT:
+        edge = min(u * su, (ni - u) * su, v * sv, (nj - v) * sv, w * sw, (nk - w) * sw)
+        if edge * edge < best:
+            best = edge * edge
+            nearest = OUTSIDE_BIT
+    i0 = max(int(math.floor(u - cap / su)), 0)
+    i1 = min(int(math.floor(u + cap / su)), ni - 1)
+    j0 = max(int(math.floor(v - cap / sv)), 0)
+    j1 = min(int(math.floor(v + cap / sv)), nj - 1)
+    k0 = max(int(math.floor(w - cap / sw)), 0)
+    k1 = min(int(math.floor(w + cap / sw)), nk - 1)
+    for k in range(k0, k1 + 1):
+        gw = max(max(k - w, w - k - 1.0), 0.0) * sw
+        if gw * gw >= best:
+            continue
+        for j in range(j0, j1 + 1):
+            gv = max(max(j - v, v - j - 1.0), 0.0) * sv
+            g2 = gw * gw + gv * gv
+            if g2 >= best:
+                continue
+            for i in range(i0, i1 + 1):
+                label = int(labels[i, j, k])
+                hit = label & bits
+                if hit == 0:
+                    continue
+                if hit == AIRWAY_BIT and exempt_branch >= 0 and (label >> BRANCH_SHIFT) - 1 == exempt_branch:
+                    continue
+                gu = max(max(i - u, u - i - 1.0), 0.0) * su
+                d2 = g2 + gu * gu
+                if d2 < best:
+                    best = d2
+                    nearest = label
+    return math.sqrt(best), nearest
+
+
+@numba.njit(cache=True)
+def bounds_at(field, geometry, points, out):
+    """Fill `out` (N,) with `distance_bound` at `points` (N, 3)."""
+    for n in range(points.shape[0]):
+        out[n] = distance_bound(field, geometry, points[n, 0], points[n, 1], points[n, 2])
+
+
+@numba.njit(cache=True)
+def exact_at(labels, geometry, points, bits, exempt_branch, cap, out):
+    """Fill `out` (N,) with `exact_distance` at `points` (N, 3)."""
+    for n in range(points.shape[0]):
+        out[n] = exact_distance(
+            labels, geometry, points[n, 0], points[n, 1], points[n, 2], bits, exempt_branch, cap
+        )[0]

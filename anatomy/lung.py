@@ -1,0 +1,121 @@
+"""The patient as the devices see it: one immutable `Lung`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy import structures
+from anatomy.airway_tree import AirwayTree
+from anatomy.errors import AnatomyError
+from anatomy.fields import DistanceField, corner_geometry
+from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.kernels import field as kernel
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lung:
+    """The anatomy of one patient, in LPS mm, immutable.
+
+    Parameters
+    ----------
+    name, kind : str
+        The patient, and the kind of folder it was read from.
+    key : str
+        Hash of the content of the inputs and of the way they were processed.
+    grid : Grid
+        The working grid: the box of the lungs and airways, at least one voxel wider all around.
+    labels : (ni, nj, nk) uint16, Fortran-contiguous
+        Structures and airway branch of every voxel, see `anatomy.structures`.
+    fields : mapping of str to DistanceField
+        Clearance to "airway", "vessel", "pleura", "fissure" (if any), and to the nearest of them:
+        "obstacle" without fissures, "obstacle_fissure" with them.
+    lumen_depth : DistanceField
+        Distance from a point in the lumen to the nearest voxel that is not lumen; 0 outside.
+    tree : AirwayTree
+    nodules, cost : Volume or None
+        Nodule mask; cost map in [0, 1] or infinite.  Both on `grid`.
+    starts, targets_lps : tuple of arrays
+        Poses `lps_from_tip` (4, 4) and points (3,) that came with the patient.
+    breath_hold : str or None
+        In which breath-hold the image was taken, if stated.
+    sources : mapping of str to str
+        SHA-256 of every input file.
+    warnings : tuple of str
+        What was assumed or repaired on the way in.
+    """
+
+    name: str
+    kind: str
+    key: str
+    grid: Grid
+    labels: NDArray[np.uint16]
+    fields: Mapping[str, DistanceField]
+    lumen_depth: DistanceField
+    tree: AirwayTree
+    nodules: Volume | None
+    cost: Volume | None
+    starts: tuple[Float, ...]
+    targets_lps: tuple[Float, ...]
+    breath_hold: str | None
+    sources: Mapping[str, str]
+    warnings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", read_only(np.asarray(self.labels)))
+
+    @property
+    def has_fissures(self) -> bool:
+        """Whether a fissure mask came with the patient."""
+        return "fissure" in self.fields
+
+    @property
+    def geometry(self) -> Float:
+        """The `(3, 5)` array that maps LPS mm to voxel corners, for kernels."""
+        return corner_geometry(self.grid)
+
+    def obstacle_field(self, *, with_fissures: bool) -> DistanceField:
+        """Return the clearance to everything forbidden."""
+        return self.fields["obstacle_fissure" if with_fissures and self.has_fissures else "obstacle"]
+
+    def mask(self, name: str) -> Volume:
+        """Return a structure as a bool volume: airway, lumen, vessel, outside, fissure or nodule."""
+        if name == "nodule":
+            if self.nodules is None:
+                raise AnatomyError(
+                    f"Patient {self.name} has no nodule mask", remedy="Name a target point instead"
+                )
+            return self.nodules
+        if name not in structures.BITS:
+            raise AnatomyError(
+                f"There is no structure {name!r}", expected=f"one of {', '.join(structures.BITS)}, nodule"
+            )
+        return Volume(grid=self.grid, array=(self.labels & structures.BITS[name]) != 0)
+
+    def label_at(self, point_lps: Float) -> int:
+        """Return the label of the voxel that holds a point; OUTSIDE beyond the grid."""
+        x, y, z = (float(c) for c in point_lps)
+        return int(kernel.label_at(self.labels, self.geometry, x, y, z))
+
+    def exact_clearance_mm(
+        self, points_lps: Float, bits: int, *, cap_mm: float, exempt_branch: int = -1
+    ) -> Float:
+        """Return exact distances in mm to the nearest voxel with any of `bits`, at most `cap_mm`.
+
+        Parameters
+        ----------
+        points_lps : (N, 3) float64, LPS mm
+        bits : int
+            Structures of `anatomy.structures` to measure to.
+        cap_mm : float
+            Search radius; the cost grows with its third power.
+        exempt_branch : int
+            Airway voxels of this branch are passed over; -1 for none.
+        """
+        points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
+        out = np.zeros(len(points))
+        kernel.exact_at(self.labels, self.geometry, points, bits, exempt_branch, float(cap_mm), out)
+        return out

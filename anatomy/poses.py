@@ -1,0 +1,57 @@
+"""Poses `lps_from_tip`: 4x4 rigid frames whose +z axis points the way the device moves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.grid import Float, read_only
+
+ANTERIOR = np.array([0.0, -1.0, 0.0])
+SUPERIOR = np.array([0.0, 0.0, 1.0])
+NEARLY_PARALLEL = 0.9
+
+
+def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = None) -> Float:
+    """Return the frame at a point with +z along `forward`.
+
+    Parameters
+    ----------
+    point_lps : (3,) float64, LPS mm
+    forward : (3,) float64
+        Need not be of unit length.
+    sideways : (3,) float64, optional
+        +x is its part perpendicular to `forward`; by default anterior, or superior where the device
+        points along the anterior axis.
+
+    Returns
+    -------
+    (4, 4) float64, read-only
+    """
+    z = np.asarray(forward, dtype=np.float64)
+    z = z / np.linalg.norm(z)
+    if sideways is None:
+        sideways = ANTERIOR if abs(float(z @ ANTERIOR)) < NEARLY_PARALLEL else SUPERIOR
+    x = np.asarray(sideways, dtype=np.float64)
+    x = x - (x @ z) * z
+    x = x / np.linalg.norm(x)
+    frame = np.eye(4)
+    frame[:3, 0] = x
+    frame[:3, 1] = np.cross(z, x)
+    frame[:3, 2] = z
+    frame[:3, 3] = point_lps
+    return read_only(frame)
+
+
+def bending_directions(frame: Float, rotations_rad: ArrayLike) -> Float:
+    """Return the unit vectors `(T, 3)` at angles about +z, counted from +x of a frame."""
+    angles = np.atleast_1d(np.asarray(rotations_rad, dtype=np.float64))[:, None]
+    return np.ascontiguousarray(np.cos(angles) * frame[:3, 0] + np.sin(angles) * frame[:3, 1])
+
+
+def roll_towards(frame: Float, direction: ArrayLike) -> float:
+    """Return the angle in [-pi, pi] about +z from +x of a frame to a direction."""
+    d = np.asarray(direction, dtype=np.float64)
+    return math.atan2(float(d @ frame[:3, 1]), float(d @ frame[:3, 0]))

@@ -1,0 +1,227 @@
+"""Lungs on disk: a folder of memory-mapped arrays, named by the hash of what it was made from."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import fields as dataclass_fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
+from anatomy.build import FORMAT, build_lung, lung_key
+from anatomy.errors import FileError
+from anatomy.fields import DistanceField, corner_geometry
+from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.lung import Lung
+from anatomy.patient import PatientImages
+
+META = "lung.json"
+REPORT_RECORDS: dict[str, Any] = {
+    "gaps_bridged": GapBridged,
+    "spurs_pruned": SpurPruned,
+    "loops_opened": LoopOpened,
+}
+FIELD_NAMES = ("airway", "vessel", "pleura", "fissure", "obstacle", "obstacle_fissure")
+
+
+def default_cache() -> Path:
+    """Return the folder for cached lungs: `$LUNGACCESS_CACHE`, or `lungaccess` in the user's cache."""
+    stated = os.environ.get("LUNGACCESS_CACHE")
+    if stated:
+        return Path(stated)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "lungaccess"
+
+
+def open_lung(
+    sources: dict[str, str],
+    read: Callable[[], PatientImages],
+    *,
+    cache: Path | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Lung:
+    """Return the lung made from inputs with these hashes, from the cache or newly built.
+
+    Parameters
+    ----------
+    sources : dict of str to str
+        SHA-256 of every input file.
+    read : callable
+        Reads the images; called only if the cache does not hold the lung.
+    cache : Path, optional
+        Folder of the cache; `default_cache()` if None.
+    progress : callable, optional
+        Told each step as it begins.
+
+    Raises
+    ------
+    FileError
+        If the cache cannot be written.
+    """
+    key = lung_key(sources)
+    folder = (cache or default_cache()) / key
+    stored = _load(folder)
+    if stored is not None:
+        return stored
+    if progress:
+        progress("reading images")
+    return _build_into(folder, key, read(), progress)
+
+
+def _build_into(
+    folder: Path, key: str, images: PatientImages, progress: Callable[[str], None] | None
+) -> Lung:
+    """Build a lung with its arrays in a new folder that gets its name when it is complete."""
+    with _new_folder(folder) as work:
+
+        def keep(name: str, array: NDArray[Any]) -> NDArray[Any]:
+            np.save(work / f"{name}.npy", array)
+            return _mapped(work, name)
+
+        _save_rest(build_lung(images, key=key, keep=keep, progress=progress), work)
+    lung = _load(folder)
+    if lung is None:
+        raise FileError(f"The cached lung in {folder} cannot be read back", remedy="Delete that folder")
+    return lung
+
+
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `folder` and rename it on success."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=".building-", dir=folder.parent))
+    except OSError as error:
+        raise FileError(
+            f"The cache folder {folder.parent} cannot be written: {error}",
+            remedy="Choose another with --cache or LUNGACCESS_CACHE",
+        ) from error
+    try:
+        yield work
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(work, folder)
+    except OSError as error:
+        raise FileError(
+            f"The lung could not be stored in {folder}: {error}",
+            remedy="Free some disk space (about 1.5 GB a patient) or choose another cache folder",
+        ) from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _save_rest(lung: Lung, folder: Path) -> None:
+    """Write everything but the large arrays; the description last."""
+    tree_arrays = {
+        f.name: getattr(lung.tree, f.name)
+        for f in dataclass_fields(AirwayTree)
+        if isinstance(getattr(lung.tree, f.name), np.ndarray)
+    }
+    np.savez(folder / "tree.npz", **tree_arrays)
+    meta = {
+        "format": FORMAT,
+        "name": lung.name,
+        "kind": lung.kind,
+        "key": lung.key,
+        "shape": lung.grid.shape,
+        "lps_from_ijk": lung.grid.lps_from_ijk.tolist(),
+        "lumen_geometry": lung.lumen_depth.geometry.tolist(),
+        "fields": [name for name in FIELD_NAMES if name in lung.fields],
+        "tree_report": _report_to_json(lung.tree.report),
+        "nodules": lung.nodules is not None,
+        "cost": lung.cost is not None,
+        "starts": [pose.tolist() for pose in lung.starts],
+        "targets_lps": [point.tolist() for point in lung.targets_lps],
+        "breath_hold": lung.breath_hold,
+        "sources": dict(lung.sources),
+        "warnings": lung.warnings,
+    }
+    (folder / META).write_text(json.dumps(meta, indent=1))
+
+
+def _load(folder: Path) -> Lung | None:
+    """Read a stored lung; None if there is none of the present format."""
+    try:
+        meta = json.loads((folder / META).read_text())
+        if meta["format"] != FORMAT:
+            return None
+        return _from_meta(folder, meta)
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
+    def array(name: str) -> NDArray[Any]:
+        return _mapped(folder, name)
+
+    grid = Grid(shape=tuple(meta["shape"]), lps_from_ijk=np.array(meta["lps_from_ijk"]))
+    geometry = corner_geometry(grid)
+    fields = {
+        name: DistanceField(name=name, corners=array(name), geometry=geometry) for name in meta["fields"]
+    }
+    lumen = DistanceField(
+        name="lumen_depth", corners=array("lumen_depth"), geometry=np.array(meta["lumen_geometry"])
+    )
+    return Lung(
+        name=meta["name"],
+        kind=meta["kind"],
+        key=meta["key"],
+        grid=grid,
+        labels=array("labels"),
+        fields=fields,
+        lumen_depth=lumen,
+        tree=_load_tree(folder, meta["tree_report"]),
+        nodules=Volume(grid=grid, array=array("nodules")) if meta["nodules"] else None,
+        cost=Volume(grid=grid, array=array("cost")) if meta["cost"] else None,
+        starts=tuple(_frozen(pose) for pose in meta["starts"]),
+        targets_lps=tuple(_frozen(point) for point in meta["targets_lps"]),
+        breath_hold=meta["breath_hold"],
+        sources=meta["sources"],
+        warnings=tuple(meta["warnings"]),
+    )
+
+
+def _mapped(folder: Path, name: str) -> NDArray[Any]:
+    """Open a stored array without reading it, as a plain read-only array."""
+    return read_only(np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")))
+
+
+def _frozen(values: list[Any]) -> Float:
+    return read_only(np.array(values, dtype=np.float64))
+
+
+def _load_tree(folder: Path, report: dict[str, Any]) -> AirwayTree:
+    with np.load(folder / "tree.npz") as arrays:
+        return AirwayTree(**dict(arrays), report=_report_from_json(report))
+
+
+def _report_to_json(report: TreeReport) -> dict[str, Any]:
+    """Return a tree report as plain values."""
+
+    def plain(record: Any) -> dict[str, Any]:
+        values = ((f.name, getattr(record, f.name)) for f in dataclass_fields(record))
+        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values}
+
+    out = plain(report)
+    for name in REPORT_RECORDS:
+        out[name] = [plain(record) for record in out[name]]
+    return out
+
+
+def _report_from_json(values: dict[str, Any]) -> TreeReport:
+    """Restore a tree report from `_report_to_json`."""
+    restored = dict(values)
+    for name, record in REPORT_RECORDS.items():
+        restored[name] = tuple(
+            record(**(item | {"position_lps": _frozen(item["position_lps"])})) for item in values[name]
+        )
+    restored["warnings"] = tuple(values["warnings"])
+    return TreeReport(**restored)

@@ -1,0 +1,251 @@
+"""The needle problem in OMPL: an SE(3) control problem, and a planner whose search is a compiled kernel.
+
+The only module that imports OMPL.  Its traps, each with a test: start states are taken through
+`getPlannerInputStates().nextStart()` (`getStartState` hands over ownership); numbers are copied out of
+a path at once (its states die with `clear`); validity functions return a real `bool`; the planner
+refers to no SimpleSetup (it would never be freed), so one problem is reused for many queries.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ompl import base, control, util
+from scipy.spatial.transform import Rotation
+
+from anatomy.grid import Float
+from anatomy.structures import OUTSIDE
+from stages.needle import kernels
+from stages.needle.path import ArcPath, arc_transform, path_from_tree
+from stages.needle.space import NeedleSpace
+
+util.setLogLevel(util.LogLevel.LOG_ERROR)
+
+PROPAGATION_STEP = 0.05
+"""Each arc has duration 1, so OMPL propagates it again in 20 steps when it checks a path."""
+
+GOAL_TOLERANCE_MM = 1e-6
+MAX_NODES = 20_000
+SLICE_ITERATIONS = 200
+
+
+@dataclass
+class Query:
+    """One start pose and target, and the effort to spend."""
+
+    lps_from_start: Float
+    target: Float
+    branch: int
+    seed: int
+    iterations: int
+
+
+class NeedleGoal(base.GoalRegion):  # type: ignore[misc]
+    """The tip is at the target; its orientation is free."""
+
+    def __init__(self, si: Any, target: Float) -> None:
+        super().__init__(si)
+        self.target = np.array(target, dtype=np.float64)
+        self.setThreshold(GOAL_TOLERANCE_MM)
+
+    def distanceGoal(self, state: Any) -> float:  # noqa: N802
+        """Return the distance in mm."""
+        tip = np.array([state.getX(), state.getY(), state.getZ()])
+        return float(np.linalg.norm(tip - self.target))
+
+
+class NeedleRRT(base.Planner):  # type: ignore[misc]
+    """The RRT of [Kuntz2015, sec. IV-C] as an OMPL planner.
+
+    `solve` runs the kernel in slices until it has a path, the termination condition holds, or the
+    iterations of the query are spent.
+    """
+
+    def __init__(self, si: Any, space: NeedleSpace) -> None:
+        super().__init__(si, "NeedleRRT")
+        self._si = si
+        self._space = space
+        self._nodes = np.zeros((MAX_NODES, kernels.NODE_COLUMNS))
+        self._parents = np.zeros(MAX_NODES, dtype=np.int64)
+        self.query: Query | None = None
+        self.path: ArcPath | None = None
+        self.iterations_used = 0
+
+    def solve(self, termination: Any) -> Any:
+        """Search; hand a path to the problem definition as arcs of duration 1."""
+        self.path = None
+        query = self.query
+        start = self.getPlannerInputStates().nextStart()
+        if query is None or start is None:
+            return base.PlannerStatus(base.PlannerStatus.INVALID_START)
+        self._nodes[0] = 0.0
+        self._nodes[0, :3] = query.lps_from_start[:3, 3]
+        self._nodes[0, 3:6] = query.lps_from_start[:3, 2]
+        solved = self._search(query, termination)
+        if not solved:
+            return base.PlannerStatus(base.PlannerStatus.TIMEOUT)
+        self._hand_over()
+        return base.PlannerStatus(base.PlannerStatus.EXACT_SOLUTION)
+
+    def _search(self, query: Query, termination: Any) -> bool:
+        state = np.array([query.seed], dtype=np.uint64)
+        count, used, solved = 1, 0, False
+        while True:
+            portion = min(SLICE_ITERATIONS, query.iterations - used)
+            count, spent, solved = kernels.grow_rrt(
+                self._space.arrays, self._space.limits, query.branch, query.target,
+                self._nodes, self._parents, count, portion, state,
+            )  # fmt: skip
+            used += spent
+            full = count + 2 > MAX_NODES
+            if solved or full or used >= query.iterations or spent == 0 or termination():
+                break
+        self.iterations_used = used
+        if solved:
+            self.path = path_from_tree(query.lps_from_start, self._nodes, self._parents, count - 1)
+        return bool(solved)
+
+    def _hand_over(self) -> None:
+        path = control.PathControl(self._si)
+        if self.path is None:
+            return
+        # OMPL splits an arc in steps of equal controls, so here the roll is counted from the start.
+        roll = 0.0
+        for frame, (length, turned, curvature) in zip(self.path.frames(), self.path.arcs, strict=False):
+            u = self._si.allocControl()
+            start = frame @ arc_transform(0.0, -roll, 0.0)
+            roll = math.remainder(roll + turned, 2 * math.pi)
+            u[0], u[1], u[2] = float(length), roll, float(curvature)
+            path.append(self._state(start), u, 1.0)
+        path.append(self._state(self.path.frames()[-1] @ arc_transform(0.0, -roll, 0.0)))
+        definition = self.getProblemDefinition()
+        definition.clearSolutionPaths()
+        definition.addSolutionPath(path)
+
+    def _state(self, frame: Float) -> Any:
+        state = self._si.allocState()
+        write_state(state, frame)
+        return state
+
+
+def write_state(state: Any, frame: Float) -> None:
+    """Set an OMPL SE(3) state to a frame."""
+    state.setX(float(frame[0, 3]))
+    state.setY(float(frame[1, 3]))
+    state.setZ(float(frame[2, 3]))
+    x, y, z, w = (float(v) for v in Rotation.from_matrix(frame[:3, :3]).as_quat())
+    rotation = state.rotation()
+    rotation.x, rotation.y, rotation.z, rotation.w = x, y, z, w
+
+
+def read_state(state: Any) -> Float:
+    """Return the frame of an OMPL SE(3) state."""
+    rotation = state.rotation()
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w]).as_matrix()
+    frame[:3, 3] = state.getX(), state.getY(), state.getZ()
+    return frame
+
+
+class NeedleProblem:
+    """Plans needle paths in one lung with OMPL; made once, asked many times.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    """
+
+    def __init__(self, space: NeedleSpace) -> None:
+        self._space = space
+        self._states = base.SE3StateSpace()
+        self._states.setBounds(_bounds_of(space))
+        controls = control.RealVectorControlSpace(self._states, 3)
+        controls.setBounds(_control_bounds(space))
+        self.setup = control.SimpleSetup(controls)
+        self._si = self.setup.getSpaceInformation()
+        self._si.setPropagationStepSize(PROPAGATION_STEP)
+        self._si.setMinMaxControlDuration(1, round(1 / PROPAGATION_STEP))
+        self.setup.setStatePropagator(_propagate)
+        self.setup.setStateValidityChecker(_validity(space))
+        self.planner = NeedleRRT(self._si, space)
+        self.setup.setPlanner(self.planner)
+
+    def plan(
+        self,
+        lps_from_start: Float,
+        target: Float,
+        *,
+        branch: int,
+        seed: int,
+        iterations: int,
+        time_s: float = math.inf,
+    ) -> ArcPath | None:
+        """Search a path of arcs from a pose to a point.
+
+        Parameters
+        ----------
+        lps_from_start : (4, 4) float64
+        target : (3,) float64, LPS mm
+        branch : int
+            Pierced branch, whose wall is exempt at the exit; -1 for none.
+        seed, iterations : int
+            The same pair gives the same path, if the time does not run out first.
+        time_s : float
+            Stop after this time.
+
+        Returns
+        -------
+        ArcPath or None
+            A path proved clear and within all limits; None if none was found.
+        """
+        self.planner.query = Query(
+            np.asarray(lps_from_start), np.array(target, dtype=np.float64), branch, seed, iterations
+        )
+        self.setup.clear()
+        self.setup.clearStartStates()
+        start = self._si.allocState()
+        write_state(start, lps_from_start)
+        self.setup.setStartState(start)
+        self.setup.setGoal(NeedleGoal(self._si, target))
+        self.setup.solve(min(time_s, 1e6))
+        return self.planner.path
+
+
+def _bounds_of(space: NeedleSpace) -> Any:
+    grid = space.lung.grid
+    corners = grid.lps(np.stack(np.meshgrid(*[(0, n) for n in grid.shape]), axis=-1).reshape(-1, 3))
+    bounds = base.RealVectorBounds(3)
+    for axis in range(3):
+        bounds.setLow(axis, float(corners[:, axis].min()))
+        bounds.setHigh(axis, float(corners[:, axis].max()))
+    return bounds
+
+
+def _control_bounds(space: NeedleSpace) -> Any:
+    """Bound length, roll and curvature of an arc."""
+    bounds = base.RealVectorBounds(3)
+    highs = (space.needle.max_length_mm, math.pi, space.needle.max_curvature_per_mm)
+    for n, (low, high) in enumerate(zip((0.0, -math.pi, 0.0), highs, strict=True)):
+        bounds.setLow(n, low)
+        bounds.setHigh(n, high)
+    return bounds
+
+
+def _propagate(state: Any, u: Any, duration: float, result: Any) -> None:
+    """Advance a state along a share `duration` of an arc that bends towards `u[1]` about its axis."""
+    bent = read_state(state) @ arc_transform(duration * u[0], u[1], u[2])
+    write_state(result, bent @ arc_transform(0.0, -u[1], 0.0))
+
+
+def _validity(space: NeedleSpace) -> Any:
+    lung = space.lung
+
+    def is_valid(state: Any) -> bool:
+        point: NDArray[np.float64] = np.array([state.getX(), state.getY(), state.getZ()])
+        return bool(lung.label_at(point) & OUTSIDE == 0)
+
+    return is_valid

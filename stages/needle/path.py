@@ -1,0 +1,162 @@
+"""Needle paths as a person steers them: roll, then insert along an arc."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy import poses as frames
+from anatomy.grid import Float, read_only
+from anatomy.kernels import arcs as arc_kernels
+from stages.needle import kernels
+
+LENGTH, ROLL, CURVATURE = 0, 1, 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ArcPath:
+    """A needle path of A arcs from a start pose.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+        +z is the direction of insertion.
+    arcs : (A, 3) float64
+        Length in mm, roll in rad about the tip's axis before the arc (it bends towards the +x of
+        the rolled frame, which stays), curvature in 1/mm.
+    """
+
+    lps_from_start: Float
+    arcs: Float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "arcs", read_only(np.asarray(self.arcs, dtype=np.float64).reshape(-1, 3)))
+
+    @property
+    def length_mm(self) -> float:
+        """Length of all arcs."""
+        return float(self.arcs[:, LENGTH].sum())
+
+    @property
+    def accumulated_turn_rad(self) -> float:
+        """Sum of the angles of all arcs."""
+        return float((self.arcs[:, LENGTH] * self.arcs[:, CURVATURE]).sum())
+
+    def frames(self) -> Float:
+        """Return the tip frame after each arc, `(A + 1, 4, 4)`, the start first."""
+        out = [np.asarray(self.lps_from_start)]
+        for length, roll, curvature in self.arcs:
+            out.append(out[-1] @ arc_transform(length, roll, curvature))
+        return np.stack(out)
+
+    def sample(self, step_mm: float) -> tuple[Float, Float]:
+        """Return points `(M, 3)` at most `step_mm` apart and their path lengths `(M,)`, ends included."""
+        points, lengths = [self.lps_from_start[:3, 3]], [0.0]
+        for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
+            count = max(1, math.ceil(length / step_mm))
+            before = lengths[-1]
+            for n in range(1, count + 1):
+                s = length * n / count
+                points.append((frame @ arc_transform(s, roll, curvature))[:3, 3])
+                lengths.append(before + s)
+        return np.array(points), np.array(lengths)
+
+    def max_angle_from_start_rad(self) -> float:
+        """Return the largest angle between the tip and its direction at the start.
+
+        Along an arc the cosine is a sinusoid of the turned angle, so its least value lies at an end
+        or where its derivative is zero.
+        """
+        start = self.lps_from_start[:3, 2]
+        worst = 0.0
+        for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
+            forward = float(start @ frame[:3, 2])
+            aside = float(start @ (math.cos(roll) * frame[:3, 0] + math.sin(roll) * frame[:3, 1]))
+            turn = length * curvature
+            angles = [0.0, turn]
+            least = math.atan2(aside, forward) + math.pi
+            angles += [a for a in (least - 2 * math.pi, least) if 0.0 < a < turn]
+            for angle in angles:
+                cosine = math.cos(angle) * forward + math.sin(angle) * aside
+                worst = max(worst, math.acos(min(1.0, max(-1.0, cosine))))
+        return worst
+
+
+def arc_transform(length_mm: float, roll_rad: float, curvature_per_mm: float) -> Float:
+    """Return `before_from_after` (4, 4) of a roll followed by an arc that bends towards +x."""
+    angle = curvature_per_mm * length_mm
+    roll = np.eye(4)
+    roll[:2, :2] = [[math.cos(roll_rad), -math.sin(roll_rad)], [math.sin(roll_rad), math.cos(roll_rad)]]
+    arc = np.eye(4)
+    arc[0, 0] = arc[2, 2] = math.cos(angle)
+    arc[0, 2], arc[2, 0] = math.sin(angle), -math.sin(angle)
+    arc[0, 3] = arc_kernels.versine_length(curvature_per_mm, length_mm)
+    arc[2, 3] = arc_kernels.sine_length(curvature_per_mm, length_mm)
+    return np.asarray(roll @ arc)
+
+
+def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
+    """Return the single arc from a pose to a point [Kuntz2015, `steer`].
+
+    The caller checks curvature and length against the needle's limits.
+    """
+    pose = tuple(float(v) for v in (*lps_from_start[:3, 3], *lps_from_start[:3, 2]))
+    point = tuple(float(v) for v in np.asarray(target))
+    length, (curvature, *normal), _turn = arc_kernels.arc_to_point(pose, point)
+    return ArcPath(
+        lps_from_start=lps_from_start,
+        arcs=np.array([[length, frames.roll_towards(lps_from_start, normal), curvature]]),
+    )
+
+
+def path_from_tree(lps_from_start: Float, nodes: Float, parents: np.ndarray, last: int) -> ArcPath:
+    """Return the path from the root of a search tree to its node `last`.
+
+    Parameters
+    ----------
+    nodes : (M, 13) float64
+        Tree of `stages.needle.kernels.grow_rrt`.
+    parents : (M,) int64
+    """
+    chain = []
+    node = last
+    while node != 0:
+        chain.append(node)
+        node = int(parents[node])
+    frame = np.asarray(lps_from_start)
+    arcs = []
+    for node in reversed(chain):
+        length = float(nodes[node, kernels.ARC_LENGTH])
+        curvature = float(nodes[node, kernels.BEND])
+        roll = frames.roll_towards(frame, nodes[node, kernels.BEND + 1 : kernels.BEND + 4])
+        arcs.append((length, roll, curvature))
+        frame = frame @ arc_transform(length, roll, curvature)
+    return ArcPath(lps_from_start=lps_from_start, arcs=np.array(arcs))
+
+
+def blocker_on_path(space: object, limits: Float, path: ArcPath, branch: int) -> int:
+    """Prove every arc of a path clear; return 0, or the label of the voxel that is too near.
+
+    Parameters
+    ----------
+    space : tuple
+        `NeedleSpace.arrays`.
+    limits : (9,) float64
+    path : ArcPath
+    branch : int
+        Pierced branch; -1 for none.
+    """
+    start = 0.0
+    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
+        bend = frame[:3, 0] * math.cos(roll) + frame[:3, 1] * math.sin(roll)
+        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+        label = kernels.blocker_on_arc(
+            space, limits, pose, (float(curvature), *map(float, bend)), float(length), start, branch
+        )
+        if label:
+            return int(label)
+        start += float(length)
+    return 0

@@ -1,0 +1,165 @@
+"""Where the tip of the bronchoscope can stand: points of the medial axis, with the way there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from anatomy.structures import OUTSIDE
+from stages.scope.device import Bronchoscope
+
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+WALL_PROBE_MM = 2.5
+PROBE_DIRECTIONS = 8
+PROOF_STEP_MM = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sites:
+    """Places for the scope tip: S tree points, about evenly spaced, and why others are not among them.
+
+    Parameters
+    ----------
+    tree_point : (S,) int64
+        Index into the airway tree.
+    poses : (S, 6) float64
+        Point and unit tangent, LPS mm: the scope tip looks along the medial axis.
+    lumen_radius_mm : (N,) float64
+        For each tree point, the smallest radius of the lumen about the way to it from the root:
+        proved for every point of the way, not only for the tree points.
+    passable : (N,) bool
+        Whether the scope fits at each tree point and all the way to it.
+    exits_ahead : (N,) bool
+        Whether an airway lying in lung tissue, not in the mediastinum, is within reach ahead.
+    narrowest : tuple of (int, float)
+        Generation at which the most branches become too narrow, and the least excess of the scope's
+        radius over the lumen there, in mm; (-1, 0) if every branch is passable.
+    """
+
+    tree_point: Int
+    poses: Float
+    lumen_radius_mm: Float
+    passable: Bool
+    exits_ahead: Bool
+    narrowest: tuple[int, float]
+
+    @property
+    def count(self) -> int:
+        """Number of sites, S."""
+        return len(self.tree_point)
+
+
+def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float = 1.0) -> Sites:
+    """Find where the scope tip can stand so that tubes can leave the airway from there.
+
+    A site is a point of the medial axis that the scope reaches through a lumen wider than itself all
+    the way, with an airway inside the lung within `reach_mm` ahead.  Airways in the mediastinum are not
+    such: leaving them pierces the pleura [Kuntz2015, fig. 5].
+
+    Parameters
+    ----------
+    lung : Lung
+    scope : Bronchoscope
+    reach_mm : float
+        How far ahead of the scope tip the airway may be left.
+    spacing_mm : float
+        Distance between sites along a branch.
+
+    References
+    ----------
+    .. [Kuntz2015] docs/bibliography.md
+    """
+    tree = lung.tree
+    needed = scope.radius_mm + scope.lumen_margin_mm
+    narrowest_so_far = _narrowest_on_the_way(lung)
+    passable = narrowest_so_far >= needed
+    ahead = _distance_to_exit(tree, _in_lung_tissue(lung)) <= reach_mm
+    chosen = np.flatnonzero(passable & ahead & _every(tree, spacing_mm))
+    return Sites(
+        tree_point=chosen,
+        poses=np.hstack([tree.points_lps[chosen], tree.tangents[chosen]]),
+        lumen_radius_mm=narrowest_so_far,
+        passable=passable,
+        exits_ahead=ahead,
+        narrowest=_where_too_narrow(tree, passable, narrowest_so_far, needed),
+    )
+
+
+def _narrowest_on_the_way(lung: Lung) -> Float:
+    """Return the proved lumen radius of the narrowest place between the root and each point.
+
+    The depth in the lumen is 1-Lipschitz: between two samples it is at most half their distance less.
+    """
+    tree = lung.tree
+    parent = np.maximum(tree.parent_point, 0)
+    step = tree.points_lps - tree.points_lps[parent]
+    count = max(1, math.ceil(float(np.linalg.norm(step, axis=1).max()) / PROOF_STEP_MM))
+    share = np.linspace(0.0, 1.0, count + 1)
+    samples = tree.points_lps[parent][:, None] + share[:, None] * step[:, None]
+    depth = lung.lumen_depth.lower_bound_mm(samples.reshape(-1, 3)).reshape(len(step), -1)
+    narrowest = np.maximum(depth.min(axis=1) - np.linalg.norm(step, axis=1) / (2 * count), 0.0)
+    for point in range(1, tree.n_points):
+        narrowest[point] = min(narrowest[point], narrowest[tree.parent_point[point]])
+    return narrowest
+
+
+def _in_lung_tissue(lung: Lung) -> Bool:
+    """Tell at which tree points the tissue beside the airway is lung in some direction."""
+    tree = lung.tree
+    helper = np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)]
+    first = np.cross(tree.tangents, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(tree.tangents, first)
+    outside_everywhere = np.ones(tree.n_points, dtype=bool)
+    for phi in np.arange(PROBE_DIRECTIONS) * (2 * math.pi / PROBE_DIRECTIONS):
+        direction = math.cos(phi) * first + math.sin(phi) * second
+        probe = tree.points_lps + (tree.radius_mm + WALL_PROBE_MM)[:, None] * direction
+        outside_everywhere &= (_labels_at(lung, probe) & OUTSIDE) != 0
+    return ~outside_everywhere
+
+
+def _labels_at(lung: Lung, points: Float) -> NDArray[np.uint16]:
+    ijk = np.floor(lung.grid.ijk(points) + 0.5).astype(np.int64)
+    inside = ((ijk >= 0) & (ijk < lung.grid.shape)).all(axis=1)
+    labels = np.full(len(points), OUTSIDE, dtype=np.uint16)
+    labels[inside] = lung.labels[tuple(ijk[inside].T)]
+    return labels
+
+
+def _distance_to_exit(tree: AirwayTree, in_tissue: Bool) -> Float:
+    """Return the way from each point down the tree to the next point in lung tissue."""
+    way = np.where(in_tissue, 0.0, np.inf)
+    for point in range(tree.n_points - 1, 0, -1):
+        parent = tree.parent_point[point]
+        step = tree.distance_from_root_mm[point] - tree.distance_from_root_mm[parent]
+        way[parent] = min(way[parent], way[point] + step)
+    return way
+
+
+def _every(tree: AirwayTree, spacing_mm: float) -> Bool:
+    """Choose points about `spacing_mm` apart along the tree."""
+    slot = np.floor(tree.distance_from_root_mm / spacing_mm)
+    chosen = np.ones(tree.n_points, dtype=bool)
+    chosen[1:] = slot[1:] != slot[tree.parent_point[1:]]
+    return chosen
+
+
+def _where_too_narrow(
+    tree: AirwayTree, passable: Bool, radius_mm: Float, needed_mm: float
+) -> tuple[int, float]:
+    """Say at which generation most routes end, and by how little."""
+    ends = np.flatnonzero(~passable[1:] & passable[tree.parent_point[1:]]) + 1
+    if not len(ends):
+        return (-1, 0.0) if passable[0] else (0, float(needed_mm - radius_mm[0]))
+    generation = tree.generation[tree.branch_of_point[ends]]
+    worst = int(np.argmax(np.bincount(generation)))
+    shortfall = needed_mm - radius_mm[ends[generation == worst]]
+    return worst, float(shortfall.min())

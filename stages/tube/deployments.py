@@ -1,0 +1,262 @@
+"""What the tubes can do from a scope tip: shape, tip pose, exit through the wall, why not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy import poses as frames
+from anatomy.grid import Float, read_only
+from anatomy.lung import Lung
+from anatomy.margins import Margins
+from anatomy.structures import FISSURE, OBSTACLES
+from stages.tube import kernels
+from stages.tube.device import ConcentricTubes
+
+Int = NDArray[np.int64]
+Scene = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int, NDArray[np.uint16], Float]
+
+REASONS: dict[int, str] = {
+    kernels.NO_EXIT: "the tube does not leave the airway",
+    kernels.NEAR_VESSEL: "the tube comes too near a vessel",
+    kernels.NEAR_PLEURA: "the tube comes too near the pleura or leaves the lung",
+    kernels.NEAR_FISSURE: "the tube comes too near a fissure",
+    kernels.NEAR_OTHER_BRANCH: "the tube comes too near another airway",
+    kernels.REENTERS_LUMEN: "the tube enters an airway again",
+    kernels.FLAT_EXIT: "the tube meets the airway wall at too flat an angle",
+    kernels.SWEEPS: "the tube would sweep tissue sideways",
+    kernels.TOO_LONG: "the tube would extend too far",
+    kernels.PROTRUDES: "the inner tube is too short to protrude so far",
+}
+"""Why a deployment is refused."""
+
+DEFAULT_ROTATIONS = 24
+DEFAULT_STOP_MM = 2.5
+THREADS = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Deployments:
+    """Accepted deployments, E of them, and counts of the refused.
+
+    Parameters
+    ----------
+    site : (E,) int64
+        Index of the scope pose.
+    rotation_rad, outer_mm, inner_mm : (E,) float64
+        Rotation of both tubes; insertions beyond the scope tip.
+    branch : (E,) int64
+        Pierced branch.
+    exit_mm, wall_angle_rad : (E,) float64
+        Arc length at which the axis leaves the lumen, and its angle to the wall there.
+    positions, tangents : (E, 3) float64
+        Tip of the inner tube, LPS mm.
+    candidates : int
+        Deployments looked at.
+    refused : dict of str to int
+        Counts by reason.
+    """
+
+    site: Int
+    rotation_rad: Float
+    outer_mm: Float
+    inner_mm: Float
+    branch: Int
+    exit_mm: Float
+    wall_angle_rad: Float
+    positions: Float
+    tangents: Float
+    candidates: int
+    refused: dict[str, int]
+
+    @property
+    def count(self) -> int:
+        """Number of accepted deployments, E."""
+        return len(self.site)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Deployment:
+    """One accepted deployment in full.
+
+    Parameters
+    ----------
+    rotation_rad, outer_mm, inner_mm : float
+    lps_from_tip : (4, 4) float64
+        +z forward, +x towards the bend.
+    branch : int
+    exit_mm, wall_angle_rad : float
+    lateral_sweep_mm : float
+    """
+
+    rotation_rad: float
+    outer_mm: float
+    inner_mm: float
+    lps_from_tip: Float
+    branch: int
+    exit_mm: float
+    wall_angle_rad: float
+    lateral_sweep_mm: float
+
+
+def scene_of(lung: Lung, *, with_fissures: bool) -> Scene:
+    """Gather the arrays that the tube kernels look at."""
+    field = lung.obstacle_field(with_fissures=with_fissures)
+    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    depth = lung.lumen_depth
+    return field.corners, lung.labels, field.geometry, bits, depth.corners, depth.geometry
+
+
+def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
+    """Return the `(10,)` array of `stages.tube.kernels`, lengths in mm, angles in rad.
+
+    Inside the outer tube the precurvature is shared in proportion to bending stiffness [Rucker2010].
+    """
+    constants = np.zeros(kernels.N_TUBES)
+    inner, outer = tubes.inner, tubes.outer
+    share = inner.bending_stiffness_n_mm2 / (inner.bending_stiffness_n_mm2 + outer.bending_stiffness_n_mm2)
+    constants[kernels.OVERLAP_CURVATURE] = inner.precurvature_per_mm * share
+    constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
+    constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
+    constants[kernels.OUTER_RADIUS] = outer.radius_mm
+    constants[kernels.INNER_RADIUS] = inner.radius_mm
+    constants[kernels.MARGIN] = margins.total_mm
+    constants[kernels.MIN_WALL_ANGLE] = math.radians(tubes.min_wall_angle_deg)
+    constants[kernels.MAX_SWEEP] = tubes.max_lateral_sweep_mm
+    constants[kernels.MAX_EXTENSION] = tubes.max_extension_mm
+    constants[kernels.MAX_PROTRUSION] = tubes.max_inner_protrusion_mm
+    return constants
+
+
+def insertion_stops(tubes: ConcentricTubes, spacing_mm: float = DEFAULT_STOP_MM) -> Float:
+    """Return insertions from 0 to the curved length, where the tube still follows its own track."""
+    longest = min(tubes.inner.curved_length_mm, tubes.max_extension_mm)
+    return np.linspace(0.0, longest, max(1, round(longest / spacing_mm)) + 1)
+
+
+def deployments(
+    lung: Lung,
+    tubes: ConcentricTubes,
+    margins: Margins,
+    scope_tips: ArrayLike,
+    *,
+    with_fissures: bool,
+    rotations: int = DEFAULT_ROTATIONS,
+    stop_spacing_mm: float = DEFAULT_STOP_MM,
+    progress: Callable[[float], None] | None = None,
+) -> Deployments:
+    """Enumerate what the tubes can do from many scope tips.
+
+    Only deployments without sideways sweep are enumerated: those whose tip stays within the curved
+    length of the scope tip.
+
+    Parameters
+    ----------
+    scope_tips : (S, 6) float64
+        Point and unit tangent of each scope tip, LPS mm.
+    with_fissures : bool
+        Whether fissures are obstacles.
+    rotations : int
+        Evenly spaced rotations of the tubes.
+    stop_spacing_mm : float
+        Spacing of the insertions of both tubes.
+    progress : callable, optional
+        Told the share of sites done.
+    """
+    tips = np.ascontiguousarray(np.asarray(scope_tips, dtype=np.float64).reshape(-1, 6))
+    angles = np.arange(rotations) * (2 * math.pi / rotations)
+    stops = insertion_stops(tubes, stop_spacing_mm)
+    scene = scene_of(lung, with_fissures=with_fissures)
+    constants = tube_constants(tubes, margins)
+    most = rotations * len(stops) * (len(stops) + 1) // 2
+    done = 0
+
+    def one_site(site: int) -> tuple[Float, Int]:
+        nonlocal done
+        normals = frames.bending_directions(frames.pose(tips[site, :3], tips[site, 3:]), angles)
+        rows = np.zeros((most, kernels.ENTRY_COLUMNS))
+        refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
+        work = np.zeros((2, kernels.N_TRACE))
+        count = kernels.enumerate_site(
+            scene, constants, tips[site], normals, site, stops, rows, refused, work
+        )
+        done += 1
+        if progress and done % 50 == 0:
+            progress(done / len(tips))
+        return rows[:count].copy(), refused
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = list(pool.map(one_site, range(len(tips))))
+    rows = np.concatenate([part for part, _ in parts] or [np.zeros((0, kernels.ENTRY_COLUMNS))])
+    refused = np.sum([counts for _, counts in parts], axis=0, dtype=np.int64) if parts else np.zeros(
+        kernels.N_REASONS, dtype=np.int64
+    )
+    return _as_deployments(rows, angles, refused, most - rotations, len(tips))
+
+
+def _as_deployments(
+    rows: Float, angles: Float, refused: Int, per_site: int, n_sites: int
+) -> Deployments:
+    tip = kernels.ENTRY_TIP
+    return Deployments(
+        site=read_only(rows[:, 0].astype(np.int64)),
+        rotation_rad=read_only(angles[rows[:, 1].astype(np.int64)]),
+        outer_mm=read_only(rows[:, 2].copy()),
+        inner_mm=read_only(rows[:, 3].copy()),
+        branch=read_only(rows[:, 4].astype(np.int64)),
+        exit_mm=read_only(rows[:, 5].copy()),
+        wall_angle_rad=read_only(rows[:, 6].copy()),
+        positions=read_only(rows[:, tip : tip + 3].copy()),
+        tangents=read_only(rows[:, tip + 3 : tip + 6].copy()),
+        candidates=per_site * n_sites,
+        refused={REASONS[code]: int(refused[code]) for code in REASONS if refused[code]},
+    )
+
+
+class TubeJudge:
+    """Judges single deployments of one pair of tubes in one lung."""
+
+    def __init__(
+        self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool
+    ) -> None:
+        self._scene = scene_of(lung, with_fissures=with_fissures)
+        self._constants = tube_constants(tubes, margins)
+        self._trace = np.zeros(kernels.N_TRACE)
+        self._tip = np.zeros(9)
+
+    def judge(
+        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
+    ) -> Deployment | str:
+        """Return the deployment, or the reason why it is refused.
+
+        Parameters
+        ----------
+        lps_from_scope_tip : (4, 4) float64
+        rotation_rad : float
+            Direction of the bend about +z of the scope tip, counted from its +x.
+        outer_mm, inner_mm : float
+            Insertions beyond the scope tip, `inner_mm >= outer_mm`.
+        """
+        base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
+        normal = frames.bending_directions(lps_from_scope_tip, rotation_rad)[0]
+        trace, tip = self._trace, self._tip
+        reason = kernels.deploy(
+            self._scene, self._constants, base, normal, float(outer_mm), float(inner_mm), trace, tip
+        )
+        if reason != kernels.ACCEPTED:
+            return REASONS[reason]
+        return Deployment(
+            rotation_rad=float(rotation_rad),
+            outer_mm=float(outer_mm),
+            inner_mm=float(inner_mm),
+            lps_from_tip=frames.pose(tip[:3], tip[3:6], tip[6:9]),
+            branch=int(trace[kernels.BRANCH]),
+            exit_mm=float(trace[kernels.LEFT_AT]),
+            wall_angle_rad=float(trace[kernels.WALL_ANGLE]),
+            lateral_sweep_mm=float(kernels.lateral_sweep(self._constants, float(outer_mm), float(inner_mm))),
+        )

@@ -1,0 +1,422 @@
+"""Compiled kernels of the tube stage: shape, sweep, wall exit, and the enumeration of deployments.
+
+A straight outer tube and an inner tube with a precurved distal part, rotated together, need no
+torsion: the centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `(10,)`
+float64 array indexed by the constants below.  `scene` is the tuple (obstacle field, labels, their
+geometry, obstacle bits, lumen depth, its geometry).  `trace` is a `(6,)` float64 array that follows
+one tube from the lumen through the wall into the tissue.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc, sine_length, versine_length
+from anatomy.kernels.field import distance_bound, exact_distance, label_at
+
+# tubes
+OVERLAP_CURVATURE = 0
+INNER_CURVATURE = 1
+CURVED_LENGTH = 2
+OUTER_RADIUS = 3
+INNER_RADIUS = 4
+MARGIN = 5
+MIN_WALL_ANGLE = 6
+MAX_SWEEP = 7
+MAX_EXTENSION = 8
+MAX_PROTRUSION = 9
+N_TUBES = 10
+
+# trace
+PHASE = 0
+LEFT_AT = 1
+BRANCH = 2
+WALL_ANGLE = 3
+HAZARD_AT = 4
+HAZARD = 5
+N_TRACE = 6
+
+IN_LUMEN = 0.0
+IN_WALL = 1.0
+IN_TISSUE = 2.0
+
+# reasons why a deployment is refused
+ACCEPTED = 0
+NO_EXIT = 1
+NEAR_VESSEL = 2
+NEAR_PLEURA = 3
+NEAR_FISSURE = 4
+NEAR_OTHER_BRANCH = 5
+REENTERS_LUMEN = 6
+FLAT_EXIT = 7
+SWEEPS = 8
+TOO_LONG = 9
+PROTRUDES = 10
+N_REASONS = 11
+
+AIRWAY_BIT = 1
+VESSEL_BIT = 2
+OUTSIDE_BIT = 4
+FISSURE_BIT = 8
+LUMEN_BIT = 16
+BRANCH_SHIFT = 5
+
+MIN_GAP_MM = 0.005
+EXACT_REACH_MM = 0.5
+FINE_STEP_MM = 0.05
+WALL_ZONE_MM = 1.0
+OUT_OF_LUMEN_MM = 0.02
+NORMAL_RADIUS_MM = 1.5
+BISECTIONS = 12
+SWEEP_SAMPLES = 24
+
+
+@numba.njit(cache=True)
+def _reason(label):
+    """Translate the label of a voxel that is too near into a reason."""
+    if label & VESSEL_BIT:
+        return NEAR_VESSEL
+    if label & OUTSIDE_BIT:
+        return NEAR_PLEURA
+    if label & FISSURE_BIT:
+        return NEAR_FISSURE
+    return NEAR_OTHER_BRANCH
+
+
+@numba.njit(cache=True)
+def planar_point(tubes, outer, inner, s):
+    """Return (aside, ahead) of the centreline at arc length `s` for given insertions, in mm.
+
+    The inner tube is curved over its last CURVED_LENGTH mm.  Inside the outer tube the two share the
+    curvature `kappa E_i I_i / (E_i I_i + E_o I_o)`; beyond it the inner has its own.
+    """
+    straight = min(max(inner - tubes[CURVED_LENGTH], 0.0), s)
+    shared = min(max(outer - straight, 0.0), s - straight)
+    free = s - straight - shared
+    angle = tubes[OVERLAP_CURVATURE] * shared
+    aside = versine_length(tubes[OVERLAP_CURVATURE], shared)
+    ahead = straight + sine_length(tubes[OVERLAP_CURVATURE], shared)
+    out = versine_length(tubes[INNER_CURVATURE], free)
+    along = sine_length(tubes[INNER_CURVATURE], free)
+    aside += math.sin(angle) * along + math.cos(angle) * out
+    ahead += math.cos(angle) * along - math.sin(angle) * out
+    return aside, ahead
+
+
+@numba.njit(cache=True)
+def lateral_sweep(tubes, outer, inner):
+    """Return the largest distance of a point of the body, at any step, from its final place, in mm.
+
+    Steps as in [Kuntz2015]: both tubes to `outer` with flush tips, then the inner to `inner`.  While
+    the tip is within the curved length of the scope, the body follows its own track exactly.
+    """
+    if inner <= tubes[CURVED_LENGTH]:
+        return 0.0
+    worst = 0.0
+    for m in range(1, SWEEP_SAMPLES + 1):
+        tip = inner * m / SWEEP_SAMPLES
+        for n in range(1, m + 1):
+            s = inner * n / SWEEP_SAMPLES
+            x0, z0 = planar_point(tubes, min(tip, outer), tip, s)
+            x1, z1 = planar_point(tubes, outer, inner, s)
+            worst = max(worst, math.hypot(x1 - x0, z1 - z0))
+    return worst
+
+
+@numba.njit(cache=True)
+def _wall_normal(labels, geometry, x, y, z):
+    """Return the outward unit normal of the lumen at a border point, in corner axes scaled to mm.
+
+    It points away from the centroid of the lumen within NORMAL_RADIUS_MM.
+    """
+    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
+    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
+    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    su = math.sqrt(geometry[0, 4])
+    sv = math.sqrt(geometry[1, 4])
+    sw = math.sqrt(geometry[2, 4])
+    r = NORMAL_RADIUS_MM
+    mu = mv = mw = 0.0
+    for k in range(max(int(w - r / sw), 0), min(int(w + r / sw) + 1, labels.shape[2])):
+        dw = (k + 0.5 - w) * sw
+        for j in range(max(int(v - r / sv), 0), min(int(v + r / sv) + 1, labels.shape[1])):
+            dv = (j + 0.5 - v) * sv
+            for i in range(max(int(u - r / su), 0), min(int(u + r / su) + 1, labels.shape[0])):
+                du = (i + 0.5 - u) * su
+                if labels[i, j, k] & LUMEN_BIT and du * du + dv * dv + dw * dw <= r * r:
+                    mu += du
+                    mv += dv
+                    mw += dw
+    norm = math.sqrt(mu * mu + mv * mv + mw * mw)
+    if norm < 1e-9:
+        return 0.0, 0.0, 0.0
+    return -mu / norm, -mv / norm, -mw / norm
+
+
+@numba.njit(cache=True)
+def wall_angle(labels, geometry, pose):
+    """Return the angle in rad between a tangent and the lumen's border at its point; pi/2 is square on."""
+    nu, nv, nw = _wall_normal(labels, geometry, pose[0], pose[1], pose[2])
+    tx, ty, tz = pose[3], pose[4], pose[5]
+    sine = 0.0
+    for axis in range(3):
+        along = geometry[axis, 0] * tx + geometry[axis, 1] * ty + geometry[axis, 2] * tz
+        normal = nu if axis == 0 else (nv if axis == 1 else nw)
+        sine += along * math.sqrt(geometry[axis, 4]) * normal
+    return math.asin(min(max(sine, -1.0), 1.0))
+
+
+@numba.njit(cache=True)
+def _leave_lumen(scene, tubes, trace, pose, bend, inside, outside, s0, radius):
+    """Find where the axis leaves the lumen between two arc lengths of a piece, and judge the exit."""
+    _field, labels, geometry, _bits, _lumen, _lumen_geometry = scene
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (inside + outside)
+        x, y, z = point_on_arc(pose, bend, middle)
+        if label_at(labels, geometry, x, y, z) & LUMEN_BIT:
+            inside = middle
+        else:
+            outside = middle
+    trace[PHASE] = IN_WALL
+    trace[LEFT_AT] = s0 + inside
+    trace[WALL_ANGLE] = wall_angle(labels, geometry, pose_on_arc(pose, bend, inside))
+    if trace[WALL_ANGLE] < tubes[MIN_WALL_ANGLE]:
+        return FLAT_EXIT
+    # The tube's side touches the wall this long before its axis does.
+    contact = radius / math.tan(trace[WALL_ANGLE])
+    if trace[HAZARD] > 0.0 and trace[HAZARD_AT] > trace[LEFT_AT] - contact:
+        return int(trace[HAZARD])
+    return ACCEPTED
+
+
+@numba.njit(cache=True)
+def _tissue_gap(scene, trace, x, y, z, required):
+    """Return the clearance beyond `required` outside the lumen and the label that limits it.
+
+    Exempt is the wall of the pierced branch; its lumen must stay out of reach of the axis.
+    """
+    field, labels, geometry, bits, _lumen, _lumen_geometry = scene
+    gap = distance_bound(field, geometry, x, y, z) - required
+    if gap >= MIN_GAP_MM:
+        return gap, 0
+    reach = required + EXACT_REACH_MM
+    distance, label = exact_distance(labels, geometry, x, y, z, bits, int(trace[BRANCH]), reach)
+    gap = distance - required
+    if trace[PHASE] == IN_TISSUE:
+        lumen, _label = exact_distance(labels, geometry, x, y, z, LUMEN_BIT, -1, reach)
+        if lumen - OUT_OF_LUMEN_MM < gap:
+            return lumen - OUT_OF_LUMEN_MM, LUMEN_BIT
+    return gap, label
+
+
+@numba.njit(cache=True)
+def _lumen_step(scene, trace, x, y, z, s, radius, required):
+    """Note branch and hazards of a point in the lumen; return the step to the next one."""
+    _field, labels, geometry, bits, lumen, lumen_geometry = scene
+    trace[BRANCH] = (label_at(labels, geometry, x, y, z) >> BRANCH_SHIFT) - 1
+    depth = distance_bound(lumen, lumen_geometry, x, y, z)
+    if depth >= radius:
+        return depth - 0.5 * radius
+    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY_BIT, -1, required)
+    if distance < required:
+        trace[HAZARD] = _reason(label)
+        trace[HAZARD_AT] = s
+    return max(0.5 * depth, FINE_STEP_MM)
+
+
+@numba.njit(cache=True)
+def march(scene, tubes, trace, pose, bend, s0, length, radius, clearance):
+    """Follow one arc of the tube, from `s0` mm beyond the scope tip, and judge every point of it.
+
+    In the lumen the axis moves freely.  Where it leaves, the wall is pierced within WALL_ZONE_MM; from
+    there on the axis is out of every lumen, and the tube keeps `clearance` from its surface to
+    vessels, pleura, fissures and other branches.  Returns a reason, ACCEPTED if there is none.
+    """
+    labels = scene[1]
+    geometry = scene[2]
+    required = radius + clearance
+    s = 0.0
+    last = 0.0
+    while True:
+        x, y, z = point_on_arc(pose, bend, s)
+        if trace[PHASE] == IN_LUMEN:
+            if label_at(labels, geometry, x, y, z) & LUMEN_BIT:
+                step = _lumen_step(scene, trace, x, y, z, s0 + s, radius, required)
+            elif s0 + s == 0.0:
+                return NO_EXIT
+            else:
+                reason = _leave_lumen(scene, tubes, trace, pose, bend, last, s, s0, radius)
+                if reason != ACCEPTED:
+                    return reason
+                s = max(trace[LEFT_AT] - s0, 0.0)
+                continue
+        else:
+            gap, label = _tissue_gap(scene, trace, x, y, z, required)
+            if gap < MIN_GAP_MM:
+                return REENTERS_LUMEN if label == LUMEN_BIT else _reason(label)
+            step = gap
+            if trace[PHASE] == IN_WALL:
+                here = label_at(labels, geometry, x, y, z)
+                if here & LUMEN_BIT and (here >> BRANCH_SHIFT) - 1 != int(trace[BRANCH]):
+                    return REENTERS_LUMEN
+                zone = trace[LEFT_AT] + WALL_ZONE_MM - s0
+                if s >= zone:
+                    trace[PHASE] = IN_TISSUE
+                    continue
+                step = min(step, max(zone - s, 1e-6))
+        if s >= length:
+            return ACCEPTED
+        last = s
+        s = min(s + step, length)
+
+
+@numba.njit(cache=True)
+def reset(trace):
+    """Put a trace at the scope tip, in the lumen."""
+    for m in range(trace.shape[0]):
+        trace[m] = 0.0
+    trace[BRANCH] = -1.0
+
+
+@numba.njit(cache=True, nogil=True)
+def deploy(scene, tubes, base, normal, outer, inner, trace, tip):
+    """Judge one deployment from the scope tip pose `base`, bending towards `normal`.
+
+    Fills `trace` and `tip` (9,): tip pose and the normal there.  Returns a reason.
+    """
+    reset(trace)
+    if inner > tubes[MAX_EXTENSION]:
+        return TOO_LONG
+    if inner - outer > tubes[MAX_PROTRUSION]:
+        return PROTRUDES
+    sweep = lateral_sweep(tubes, outer, inner)
+    if sweep > tubes[MAX_SWEEP]:
+        return SWEEPS
+    clearance = tubes[MARGIN] + sweep
+    straight = max(inner - tubes[CURVED_LENGTH], 0.0)
+    bounds = (
+        (0.0, min(straight, outer), 0.0, tubes[OUTER_RADIUS]),
+        (min(straight, outer), outer, tubes[OVERLAP_CURVATURE], tubes[OUTER_RADIUS]),
+        (outer, max(straight, outer), 0.0, tubes[INNER_RADIUS]),
+        (max(straight, outer), inner, tubes[INNER_CURVATURE], tubes[INNER_RADIUS]),
+    )
+    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    for start, stop, kappa, radius in bounds:
+        if stop - start <= 0.0:
+            continue
+        bend = (kappa, nx, ny, nz)
+        reason = march(scene, tubes, trace, pose, bend, start, stop - start, radius, clearance)
+        if reason != ACCEPTED:
+            return reason
+        nx, ny, nz = normal_on_arc(pose, bend, stop - start)
+        pose = pose_on_arc(pose, bend, stop - start)
+    for m in range(6):
+        tip[m] = pose[m]
+    tip[6], tip[7], tip[8] = nx, ny, nz
+    return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
+
+
+# Columns of an enumerated deployment: site, rotation (indices), outer and inner insertion (mm),
+# pierced branch, arc length at the exit (mm), wall angle (rad), tip pose (6).
+ENTRY_TIP = 7
+ENTRY_COLUMNS = 13
+
+
+@numba.njit(cache=True)
+def _record(entries, row, site, rotation, outer, inner, trace, pose):
+    entry = entries[row]
+    entry[0] = site
+    entry[1] = rotation
+    entry[2] = outer
+    entry[3] = inner
+    entry[4] = trace[BRANCH]
+    entry[5] = trace[LEFT_AT]
+    entry[6] = trace[WALL_ANGLE]
+    for m in range(6):
+        entry[ENTRY_TIP + m] = pose[m]
+
+
+@numba.njit(cache=True, nogil=True)
+def enumerate_site(scene, tubes, base, normals, site, stops, entries, reasons, work):
+    """Enumerate the deployments from one site that follow their own track exactly.
+
+    The outer tube stops at `stops[m]`, the inner at `stops[m + 1]` and beyond, up to the curved
+    length, so a longer deployment shares its beginning with the shorter ones: each piece is judged once.
+
+    Parameters
+    ----------
+    scene, tubes
+        See the module.
+    base : (6,) float64
+        Scope tip pose.
+    normals : (T, 3) float64
+        Bending direction of each rotation.
+    site : int
+    stops : (S,) float64
+        Insertions in mm, increasing from 0.
+    entries : (rows, 13) float64
+        Receives the accepted deployments; at least `T S (S + 1) / 2` rows.
+    reasons : (11,) int64
+        Counts the refused ones by reason.
+    work : (2, 6) float64
+        Scratch.
+
+    Returns
+    -------
+    int
+        Number of rows filled.
+    """
+    count = 0
+    outer_trace = work[0]
+    inner_trace = work[1]
+    n_stops = stops.shape[0]
+    for t in range(normals.shape[0]):
+        reset(outer_trace)
+        pose = (base[0], base[1], base[2], base[3], base[4], base[5])
+        nx, ny, nz = normals[t, 0], normals[t, 1], normals[t, 2]
+        for m in range(n_stops):
+            if m > 0:
+                bend = (tubes[OVERLAP_CURVATURE], nx, ny, nz)
+                length = stops[m] - stops[m - 1]
+                reason = march(
+                    scene, tubes, outer_trace, pose, bend, stops[m - 1], length,
+                    tubes[OUTER_RADIUS], tubes[MARGIN],
+                )  # fmt: skip
+                if reason != ACCEPTED:
+                    reasons[reason] += (n_stops - m) * (n_stops - m + 1) // 2
+                    break
+                nx, ny, nz = normal_on_arc(pose, bend, length)
+                pose = pose_on_arc(pose, bend, length)
+                if outer_trace[PHASE] == IN_TISSUE:
+                    _record(entries, count, site, t, stops[m], stops[m], outer_trace, pose)
+                    count += 1
+                else:
+                    reasons[NO_EXIT] += 1
+            for n in range(work.shape[1]):
+                inner_trace[n] = outer_trace[n]
+            inner_pose = pose
+            ix, iy, iz = nx, ny, nz
+            for e in range(m + 1, n_stops):
+                if stops[e] - stops[m] > tubes[MAX_PROTRUSION]:
+                    reasons[PROTRUDES] += n_stops - e
+                    break
+                bend = (tubes[INNER_CURVATURE], ix, iy, iz)
+                length = stops[e] - stops[e - 1]
+                reason = march(
+                    scene, tubes, inner_trace, inner_pose, bend, stops[e - 1], length,
+                    tubes[INNER_RADIUS], tubes[MARGIN],
+                )  # fmt: skip
+                if reason != ACCEPTED:
+                    reasons[reason] += n_stops - e
+                    break
+                ix, iy, iz = normal_on_arc(inner_pose, bend, length)
+                inner_pose = pose_on_arc(inner_pose, bend, length)
+                if inner_trace[PHASE] == IN_TISSUE:
+                    _record(entries, count, site, t, stops[m], stops[e], inner_trace, inner_pose)
+                    count += 1
+                else:
+                    reasons[NO_EXIT] += 1
+    return count

@@ -1,0 +1,57 @@
+"""The centreline of deployed tubes, in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.grid import Float
+from anatomy.margins import Margins
+from anatomy.poses import bending_directions
+from stages.tube import kernels
+from stages.tube.deployments import tube_constants
+from stages.tube.device import ConcentricTubes
+
+TRACK_SAMPLES = 200
+
+
+def centreline(
+    tubes: ConcentricTubes,
+    lps_from_scope_tip: Float,
+    rotation_rad: float,
+    outer_mm: float,
+    inner_mm: float,
+    arc_lengths_mm: ArrayLike,
+) -> Float:
+    """Return points `(N, 3)` LPS mm of the tubes' centreline at arc lengths `(N,)` from the scope tip.
+
+    Parameters
+    ----------
+    tubes : ConcentricTubes
+    lps_from_scope_tip : (4, 4) float64
+    rotation_rad : float
+        Direction of the bend about +z of the scope tip, counted from its +x.
+    outer_mm, inner_mm : float
+        Insertions of the two tubes.
+    """
+    constants = tube_constants(tubes, Margins())
+    planar = np.array(
+        [
+            kernels.planar_point(constants, float(outer_mm), float(inner_mm), float(s))
+            for s in np.atleast_1d(np.asarray(arc_lengths_mm, dtype=np.float64))
+        ]
+    )
+    bend = bending_directions(lps_from_scope_tip, rotation_rad)[0]
+    forward = lps_from_scope_tip[:3, 2]
+    return np.asarray(lps_from_scope_tip[:3, 3] + planar[:, :1] * bend + planar[:, 1:] * forward)
+
+
+def follow_the_leader_error_mm(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> float:
+    """Return the largest distance between the track of the tip and the final shape at equal arc length."""
+    constants = tube_constants(tubes, Margins())
+    worst = 0.0
+    for tip in np.linspace(0.0, inner_mm, TRACK_SAMPLES):
+        track = kernels.planar_point(constants, min(float(tip), outer_mm), float(tip), float(tip))
+        final = kernels.planar_point(constants, float(outer_mm), float(inner_mm), float(tip))
+        worst = max(worst, float(np.hypot(track[0] - final[0], track[1] - final[1])))
+    return worst

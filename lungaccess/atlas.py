@@ -1,0 +1,92 @@
+"""The deployment atlas: everything scope and tubes can do, enumerated once per patient and system."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from lungaccess.system import System
+from stages.scope.sites import Sites, sites
+from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, deployments
+
+SITE_SPACING_MM = 1.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Atlas:
+    """All accepted deployments of a system in a lung; independent of any target.
+
+    Parameters
+    ----------
+    lung : Lung
+    system : System
+    with_fissures : bool
+        Whether fissures are obstacles.
+    sites : Sites
+    deployments : Deployments
+        `deployments.site` indexes `sites`.
+    build_s : float
+        Seconds it took.
+    """
+
+    lung: Lung
+    system: System
+    with_fissures: bool
+    sites: Sites
+    deployments: Deployments
+    build_s: float
+
+    def site_pose(self, site: int) -> Float:
+        """Return point and tangent `(6,)` of a site."""
+        return np.asarray(self.sites.poses[site])
+
+
+def build_atlas(
+    lung: Lung,
+    system: System,
+    *,
+    rotations: int = DEFAULT_ROTATIONS,
+    stop_spacing_mm: float = DEFAULT_STOP_MM,
+    site_spacing_mm: float = SITE_SPACING_MM,
+    progress: Callable[[float], None] | None = None,
+) -> Atlas:
+    """Enumerate sites, rotations and insertions, and keep what is safe.
+
+    Parameters
+    ----------
+    lung : Lung
+    system : System
+    rotations : int
+        Evenly spaced rotations of the tubes.
+    stop_spacing_mm, site_spacing_mm : float
+        Spacing of insertions and of sites along the airway.
+    progress : callable, optional
+        Told the share of the work done.
+    """
+    began = time.perf_counter()
+    with_fissures = lung.has_fissures and not system.fissures_allowed
+    reach = min(system.tubes.inner.curved_length_mm, system.tubes.max_extension_mm)
+    places = sites(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
+    found = deployments(
+        lung,
+        system.tubes,
+        system.margins,
+        places.poses,
+        with_fissures=with_fissures,
+        rotations=rotations,
+        stop_spacing_mm=stop_spacing_mm,
+        progress=progress,
+    )
+    return Atlas(
+        lung=lung,
+        system=system,
+        with_fissures=with_fissures,
+        sites=places,
+        deployments=found,
+        build_s=time.perf_counter() - began,
+    )

@@ -1,0 +1,76 @@
+"""What a needle path costs: 1 / clearance, the cost map, length."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from anatomy.structures import FISSURE, OBSTACLES
+from stages.needle.path import ArcPath
+
+OBJECTIVES = ("inverse_clearance", "cost_map", "length_mm")
+
+SAMPLE_MM = 0.1
+ROUGH_SAMPLE_MM = 0.5
+EXACT_BELOW_MM = 5.0
+CLEARANCE_FLOOR_MM = 0.1
+"""Nearer than this, 1 / clearance stays at its value here, so that the integral is finite."""
+
+
+def require_objective(objective: str) -> None:
+    """Raise SettingsError unless the objective is known."""
+    if objective not in OBJECTIVES:
+        raise SettingsError(
+            f"There is no objective {objective!r}", expected=f"one of {', '.join(OBJECTIVES)}"
+        )
+
+
+def path_cost(lung: Lung, path: ArcPath, objective: str, *, with_fissures: bool, exact: bool) -> float:
+    """Return the cost of a needle path.
+
+    Parameters
+    ----------
+    lung : Lung
+    path : ArcPath
+    objective : str
+        "inverse_clearance": integral of 1 / clearance over arc length, clearance being that of the
+        needle's axis to the nearest obstacle, no less than 0.1 mm [Kuntz2015, eq. 1].  "cost_map":
+        line integral of the cost map in mm, 0 without a map.  "length_mm".
+    with_fissures : bool
+        Whether fissures are obstacles.
+    exact : bool
+        Distances to voxels as solid boxes where they are below 5 mm, samples every 0.1 mm; else
+        bounds from the clearance field, samples every 0.5 mm.
+    """
+    if objective == "length_mm":
+        return path.length_mm
+    points, lengths = path.sample(SAMPLE_MM if exact else ROUGH_SAMPLE_MM)
+    if objective == "cost_map":
+        return _cost_map_integral(lung, points, lengths)
+    clearance = obstacle_clearance_mm(lung, points, with_fissures=with_fissures, exact=exact)
+    weight = 1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM)
+    return float(np.trapezoid(weight, lengths))
+
+
+def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool, exact: bool) -> Float:
+    """Return the distance `(N,)` in mm from points to the nearest obstacle."""
+    clearance = lung.obstacle_field(with_fissures=with_fissures).lower_bound_mm(points)
+    if exact:
+        near = np.flatnonzero(clearance < EXACT_BELOW_MM)
+        bits = OBSTACLES | (FISSURE if with_fissures else 0)
+        found = lung.exact_clearance_mm(points[near], bits, cap_mm=EXACT_BELOW_MM + 1.0)
+        clearance[near] = np.maximum(found, clearance[near])
+    return clearance
+
+
+def _cost_map_integral(lung: Lung, points: Float, lengths: Float) -> float:
+    """Integrate the cost map by the midpoint rule on the voxel that holds each midpoint."""
+    if lung.cost is None:
+        return 0.0
+    middle = 0.5 * (points[1:] + points[:-1])
+    ijk = np.floor(lung.grid.ijk(middle) + 0.5).astype(np.int64)
+    if ((ijk < 0) | (ijk >= lung.grid.shape)).any():
+        return float("inf")
+    return float((lung.cost.array[tuple(ijk.T)].astype(np.float64) * np.diff(lengths)).sum())

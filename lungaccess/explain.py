@@ -1,0 +1,102 @@
+"""Why there is no plan: the reasons counted, and the smallest change of device that would help."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lungaccess.noplan import NoPlan
+from lungaccess.searches import AtlasSearch
+from stages.needle.device import Needle
+from stages.needle.space import direct_arcs, needle_space, workspace_lengths
+
+TIGHTER_RADII_MM = (100.0, 80.0, 60.0, 50.0, 40.0, 30.0)
+
+
+def explain(search: AtlasSearch, iterations: int) -> NoPlan:
+    """Return the `NoPlan` of a search that ended without a plan."""
+    reasons = _reasons(search)
+    return NoPlan(
+        f"No plan to the target after {iterations} iterations: {_main_reason(search)}",
+        reasons=reasons,
+        advice=_advice(search),
+    )
+
+
+def _main_reason(search: AtlasSearch) -> str:
+    atlas = search.atlas
+    if atlas.sites.count == 0:
+        generation, excess = atlas.sites.narrowest
+        return (
+            f"the scope ({search.task.system.scope.outer_diameter_mm:g} mm) has nowhere to stand; "
+            f"the airway is too narrow at generation {generation}, by {2 * excess:.1f} mm or more"
+        )
+    if atlas.deployments.count == 0:
+        return "the tubes cannot leave the airway safely from any site"
+    if not len(search.in_workspace):
+        return "the target lies outside the needle's workspace for every deployment"
+    return "every path tried from a deployment that could reach the target is blocked"
+
+
+def _reasons(search: AtlasSearch) -> dict[str, int]:
+    """Count, stage by stage, what was ruled out and why."""
+    atlas = search.atlas
+    reasons = {"scope: sites": atlas.sites.count}
+    generation, excess = atlas.sites.narrowest
+    closed = int((~atlas.sites.passable).sum())
+    if closed:
+        reasons[
+            f"scope: tree points beyond airways too narrow (mostly at generation {generation}, "
+            f"by {2 * excess:.2f} mm or more)"
+        ] = closed
+    reasons["tube: deployments looked at"] = atlas.deployments.candidates
+    reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
+    outside = atlas.deployments.count - len(search.in_workspace)
+    reasons["needle: deployments whose workspace does not hold the target"] = outside
+    for name, count in sorted(search.desk.blocked.items()):
+        if name != "nothing":
+            reasons[f"needle: arcs stopped by {name}"] = count
+    return reasons
+
+
+def _advice(search: AtlasSearch) -> str:
+    """Name the smallest change, of those tried, that makes the target reachable by a direct arc."""
+    atlas, system = search.atlas, search.task.system
+    if atlas.sites.count == 0:
+        return "Use a thinner bronchoscope"
+    if atlas.deployments.count == 0:
+        return "Use thinner tubes or another curvature"
+    present = system.needle.min_radius_of_curvature_mm
+    for radius in (r for r in TIGHTER_RADII_MM if r < present):
+        if _reached_with(search, replace(system.needle, max_curvature_per_mm=1.0 / radius)):
+            return f"A needle with a radius of curvature of {radius:g} mm instead of {present:.0f} mm would reach it"
+    thin = system.needle.diameter_mm / 2
+    if _reached_with(search, replace(system.needle, diameter_mm=thin)):
+        return f"A needle of {thin:g} mm instead of {system.needle.diameter_mm:g} mm would reach it"
+    if atlas.with_fissures and _reached_with(search, system.needle, with_fissures=False):
+        return "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
+    return "No needle of a smaller radius of curvature or diameter helps; try a thinner bronchoscope"
+
+
+def _reached_with(search: AtlasSearch, needle: Needle, *, with_fissures: bool | None = None) -> bool:
+    """Tell whether a direct arc of another needle reaches the target from the same deployments."""
+    atlas, task = search.atlas, search.task
+    space = needle_space(
+        task.lung,
+        needle,
+        task.system.margins,
+        with_fissures=task.with_fissures if with_fissures is None else with_fissures,
+    )
+    entries, target = atlas.deployments, task.target.lps_mm
+    near = np.flatnonzero(
+        np.isfinite(workspace_lengths(space, entries.positions, entries.tangents, target))
+    )
+    blockers, _lengths, _costs = direct_arcs(
+        space,
+        np.ascontiguousarray(entries.positions[near]),
+        np.ascontiguousarray(entries.tangents[near]),
+        np.ascontiguousarray(entries.branch[near]),
+        target,
+    )
+    return bool((blockers == 0).any())

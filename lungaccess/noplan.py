@@ -1,0 +1,27 @@
+"""`NoPlan`: the answer when there is no plan, with the reasons counted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from anatomy.errors import LungaccessError
+
+
+class NoPlan(LungaccessError):
+    """No plan was found; says why, stage by stage.
+
+    Parameters
+    ----------
+    found : str
+        One sentence: what stands in the way.
+    reasons : mapping of str to int
+        How many sites, deployments or needle paths each reason ruled out.
+    advice : str
+        The smallest change of device that would make the target reachable, if one was found.
+    """
+
+    def __init__(self, found: str, *, reasons: Mapping[str, int], advice: str = "") -> None:
+        self.reasons: Mapping[str, int] = MappingProxyType(dict(reasons))
+        self.advice = advice
+        super().__init__(found, remedy=advice)

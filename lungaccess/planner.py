@@ -1,0 +1,171 @@
+"""The anytime coupled planner: an iterator of better and better plans."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from anatomy.errors import SettingsError
+from anatomy.lung import Lung
+from lungaccess.assemble import Task, assemble
+from lungaccess.atlas import Atlas, build_atlas
+from lungaccess.costs import require_objective
+from lungaccess.plan import Plan
+from lungaccess.searches import AtlasSearch, KuntzSearch, Step
+from lungaccess.system import System
+from lungaccess.target import Target
+
+METHODS = {"atlas": AtlasSearch, "kuntz2015": KuntzSearch}
+PROGRESS_EVERY_S = 0.1
+HOPELESS_ITERATIONS = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressEvent:
+    """Where a search stands.
+
+    Parameters
+    ----------
+    iteration : int
+    elapsed_s : float
+        Planning time, without that of the atlas.
+    best_cost : float or None
+        None as long as there is no plan.
+    phase, message : str
+    """
+
+    iteration: int
+    elapsed_s: float
+    best_cost: float | None
+    phase: str
+    message: str = ""
+
+
+def plan(
+    lung: Lung,
+    system: System,
+    target: Target,
+    *,
+    objective: str = "inverse_clearance",
+    method: str = "atlas",
+    seed: int = 0,
+    iterations: int | None = None,
+    time_s: float | None = None,
+    atlas: Atlas | None = None,
+    on_progress: Callable[[ProgressEvent], None] | None = None,
+) -> Iterator[Plan]:
+    """Plan all three stages; yield each plan that is better than the one before.
+
+    Parameters
+    ----------
+    lung : Lung
+    system : System
+    target : Target
+    objective : str
+        "inverse_clearance" [Kuntz2015, eq. 1], "cost_map" or "length_mm".
+    method : str
+        "atlas": direct arcs from every deployment of the atlas, then random refinement of the best and
+        RRTs from the others.  "kuntz2015": Algorithm 1 of that paper.
+    seed : int
+        The same seed and `iterations` give the same plans.
+    iterations : int, optional
+        Stop after so many iterations beyond the direct arcs.
+    time_s : float, optional
+        Stop after so many seconds of planning.  With neither limit the caller stops the iterator.
+    atlas : Atlas, optional
+        Made with `build_atlas` beforehand; made here if None.
+    on_progress : callable, optional
+        Told about ten times a second.
+
+    Raises
+    ------
+    NoPlan
+        If the search ends without a plan; counts the reasons.
+    SettingsError
+        If objective or method is unknown.
+    """
+    require_objective(objective)
+    if method not in METHODS:
+        raise SettingsError(f"There is no method {method!r}", expected=f"one of {', '.join(METHODS)}")
+    tell = on_progress or (lambda _event: None)
+    tell(ProgressEvent(iteration=0, elapsed_s=0.0, best_cost=None, phase="atlas", message="deployment atlas"))
+    atlas = atlas or build_atlas(lung, system)
+    task = Task(
+        lung=lung,
+        system=system,
+        target=target,
+        objective=objective,
+        with_fissures=atlas.with_fissures,
+        method=method,
+        seed=seed,
+    )
+    return _run(METHODS[method](task, atlas), task, iterations, time_s, tell)
+
+
+def _run(
+    search: AtlasSearch,
+    task: Task,
+    iterations: int | None,
+    time_s: float | None,
+    tell: Callable[[ProgressEvent], None],
+) -> Iterator[Plan]:
+    """Drive a search within its budget."""
+    from lungaccess.explain import explain
+
+    clock = Clock()
+    best: float | None = None
+    iteration = 0
+    for step in search.steps():
+        if _spent(step, clock, iterations, time_s):
+            break
+        iteration = step.iteration
+        if step.candidate is not None:
+            best = step.cost
+            timing = {"planning_s": clock.elapsed_s, "atlas_s": search.atlas.build_s}
+            yield assemble(task, search.atlas.sites, step.candidate, iteration=iteration, timing=timing)
+        if best is None and _hopeless(search, step):
+            break
+        if clock.due():
+            tell(
+                ProgressEvent(
+                    iteration=iteration, elapsed_s=clock.elapsed_s, best_cost=best, phase=step.phase
+                )
+            )
+    if best is None:
+        raise explain(search, iteration)
+
+
+def _spent(step: Step, clock: Clock, iterations: int | None, time_s: float | None) -> bool:
+    if iterations is not None and step.iteration > iterations:
+        return True
+    return clock.elapsed_s > (math.inf if time_s is None else time_s)
+
+
+def _hopeless(search: AtlasSearch, step: Step) -> bool:
+    """Tell whether varying deployments has not brought the target into any workspace."""
+    if search.atlas.sites.count == 0 or search.atlas.deployments.count == 0:
+        return True
+    return not len(search.in_workspace) and step.iteration >= HOPELESS_ITERATIONS
+
+
+class Clock:
+    """Measures planning time; time in which the caller holds a yielded plan counts too."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._told = self._began
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began
+
+    def due(self) -> bool:
+        """Tell whether the next progress report is due, and start counting anew if so."""
+        now = time.perf_counter()
+        if now - self._told < PROGRESS_EVERY_S:
+            return False
+        self._told = now
+        return True

@@ -1,0 +1,131 @@
+"""The target: a stated point, or a point in the nodule mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import TargetError
+from anatomy.grid import Float, Volume, read_only
+from anatomy.lung import Lung
+from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Target:
+    """Where the needle has to end.
+
+    Parameters
+    ----------
+    lps_mm : (3,) float64, LPS mm
+    origin : str
+        Where it came from; starts with "nodule" if it lies in the nodule mask.
+    """
+
+    lps_mm: Float
+    origin: str
+
+
+def resolve_target(lung: Lung, text: str | None = None, nodule: int | None = None) -> Target:
+    """Return the target that a user names.
+
+    Parameters
+    ----------
+    lung : Lung
+    text : str, optional
+        A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm.
+    nodule : int, optional
+        Number of a nodule, 1 for the largest.  The target is its centroid where a needle may end
+        there, else its voxel farthest from every obstacle.
+
+    Raises
+    ------
+    FrameError
+        If the text states no frame.
+    TargetError
+        If there is no such nodule, or the point lies outside the lung or inside an obstacle.
+    """
+    if text is not None:
+        from anatomy.io.frames import parse_point
+
+        return point_target(lung, parse_point(text), origin=f"point {text}")
+    return nodule_target(lung, 1 if nodule is None else nodule)
+
+
+def point_target(lung: Lung, lps_mm: Float, *, origin: str = "point") -> Target:
+    """Return a target at a point `(3,)` LPS mm.
+
+    Raises
+    ------
+    TargetError
+        If the point is not finite, outside the lung or inside an obstacle.
+    """
+    point = np.array(lps_mm, dtype=np.float64)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise TargetError(f"The target {point.tolist()} is not a point", expected="three finite mm")
+    _require_free(lung, point)
+    return Target(lps_mm=read_only(point), origin=origin)
+
+
+def nodule_target(lung: Lung, number: int) -> Target:
+    """Return a target in the nodule `number`, counted from 1 by decreasing size.
+
+    Raises
+    ------
+    TargetError
+        If there is no such nodule or none of it can be entered.
+    """
+    if lung.nodules is None or not lung.nodules.array.any():
+        raise TargetError(
+            f"Patient {lung.name} has no nodule mask",
+            expected="a nodule mask among the patient's files",
+            remedy="Name a point with --target ras:x,y,z or lps:x,y,z",
+        )
+    voxels = _nodule_voxels(lung.nodules, number)
+    centres = lung.nodules.grid.lps(voxels)
+    clearance = lung.obstacle_field(with_fissures=True).lower_bound_mm(centres)
+    nearest = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
+    point = nearest if _is_free(lung, nearest) else centres[int(np.argmax(clearance))]
+    _require_free(lung, point)
+    return Target(lps_mm=read_only(point), origin=f"nodule {number}")
+
+
+def _nodule_voxels(nodules: Volume, number: int) -> NDArray[np.int64]:
+    from scipy import ndimage
+
+    voxels = np.argwhere(nodules.array)
+    low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
+    window = nodules.array[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    parts, count = ndimage.label(window, np.ones((3, 3, 3)))
+    if not 1 <= number <= count:
+        raise TargetError(
+            f"There is no nodule {number}", expected=f"a number from 1 to {count}, 1 being the largest"
+        )
+    sizes = np.bincount(parts.ravel())[1:]
+    chosen = int(np.argsort(-sizes, kind="stable")[number - 1]) + 1
+    return np.argwhere(parts == chosen) + low
+
+
+def _is_free(lung: Lung, point: Float) -> bool:
+    return lung.label_at(point) & (OUTSIDE | VESSEL | AIRWAY) == 0
+
+
+def _require_free(lung: Lung, point: Float) -> None:
+    """Raise a TargetError that says where the point lies, unless it is in free lung tissue."""
+    place = "LPS ({:.1f}, {:.1f}, {:.1f}) mm".format(*point)
+    label = lung.label_at(point)
+    if label & OUTSIDE:
+        raise TargetError(
+            f"The target at {place} lies outside the lung",
+            expected="a point in lung tissue",
+            remedy="Check the frame: RAS and LPS differ by the signs of x and y",
+        )
+    for bit, name in ((VESSEL, "a vessel"), (AIRWAY, "an airway")):
+        if label & bit:
+            raise TargetError(
+                f"The target at {place} lies inside {name}",
+                expected="a point in lung tissue",
+                remedy="Move the target, or remove the nodule from that mask",
+            )

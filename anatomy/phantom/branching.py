@@ -1,0 +1,225 @@
+"""Trees of tubes: the growing list of branches and the finished ground-truth centrelines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float, read_only
+
+Int = NDArray[np.int64]
+
+
+def unit(vector: Float) -> Float:
+    """Scale vectors `(..., 3)` to length one (zero stays zero)."""
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.asarray(vector / np.maximum(length, 1e-12))
+
+
+def bent_line(start: Float, leaving: Float, end: Float, step_mm: float, bend: float = 0.35) -> Float:
+    """Return points `(K, 3)` of a curve that leaves `start` partly along `leaving` and reaches `end`."""
+    chord = end - start
+    length = float(np.linalg.norm(chord))
+    control = start + 0.5 * length * ((1 - bend) * chord / max(length, 1e-9) + bend * leaving)
+    t = np.linspace(0, 1, max(3, int(np.ceil(length / step_mm)) + 1))[:, None]
+    return np.asarray((1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end)
+
+
+def smooth_line(knots: Float, step_mm: float) -> Float:
+    """Return points of a Catmull-Rom spline through `knots` `(K, 3)`, about `step_mm` apart."""
+    padded = np.vstack([2 * knots[0] - knots[1], knots, 2 * knots[-1] - knots[-2]])
+    pieces = [knots[:1]]
+    for a, b, c, d in zip(padded, padded[1:], padded[2:], padded[3:], strict=False):
+        t = np.linspace(0, 1, max(2, int(np.ceil(np.linalg.norm(c - b) / step_mm)) + 1))[1:, None]
+        cubic = 3 * b - a - 3 * c + d
+        square = 2 * a - 5 * b + 4 * c - d
+        pieces.append(b + 0.5 * t * (c - a + t * (square + t * cubic)))
+    return np.vstack(pieces)
+
+
+@dataclass
+class Sprouts:
+    """A tree while it grows; one list entry a branch, parents before children.
+
+    The first point of a branch is the last point of its parent.
+    """
+
+    parent: list[int] = field(default_factory=list)
+    points: list[Float] = field(default_factory=list)
+    diameter_mm: list[float] = field(default_factory=list)
+    lobe: list[int] = field(default_factory=list)
+    name: list[str] = field(default_factory=list)
+
+    def add(self, parent: int, points: Float, diameter_mm: float, lobe: int, name: str = "") -> int:
+        """Append a branch and return its index."""
+        if parent >= 0:
+            diameter_mm = min(diameter_mm, 0.98 * self.diameter_mm[parent])
+        self.parent.append(parent)
+        self.points.append(points)
+        self.diameter_mm.append(diameter_mm)
+        self.lobe.append(lobe)
+        self.name.append(name)
+        return len(self.parent) - 1
+
+    def children(self) -> list[list[int]]:
+        """Return the children of every branch."""
+        lists: list[list[int]] = [[] for _ in self.parent]
+        for branch, parent in enumerate(self.parent):
+            if parent >= 0:
+                lists[parent].append(branch)
+        return lists
+
+    @property
+    def counts(self) -> Int:
+        """Number of points of each branch, `(B,)`."""
+        return np.array([len(line) for line in self.points], dtype=np.int64)
+
+    def pruned(self, keep: NDArray[np.bool_]) -> Sprouts:
+        """Return the tree of the branches `keep` `(B,)` whose ancestors are all kept."""
+        tree, index = Sprouts(), {-1: -1}
+        for branch, parent in enumerate(self.parent):
+            if keep[branch] and parent in index:
+                index[branch] = tree.add(
+                    index[parent],
+                    self.points[branch],
+                    self.diameter_mm[branch],
+                    self.lobe[branch],
+                    self.name[branch],
+                )
+        return tree
+
+    def direction(self, branch: int) -> Float:
+        """Return the unit chord of a branch."""
+        return unit(self.points[branch][-1] - self.points[branch][0])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Centerlines:
+    """Ground-truth centrelines of one tree (N points, B branches).
+
+    Parameters
+    ----------
+    points_lps : (N, 3) float64
+        Points of a branch are consecutive; its first point repeats the last point of its parent.
+    radius_mm, outer_radius_mm : (N,) float64
+        Radius of the lumen and of the outside of the wall (equal for vessels).
+    branch_start : (B + 1,) int64
+        Points of branch b are `branch_start[b]:branch_start[b + 1]`.
+    branch_parent : (B,) int64
+        -1 at the root; parents come before children.  Blood of a vein flows from child to parent.
+    lobe : (B,) int64
+        The lobe (1 to 5) a branch supplies, 0 where it supplies more than one.
+    names : tuple of str
+        Name of the anatomical branch, empty for the nameless ones.
+    """
+
+    points_lps: Float
+    radius_mm: Float
+    outer_radius_mm: Float
+    branch_start: Int
+    branch_parent: Int
+    lobe: Int
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        for key in ("points_lps", "radius_mm", "outer_radius_mm", "branch_start", "branch_parent", "lobe"):
+            object.__setattr__(self, key, read_only(getattr(self, key)))
+
+    @property
+    def n_branches(self) -> int:
+        """Number of branches."""
+        return len(self.branch_parent)
+
+    @property
+    def branch_diameter_mm(self) -> Float:
+        """Mean lumen diameter of every branch, `(B,)` mm."""
+        return np.asarray(
+            2 * np.add.reduceat(self.radius_mm, self.branch_start[:-1]) / np.diff(self.branch_start)
+        )
+
+    @property
+    def branch_length_mm(self) -> Float:
+        """Arc length of every branch, `(B,)` mm."""
+        a, b = self.edges.T
+        length = np.linalg.norm(self.points_lps[a] - self.points_lps[b], axis=1)
+        branch = np.repeat(np.arange(self.n_branches), np.diff(self.branch_start))
+        return np.bincount(branch[b], weights=length, minlength=self.n_branches).astype(np.float64)
+
+    @property
+    def edges(self) -> Int:
+        """Index pairs `(M, 2)` of joined points within branches."""
+        first = np.arange(len(self.points_lps) - 1)
+        inside = np.ones(len(first), dtype=bool)
+        inside[self.branch_start[1:-1] - 1] = False
+        return np.stack([first[inside], first[inside] + 1], axis=1)
+
+    @property
+    def generation(self) -> Int:
+        """Number of branchings from the root, `(B,)`; the root has 0."""
+        generation = np.zeros(self.n_branches, dtype=np.int64)
+        for branch, parent in enumerate(self.branch_parent):
+            if parent >= 0:
+                generation[branch] = generation[parent] + 1
+        return generation
+
+    @property
+    def horsfield_order(self) -> Int:
+        """Horsfield order `(B,)`: 1 at the tips, else one more than the largest of the children."""
+        order = np.ones(self.n_branches, dtype=np.int64)
+        for branch in range(self.n_branches - 1, 0, -1):
+            parent = self.branch_parent[branch]
+            order[parent] = max(order[parent], order[branch] + 1)
+        return order
+
+    @property
+    def strahler_order(self) -> Int:
+        """Strahler order `(B,)`: 1 at the tips, one more only where two of the highest order meet."""
+        highest = np.zeros(self.n_branches, dtype=np.int64)
+        order = np.ones(self.n_branches, dtype=np.int64)
+        ties = np.zeros(self.n_branches, dtype=np.int64)
+        for branch in range(self.n_branches - 1, -1, -1):
+            if highest[branch]:
+                order[branch] = highest[branch] + (ties[branch] > 1)
+            parent = self.branch_parent[branch]
+            if parent < 0:
+                continue
+            if order[branch] > highest[parent]:
+                highest[parent], ties[parent] = order[branch], 1
+            elif order[branch] == highest[parent]:
+                ties[parent] += 1
+        return order
+
+
+def centerlines(
+    sprouts: Sprouts, radius_mm: Float, outer_radius_mm: Float, keep: NDArray[np.bool_]
+) -> Centerlines:
+    """Freeze the branches of `keep` `(B,)`, whose radii `(N,)` by point are given, into centrelines.
+
+    Where a branch keeps a single child, the two become one branch: without a branching no generation begins.
+    """
+    kept = [int(b) for b in np.flatnonzero(keep)]
+    siblings = np.bincount([sprouts.parent[b] + 1 for b in kept], minlength=len(keep) + 1)
+    head: dict[int, int] = {}
+    members: dict[int, list[int]] = {}
+    for branch in kept:
+        parent = sprouts.parent[branch]
+        continues = parent >= 0 and siblings[parent + 1] == 1
+        head[branch] = head[parent] if continues else branch
+        members.setdefault(head[branch], []).append(branch)
+    index = {branch: i for i, branch in enumerate(members)}
+    lines = [np.vstack([sprouts.points[b][b != h :] for b in group]) for h, group in members.items()]
+    start = np.concatenate([[0], np.cumsum(sprouts.counts)])
+    spans = [np.arange(start[b] + (b != h), start[b + 1]) for h, group in members.items() for b in group]
+    order = np.concatenate(spans)
+    parents = [sprouts.parent[h] for h in members]
+    return Centerlines(
+        points_lps=np.vstack(lines),
+        radius_mm=radius_mm[order],
+        outer_radius_mm=outer_radius_mm[order],
+        branch_start=np.concatenate([[0], np.cumsum([len(line) for line in lines])]),
+        branch_parent=np.array([index[head[p]] if p >= 0 else -1 for p in parents], dtype=np.int64),
+        lobe=np.array([sprouts.lobe[h] for h in members], dtype=np.int64),
+        names=tuple(sprouts.name[h] for h in members),
+    )

@@ -1,0 +1,183 @@
+"""The shape of a chest: two lungs with lobes, heart, diaphragm, rib cage; smooth functions of position.
+
+All lengths in the code are those of an adult in mm, with the carina at the origin of the LPS frame; a
+`Chest` of another size scales them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
+LOBES = {
+    "right upper": RIGHT_UPPER,
+    "right middle": RIGHT_MIDDLE,
+    "right lower": RIGHT_LOWER,
+    "left upper": LEFT_UPPER,
+    "left lower": LEFT_LOWER,
+}
+
+CAGE_CENTRE_Z = -95.0
+EDGE_ROUNDING_MM = 9.0
+
+
+def _bump(u: Array, centre: float, width: float) -> Array:
+    return np.exp(-(((u - centre) / width) ** 2))
+
+
+def smooth_maximum(a: Array, b: Array, width: float) -> Array:
+    """Return max(a, b) with the kink rounded over `width`; never below the true maximum."""
+    overlap = np.maximum(width - np.abs(a - b), 0)
+    return np.asarray(np.maximum(a, b) + overlap * overlap / (4 * width))
+
+
+def ellipsoid_distance(dx: Array, dy: Array, dz: Array, radii: tuple[float, float, float]) -> Array:
+    """Return the signed distance along the ray from the centre to an ellipsoid (negative inside)."""
+    rho = np.sqrt((dx / radii[0]) ** 2 + (dy / radii[1]) ** 2 + (dz / radii[2]) ** 2) + 1e-6
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    return np.asarray(length - length / rho)
+
+
+def _power(u: Array) -> Array:
+    return np.asarray(u * u * np.sqrt(u))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """One half of the chest; `sign` is +1 for the patient's left, which is +x."""
+
+    sign: float
+    half_width: float
+    half_depth: float
+    height: float
+    dome_z: float
+    hilum_width: float
+    oblique_z: float
+    oblique_slope: float
+    horizontal_z: float
+    wave_phase: float
+
+    def cage(self, x: Array, y: Array, z: Array) -> Array:
+        """Return the distance to the inside of the rib cage of this side (negative inside)."""
+        dx = np.abs(self.sign * x - (60 - 0.13 * (z - CAGE_CENTRE_Z)))
+        dy = np.abs(y - 1)
+        dz = np.maximum(z - CAGE_CENTRE_Z, 0)
+        terms = _power(dx / self.half_width) + _power(dy / self.half_depth) + (dz / self.height) ** 2
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        return np.asarray(length - length / (terms + 1e-6) ** 0.4)
+
+    def mediastinum(self, y: Array, z: Array) -> Array:
+        """Return the half width of the mediastinum: thin in front, wide at hilum and spine."""
+        width = 6 + 15 * _bump(y, 5, 34) + 17 * _bump(y, 66, 27)
+        width = width + 12 * _bump(y, 20, 40) / (1 + np.exp((z + 105) / 10))
+        if self.sign > 0:
+            width = width + 10 * _bump(y, 42, 18) * (1 / (1 + np.exp((z - 25) / 6)))
+        return np.asarray(width + self.hilum_width * _bump(y, 7, 26) * _bump(z, -27, 27))
+
+    def diaphragm(self, x: Array, y: Array) -> Array:
+        """Return the height z of the diaphragm's dome."""
+        r2 = ((self.sign * x - 66) / 78) ** 2 + ((y + 12) / 100) ** 2
+        return np.asarray(self.dome_z - 44 * r2**1.1 - 5 * np.maximum(y, 0) / 60)
+
+    def oblique(self, x: Array, y: Array) -> Array:
+        """Return the height z of the oblique fissure, which rises backwards."""
+        lateral = self.sign * x - 60
+        wave = 3.0 * np.sin(y / 23 + self.wave_phase) + 2.0 * np.sin(lateral / 19 - self.wave_phase)
+        return np.asarray(self.oblique_z + self.oblique_slope * y - 0.0016 * lateral**2 + wave)
+
+    def horizontal(self, x: Array, y: Array) -> Array:
+        """Return the height z of the horizontal fissure, which exists on the right."""
+        lateral = self.sign * x - 60
+        wave = 2.0 * np.sin(lateral / 21 + self.wave_phase) + 1.5 * np.sin(y / 26)
+        return np.asarray(self.horizontal_z - 0.1 * lateral - 0.0022 * (y + 35) ** 2 + wave)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chest:
+    """A chest of `scale` times adult size.
+
+    Every method takes LPS mm arrays x, y, z that broadcast together.
+    """
+
+    scale: float
+    right: Side
+    left: Side
+    heart_centre: tuple[float, float, float]
+    heart_radii: tuple[float, float, float]
+
+    @property
+    def sides(self) -> tuple[Side, Side]:
+        """The right and the left half."""
+        return self.right, self.left
+
+    def heart(self, x: Array, y: Array, z: Array) -> Array:
+        """Return the distance to the heart in mm (negative inside)."""
+        s = self.scale
+        centre = self.heart_centre
+        distance = ellipsoid_distance(
+            x / s - centre[0], y / s - centre[1], z / s - centre[2], self.heart_radii
+        )
+        return np.asarray(s * distance)
+
+    def lung(self, side: Side, x: Array, y: Array, z: Array) -> Array:
+        """Return the approximate distance to the pleura of one lung in mm (negative inside)."""
+        s = self.scale
+        heart = 4 - self.heart(x, y, z) / s
+        x, y, z = x / s, y / s, z / s
+        medial = 0.9 * (side.mediastinum(y, z) - side.sign * x)
+        level = smooth_maximum(side.cage(x, y, z), medial, EDGE_ROUNDING_MM)
+        level = smooth_maximum(level, heart, EDGE_ROUNDING_MM)
+        level = smooth_maximum(level, 0.75 * (side.diaphragm(x, y) - z), 0.5 * EDGE_ROUNDING_MM)
+        return np.asarray(s * level)
+
+    def lobe(self, side: Side, x: Array, y: Array, z: Array) -> Array:
+        """Return the number of the lobe (1 to 5) that a position in this lung belongs to."""
+        x, y, z = x / self.scale, y / self.scale, z / self.scale
+        lower = z < side.oblique(x, y)
+        if side.sign > 0:
+            return np.where(lower, np.uint8(LEFT_LOWER), np.uint8(LEFT_UPPER))
+        middle = z < side.horizontal(x, y)
+        upper = np.where(middle, np.uint8(RIGHT_MIDDLE), np.uint8(RIGHT_UPPER))
+        return np.where(lower, np.uint8(RIGHT_LOWER), upper)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Return the corners `(3,)`, `(3,)` LPS mm of the imaged box."""
+        return self.scale * np.array([-160.0, -114.0, -176.0]), self.scale * np.array([160.0, 112.0, 106.0])
+
+
+def make_chest(rng: np.random.Generator, scale: float) -> Chest:
+    """Draw a chest: adult proportions with a few per cent of variation."""
+
+    def vary(value: float, fraction: float) -> float:
+        return value * (1 + fraction * rng.uniform(-1, 1))
+
+    width, depth, height = vary(72, 0.04), vary(89, 0.04), vary(182, 0.03)
+    dome = -104 + rng.uniform(-5, 5)
+
+    def side(sign: float) -> Side:
+        return Side(
+            sign=sign,
+            half_width=width - (3 if sign > 0 else 0),
+            half_depth=depth,
+            height=height,
+            dome_z=dome - (8 if sign > 0 else 0),
+            hilum_width=10.0 if sign > 0 else 5.0,
+            oblique_z=-63 + rng.uniform(-4, 4),
+            oblique_slope=vary(1.45, 0.06),
+            horizontal_z=-35 + rng.uniform(-3, 3),
+            wave_phase=rng.uniform(0, 2 * np.pi),
+        )
+
+    return Chest(
+        scale=scale,
+        right=side(-1.0),
+        left=side(1.0),
+        heart_centre=(vary(25, 0.1), -28.0, -80 + rng.uniform(-3, 3)),
+        heart_radii=(vary(58, 0.05), vary(42, 0.05), vary(49, 0.05)),
+    )

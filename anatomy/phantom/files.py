@@ -1,0 +1,102 @@
+"""Write a phantom as a patient folder that `anatomy.io.load_patient` reads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from anatomy.grid import Volume
+from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.images import write_volume
+from anatomy.io.own_masks import DESCRIPTION
+from anatomy.phantom.branching import Centerlines
+from anatomy.phantom.chest import LOBES
+from anatomy.phantom.patient import Phantom
+from anatomy.phantom.rasterize import LABELS
+
+
+def write_phantom(phantom: Phantom, folder: str | Path) -> Path:
+    """Write masks, `patient.toml`, CT and the truth of a phantom into `folder`, which is made if needed.
+
+    `lumen`, `wall`, `vessels`, `lung`, `fissures`, `nodules`, `ct`, `labels` and `lobes` become NIfTI
+    images; `truth.json` holds the centrelines, the nodules and the meaning of the labels (LPS mm).
+    `patient.toml` is written last, so that a folder that has it is complete.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    FileError
+        If the folder cannot be written to.
+    """
+    folder = require_writable_folder(folder)
+    images = phantom.images
+    volumes: dict[str, Volume | None] = {
+        "lumen": images.lumen,
+        "wall": images.wall,
+        "vessels": images.vessels,
+        "lung": images.lung,
+        "fissures": images.fissures,
+        "nodules": images.nodules,
+        "ct": phantom.ct,
+        "labels": phantom.labels,
+        "lobes": phantom.lobes,
+    }
+    for name, volume in volumes.items():
+        if volume is not None:
+            write_volume(folder / f"{name}.nii.gz", volume)
+    _write_text(folder / "truth.json", json.dumps(_truth(phantom)))
+    _write_text(folder / DESCRIPTION, _description(phantom))
+    return folder
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _description(phantom: Phantom) -> str:
+    points = [",".join(repr(float(x)) for x in nodule.centre_lps) for nodule in phantom.nodules]
+    targets = ", ".join(f'"lps:{point}"' for point in points)
+    lines = [
+        f'name = "{phantom.images.name}"',
+        f'breath_hold = "{phantom.images.breath_hold}"',
+        *(f'{key} = "{key}.nii.gz"' for key in ("lumen", "wall", "vessels", "lung", "fissures")),
+        'nodule = "nodules.nii.gz"',
+        f"targets = [{targets}]",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _truth(phantom: Phantom) -> dict[str, Any]:
+    return {
+        "seed": phantom.seed,
+        "size": phantom.size,
+        "frame": "lps",
+        "labels": LABELS,
+        "lobes": LOBES,
+        "nodules": [
+            {"centre_lps": n.centre_lps.tolist(), "radius_mm": n.radius_mm, "lobe": n.lobe}
+            for n in phantom.nodules
+        ],
+        "centerlines": {kind: _tree(lines) for kind, lines in phantom.centerlines.items()},
+    }
+
+
+def _tree(lines: Centerlines) -> dict[str, Any]:
+    return {
+        "points_lps": lines.points_lps.round(4).tolist(),
+        "radius_mm": lines.radius_mm.round(4).tolist(),
+        "outer_radius_mm": lines.outer_radius_mm.round(4).tolist(),
+        "branch_start": lines.branch_start.tolist(),
+        "branch_parent": lines.branch_parent.tolist(),
+        "generation": lines.generation.tolist(),
+        "horsfield_order": lines.horsfield_order.tolist(),
+        "strahler_order": lines.strahler_order.tolist(),
+        "lobe": lines.lobe.tolist(),
+        "names": list(lines.names),
+    }

@@ -1,0 +1,88 @@
+"""Where nodules grow: in the outer lung, away from fissures and from airways of some size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float, read_only
+from anatomy.phantom.territory import Territory
+
+LEAST_PLEURA_MM, GREATEST_PLEURA_MM = 5.0, 30.0
+LEAST_RADIUS_MM, GREATEST_RADIUS_MM = 3.0, 8.0
+TUBE_GAP_MM = 2.0
+NODULE_GAP_MM = 25.0
+TUBES_LOOKED_AT = 8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Nodule:
+    """A ball of tissue in the lung.
+
+    Parameters
+    ----------
+    centre_lps : (3,) float64
+        LPS mm.
+    radius_mm : float
+    lobe : int
+        1 to 5.
+    """
+
+    centre_lps: Float
+    radius_mm: float
+    lobe: int
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centre_lps", read_only(np.asarray(self.centre_lps, dtype=np.float64)))
+
+
+def place_nodules(
+    territory: Territory,
+    tube_points: Float,
+    tube_radius_mm: Float,
+    scale: float,
+    rng: np.random.Generator,
+) -> tuple[Nodule, ...]:
+    """Choose 3 to 6 nodules among the points of a territory.
+
+    They keep clear of the tubes with centres `(M, 3)` LPS mm and radii `(M,)`.
+
+    The surface of a nodule is at least 5 mm and its centre at most 30 mm (times `scale`) from the pleura.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no room for three.
+    """
+    from scipy.spatial import cKDTree
+
+    wanted = int(rng.integers(3, 7))
+    points = territory.points_lps
+    distance, nearest = cKDTree(tube_points).query(points, k=TUBES_LOOKED_AT)
+    room = (distance - tube_radius_mm[nearest]).min(axis=1)
+    found: list[Nodule] = []
+    map_error = territory.spacing_mm
+    for index in rng.permutation(len(points)):
+        centre, lobe = points[index], int(territory.lobe_of_point[index])
+        radius = rng.uniform(LEAST_RADIUS_MM, scale * GREATEST_RADIUS_MM)
+        voxel = territory.index(centre)
+        pleura = territory.pleura_depth_mm[voxel]
+        fits = (
+            radius + scale * LEAST_PLEURA_MM + map_error < pleura < scale * GREATEST_PLEURA_MM - map_error
+            and territory.holds(centre, lobe, radius + 2 * map_error)
+            and room[index] > radius + scale * TUBE_GAP_MM
+            and all(np.linalg.norm(n.centre_lps - centre) > scale * NODULE_GAP_MM for n in found)
+        )
+        if fits:
+            found.append(Nodule(centre_lps=centre, radius_mm=float(radius), lobe=lobe))
+        if len(found) == wanted:
+            return tuple(found)
+    if len(found) >= 3:
+        return tuple(found)
+    raise AnatomyError(
+        "The synthetic lungs have no room for three nodules",
+        expected="free tissue near the pleura",
+        remedy="Use another seed",
+    )

@@ -1,0 +1,179 @@
+"""Make a whole synthetic patient from a seed and a size."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Grid, Volume
+from anatomy.patient import PatientImages
+from anatomy.phantom.branching import Centerlines, centerlines
+from anatomy.phantom.chest import make_chest
+from anatomy.phantom.ct import simulate_ct
+from anatomy.phantom.nodules import Nodule
+from anatomy.phantom.plan import plan_patient
+from anatomy.phantom.rasterize import LABELS, Canvas, draw_ball, draw_body, draw_tree, phantom_grid
+from anatomy.phantom.territory import make_territory
+
+Size = Literal["adult", "small"]
+SCALES: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 0.7})
+DEFAULT_SPACING_MM: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 1.25})
+FINEST_MM, COARSEST_MM = 0.3, 2.5
+GREATEST_NOISE_HU = 200.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Phantom:
+    """A synthetic patient with the truth about it; all volumes lie on one grid, LPS mm.
+
+    Parameters
+    ----------
+    seed : int
+    size : str
+        "adult" or "small".
+    images : PatientImages
+        The masks as a segmentation would give them, of kind "phantom".
+    ct : Volume
+        int16, Hounsfield units.
+    labels : Volume
+        uint8, one of `LABELS` for every voxel.
+    lobes : Volume
+        uint8, 1 to 5 by `LOBES` within the lungs, also where airways and vessels run; 0 elsewhere.
+    centerlines : mapping of str to Centerlines
+        "airway", "artery", "vein": what was drawn, with the radii that were drawn.
+    nodules : tuple of Nodule
+    """
+
+    seed: int
+    size: str
+    images: PatientImages
+    ct: Volume
+    labels: Volume
+    lobes: Volume
+    centerlines: Mapping[str, Centerlines]
+    nodules: tuple[Nodule, ...]
+
+    @property
+    def grid(self) -> Grid:
+        """The voxel grid of all volumes."""
+        return self.images.grid
+
+    def mask(self, *names: str) -> NDArray[np.bool_]:
+        """Return the voxels `(ni, nj, nk)` that carry one of the named labels."""
+        table = np.zeros(256, dtype=np.bool_)
+        table[[LABELS[name] for name in names]] = True
+        return np.asarray(table[self.labels.array])
+
+
+def phantom(
+    seed: int = 0, spacing_mm: float | None = None, size: Size = "adult", *, noise_hu: float = 18.0
+) -> Phantom:
+    """Make a synthetic patient.
+
+    The same arguments give the same voxels, bit for bit.  +x is the patient's left, +y posterior, +z
+    superior; the carina is the origin.
+
+    Parameters
+    ----------
+    seed : int
+        Not negative.
+    spacing_mm : float, optional
+        Edge of the cubic voxels, 0.3 to 2.5; by default 1 mm for the adult and 1.25 mm for the small patient.
+    size : str
+        "adult", or "small": 0.7 times an adult, about a child of seven.
+    noise_hu : float
+        Standard deviation of the noise in the CT.
+
+    Returns
+    -------
+    Phantom
+
+    Raises
+    ------
+    SettingsError
+        If an argument is out of its range.
+    AnatomyError
+        If the lungs of this seed have no room for what belongs in them.
+
+    References
+    ----------
+    [Kitaoka1999], [Tawhai2000], [Weibel1963]
+
+    Examples
+    --------
+    >>> patient = phantom(seed=1, size="small")
+    >>> patient.images.kind
+    'phantom'
+    """
+    scale, spacing_mm = _require_settings(seed, spacing_mm, size, noise_hu)
+    rng = np.random.default_rng(seed)
+    chest = make_chest(rng, scale)
+    plan = plan_patient(make_territory(chest, rng), scale, spacing_mm, rng)
+    canvas = draw_body(chest, phantom_grid(chest, spacing_mm))
+    for nodule in plan.nodules:
+        draw_ball(canvas, nodule.centre_lps, nodule.radius_mm)
+    lines, base = {}, 0
+    for kind, tree in (("airway", plan.airways), ("artery", plan.arteries), ("vein", plan.veins)):
+        keep = draw_tree(canvas, tree, base, kind)
+        lines[kind] = centerlines(tree.sprouts, tree.inner_mm, tree.outer_mm, keep)
+        base += len(tree.sprouts.parent)
+    return Phantom(
+        seed=seed,
+        size=size,
+        images=_images(canvas, f"phantom {size} {seed}", plan.nodules),
+        ct=simulate_ct(canvas, noise_hu, rng),
+        labels=Volume(grid=canvas.grid, array=canvas.labels),
+        lobes=Volume(grid=canvas.grid, array=canvas.lobes),
+        centerlines=MappingProxyType(lines),
+        nodules=plan.nodules,
+    )
+
+
+def _is_whole(number: object) -> bool:
+    return isinstance(number, int | np.integer) and not isinstance(number, bool)
+
+
+def _require_settings(seed: int, spacing_mm: float | None, size: str, noise_hu: float) -> tuple[float, float]:
+    if size not in SCALES:
+        raise SettingsError(f"The phantom size is {size!r}", expected=f"one of {', '.join(SCALES)}")
+    if not _is_whole(seed) or seed < 0:
+        raise SettingsError(f"The phantom seed is {seed!r}", expected="a whole number, not negative")
+    spacing_mm = DEFAULT_SPACING_MM[size] if spacing_mm is None else float(spacing_mm)
+    if not FINEST_MM <= spacing_mm <= COARSEST_MM * SCALES[size]:
+        raise SettingsError(
+            f"The voxel size of the phantom is {spacing_mm} mm",
+            expected=f"{FINEST_MM} to {COARSEST_MM * SCALES[size]:g} mm for the size {size!r}",
+            remedy="Coarser voxels cannot hold the bronchi",
+        )
+    if not 0 <= noise_hu <= GREATEST_NOISE_HU:
+        raise SettingsError(f"The noise is {noise_hu} HU", expected=f"0 to {GREATEST_NOISE_HU:g} HU")
+    return SCALES[size], spacing_mm
+
+
+def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...]) -> PatientImages:
+    def labelled(*names: str) -> Volume:
+        table = np.zeros(256, dtype=np.bool_)
+        table[[LABELS[n] for n in names]] = True
+        return Volume(grid=canvas.grid, array=table[canvas.labels])
+
+    return PatientImages(
+        name=name,
+        kind="phantom",
+        grid=canvas.grid,
+        lumen=labelled("lumen"),
+        wall=labelled("wall"),
+        vessels=labelled("artery", "vein"),
+        lung=Volume(grid=canvas.grid, array=canvas.lobes > 0),
+        fissures=labelled("fissure"),
+        nodules=labelled("nodule"),
+        targets_lps=tuple(n.centre_lps for n in nodules),
+        breath_hold="inspiration",
+        sources={"labels": hashlib.sha256(canvas.labels.T.tobytes()).hexdigest()},
+    )

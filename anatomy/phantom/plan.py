@@ -1,0 +1,145 @@
+"""Plan the trees and nodules of a phantom: what runs where and how thick, before anything is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float
+from anatomy.phantom.branching import Sprouts
+from anatomy.phantom.bronchi import grow_airways
+from anatomy.phantom.nodules import Nodule, place_nodules
+from anatomy.phantom.territory import Territory
+from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way
+
+# A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
+GAPLESS_RADIUS = 0.87
+AIRWAY_LIMIT_MM, VESSEL_LIMIT_MM = 1.8, 1.3
+THINNEST_WALL_MM = 0.5
+CENTRAL_ARTERY_RADII_MM = (12.5, 9.5, 9.5)
+CENTRAL_BRANCHES = 3
+CENTRAL_VEIN_MM = 6.0
+VESSEL_GAP_MM = 0.3
+NODULE_NEIGHBOUR_MM = 1.4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedTree:
+    """A tree with radii `(N,)` mm by point of lumen and outside, and `freedom` `(B,)` of `paint_tree`."""
+
+    sprouts: Sprouts
+    inner_mm: Float
+    outer_mm: Float
+    freedom: NDArray[np.uint8]
+
+    @property
+    def points_lps(self) -> Float:
+        """All points `(N, 3)`, LPS mm."""
+        return np.vstack(self.sprouts.points)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PatientPlan:
+    """What a phantom holds besides the chest."""
+
+    airways: PlannedTree
+    arteries: PlannedTree
+    veins: PlannedTree
+    nodules: tuple[Nodule, ...]
+
+
+def plan_patient(
+    territory: Territory, scale: float, spacing_mm: float, rng: np.random.Generator
+) -> PatientPlan:
+    """Plan trees and nodules for a territory of `scale` times adult size and voxels of `spacing_mm`.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no room for three nodules.
+    """
+    sprouts, rule = grow_airways(territory, scale, rng)
+    airways = _plan_airways(sprouts, spacing_mm)
+    arteries = _plan_arteries(sprouts, scale, spacing_mm)
+    tubes = _obstacles(airways, arteries)
+    large = tubes.radii > NODULE_NEIGHBOUR_MM * scale
+    nodules = place_nodules(territory, tubes.centres[large], tubes.radii[large], scale, rng)
+    obstacles = Obstacles(
+        centres=np.vstack([tubes.centres, *(n.centre_lps for n in nodules)]),
+        radii=np.concatenate([tubes.radii, [n.radius_mm for n in nodules]]),
+    )
+    rule = replace(rule, smallest_diameter_mm=_vessel_limit_mm(scale, spacing_mm))
+    veins = _plan_veins(grow_veins(territory, obstacles, rule, scale, rng), obstacles, scale, spacing_mm)
+    return PatientPlan(airways=airways, arteries=arteries, veins=veins, nodules=nodules)
+
+
+def wall_thickness_mm(diameter_mm: Float) -> Float:
+    """Return the wall thickness for lumen diameters: about 20 % of thin airways, 10 % of wide ones."""
+    return np.asarray(np.maximum(THINNEST_WALL_MM, diameter_mm * (0.1 + 0.1 * np.exp(-diameter_mm / 6.0))))
+
+
+def _freedom(sprouts: Sprouts) -> NDArray[np.uint8]:
+    """Let central branches be drawn in any case and named ones outside the lung."""
+    named = np.array([bool(name) for name in sprouts.name])
+    central = np.arange(len(named)) < CENTRAL_BRANCHES
+    return np.where(central, 2, np.where(named, 1, 0)).astype(np.uint8)
+
+
+def _plan_airways(sprouts: Sprouts, spacing_mm: float) -> PlannedTree:
+    limit = max(AIRWAY_LIMIT_MM, 2 * GAPLESS_RADIUS * spacing_mm)
+    drawn = sprouts.pruned(np.array(sprouts.diameter_mm) >= limit)
+    diameter = np.repeat(drawn.diameter_mm, drawn.counts)
+    outer = 0.5 * diameter + wall_thickness_mm(diameter)
+    return PlannedTree(sprouts=drawn, inner_mm=0.5 * diameter, outer_mm=outer, freedom=_freedom(drawn))
+
+
+def _vessel_limit_mm(scale: float, spacing_mm: float) -> float:
+    """Return the diameter at which vessels end: in small patients later, in coarse voxels earlier."""
+    return VESSEL_LIMIT_MM * max(scale, spacing_mm)
+
+
+def _vessel_part(sprouts: Sprouts, scale: float, spacing_mm: float) -> tuple[Sprouts, Float]:
+    """Return the branches that carry a drawn vessel, and the vessel's radius `(B,)`."""
+    part = sprouts.pruned(np.array(sprouts.diameter_mm) >= _vessel_limit_mm(scale, spacing_mm))
+    return part, np.maximum(0.5 * np.array(part.diameter_mm), GAPLESS_RADIUS * spacing_mm)
+
+
+def _vessels(
+    sprouts: Sprouts,
+    radius_mm: Float,
+    obstacles: Obstacles,
+    spacing_mm: float,
+    fixed: int,
+    freedom: NDArray[np.uint8],
+) -> PlannedTree:
+    """Lead vessels around obstacles; they become thinner in narrow places, but never too thin to draw."""
+    radius = make_way(sprouts, radius_mm, obstacles, VESSEL_GAP_MM, fixed)
+    radius = np.maximum(radius, GAPLESS_RADIUS * spacing_mm)
+    return PlannedTree(sprouts=sprouts, inner_mm=radius, outer_mm=radius, freedom=freedom)
+
+
+def _plan_arteries(sprouts: Sprouts, scale: float, spacing_mm: float) -> PlannedTree:
+    airways, radius = _vessel_part(sprouts, scale, spacing_mm)
+    radius[:CENTRAL_BRANCHES] = scale * np.array(CENTRAL_ARTERY_RADII_MM)
+    diameter = np.array(airways.diameter_mm)
+    outer = 0.5 * diameter + wall_thickness_mm(diameter)
+    arteries = copy_arteries(airways, outer, radius, scale)
+    obstacles = Obstacles(centres=np.vstack(airways.points), radii=np.repeat(outer, airways.counts))
+    fixed = int(arteries.counts[:CENTRAL_BRANCHES].sum())
+    return _vessels(arteries, radius, obstacles, spacing_mm, fixed, _freedom(arteries))
+
+
+def _plan_veins(grown: Sprouts, obstacles: Obstacles, scale: float, spacing_mm: float) -> PlannedTree:
+    veins, radius = _vessel_part(grown, scale, spacing_mm)
+    freedom = (np.array(veins.diameter_mm) > CENTRAL_VEIN_MM * scale).astype(np.uint8)
+    freedom[0] = 2
+    return _vessels(veins, radius, obstacles, spacing_mm, len(veins.points[0]), freedom)
+
+
+def _obstacles(*trees: PlannedTree) -> Obstacles:
+    return Obstacles(
+        centres=np.vstack([tree.points_lps for tree in trees]),
+        radii=np.concatenate([tree.outer_mm for tree in trees]),
+    )

@@ -1,0 +1,202 @@
+"""From shapes to voxels: body, lungs, lobes, fissures, trees and nodules drawn into one label image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float, Grid
+from anatomy.phantom.branching import Sprouts
+from anatomy.phantom.chest import CAGE_CENTRE_Z, Chest, Side
+from anatomy.phantom.kernels import NODULE_OWNER, paint_tree
+from anatomy.phantom.plan import PlannedTree
+
+LABELS = {
+    "background": 0,
+    "soft_tissue": 1,
+    "lung": 2,
+    "lumen": 3,
+    "wall": 4,
+    "artery": 5,
+    "vein": 6,
+    "fissure": 7,
+    "nodule": 8,
+    "mediastinum": 9,
+    "heart": 10,
+    "bone": 11,
+}
+SLAB = 4
+HILUM_LPS = {-1.0: (-20.0, 5.0, -32.0), 1.0: (36.0, 8.0, -32.0)}
+HILUM_WITHOUT_FISSURE_MM = 26.0
+RIB_DISTANCE_MM, RIB_HEIGHT_MM, RIB_SLOPE = 25.0, 9.0, 0.45
+
+
+@dataclass(kw_only=True, eq=False)
+class Canvas:
+    """The images while they are drawn, all `(ni, nj, nk)` and Fortran-contiguous.
+
+    `labels` uint8 by `LABELS`, `lobes` uint8, `owner` int16 of `paint_tree`, and the covers uint8: share
+    (0 to 255) of a voxel within lungs, lumen, airways, and vessels or nodules.
+    """
+
+    grid: Grid
+    labels: NDArray[np.uint8]
+    lobes: NDArray[np.uint8]
+    owner: NDArray[np.int16]
+    lung_cover: NDArray[np.uint8]
+    lumen_cover: NDArray[np.uint8]
+    airway_cover: NDArray[np.uint8]
+    solid_cover: NDArray[np.uint8]
+
+    @property
+    def spacing_mm(self) -> float:
+        """Edge of the cubic voxels."""
+        return float(self.grid.spacing_mm[0])
+
+
+def phantom_grid(chest: Chest, spacing_mm: float) -> Grid:
+    """Return a grid of cubic voxels over the chest; the midline falls between two voxels."""
+    low, high = chest.bounds()
+    shape = np.round((high - low) / spacing_mm).astype(np.int64)
+    shape[0] += shape[0] % 2
+    origin = low.copy()
+    origin[0] = -0.5 * (shape[0] - 1) * spacing_mm
+    return Grid.from_spacing(shape, (spacing_mm,) * 3, origin)
+
+
+def draw_body(chest: Chest, grid: Grid) -> Canvas:
+    """Draw everything but trees and nodules."""
+    shape = grid.shape
+    images = [np.zeros(shape, dtype=np.uint8, order="F") for _ in range(6)]
+    canvas = Canvas(
+        grid=grid,
+        labels=images[0],
+        lobes=images[1],
+        owner=np.zeros(shape, dtype=np.int16, order="F"),
+        lung_cover=images[2],
+        lumen_cover=images[3],
+        airway_cover=images[4],
+        solid_cover=images[5],
+    )
+    half = shape[0] // 2
+    first = grid.lps_from_ijk[:3, 3]
+    axes = [(first[a] + grid.spacing_mm[a] * np.arange(shape[a])).astype(np.float32) for a in range(3)]
+    for side, columns in zip(chest.sides, (slice(0, half), slice(half, None)), strict=True):
+        for k in range(0, shape[2], SLAB):
+            block = (columns, slice(None), slice(k, k + SLAB))
+            # Arrays run [k, j, i] here, so that the writes below go along memory.
+            x, y, z = axes[0][None, None, columns], axes[1][None, :, None], axes[2][k : k + SLAB, None, None]
+            level = chest.lung(side, x, y, z)
+            inside = level < 0
+            canvas.labels[block] = np.where(inside, np.uint8(LABELS["lung"]), _around(chest, side, x, y, z)).T
+            canvas.lobes[block] = np.where(inside, chest.lobe(side, x, y, z), np.uint8(0)).T
+            share = np.clip(0.5 - level / grid.spacing_mm[0], 0, 1)
+            canvas.lung_cover[block] = (255 * share).astype(np.uint8).T
+    _draw_fissures(canvas, chest.scale)
+    return canvas
+
+
+def _around(chest: Chest, side: Side, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the labels of what is not lung."""
+    s = chest.scale
+    heart = chest.heart(x, y, z) < 0
+    x, y, z = x / s, y / s, z / s
+    shoulder = 1 - 0.18 / (1 + np.exp((70 - z) / 10))
+    body = (np.abs(x) / (152 * shoulder)) ** 2.6 + (np.abs(y + 1) / (107 * shoulder)) ** 2.6 < 1
+    cage = side.cage(x, y, z)
+    lateral = side.sign * x
+    ribs = (
+        (cage > 4)
+        & (cage < 12)
+        & (lateral > 26)
+        & (np.mod(z - RIB_SLOPE * y, RIB_DISTANCE_MM) < RIB_HEIGHT_MM)
+    )
+    ribs &= z > CAGE_CENTRE_Z - 75
+    spine = (x / 19) ** 2 + ((y - 66) / 16) ** 2 < 1
+    spinous = (np.abs(x) < 4) & (y > 84) & (y < 100) & (np.mod(z, 26) < 15)
+    sternum = (np.abs(x) < 15) & (np.abs(y + 95) < 5) & (z < -10) & (z > -140)
+    above = (z > side.diaphragm(x, y)) & (cage < 3) & (lateral < side.mediastinum(y, z) + 12)
+    labels = np.where(body, np.uint8(LABELS["soft_tissue"]), np.uint8(LABELS["background"]))
+    labels = np.where(above & body, np.uint8(LABELS["mediastinum"]), labels)
+    labels = np.where(heart & body, np.uint8(LABELS["heart"]), labels)
+    bone = (ribs | spine | spinous | sternum) & body & ~heart
+    return np.where(bone, np.uint8(LABELS["bone"]), labels)
+
+
+def _draw_fissures(canvas: Canvas, scale: float) -> None:
+    """Label one layer of voxels between neighbouring lobes, open at the hilum as in most people."""
+    lobes = canvas.lobes
+    found = np.zeros(lobes.shape, dtype=bool, order="F")
+    for axis in range(3):
+        here: list[slice] = [slice(None)] * 3
+        there = here.copy()
+        here[axis], there[axis] = slice(0, -1), slice(1, None)
+        a, b = lobes[tuple(here)], lobes[tuple(there)]
+        found[tuple(here)] |= (a != b) & (a > 0) & (b > 0)
+    ijk = np.argwhere(found)
+    lps = canvas.grid.lps(ijk)
+    hila = np.where(lps[:, :1] > 0, np.array(HILUM_LPS[1.0]), np.array(HILUM_LPS[-1.0])) * scale
+    closed = np.linalg.norm(lps - hila, axis=1) > HILUM_WITHOUT_FISSURE_MM * scale
+    canvas.labels[tuple(ijk[closed].T)] = LABELS["fissure"]
+
+
+def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> NDArray[np.bool_]:
+    """Draw a tree of kind "airway", "artery" or "vein"; `base` is the number of branches drawn before.
+
+    Returns
+    -------
+    (B,) bool
+        Which branches found room and were drawn.
+    """
+    sprouts = tree.sprouts
+    allowed = np.zeros(len(LABELS), dtype=np.bool_)
+    allowed[[LABELS[name] for name in ("lung", "fissure", "lumen", "wall", "artery", "vein")]] = True
+    keep = np.zeros(len(sprouts.parent), dtype=np.bool_)
+    airway = kind == "airway"
+    paint_tree(
+        canvas.labels,
+        canvas.owner,
+        canvas.lumen_cover,
+        canvas.airway_cover if airway else canvas.solid_cover,
+        canvas.grid.lps_from_ijk[:3, 3].copy(),
+        canvas.spacing_mm,
+        np.vstack(sprouts.points),
+        tree.inner_mm,
+        tree.outer_mm,
+        np.concatenate([[0], np.cumsum(sprouts.counts)]),
+        np.array(sprouts.parent, dtype=np.int64),
+        _large_first(sprouts),
+        tree.freedom,
+        base,
+        canvas.spacing_mm if airway else -1.0,
+        0.0 if airway else 0.5 * canvas.spacing_mm,
+        LABELS["lumen" if airway else kind],
+        LABELS["wall" if airway else kind],
+        allowed,
+        keep,
+    )
+    return keep
+
+
+def _large_first(tree: Sprouts) -> NDArray[np.int64]:
+    """Order branches by falling diameter; children are thinner than parents, so parents come first."""
+    return np.argsort(-np.array(tree.diameter_mm), kind="stable").astype(np.int64)
+
+
+def draw_ball(canvas: Canvas, centre_lps: Float, radius_mm: float) -> None:
+    """Draw a nodule, which later trees must leave free."""
+    middle = canvas.grid.ijk(centre_lps)
+    reach = radius_mm / canvas.spacing_mm + 1.5
+    low = np.maximum(np.floor(middle - reach).astype(int), 0)
+    high = np.minimum(np.ceil(middle + reach).astype(int) + 1, canvas.grid.shape)
+    block = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    ranges = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
+    ijk = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1)
+    distance = np.linalg.norm(canvas.grid.lps(ijk) - centre_lps, axis=-1)
+    share = (255 * np.clip((radius_mm - distance) / canvas.spacing_mm + 0.5, 0, 1)).astype(np.uint8)
+    canvas.solid_cover[block] = np.maximum(canvas.solid_cover[block], share)
+    canvas.labels[block][distance <= radius_mm] = LABELS["nodule"]
+    canvas.owner[block][distance <= radius_mm] = NODULE_OWNER

@@ -1,0 +1,104 @@
+"""The room that trees grow into: a coarse map of the lobes, its depths, and points spread evenly in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float
+from anatomy.phantom.chest import LOBES, Chest
+
+MAP_SPACING_MM = 3.0
+TISSUE_PER_POINT_MM = 6.6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Territory:
+    """A coarse map of the lobes.
+
+    Parameters
+    ----------
+    origin : (3,) float64
+        LPS mm of the centre of voxel 0, 0, 0.
+    spacing_mm : float
+    lobes : (ni, nj, nk) uint8
+        1 to 5, 0 outside the lungs.
+    lobe_depth_mm, pleura_depth_mm : (ni, nj, nk) float32
+        Distance to the border of the lobe and to the nearest position outside the lungs.
+    points_lps : (N, 3) float64
+        Points spread evenly, each standing for the same volume of tissue.
+    lobe_of_point : (N,) uint8
+    """
+
+    origin: Float
+    spacing_mm: float
+    lobes: NDArray[np.uint8]
+    lobe_depth_mm: NDArray[np.float32]
+    pleura_depth_mm: NDArray[np.float32]
+    points_lps: Float
+    lobe_of_point: NDArray[np.uint8]
+
+    def index(self, point: Float) -> tuple[int, int, int]:
+        """Return the voxel of a point `(3,)`, clamped to the map."""
+        i, j, k = (
+            min(max(round((point[a] - self.origin[a]) / self.spacing_mm), 0), self.lobes.shape[a] - 1)
+            for a in range(3)
+        )
+        return i, j, k
+
+    def holds(self, point: Float, lobe: int, depth_mm: float) -> bool:
+        """Tell whether a point `(3,)` lies in `lobe`, at least `depth_mm` from its border."""
+        index = self.index(point)
+        return bool(self.lobes[index] == lobe and self.lobe_depth_mm[index] >= depth_mm)
+
+
+def _spread_points(
+    lobes: NDArray[np.uint8], origin: Float, spacing_mm: float, rng: np.random.Generator
+) -> tuple[Float, NDArray[np.uint8]]:
+    """Spread points `(N, 3)` LPS mm evenly over the lobes; return them and their lobes `(N,)`."""
+    step = TISSUE_PER_POINT_MM / MAP_SPACING_MM
+    axes = [np.arange(0, n - 1, step) for n in lobes.shape]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    lattice += rng.uniform(0, step, lattice.shape)
+    nearest = np.minimum(np.rint(lattice).astype(np.int64), np.array(lobes.shape) - 1)
+    lobe = lobes[tuple(nearest.T)]
+    return origin + spacing_mm * lattice[lobe > 0], lobe[lobe > 0]
+
+
+def make_territory(chest: Chest, rng: np.random.Generator) -> Territory:
+    """Map the lobes of a chest at `MAP_SPACING_MM` times its scale and spread points in them.
+
+    Raises
+    ------
+    AnatomyError
+        If a lobe is empty.
+    """
+    import edt
+
+    spacing = MAP_SPACING_MM * chest.scale
+    low, high = chest.bounds()
+    x, y, z = (np.arange(low[a], high[a], spacing) for a in range(3))
+    x, y, z = x[:, None, None], y[None, :, None], z[None, None, :]
+    lobes = np.zeros((x.size, y.size, z.size), dtype=np.uint8)
+    for side in chest.sides:
+        inside = (chest.lung(side, x, y, z) < 0) & (side.sign * x > 0)
+        lobes[inside] = np.broadcast_to(chest.lobe(side, x, y, z), lobes.shape)[inside]
+    counts = np.bincount(lobes.ravel(), minlength=len(LOBES) + 1)
+    if (counts[1:] == 0).any():
+        raise AnatomyError(
+            "A lobe of the synthetic lungs is empty", expected="five lobes", remedy="Use another seed"
+        )
+    anisotropy = (spacing,) * 3
+    points, lobe_of_point = _spread_points(lobes, low, spacing, rng)
+    return Territory(
+        origin=low,
+        spacing_mm=spacing,
+        lobes=lobes,
+        lobe_depth_mm=edt.edt(lobes, anisotropy=anisotropy),
+        pleura_depth_mm=edt.edt(lobes > 0, anisotropy=anisotropy),
+        points_lps=points,
+        lobe_of_point=lobe_of_point,
+    )

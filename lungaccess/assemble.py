@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.grid import Float
 from anatomy.lung import Lung
-from anatomy.structures import AIRWAY, BITS
+from anatomy.structures import BITS
 from lungaccess import costs
 from lungaccess.plan import (
     Exemption,
@@ -31,7 +31,7 @@ from stages.tube.deployments import Deployment
 from stages.tube.shape import centreline, follow_the_leader_error_mm
 
 CLEARANCE_CAP_MM = 5.0
-SAMPLE_MM = 0.1
+SAMPLE_MM = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -220,12 +220,16 @@ def _structures(task: Task) -> tuple[str, ...]:
 
 
 def _least_clearance(lung: Lung, points: Float, name: str, exempt_branch: int) -> float:
-    """Return the least distance to a structure: exact below 5 mm, else the field's lower bound."""
-    found = lung.exact_clearance_mm(
-        points, BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=exempt_branch
-    )
-    least = float(found.min())
-    if least < CLEARANCE_CAP_MM or (BITS[name] == AIRWAY and exempt_branch >= 0):
-        return least
+    """Return a distance that the curve through `points` never falls below.
+
+    Exact distances below 5 mm, else the field's lower bound; between two samples the distance is at
+    most half their spacing less.
+    """
     field = lung.fields["pleura" if name == "outside" else name]
-    return max(least, float(field.lower_bound_mm(points).min()))
+    bound = field.lower_bound_mm(points)
+    near = bound < CLEARANCE_CAP_MM
+    if near.any():
+        bound[near] = lung.exact_clearance_mm(
+            points[near], BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=exempt_branch
+        )
+    return max(float(bound.min()) - 0.5 * SAMPLE_MM, 0.0)

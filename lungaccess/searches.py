@@ -19,7 +19,7 @@ from lungaccess.atlas import Atlas
 from lungaccess.costs import path_cost
 from stages.needle.path import ArcPath, blocker_on_path, direct_path
 from stages.needle.space import NeedleSpace, direct_arcs, needle_space, workspace_lengths
-from stages.scope.tips import MedialAxis, ScopeTip, tip_at, walk
+from stages.scope.tips import MedialAxis, ScopeTip, looks_ahead, tip_at, walk
 from stages.tube.deployments import Deployment, TubeJudge
 
 CHUNK = 1000
@@ -237,7 +237,7 @@ class AtlasSearch:
         shift, turn, outer, inner = rng.standard_normal(4) * spread
         tip = walk(self.task.lung.tree, around.tip, shift * SITE_SPREAD_MM, rng)
         nothing = Step(iteration=iteration, phase="refinement")
-        if not self.atlas.sites.passable[tip.tree_point]:
+        if not (self.atlas.sites.passable[tip.tree_point] and looks_ahead(self.task.lung.tree, tip)):
             return nothing
         outer_mm = max(0.0, around.deployment.outer_mm + outer * INSERTION_SPREAD_MM)
         inner_mm = around.deployment.inner_mm + inner * INSERTION_SPREAD_MM
@@ -292,6 +292,8 @@ class KuntzSearch(AtlasSearch):
         longest = min(tubes.max_extension_mm, tubes.inner.curved_length_mm)
         outer, inner = np.sort(rng.uniform(0.0, longest, 2))
         seed = int(rng.integers(2**63))
+        if not looks_ahead(self.task.lung.tree, tip):
+            return Step(iteration=iteration, phase="Algorithm 1")
         deployment = self._judged(tip, rotation, float(outer), float(inner))
         if deployment is None or not self.desk.reaches(deployment.lps_from_tip):
             return Step(iteration=iteration, phase="Algorithm 1")

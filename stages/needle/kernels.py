@@ -32,6 +32,7 @@ EXACT_REACH_MM = 0.5
 LUMEN_BIT = 16
 CLEARANCE_FLOOR_MM = 0.1
 SAMPLE_TRIES = 50
+PROBE_SPACING_MM = 1.5
 TINY = 1e-9
 
 # Columns of a tree node: pose (6), arc from the parent: length, bend (4); path length, accumulated turn.
@@ -79,6 +80,22 @@ def shortest_length(pose, q, limits):
 
 
 @numba.njit(cache=True)
+def _early_blocker(space, required, pose, bend, begin, length):
+    """Look for an obstacle at a few points of an arc, the middle first; 0 if none is met."""
+    field, labels, geometry, bits = space
+    count = 1
+    while (length - begin) / count > PROBE_SPACING_MM:
+        for m in range(count):
+            x, y, z = point_on_arc(pose, bend, begin + (length - begin) * (m + 0.5) / count)
+            if distance_bound(field, geometry, x, y, z) < required:
+                distance, label = exact_distance(labels, geometry, x, y, z, bits, -1, required)
+                if distance < required:
+                    return label
+        count *= 2
+    return 0
+
+
+@numba.njit(cache=True)
 def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
     """Prove an arc clear of obstacles: 0 if it is, else the label of the voxel that is too near.
 
@@ -91,6 +108,9 @@ def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
     required = limits[REQUIRED]
     reach = required + EXACT_REACH_MM
     exempt = limits[EXEMPT_LENGTH] - s0 if branch >= 0 else 0.0
+    early = _early_blocker(space, required, pose, bend, max(exempt, 0.0), length)
+    if early != 0:
+        return early
     s = 0.0
     while True:
         x, y, z = point_on_arc(pose, bend, s)

@@ -13,6 +13,7 @@ from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import OUTSIDE
 from stages.scope.device import Bronchoscope
+from stages.scope.tips import looks_ahead, tip_at
 
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
@@ -61,8 +62,8 @@ def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float
     """Find where the scope tip can stand so that tubes can leave the airway from there.
 
     A site is a point of the medial axis that the scope reaches through a lumen wider than itself all
-    the way, with an airway inside the lung within `reach_mm` ahead.  Airways in the mediastinum are not
-    such: leaving them pierces the pleura [Kuntz2015, fig. 5].
+    the way, where its tip looks on along the route, with an airway inside the lung within `reach_mm`
+    ahead.  Airways in the mediastinum are not such: leaving them pierces the pleura [Kuntz2015, fig. 5].
 
     Parameters
     ----------
@@ -82,7 +83,8 @@ def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float
     narrowest_so_far = _narrowest_on_the_way(lung)
     passable = narrowest_so_far >= needed
     ahead = _distance_to_exit(tree, _in_lung_tissue(lung)) <= reach_mm
-    chosen = np.flatnonzero(passable & ahead & _every(tree, spacing_mm))
+    spaced = np.flatnonzero(passable & ahead & _every(tree, spacing_mm))
+    chosen = np.array([p for p in spaced if looks_ahead(tree, tip_at(tree, p))], dtype=np.int64)
     return Sites(
         tree_point=chosen,
         poses=np.hstack([tree.points_lps[chosen], tree.tangents[chosen]]),

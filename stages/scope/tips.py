@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,11 @@ from numpy.typing import NDArray
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Float
+
+
+TURN_CHORD_MM = 2.0
+MAX_TURN_AT_TIP_RAD = math.radians(45.0)
+"""A tip must look where the scope comes from going, within this angle of its last TURN_CHORD_MM."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,6 +52,19 @@ def tip_at(tree: AirwayTree, point: int, back_mm: float = 0.0) -> ScopeTip:
     return ScopeTip(
         tree_point=int(point), back_mm=share * step, lps_from_scope_tip=frames.pose(position, tangent)
     )
+
+
+def looks_ahead(tree: AirwayTree, tip: ScopeTip) -> bool:
+    """Tell whether a tip points on along its route, and not sideways just behind a fork."""
+    position, forward = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
+    point = max(int(tree.parent_point[tip.tree_point]), 0)
+    while (
+        np.linalg.norm(position - tree.points_lps[point]) < TURN_CHORD_MM and tree.parent_point[point] >= 0
+    ):
+        point = int(tree.parent_point[point])
+    chord = position - tree.points_lps[point]
+    length = float(np.linalg.norm(chord))
+    return length == 0.0 or float(chord @ forward) >= length * math.cos(MAX_TURN_AT_TIP_RAD)
 
 
 def walk(tree: AirwayTree, tip: ScopeTip, distance_mm: float, rng: np.random.Generator) -> ScopeTip:

@@ -35,8 +35,8 @@ REASONS: dict[int, str] = {
 }
 """Why a deployment is refused."""
 
-DEFAULT_ROTATIONS = 24
-DEFAULT_STOP_MM = 2.5
+DEFAULT_ROTATIONS = 36
+DEFAULT_STOP_MM = 2.0
 THREADS = 2
 
 

@@ -3,7 +3,7 @@
 A straight outer tube and an inner tube with a precurved distal part, rotated together, need no
 torsion: the centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `(10,)`
 float64 array indexed by the constants below.  `scene` is the tuple (obstacle field, labels, their
-geometry, obstacle bits, lumen depth, its geometry).  `trace` is a `(6,)` float64 array that follows
+geometry, obstacle bits, lumen depth, its geometry).  `trace` is a `(5,)` float64 array that follows
 one tube from the lumen through the wall into the tissue.
 """
 
@@ -34,9 +34,8 @@ PHASE = 0
 LEFT_AT = 1
 BRANCH = 2
 WALL_ANGLE = 3
-HAZARD_AT = 4
-HAZARD = 5
-N_TRACE = 6
+HAZARD = 4
+N_TRACE = 5
 
 IN_LUMEN = 0.0
 IN_WALL = 1.0
@@ -169,7 +168,7 @@ def wall_angle(labels, geometry, pose):
 
 
 @numba.njit(cache=True)
-def _leave_lumen(scene, tubes, trace, pose, bend, inside, outside, s0, radius):
+def _leave_lumen(scene, tubes, trace, pose, bend, inside, outside, s0):
     """Find where the axis leaves the lumen between two arc lengths of a piece, and judge the exit."""
     _field, labels, geometry, _bits, _lumen, _lumen_geometry = scene
     for _ in range(BISECTIONS):
@@ -184,11 +183,7 @@ def _leave_lumen(scene, tubes, trace, pose, bend, inside, outside, s0, radius):
     trace[WALL_ANGLE] = wall_angle(labels, geometry, pose_on_arc(pose, bend, inside))
     if trace[WALL_ANGLE] < tubes[MIN_WALL_ANGLE]:
         return FLAT_EXIT
-    # The tube's side touches the wall this long before its axis does.
-    contact = radius / math.tan(trace[WALL_ANGLE])
-    if trace[HAZARD] > 0.0 and trace[HAZARD_AT] > trace[LEFT_AT] - contact:
-        return int(trace[HAZARD])
-    return ACCEPTED
+    return int(trace[HAZARD])
 
 
 @numba.njit(cache=True)
@@ -212,17 +207,21 @@ def _tissue_gap(scene, trace, x, y, z, required):
 
 
 @numba.njit(cache=True)
-def _lumen_step(scene, trace, x, y, z, s, radius, required):
-    """Note branch and hazards of a point in the lumen; return the step to the next one."""
+def _lumen_step(scene, trace, x, y, z, radius, required):
+    """Note branch and hazards of a point in the lumen; return the step to the next one.
+
+    Where the tube touches the wall, what lies behind it must be as clear as in the tissue, unless the
+    tube comes free again before it leaves.
+    """
     _field, labels, geometry, bits, lumen, lumen_geometry = scene
     trace[BRANCH] = (label_at(labels, geometry, x, y, z) >> BRANCH_SHIFT) - 1
     depth = distance_bound(lumen, lumen_geometry, x, y, z)
     if depth >= radius:
+        trace[HAZARD] = ACCEPTED
         return depth - 0.5 * radius
     distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY_BIT, -1, required)
     if distance < required:
         trace[HAZARD] = _reason(label)
-        trace[HAZARD_AT] = s
     return max(0.5 * depth, FINE_STEP_MM)
 
 
@@ -243,11 +242,11 @@ def march(scene, tubes, trace, pose, bend, s0, length, radius, clearance):
         x, y, z = point_on_arc(pose, bend, s)
         if trace[PHASE] == IN_LUMEN:
             if label_at(labels, geometry, x, y, z) & LUMEN_BIT:
-                step = _lumen_step(scene, trace, x, y, z, s0 + s, radius, required)
+                step = _lumen_step(scene, trace, x, y, z, radius, required)
             elif s0 + s == 0.0:
                 return NO_EXIT
             else:
-                reason = _leave_lumen(scene, tubes, trace, pose, bend, last, s, s0, radius)
+                reason = _leave_lumen(scene, tubes, trace, pose, bend, last, s, s0)
                 if reason != ACCEPTED:
                     return reason
                 s = max(trace[LEFT_AT] - s0, 0.0)
@@ -361,7 +360,7 @@ def enumerate_site(scene, tubes, base, normals, site, stops, entries, reasons, w
         Receives the accepted deployments; at least `T S (S + 1) / 2` rows.
     reasons : (11,) int64
         Counts the refused ones by reason.
-    work : (2, 6) float64
+    work : (2, 5) float64
         Scratch.
 
     Returns

@@ -1,0 +1,291 @@
+"""Third part of the check: the tubes follow from their insertions, leave the airway once and stay clear."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy import structures
+from anatomy.grid import Float
+from lungaccess.check import shapes
+from lungaccess.check.findings import Findings
+from lungaccess.check.poses import POSITION_TOLERANCE_MM, check_rigid, check_same_pose
+from lungaccess.check.shapes import Curve
+from lungaccess.check.space import (
+    Boxes,
+    Select,
+    airway_except,
+    branch_of,
+    has,
+    labels_at,
+    region_around,
+    segment_clearance_mm,
+)
+from lungaccess.plan import Plan
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+EXIT_TOLERANCE_MM = 0.02
+BISECTIONS = 20
+CORNER_MM = 0.1
+"""An axis that leaves the lumen for less than this cuts the corner of a voxel: not yet an exit."""
+
+WALL_ANGLE_TOLERANCE_RAD = 0.05
+NORMAL_RADIUS_MM = 1.5
+WALL_ZONE_MM = 1.0
+"""Behind the exit the axis may cross corners of lumen voxels of the same branch for this length."""
+
+BRANCH_ZONE_MM = 0.25
+"""The pierced branch is that of a lumen voxel which the axis meets in this last length before the exit."""
+
+RIM_POINTS = 24
+SWEEP_STEP_MM = 1.0
+SWEEP_POINT_MM = 0.5
+SWEEP_TOLERANCE_MM = 0.02
+CLEARANCE_TOLERANCE_MM = 1e-3
+SPARE = "clearance beyond what is required"
+UNDERSTATED_MM = 0.25
+"""A planner may state its proved lower bound: less than the truth by a voxel's diagonal and this."""
+
+STATED_TOLERANCE_MM = 0.05
+"""A stated clearance is the smallest of samples 0.1 mm apart; between two it may be this much smaller."""
+
+STATED_MM = 5.0
+"""A clearance beyond this may be stated as no more than this."""
+
+REACH_MM = 20.0
+"""Clearances are recomputed up to this distance; what lies farther counts as this far."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Exit:
+    """Where the re-integrated tube leaves the lumen: the last frame in it, and the length there."""
+
+    frame: int
+    arc_mm: float
+    branch: int
+
+
+def check_deployment(plan: Plan, lung: Lung, found: Findings) -> Curve | None:
+    """Record everything about the tubes; return their re-integrated centreline if it can be followed."""
+    tube, tubes = plan.tube, plan.system.tubes
+    if not (check_rigid("tube.tip", tube.lps_from_tip, found) and _is_pose(plan.scope.lps_from_scope_tip)):
+        return None
+    bend = shapes.bend_of(tubes, tube.outer_insertion_mm, tube.inner_insertion_mm)
+    curve = shapes.tube_curve(plan.scope.lps_from_scope_tip, tube.rotation_rad, bend)
+    check_same_pose("tube.tip", tube.lps_from_tip, curve.end, found)
+    _check_limits(plan, bend, found)
+    sweep_mm = _check_sweep(plan, found)
+    labels = labels_at(lung, curve.points)
+    way_out = _check_exit(plan, lung, curve, labels, found)
+    if way_out is not None:
+        _check_containment(plan, curve, labels, way_out, found)
+        _check_clearance(plan, lung, curve, way_out, sweep_mm, found)
+    return curve
+
+
+def _is_pose(pose: Float) -> bool:
+    return bool(np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < 1e-3)
+
+
+def _check_limits(plan: Plan, bend: shapes.Bend, found: Findings) -> None:
+    """Insertions and strains are within what the tubes allow."""
+    tube, tubes = plan.tube, plan.system.tubes
+    outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
+    found.at_most("tube.extension", inner, tubes.max_extension_mm, "mm", "tip beyond the scope tip")
+    found.at_most("tube.outer_length", outer, tubes.outer.length_mm, "mm")
+    found.at_most("tube.inner_length", inner, tubes.inner.length_mm, "mm")
+    ahead = tubes.inner.length_mm - tubes.outer.length_mm
+    found.at_most("tube.protrusion", inner - outer, ahead, "mm", "inner beyond outer tube")
+    # Straightened in the scope the inner tube is bent by its whole precurvature; the outer one bends with it.
+    strains = [tubes.inner.precurvature_per_mm * tubes.inner.outer_diameter_mm / 2]
+    in_overlap = [k for k, end in zip(bend.per_mm, bend.edges_mm[1:], strict=True) if end <= outer]
+    strains += [k * tubes.outer.outer_diameter_mm / 2 for k in in_overlap]
+    found.at_most("tube.strain", max(strains), tubes.max_strain, "", "largest strain of the tube material")
+
+
+def _check_sweep(plan: Plan, found: Findings) -> float:
+    """Replay the deployment and return how far the tubes get from their final shape."""
+    tube, tubes = plan.tube, plan.system.tubes
+    outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
+    final = shapes.planar_shape(shapes.bend_of(tubes, outer, inner), SWEEP_POINT_MM)
+    sweep = leader = 0.0
+    for bend in shapes.deployment_bends(tubes, outer, inner, SWEEP_STEP_MM):
+        apart = shapes.distance_to_polyline(shapes.planar_shape(bend, SWEEP_POINT_MM), final)
+        sweep, leader = max(sweep, float(apart.max())), max(leader, float(apart[-1]))
+    limit = tubes.max_lateral_sweep_mm
+    detail = "sideways motion while the tubes are deployed"
+    found.at_most("tube.sweep.limit", sweep, limit + SWEEP_TOLERANCE_MM, "mm", detail)
+    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm")
+    stated = ((tube.lateral_sweep_mm, sweep, "sweep"), (tube.follow_the_leader_error_mm, leader, "leader"))
+    for value, recomputed, name in stated:
+        found.at_least(
+            f"tube.{name}.stated", value, max(recomputed - SWEEP_TOLERANCE_MM, 0.0), "mm", "not understated"
+        )
+    return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)
+
+
+def _check_exit(
+    plan: Plan, lung: Lung, curve: Curve, labels: NDArray[np.uint16], found: Findings
+) -> Exit | None:
+    """Derive the exit anew and compare it with what the plan states and exempts."""
+    stated, exemption = plan.tube.exit, plan.exemption
+    in_lumen = (labels & structures.LUMEN) != 0
+    left = np.flatnonzero(~in_lumen)
+    if not found.true("tube.starts_in_lumen", in_lumen[0], "tip of the scope"):
+        return None
+    if not found.true("tube.leaves", len(left) > 0, "the tube leaves the airway lumen"):
+        return None
+    last = _exit_frame(curve, in_lumen, stated.arc_length_mm)
+    arc_mm, point = _border(lung, curve, last)
+    before = curve.arc_mm[last] - curve.arc_mm
+    near = (before >= 0.0) & (before <= BRANCH_ZONE_MM)
+    branches = {int(b) for b in branch_of(labels[near])}
+    found.true("tube.exit.branch", stated.branch in branches, f"{stated.branch} against {sorted(branches)}")
+    detail = f"{exemption.branch} against {stated.branch}"
+    found.true("exemption.branch", exemption.branch == stated.branch, detail)
+    found.agrees("tube.exit.arc", stated.arc_length_mm, arc_mm, EXIT_TOLERANCE_MM, "mm")
+    found.agrees("tube.exit.point", stated.point_lps, point, EXIT_TOLERANCE_MM, "mm")
+    found.agrees("exemption.point", exemption.exit_point_lps, stated.point_lps, POSITION_TOLERANCE_MM, "mm")
+    angle = wall_angle_rad(lung, point, curve.tangents[last])
+    found.agrees("tube.exit.angle", stated.wall_angle_rad, angle, WALL_ANGLE_TOLERANCE_RAD, "rad")
+    limit = float(np.deg2rad(plan.system.tubes.min_wall_angle_deg))
+    found.at_least("tube.exit.angle.stated_limit", stated.wall_angle_rad, limit, "rad")
+    found.at_least("tube.exit.angle.limit", angle, limit - WALL_ANGLE_TOLERANCE_RAD, "rad")
+    return Exit(frame=last, arc_mm=arc_mm, branch=exemption.branch)
+
+
+def _exit_frame(curve: Curve, in_lumen: NDArray[np.bool_], stated_mm: float) -> int:
+    """Return the last frame in the lumen.
+
+    Of the exit and the voxel corners that are cut on the way to it, the one nearest to what is stated.
+    """
+    leaves = np.flatnonzero(in_lumen[:-1] & ~in_lumen[1:])
+    enters = np.append(np.flatnonzero(~in_lumen[:-1] & in_lumen[1:]), len(in_lumen) - 1)
+    back = enters[np.searchsorted(enters, leaves)]
+    away = curve.arc_mm[back] - curve.arc_mm[leaves]
+    away[back == len(in_lumen) - 1] = np.inf
+    candidates = leaves[: int(np.argmax(away > CORNER_MM)) + 1]
+    return int(candidates[np.argmin(np.abs(curve.arc_mm[candidates] - stated_mm))])
+
+
+def _border(lung: Lung, curve: Curve, frame: int) -> tuple[float, Float]:
+    """Return arc length and position of the border of the lumen behind a frame, by bisection."""
+    inside, outside = 0.0, 1.0
+    a, b = curve.points[frame], curve.points[frame + 1]
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (inside + outside)
+        if labels_at(lung, a + middle * (b - a))[0] & structures.LUMEN:
+            inside = middle
+        else:
+            outside = middle
+    arc_mm = curve.arc_mm[frame] + inside * (curve.arc_mm[frame + 1] - curve.arc_mm[frame])
+    return float(arc_mm), a + inside * (b - a)
+
+
+def wall_angle_rad(lung: Lung, point_lps: Float, tangent: Float) -> float:
+    """Return the angle between a tangent and the lumen's border; pi/2 is perpendicular to the wall.
+
+    The border faces away from the centroid of the lumen voxels whose centres lie within
+    `NORMAL_RADIUS_MM` of the point.
+    """
+    region = region_around(lung, point_lps[None], NORMAL_RADIUS_MM)
+    centres = region.grid.lps(np.argwhere((region.labels & structures.LUMEN) != 0))
+    near = centres[np.linalg.norm(centres - point_lps, axis=1) <= NORMAL_RADIUS_MM]
+    if not len(near):
+        return 0.0
+    outwards = point_lps - near.mean(axis=0)
+    size = float(np.linalg.norm(outwards))
+    return float(np.arcsin(np.clip(outwards @ tangent / size, -1.0, 1.0))) if size > 1e-9 else 0.0
+
+
+def _check_containment(
+    plan: Plan, curve: Curve, labels: NDArray[np.uint16], way_out: Exit, found: Findings
+) -> None:
+    """Behind the exit the axis meets no lumen again, no vessel, no outside, no other branch."""
+    behind = labels[way_out.frame + 1 :]
+    beyond_zone = curve.arc_mm[way_out.frame + 1 :] > way_out.arc_mm + WALL_ZONE_MM
+    lumen = (behind & structures.LUMEN) != 0
+    again = lumen & (beyond_zone | (branch_of(behind) != way_out.branch))
+    found.true("tube.one_exit", not again.any(), "the axis enters no lumen again")
+    through = bool(beyond_zone.any()) and not lumen[-1:].any()
+    found.true("tube.tip_in_tissue", through, "the tip is through the wall")
+    forbidden = structures.VESSEL | structures.OUTSIDE
+    forbidden |= structures.FISSURE if plan.fissures_are_obstacles else 0
+    other = ((behind & structures.AIRWAY) != 0) & (branch_of(behind) != way_out.branch)
+    hit = ((behind & forbidden) != 0) | other
+    found.true("tube.containment", not hit.any(), f"{int(hit.sum())} samples behind the exit in an obstacle")
+
+
+def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:
+    """Return the frame from which on, up to the exit, the tube's rim is never wholly in the lumen."""
+    phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
+    for frame in range(way_out.frame, -1, -1):
+        device = plan.system.tubes
+        tube = device.outer if curve.arc_mm[frame] <= plan.tube.outer_insertion_mm else device.inner
+        x, y, centre = curve.frames[frame, :3, 0], curve.frames[frame, :3, 1], curve.points[frame]
+        rim = centre + 0.5 * tube.outer_diameter_mm * (np.cos(phi)[:, None] * x + np.sin(phi)[:, None] * y)
+        if ((labels_at(lung, rim) & structures.LUMEN) != 0).all():
+            return frame
+    return 0
+
+
+def _check_clearance(
+    plan: Plan, lung: Lung, curve: Curve, way_out: Exit, sweep_mm: float, found: Findings
+) -> None:
+    """From its first contact with the wall on, each tube keeps radius, margins and sweep from obstacles."""
+    contact = _first_contact(lung, curve, way_out, plan)
+    margin = plan.system.margins.total_mm + sweep_mm
+    tubes = plan.system.tubes
+    radius = np.where(
+        curve.arc_mm[:-1] < plan.tube.outer_insertion_mm,
+        0.5 * tubes.outer.outer_diameter_mm,
+        0.5 * tubes.inner.outer_diameter_mm,
+    )
+    needed = radius + margin + curve.sagitta_mm
+    region = region_around(lung, curve.points[contact:], REACH_MM)
+    for name, select, first in obstacles_of(way_out.branch, contact, way_out.frame):
+        boxes = Boxes(region, select)
+        points = curve.points[first:]
+        if name != "fissure" or plan.fissures_are_obstacles:
+            gap = segment_clearance_mm(boxes, points, float(needed.max()) + 1.0)
+            spare = float((gap - needed[first:]).min())
+            found.at_least(f"tube.clearance.{name}", spare, -CLEARANCE_TOLERANCE_MM, "mm", SPARE)
+        least = float(boxes.distance_mm(points).min())
+        most = float(boxes.distance_mm(curve.points[way_out.frame :]).min())
+        diagonal = float(np.linalg.norm(region.grid.spacing_mm))
+        check_stated_clearance(plan, "tube", name, (least, most), diagonal, found)
+
+
+def obstacles_of(branch: int, contact: int, way_out: int) -> list[tuple[str, Select, int]]:
+    """Return each structure, how to select it, and the first frame that must be clear of it.
+
+    In the lumen, up to the exit, other branches are only open space.
+    """
+    return [
+        ("vessel", has(structures.VESSEL), contact),
+        ("outside", has(structures.OUTSIDE), contact),
+        ("fissure", has(structures.FISSURE), contact),
+        ("airway", airway_except(branch), way_out),
+    ]
+
+
+def check_stated_clearance(
+    plan: Plan, stage: str, name: str, range_mm: tuple[float, float], diagonal_mm: float, found: Findings
+) -> None:
+    """Record whether a stated clearance is true: not more than there is, nor much less.
+
+    `range_mm` is what was recomputed; the tube's differs with and without its contact in the lumen.
+    """
+    stated = plan.clearance_mm.get(stage, {}).get(name)
+    if stated is None:
+        return
+    least, most = range_mm
+    label = f"{stage}.clearance.{name}.stated"
+    found.at_most(label, min(stated, REACH_MM), most + STATED_TOLERANCE_MM, "mm", "not more than recomputed")
+    limit = min(least, STATED_MM) - diagonal_mm - UNDERSTATED_MM
+    found.at_least(f"{label}.least", stated, limit, "mm", "not much less than recomputed")

@@ -1,0 +1,52 @@
+"""The judge: looks at a finished plan with arithmetic of its own and accepts or refuses it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lungaccess.check.deployment import check_deployment
+from lungaccess.check.findings import CheckReport, Findings
+from lungaccess.check.record import check_record
+from lungaccess.check.route import check_route
+from lungaccess.check.steering import check_needle
+from lungaccess.plan import Plan
+from lungaccess.system import System
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+
+def check(
+    plan: Plan, lung: Lung, system: System | None = None, *, target_lps: ArrayLike | None = None
+) -> CheckReport:
+    """Judge a plan against the masks of a patient, independently of how it was made.
+
+    The kinematics are re-integrated, clearances are measured with FCL to the exact surface of the voxel
+    boxes, containment is looked up in the label volume, and every stated value is recomputed.  Nothing
+    of the planners' arithmetic is used, nor the clearance fields.  `docs/check.md` explains every finding.
+
+    Parameters
+    ----------
+    plan : Plan
+    lung : Lung
+        The patient that the plan is for.
+    system : System, optional
+        The devices that will be used; the plan's must be the same.  Without it only a plan whose system has
+        the name of a preset is compared with something.
+    target_lps : (3,) array_like, optional
+        The target that was asked for, LPS mm; the plan's must be the same.
+
+    Returns
+    -------
+    CheckReport
+    """
+    found = Findings()
+    target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
+    if check_record(plan, lung, found, system, target):
+        check_route(plan, lung, found)
+        curve = check_deployment(plan, lung, found)
+        check_needle(plan, lung, None if curve is None else curve.end, found)
+    return found.report()

@@ -1,0 +1,133 @@
+"""First part of the check: is the plan intact, and does it belong to this patient and this device."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from anatomy.errors import LungaccessError
+from anatomy.grid import Float
+from anatomy.settings import to_mapping
+from lungaccess.check.findings import Findings
+from lungaccess.plan import SCHEMA, Plan
+from lungaccess.system import System, load_system, preset_names, system_fingerprint
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+NUMBER_TOLERANCE = 1e-9
+STRUCTURES = {"airway", "vessel", "outside", "fissure"}
+MAX_NUMBER = 1e5
+MAX_TOTAL_MM = 2000.0
+MAX_CURVATURE_PER_MM = 1.0
+"""No plan goes beyond these: they keep the check short on an absurd one."""
+
+
+def check_record(
+    plan: Plan, lung: Lung, found: Findings, system: System | None, target_lps: Float | None
+) -> bool:
+    """Record all that needs no geometry; return whether geometry can be looked at."""
+    usable = _check_numbers(plan, found)
+    if not usable:
+        return False
+    _check_integrity(plan, found)
+    _check_patient(plan, lung, found)
+    _check_system(plan, found, system)
+    _check_required(plan, found)
+    allowed = plan.system.fissures_allowed
+    found.true(
+        "patient.fissures",
+        plan.fissures_are_obstacles == (lung.has_fissures and not allowed),
+        f"obstacles: {plan.fissures_are_obstacles}; mask: {lung.has_fissures}; system allows: {allowed}",
+    )
+    if target_lps is not None:
+        found.agrees("target.given", plan.target_lps, target_lps, 1e-6, "mm")
+    return _check_lengths(plan, found)
+
+
+def _sizes(value: object, where: str) -> Iterator[tuple[str, float]]:
+    """Yield the name and size of every number (or the largest of an array) in a record."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _sizes(inner, f"{where}.{key}")
+    elif isinstance(value, tuple | list):
+        for n, inner in enumerate(value):
+            yield from _sizes(inner, f"{where}[{n}]")
+    elif dataclasses.is_dataclass(value):
+        for item in dataclasses.fields(value):
+            yield from _sizes(getattr(value, item.name), f"{where}.{item.name}")
+    elif isinstance(value, np.ndarray):
+        yield where, float(np.abs(value).max(initial=0.0))
+    elif isinstance(value, float | int | np.generic):
+        yield where, abs(float(value))
+
+
+def _check_numbers(plan: Plan, found: Findings) -> bool:
+    bad = [name for name, size in _sizes(plan, "plan") if not math.isfinite(size)]
+    return found.true("record.finite", not bad, ", ".join(bad))
+
+
+def _check_integrity(plan: Plan, found: Findings) -> None:
+    found.true("record.schema", plan.schema == SCHEMA, plan.schema)
+    found.true("record.version", bool(plan.software_version.strip()), plan.software_version)
+    try:
+        same = Plan.from_json(plan.to_json()).digest == plan.digest
+        found.true("record.round_trip", same, "the plan as text is the same plan")
+    except LungaccessError as error:
+        found.true("record.round_trip", False, str(error))
+
+
+def _check_patient(plan: Plan, lung: Lung, found: Findings) -> None:
+    found.true("patient.name", plan.patient_name == lung.name, f"{plan.patient_name} against {lung.name}")
+    found.true("patient.key", plan.lung_key == lung.key, f"{plan.lung_key} against {lung.key}")
+    found.true("patient.sources", dict(plan.sources) == dict(lung.sources), "hashes of the image files")
+    found.true("patient.breath_hold", plan.breath_hold == lung.breath_hold, str(plan.breath_hold))
+
+
+def _check_system(plan: Plan, found: Findings, system: System | None) -> None:
+    stated = to_mapping(plan.system)
+    found.true(
+        "system.fingerprint", plan.system_fingerprint == system_fingerprint(plan.system), plan.system.name
+    )
+    if plan.system.name in preset_names():
+        preset = to_mapping(load_system(plan.system.name))
+        found.true("system.preset", stated == preset, "settings of the preset of that name")
+    if system is not None:
+        found.true("system.given", stated == to_mapping(system), "settings of the system that was asked for")
+
+
+def _check_required(plan: Plan, found: Findings) -> None:
+    tubes, margin = plan.system.tubes, plan.system.margins
+    extra = margin.segmentation_margin_mm + margin.registration_margin_mm
+    wanted = {
+        "outer_tube": 0.5 * tubes.outer.outer_diameter_mm + extra,
+        "inner_tube": 0.5 * tubes.inner.outer_diameter_mm + extra,
+        "needle": 0.5 * plan.system.needle.diameter_mm + extra,
+    }
+    names = {name for stage in plan.clearance_mm.values() for name in stage}
+    known = set(plan.clearance_mm) == {"tube", "needle"} and names <= STRUCTURES
+    found.true("clearance.names", known, ", ".join(sorted(names)))
+    stated = plan.required_clearance_mm
+    if found.true("clearance.required.names", set(stated) == set(wanted), ", ".join(stated)):
+        for name, value in wanted.items():
+            found.agrees(f"clearance.required.{name}", stated[name], value, NUMBER_TOLERANCE, "mm")
+
+
+def _check_lengths(plan: Plan, found: Findings) -> bool:
+    """Tell whether every length is positive and of a size that can be re-integrated."""
+    tube, arcs = plan.tube, plan.needle.arcs
+    found.true("needle.arcs", len(arcs) > 0, f"{len(arcs)} arcs")
+    lengths = [tube.inner_insertion_mm, *(arc.length_mm for arc in arcs)]
+    usable = bool(arcs) and min(lengths) > 0.0 and sum(lengths) <= MAX_TOTAL_MM
+    usable &= 0.0 <= tube.outer_insertion_mm <= tube.inner_insertion_mm
+    usable &= len(plan.scope.points_lps) >= 2
+    route_shape = len(plan.scope.points_lps) == len(plan.scope.lumen_radius_mm) == len(plan.scope.branches)
+    curvatures = [arc.curvature_per_mm for arc in arcs]
+    usable &= route_shape and float(np.abs(curvatures).max(initial=0.0)) <= MAX_CURVATURE_PER_MM
+    geometry = (plan.scope, plan.tube, plan.needle, plan.exemption, plan.target_lps)
+    usable &= all(size <= MAX_NUMBER for part in geometry for _, size in _sizes(part, ""))
+    return found.true("record.lengths", usable, "lengths positive, in order and not absurd")

@@ -1,0 +1,150 @@
+"""Second part of the check: the bronchoscope fits where it runs, and its tip stands on the airway axis."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from anatomy import structures
+from anatomy.grid import Float
+from lungaccess.check.findings import Findings
+from lungaccess.check.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
+from lungaccess.check.shapes import distance_to_polyline
+from lungaccess.check.space import Boxes, labels_at, not_lumen, region_around
+from lungaccess.plan import Plan, ScopeRoute
+
+if TYPE_CHECKING:
+    from anatomy.airway_tree import AirwayTree
+    from anatomy.lung import Lung
+
+SAMPLE_MM = 0.1
+AXIS_TOLERANCE_MM = 0.01
+MAX_STEP_MM = 5.0
+REACH_MM = 15.0
+RADIUS_TOLERANCE_MM = 0.05
+"""Radii are stated at points; between two points the lumen may be this much narrower."""
+
+MAX_CHORD_ANGLE_RAD = 0.5 * np.pi
+"""Between the tip and the last `CHORD_MM` of the route: a tip must look where the scope is going."""
+
+CHORD_MM = 2.0
+
+
+def check_route(plan: Plan, lung: Lung, found: Findings) -> None:
+    """Record everything about the bronchoscope."""
+    route, tree = plan.scope, lung.tree
+    astray_mm = _check_on_tree(route, tree, found)
+    samples = _resample(route.points_lps, SAMPLE_MM)
+    in_lumen = (labels_at(lung, samples) & structures.LUMEN) != 0
+    detail = f"{int((~in_lumen).sum())} of {len(samples)} samples outside"
+    found.true("scope.in_lumen", in_lumen.all(), detail)
+    if astray_mm <= REACH_MM:
+        _check_fit(plan, lung, samples, found)
+    _check_tip(route, tree, found)
+    _check_statements(route, tree, found)
+
+
+def _resample(points: Float, step_mm: float) -> Float:
+    """Return points along a polyline at most `step_mm` apart, the given ones among them."""
+    pieces = [points[:1]]
+    for a, b in zip(points[:-1], points[1:], strict=True):
+        count = max(int(np.ceil(np.linalg.norm(b - a) / step_mm)), 1)
+        pieces.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
+    return np.concatenate(pieces)
+
+
+def _check_on_tree(route: ScopeRoute, tree: AirwayTree, found: Findings) -> float:
+    """The route begins at the root and keeps to the edges of the airway tree; return how far it strays."""
+    points = route.points_lps
+    start = float(np.linalg.norm(points[0] - tree.points_lps[0]))
+    found.at_most("scope.start", start, AXIS_TOLERANCE_MM, "mm", "first point to the root of the airway tree")
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    found.at_most("scope.connected", float(steps.max()), MAX_STEP_MM, "mm", "largest step of the route")
+    gaps = _distance_to_tree(_resample(points, 10.0 * SAMPLE_MM), tree)
+    found.at_most("scope.on_axis", float(gaps.max()), AXIS_TOLERANCE_MM, "mm", "route to airway axis")
+    nearest = cKDTree(tree.points_lps).query(points, k=min(3, tree.n_points))[1].reshape(len(points), -1)
+    same = (tree.branch_of_point[nearest] == route.branches[:, None]).any(axis=1)
+    found.true("scope.branches", bool(same.all()), f"{int((~same).sum())} points name another branch")
+    return float(gaps.max())
+
+
+def _distance_to_tree(points: Float, tree: AirwayTree) -> Float:
+    """Return the distances from points to the nearest edge of the tree."""
+    child = np.flatnonzero(tree.parent_point >= 0)
+    a, b = tree.points_lps[tree.parent_point[child]], tree.points_lps[child]
+    longest = float(np.linalg.norm(b - a, axis=1).max())
+    middles = cKDTree(0.5 * (a + b))
+    gaps = np.array(middles.query(points)[0], dtype=np.float64)
+    for n, point in enumerate(points):
+        near = middles.query_ball_point(point, 0.5 * longest + 1.0)
+        lines = [distance_to_polyline(point[None], np.stack([a[e], b[e]]))[0] for e in near]
+        gaps[n] = min([gaps[n], *lines])
+    return gaps
+
+
+def _check_fit(plan: Plan, lung: Lung, samples: Float, found: Findings) -> None:
+    """The lumen is wide enough all along, and the stated radii and margin are not more than there is."""
+    route, scope = plan.scope, plan.system.scope
+    boxes = Boxes(region_around(lung, samples, REACH_MM), not_lumen)
+    radius = 0.5 * scope.outer_diameter_mm
+    narrowest = float(boxes.distance_mm(samples).min())
+    found.at_least(
+        "scope.fits",
+        narrowest,
+        radius + scope.lumen_margin_mm - POSITION_TOLERANCE_MM,
+        "mm",
+        "smallest lumen radius, at points and between them; needed: radius of the scope plus its margin",
+    )
+    stated = np.minimum(route.lumen_radius_mm, REACH_MM) - boxes.distance_mm(route.points_lps)
+    found.at_most("scope.lumen_radius", float(stated.max()), RADIUS_TOLERANCE_MM, "mm", "stated beyond found")
+    slack = float(np.linalg.norm(lung.grid.spacing_mm))
+    found.at_least("scope.lumen_radius.least", float(stated.min()), -slack, "mm", "stated below found")
+    over = route.min_lumen_margin_mm - (narrowest - radius)
+    found.at_most("scope.margin", over, RADIUS_TOLERANCE_MM, "mm", "stated beyond recomputed margin")
+
+
+def _check_tip(route: ScopeRoute, tree: AirwayTree, found: Findings) -> None:
+    """The tip stands at the end of the route and looks along the airway."""
+    pose = route.lps_from_scope_tip
+    if not check_rigid("scope.tip", pose, found):
+        return
+    found.agrees("scope.tip.position", pose[:3, 3], route.points_lps[-1], POSITION_TOLERANCE_MM, "mm")
+    if 0 <= route.site_point < tree.n_points:
+        site = route.site_point
+        found.agrees("scope.site", route.points_lps[-1], tree.points_lps[site], POSITION_TOLERANCE_MM, "mm")
+        tangent = tree.tangents[site]
+    else:
+        found.true("scope.site", route.site_point == -1, f"site {route.site_point}")
+        tangent = _tangent_between(tree, pose[:3, 3])
+    tilt = float(angle_between(pose[:3, 2], tangent))
+    found.at_most("scope.tip.tangent", tilt, ANGLE_TOLERANCE_RAD, "rad", "tip to airway axis")
+    back = np.linalg.norm(route.points_lps - route.points_lps[-1], axis=1) >= CHORD_MM
+    before = route.points_lps[np.flatnonzero(back)[-1]] if back.any() else route.points_lps[0]
+    tilt = float(angle_between(pose[:3, 2], route.points_lps[-1] - before))
+    found.at_most("scope.tip.forward", tilt, float(MAX_CHORD_ANGLE_RAD), "rad", "tip to the end of the route")
+
+
+def _tangent_between(tree: AirwayTree, point: Float) -> Float:
+    """Return the direction of the airway at a point on an edge of the tree, linear along the edge."""
+    child = np.flatnonzero(tree.parent_point >= 0)
+    parent = tree.parent_point[child]
+    begin, step = tree.points_lps[parent], tree.points_lps[child] - tree.points_lps[parent]
+    share = np.clip(((point - begin) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)[:, None]
+    edge = int(np.linalg.norm(begin + share * step - point, axis=1).argmin())
+    ends = tree.tangents[parent[edge]], tree.tangents[child[edge]]
+    return np.asarray((1.0 - share[edge]) * ends[0] + share[edge] * ends[1])
+
+
+def _check_statements(route: ScopeRoute, tree: AirwayTree, found: Findings) -> None:
+    """Generation and lengths are what the tree and the points say."""
+    branch = int(route.branches[-1])
+    generation = int(tree.generation[branch]) if 0 <= branch < tree.n_branches else -1
+    found.true("scope.generation", route.generation == generation, f"{route.generation} against {generation}")
+    length = float(np.linalg.norm(np.diff(route.points_lps, axis=0), axis=1).sum())
+    found.agrees("scope.length", route.length_mm, length, POSITION_TOLERANCE_MM, "mm")
+    beyond = length - float(tree.distance_from_root_mm[tree.branch_start[1] - 1])
+    stated = route.length_from_carina_mm
+    wanted = beyond if stated < 0.0 else max(beyond, 0.0)
+    found.agrees("scope.length_from_carina", stated, wanted, 10.0 * POSITION_TOLERANCE_MM, "mm")

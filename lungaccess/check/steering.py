@@ -1,0 +1,222 @@
+"""Fourth part of the check: the needle follows its arcs to the target, within its limits and clear of all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from anatomy import structures
+from anatomy.grid import Float
+from lungaccess.check.deployment import CLEARANCE_TOLERANCE_MM, REACH_MM, SPARE, check_stated_clearance
+from lungaccess.check.findings import Findings
+from lungaccess.check.poses import (
+    ANGLE_TOLERANCE_RAD,
+    POSITION_TOLERANCE_MM,
+    angle_between,
+    check_rigid,
+    check_same_pose,
+)
+from lungaccess.check.shapes import TINY_MM, Curve, Piece, cut_at, integrate
+from lungaccess.check.space import (
+    Boxes,
+    Region,
+    Select,
+    airway_except,
+    branch_of,
+    has,
+    labels_at,
+    region_around,
+    segment_clearance_mm,
+)
+from lungaccess.plan import Plan
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+TURN_TOLERANCE_RAD = 1e-3
+LENGTH_TOLERANCE_MM = 1e-6
+LIMIT_TOLERANCE = 1e-9
+COST_TOLERANCE = 0.02
+COST_STEP_MM = 0.1
+CLEARANCE_FLOOR_MM = 0.1
+
+
+def check_needle(plan: Plan, lung: Lung, tube_end: Float | None, found: Findings) -> None:
+    """Record everything about the needle, the target and the costs."""
+    needle = plan.needle
+    if not check_rigid("needle.start", needle.lps_from_start, found):
+        return
+    check_same_pose("needle.start", needle.lps_from_start, plan.tube.lps_from_tip, found)
+    if tube_end is not None:
+        check_same_pose("needle.start.integrated", needle.lps_from_start, tube_end, found)
+    pieces = [
+        Piece(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
+        for arc in needle.arcs
+    ]
+    curve = integrate(needle.lps_from_start, cut_at(pieces, plan.exemption.needle_length_mm))
+    if not _check_motion(plan, curve, found):
+        return
+    _check_target(plan, lung, curve, found)
+    _check_exemption(plan, found)
+    _check_containment(plan, lung, curve, found)
+    region = region_around(lung, curve.points, REACH_MM)
+    _check_clearance(plan, region, curve, found)
+    _check_costs(plan, lung, region, curve, found)
+
+
+def _check_motion(plan: Plan, curve: Curve, found: Findings) -> bool:
+    """Curvature, length and both turning limits; tell whether the needle is as short as the device's."""
+    needle, device = plan.needle, plan.system.needle
+    curvature = [arc.curvature_per_mm for arc in needle.arcs]
+    bound = device.max_curvature_per_mm
+    found.at_most("needle.curvature", max(curvature), bound * (1.0 + LIMIT_TOLERANCE), "1/mm")
+    found.at_least("needle.curvature.sign", min(curvature), 0.0, "1/mm", "a bend is turned by its roll")
+    found.at_least("needle.arc_length", min(arc.length_mm for arc in needle.arcs), 1e-9, "mm", "shortest arc")
+    length = float(sum(arc.length_mm for arc in needle.arcs))
+    found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
+    fits = found.at_most("needle.length.limit", length, device.max_length_mm + LENGTH_TOLERANCE_MM, "mm")
+    turned = float(angle_between(curve.tangents[:-1], curve.tangents[1:]).sum())
+    found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
+    limit = float(np.deg2rad(device.max_accumulated_turn_deg)) + ANGLE_TOLERANCE_RAD
+    found.at_most("needle.turn.limit", turned, limit, "rad", "sum of all turning")
+    angle = float(angle_between(curve.tangents, curve.tangents[0]).max())
+    found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
+    limit = float(np.deg2rad(device.max_angle_from_start_deg)) + ANGLE_TOLERANCE_RAD
+    found.at_most("needle.angle.limit", angle, limit, "rad", "largest angle from the start direction")
+    return fits
+
+
+def _check_target(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> None:
+    """The needle ends at the target, which lies in the lung and in no obstacle."""
+    end = curve.points[-1]
+    found.agrees("needle.end", plan.needle.end_lps, end, POSITION_TOLERANCE_MM, "mm")
+    miss = float(np.linalg.norm(end - plan.target_lps))
+    if plan.target_origin.startswith("nodule"):
+        ends = np.stack([end, plan.target_lps])
+        found.true("target.in_nodule", _in_nodule(lung, ends), "needle end and target are nodule")
+    else:
+        found.at_most("target.reached", miss, POSITION_TOLERANCE_MM, "mm", "end of the needle to the target")
+    label = int(labels_at(lung, plan.target_lps)[0])
+    found.true("target.in_lung", not label & structures.OUTSIDE, "the target is lung")
+    forbidden = forbidden_bits(plan)
+    found.true("target.free", not label & forbidden, "the target lies in no obstacle")
+
+
+def _in_nodule(lung: Lung, points: Float) -> bool:
+    if lung.nodules is None:
+        return False
+    index = np.rint(lung.nodules.grid.ijk(points)).astype(np.int64)
+    if ((index < 0) | (index >= np.asarray(lung.nodules.grid.shape))).any():
+        return False
+    return bool(lung.nodules.array[tuple(index.T)].all())
+
+
+def forbidden_bits(plan: Plan) -> int:
+    """Return the structures that the needle must stay clear of."""
+    return structures.OBSTACLES | (structures.FISSURE if plan.fissures_are_obstacles else 0)
+
+
+def _check_exemption(plan: Plan, found: Findings) -> None:
+    """The exemption is not longer than the device's; its branch and point are judged with the tube's exit."""
+    exempt = plan.exemption.needle_length_mm
+    limit = plan.system.needle.exit_exemption_mm + LENGTH_TOLERANCE_MM
+    found.at_most("exemption.length", exempt, limit, "mm", "needle that may be near the pierced wall")
+    found.at_least("exemption.length.sign", exempt, 0.0, "mm")
+
+
+def _check_containment(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> None:
+    """Every sample is in the lung and in no obstacle: a surface alone does not tell inside from outside."""
+    labels = labels_at(lung, curve.points)
+    outside = (labels & structures.OUTSIDE) != 0
+    detail = f"{int(outside.sum())} samples outside the lung, or between the lungs"
+    found.true("needle.in_lung", not outside.any(), detail)
+    found.true("needle.not_in_lumen", not ((labels & structures.LUMEN) != 0).any(), "no sample in an airway")
+    exempt = curve.arc_mm < plan.exemption.needle_length_mm - TINY_MM
+    own_wall = ((labels & structures.AIRWAY) != 0) & (branch_of(labels) == plan.exemption.branch) & exempt
+    others = forbidden_bits(plan) & ~structures.AIRWAY
+    hit = ((labels & others) != 0) | (((labels & structures.AIRWAY) != 0) & ~own_wall)
+    found.true("needle.containment", not hit.any(), f"{int(hit.sum())} samples in an obstacle")
+
+
+def _check_clearance(plan: Plan, region: Region, curve: Curve, found: Findings) -> None:
+    """The needle, as capsules padded by the sagitta, keeps radius and margins from every structure."""
+    radius = 0.5 * plan.system.needle.diameter_mm
+    required = radius + plan.system.margins.total_mm
+    everywhere = np.ones(len(curve.points), dtype=bool)
+    exempt = curve.arc_mm < plan.exemption.needle_length_mm - TINY_MM
+    cases: list[tuple[str, Select, np.ndarray, float]] = [
+        ("vessel", has(structures.VESSEL), everywhere, required),
+        ("outside", has(structures.OUTSIDE), everywhere, required),
+        ("airway", has(structures.AIRWAY), ~exempt, required),
+        ("other_airway", airway_except(plan.exemption.branch), exempt, required),
+        ("lumen", has(structures.LUMEN), exempt, radius),
+        ("fissure", has(structures.FISSURE), everywhere, required),
+    ]
+    nearest: dict[str, float] = {}
+    for name, select, where, needed in cases:
+        first, last = _stretch(where)
+        if last - first < 1:
+            continue
+        boxes = Boxes(region, select)
+        points = curve.points[first : last + 1]
+        if name != "fissure" or plan.fissures_are_obstacles:
+            gap = segment_clearance_mm(boxes, points, needed + 1.0) - curve.sagitta_mm[first:last]
+            spare = float(gap.min()) - needed
+            found.at_least(f"needle.clearance.{name}", spare, -CLEARANCE_TOLERANCE_MM, "mm", SPARE)
+        nearest[name] = float(boxes.distance_mm(points).min())
+    # Towards the airway counts all of it behind the exempt length, and other branches before.
+    airway = min(nearest.pop("airway", REACH_MM), nearest.pop("other_airway", REACH_MM))
+    nearest.pop("lumen", None)
+    diagonal = float(np.linalg.norm(region.grid.spacing_mm))
+    for name, exact in {**nearest, "airway": airway}.items():
+        check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
+
+
+def _stretch(where: np.ndarray) -> tuple[int, int]:
+    """Return first and last frame of a run of True frames; an exempt run reaches the next frame."""
+    frames = np.flatnonzero(where)
+    if not len(frames):
+        return 0, 0
+    return int(frames[0]), min(int(frames[-1]) + 1, len(where) - 1)
+
+
+def _check_costs(plan: Plan, lung: Lung, region: Region, curve: Curve, found: Findings) -> None:
+    """The stated costs are those of the re-integrated needle."""
+    stated: Mapping[str, float] = plan.costs
+    names = {"inverse_clearance", "cost_map", "length_mm"}
+    if not found.true("costs.names", set(stated) == names, ", ".join(stated)):
+        return
+    found.true("costs.objective", plan.objective in names, plan.objective)
+    found.agrees("costs.length_mm", stated["length_mm"], curve.arc_mm[-1], LENGTH_TOLERANCE_MM, "mm")
+    recomputed = inverse_clearance(plan, region, curve)
+    tolerance = COST_TOLERANCE * recomputed
+    found.agrees("costs.inverse_clearance", stated["inverse_clearance"], recomputed, tolerance, "")
+    mapped = cost_map_integral(lung, curve)
+    found.agrees("costs.cost_map", stated["cost_map"], mapped, COST_TOLERANCE * mapped + 1e-9, "mm")
+
+
+def inverse_clearance(plan: Plan, region: Region, curve: Curve) -> float:
+    """Return the integral of 1 / clearance over the needle's length [Kuntz2015], by the trapezoid rule.
+
+    The clearance to the nearest obstacle, voxels as solid boxes, is not taken below 0.1 mm nor above
+    `REACH_MM`, where the integrand is at most 0.05 / mm.
+    """
+    length = float(curve.arc_mm[-1])
+    arc = np.linspace(0.0, length, max(int(np.ceil(length / COST_STEP_MM)), 1) + 1)
+    points = np.stack([np.interp(arc, curve.arc_mm, curve.points[:, axis]) for axis in range(3)], axis=1)
+    clearance = Boxes(region, has(forbidden_bits(plan))).distance_mm(points)
+    return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
+
+
+def cost_map_integral(lung: Lung, curve: Curve) -> float:
+    """Return the line integral of the cost map along the needle, in mm: 0 without a map."""
+    if lung.cost is None:
+        return 0.0
+    middles = 0.5 * (curve.points[:-1] + curve.points[1:])
+    index = np.rint(lung.cost.grid.ijk(middles)).astype(np.int64)
+    inside = ((index >= 0) & (index < np.asarray(lung.cost.grid.shape))).all(axis=1)
+    values = np.full(len(middles), np.inf)
+    values[inside] = lung.cost.array[tuple(index[inside].T)]
+    return float((values * np.diff(curve.arc_mm)).sum())

@@ -1,0 +1,367 @@
+"""The command line: demo, plan, check, info and presets.
+
+Exit codes: 0, a plan was found and the independent check accepts it; 1, there is no plan or the check
+refuses it; 2, the input is bad.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from cyclopts import App, CycloptsError
+from rich.panel import Panel
+
+from anatomy.errors import AnatomyError, LungaccessError, SettingsError, TargetError
+from anatomy.io.files import require_writable_folder
+from anatomy.io.frames import parse_point
+from lungaccess import terminal
+from lungaccess.terminal import console, error_console
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.searching import SearchRequest
+    from lungaccess.system import System
+
+OK, NO_PLAN, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DEFAULT_SYSTEM = "lung-default"
+DEFAULT_BUDGET_S = 10.0
+# The first nodule of this synthetic patient can be reached.
+DEMO_SEED = 2
+
+Objective = Literal["inverse-clearance", "cost-map", "length"]
+Method = Literal["atlas", "kuntz2015"]
+
+_TOO_LARGE = AnatomyError(
+    "There is not enough memory for this patient",
+    expected="about 6 GiB free for 512 x 512 x 600 voxels",
+    remedy="Close other programs, or resample the masks to 1 mm voxels",
+)
+
+OBJECTIVES = {"inverse-clearance": "inverse_clearance", "cost-map": "cost_map", "length": "length_mm"}
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("lungaccess")
+    except PackageNotFoundError:
+        return "unknown (not installed)"
+
+
+app = App(
+    name="lungaccess",
+    help="Plan access to a lung nodule with three stages: bronchoscope, concentric tubes, steerable needle.",
+    help_epilogue="Exit codes: 0 a plan that the check accepts, 1 no plan or a refused one, 2 bad input.",
+    version=_version,
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; no user error ever shows a traceback.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The words after the name of the program; those of this process if None.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = app(_with_nodule_number(words), exit_on_error=False, error_console=error_console)
+    except CycloptsError:
+        return BAD_INPUT
+    except LungaccessError as error:
+        return _explain(error)
+    except MemoryError:
+        terminal.show_error(_TOO_LARGE)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        error_console.print("interrupted")
+        return INTERRUPTED
+    return int(code or OK)
+
+
+def _explain(error: LungaccessError) -> int:
+    """Print an error for people and return the exit code that belongs to it."""
+    from lungaccess.noplan import NoPlan
+
+    if isinstance(error, NoPlan):
+        terminal.show_no_plan(error)
+        return NO_PLAN
+    terminal.show_error(error)
+    return BAD_INPUT
+
+
+def _with_nodule_number(words: list[str]) -> list[str]:
+    """Let `--nodule` stand alone for `--nodule 1`."""
+    completed: list[str] = []
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        completed.append(word)
+        if word == "--nodule" and not following.lstrip("+-").isdigit():
+            completed.append("1")
+    return completed
+
+
+@app.command
+def plan(
+    patient: Path,
+    *,
+    target: str | None = None,
+    nodule: int | None = None,
+    system: str = DEFAULT_SYSTEM,
+    budget: float | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
+    objective: Objective = "inverse-clearance",
+    method: Method = "atlas",
+    allow_fissures: bool | None = None,
+    out: Path = Path("lungaccess-plan"),
+    cache: Path | None = None,
+) -> int:
+    """Plan the way to a target, check the plan, and write plan, pictures and cost over time.
+
+    Parameters
+    ----------
+    patient : Path
+        Folder of masks (Med-RAD, TotalSegmentator, or own masks with a lungaccess TOML file).
+    target : str
+        Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
+    nodule : int
+        Go to the centre of this nodule of the nodule mask; 1, the largest, if no number follows.
+    system : str
+        Name of a preset (see `lungaccess presets`) or path of a TOML file.
+    budget : float
+        Planning time in seconds; 10 if neither this nor --iterations is given.
+    iterations : int
+        Number of iterations instead of a time: the same seed then gives the same plan.
+    seed : int
+        Seed of the random numbers.
+    objective : str
+        What to make small: integral of 1/clearance, integral of the patient's cost map, or length.
+    method : str
+        Search over the deployment atlas, or Algorithm 1 of Kuntz et al. 2015.
+    allow_fissures : bool
+        Whether fissures may be crossed; as the system says if not given.
+    out : Path
+        Folder for plan.json, overview.png, cost_over_time.png and cost_over_time.csv.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.searching import SearchRequest
+
+    _require_one_target(target, nodule)
+    _require_budget(budget, iterations)
+    require_writable_folder(out)
+    device = _system(system, allow_fissures)
+    lung = _load(patient, cache)
+    if objective == "cost-map" and lung.cost is None:
+        raise SettingsError(
+            f"Patient {lung.name} has no cost map",
+            expected="a cost map among the patient's files for --objective cost-map",
+            remedy="Choose inverse-clearance or length",
+        )
+    if budget is None and iterations is None:
+        budget = DEFAULT_BUDGET_S
+    request = SearchRequest(
+        system=device,
+        target=target,
+        nodule=nodule,
+        objective=OBJECTIVES[objective],
+        method=method,
+        seed=seed,
+        time_s=budget,
+        iterations=iterations,
+    )
+    return _plan_and_report(lung, request, out)
+
+
+@app.command
+def check(plan: Path, patient: Path, *, system: str | None = None, cache: Path | None = None) -> int:
+    """Judge a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
+
+    Parameters
+    ----------
+    plan : Path
+        The plan.json to judge.
+    patient : Path
+        Folder of the patient it was made for.
+    system : str
+        Judge against this preset or TOML file instead of the devices stated in the plan.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.check import check as judge
+    from lungaccess.plan import Plan
+
+    stored = Plan.load(plan)
+    device = None if system is None else _system(system, None)
+    report = judge(stored, _load(patient, cache), system=device)
+    console.print(terminal.check_table(report))
+    return _verdict(report.accepted)
+
+
+@app.command
+def info(patient: Path, *, out: Path | None = None, cache: Path | None = None) -> int:
+    """Show what was understood of a patient: volumes, airway tree, sources and warnings.
+
+    Parameters
+    ----------
+    patient : Path
+        Folder of masks.
+    out : Path
+        Folder for tree.png, a picture of the airway tree.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    if out is not None:
+        require_writable_folder(out)
+    lung = _load(patient, cache)
+    terminal.show(terminal.anatomy_tables(lung))
+    _print_warnings(lung)
+    if out is not None:
+        from lungaccess.report import tree_png
+
+        console.print(f"Picture of the tree: {tree_png(lung, out / 'tree.png')}")
+    return OK
+
+
+@app.command
+def presets() -> int:
+    """List the systems that ship with lungaccess."""
+    from lungaccess.system import load_system, preset_names
+
+    console.print(terminal.preset_table({name: load_system(name) for name in preset_names()}))
+    return OK
+
+
+@app.command
+def demo(
+    *,
+    out: Path = Path("demo-output"),
+    budget: float = 3.0,
+    seed: int = DEMO_SEED,
+    cache: Path | None = None,
+) -> int:
+    """Make a synthetic patient, plan to one of its nodules, check the plan and draw it.
+
+    Parameters
+    ----------
+    out : Path
+        Folder for plan.json and the pictures.
+    budget : float
+        Planning time in seconds.
+    seed : int
+        Seed of the patient and of the search.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.searching import demo_lung
+
+    _require_budget(budget, None)
+    require_writable_folder(out)
+    with console.status("making a synthetic patient") as status:
+        lung = demo_lung(seed, cache, status.update)
+    terminal.show(terminal.anatomy_tables(lung)[1:3])
+    code = _first_reachable_nodule(lung, _system(DEFAULT_SYSTEM, None), budget, seed, out)
+    if code == OK:
+        console.print(terminal.what_to_look_at(out))
+    return code
+
+
+def _first_reachable_nodule(lung: Lung, device: System, budget: float, seed: int, out: Path) -> int:
+    """Plan to the nodules in their order until one can be reached."""
+    from lungaccess.noplan import NoPlan
+    from lungaccess.searching import SearchRequest
+
+    failure: NoPlan | None = None
+    for number in range(1, len(lung.targets_lps) + 1):
+        request = SearchRequest(system=device, nodule=number, seed=seed, time_s=budget)
+        try:
+            return _plan_and_report(lung, request, out)
+        except NoPlan as error:
+            console.print(f"Nodule {number} cannot be reached; trying the next one.")
+            failure = error
+    raise failure or AnatomyError("The synthetic patient has no nodule", remedy="Choose another --seed")
+
+
+def _plan_and_report(lung: Lung, request: SearchRequest, out: Path) -> int:
+    """Search, check, write everything to `out`, show it, and return the exit code."""
+    from lungaccess.check import check as judge
+    from lungaccess.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
+    from lungaccess.searching import run_search
+
+    found, history = run_search(lung, request, terminal.SearchDisplay(request.time_s, request.iterations))
+    found.save(out / "plan.json")
+    with console.status("checking and drawing the plan"):
+        report = judge(found, lung)
+        overview_png(found, lung, out / "overview.png")
+        tree_png(lung, out / "tree.png")
+        cost_over_time_csv(history, out / "cost_over_time.csv")
+        cost_over_time_png(history, out / "cost_over_time.png", terminal.objective_words(found.objective))
+    terminal.show(terminal.plan_tables(found))
+    _print_warnings(lung)
+    if not report.accepted:
+        console.print(terminal.check_table(report, refusals_only=True))
+    written = ", ".join(("plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv"))
+    console.print(terminal.escaped(f"Written to {out}: {written}"))
+    return _verdict(report.accepted)
+
+
+def _verdict(accepted: bool) -> int:
+    if accepted:
+        console.print("[bold green]The independent check accepts the plan.[/]")
+        return OK
+    console.print("[bold red]The independent check refuses the plan.[/]")
+    return NO_PLAN
+
+
+def _print_warnings(lung: Lung) -> None:
+    if lung.warnings:
+        text = terminal.escaped("\n".join(f"- {warning}" for warning in lung.warnings))
+        console.print(Panel(text, title="warnings", title_align="left", border_style="yellow"))
+
+
+def _system(name: str, allow_fissures: bool | None) -> System:
+    """Return the system, with its rule about fissures replaced if the user states one."""
+    from dataclasses import replace
+
+    from lungaccess.system import load_system
+
+    loaded = load_system(name)
+    if allow_fissures is None or allow_fissures == loaded.fissures_allowed:
+        return loaded
+    rule = "fissures may be crossed" if allow_fissures else "fissures are obstacles"
+    return replace(loaded, name=f"{loaded.name} ({rule})", fissures_allowed=allow_fissures)
+
+
+def _load(patient: Path, cache: Path | None) -> Lung:
+    from lungaccess.patients import load_patient
+
+    with console.status(f"reading {terminal.escaped(str(patient))}") as status:
+        return load_patient(patient, cache=cache, progress=lambda step: status.update(step))
+
+
+def _require_one_target(target: str | None, nodule: int | None) -> None:
+    if (target is None) == (nodule is None):
+        raise TargetError(
+            "No target was given" if target is None else "Both a target and a nodule were given",
+            expected="either --target ras:x,y,z (or lps:x,y,z) or --nodule",
+            remedy="lungaccess plan --help shows examples",
+        )
+    if target is not None:
+        parse_point(target)
+
+
+def _require_budget(budget: float | None, iterations: int | None) -> None:
+    if budget is not None and not 0.0 < budget < float("inf"):
+        raise SettingsError(f"--budget is {budget:g} s", expected="a finite time above 0")
+    if iterations is not None and iterations < 1:
+        raise SettingsError(f"--iterations is {iterations}", expected="at least 1")
+
+
+__all__ = ["app", "main"]

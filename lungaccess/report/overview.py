@@ -1,0 +1,140 @@
+"""The one picture of a plan: three projections, two cuts, the clearances and the key numbers."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from lungaccess.report import drawing, panels, style, zoom
+from lungaccess.report.geometry import needle_polyline, tube_centreline
+from lungaccess.report.layers import Layers
+from lungaccess.report.views import STANDARD, View
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from anatomy.lung import Lung
+    from lungaccess.plan import Plan
+
+Float = NDArray[np.float64]
+
+WIDTH_IN, HEIGHT_IN = 18.0, 11.6
+# left, bottom, width, height of each panel, inches
+PROJECTIONS_IN = ((0.55, 6.0, 4.75, 4.7), (5.85, 6.0, 4.75, 4.7), (11.15, 6.0, 3.35, 4.7))
+EXIT_IN, NEEDLE_IN = (0.3, 0.75, 4.3, 4.3), (4.8, 0.75, 4.3, 4.3)
+CLEARANCE_IN, TEXT_IN = (9.75, 0.95, 4.75, 4.05), (14.85, 0.5, 2.95, 10.4)
+
+
+def overview_png(plan: Plan, lung: Lung, path: str | os.PathLike[str]) -> Path:
+    """Draw a plan in its anatomy and write the picture to `path`.
+
+    The axial projection is seen from the feet and the coronal one from the front, as radiologists
+    do: the patient's left is on the right of the picture.  Ticks are LPS mm.  The two cuts below show
+    scope, tubes and needle true to their width; vessels up to 2 mm beside the cut show faintly.
+
+    Parameters
+    ----------
+    plan : Plan
+    lung : Lung
+        The patient of the plan.  Fissures, nodules and cost may be missing.
+    path : path of a PNG file in an existing folder
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    anatomy.errors.FileError
+        If the file cannot be written.
+    """
+    figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
+    layers = Layers(lung)
+    for box, view in zip(PROJECTIONS_IN, STANDARD, strict=True):
+        projection(_panel(figure, box), plan, layers, view)
+    zoom.exit_zoom(_panel(figure, EXIT_IN), plan, layers)
+    zoom.needle_zoom(_panel(figure, NEEDLE_IN), plan, layers)
+    panels.clearance_panel(_panel(figure, CLEARANCE_IN), plan, lung)
+    panels.text_panel(_panel(figure, TEXT_IN), plan)
+    _heading_and_legend(figure, plan, layers)
+    return style.save_png(figure, path)
+
+
+def _panel(figure: Figure, box_in: tuple[float, float, float, float]) -> Axes:
+    left, bottom, width, height = box_in
+    return figure.add_axes((left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN))
+
+
+def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
+    """Draw anatomy and all three stages as seen along a view."""
+    frame = layers.footprint("lung", view) or layers.footprint("airway", view)
+    scope = view.project(np.asarray(plan.scope.points_lps))
+    if frame is None:
+        low, high = scope.min(axis=0), scope.max(axis=0)
+    else:
+        left, right, bottom, top = frame.extent_mm
+        low = np.minimum([left, bottom], scope.min(axis=0))
+        high = np.maximum([right, top], scope.max(axis=0))
+    drawing.anatomy_seen_through(axes, layers, view)
+    drawing.fit(axes, low - 4.0, high + 4.0)
+    _nodule(axes, layers, view)
+    _stages(axes, plan, view, scope)
+    drawing.target_mark(axes, view.project(np.asarray(plan.target_lps)))
+    drawing.dress(axes, view, ticks=True)
+    drawing.title(axes, view.name)
+
+
+def _stages(axes: Axes, plan: Plan, view: View, scope: Float) -> None:
+    tube, _ = tube_centreline(plan)
+    needle, _ = needle_polyline(plan.needle)
+    drawing.curve(axes, scope, style.SCOPE, 3.4, 6)
+    drawing.curve(axes, view.project(tube), style.TUBE, 3.0, 7)
+    drawing.curve(axes, view.project(needle), style.NEEDLE, 2.2, 8)
+
+
+def _nodule(axes: Axes, layers: Layers, view: View) -> None:
+    footprint = layers.footprint("nodule", view)
+    drawing.see_through(axes, footprint, style.NODULE, 2.0, 0.8)
+    drawing.outline(axes, footprint, style.NODULE, 1.0)
+
+
+def _heading_and_legend(figure: Figure, plan: Plan, layers: Layers) -> None:
+    figure.text(
+        0.3 / WIDTH_IN, 1 - 0.14 / HEIGHT_IN, f"Three-stage plan for {plan.patient_name}", va="top",
+        fontsize=15, fontweight="bold", color=style.INK,
+    )  # fmt: skip
+    figure.legend(
+        handles=_legend_entries(layers), loc="lower left", bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN),
+        ncols=12, fontsize=9, frameon=False, handlelength=1.8, columnspacing=1.3,
+    )  # fmt: skip
+
+
+def _legend_entries(layers: Layers) -> list[Line2D | Patch]:
+    entries: list[Line2D | Patch] = [
+        Line2D([], [], color=style.SCOPE, lw=4, label="bronchoscope"),
+        Line2D([], [], color=style.TUBE, lw=4, label="tubes"),
+        Line2D([], [], color=style.NEEDLE, lw=3, label="needle"),
+        Line2D([], [], color=style.INK, lw=0.9, ls=(0, (3, 2)), label="room to keep free"),
+        Line2D([], [], ls="none", marker="D", mfc="white", mec=style.INK, label="exit"),
+        Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2, label="target"),
+    ]
+    if layers.mask("nodule") is not None:
+        entries.append(Patch(color=style.NODULE, alpha=0.6, label="nodule"))
+    entries.append(Patch(facecolor=style.LUMEN, edgecolor=style.AIRWAY, label="airway lumen"))
+    if layers.count("airway") > layers.count("lumen"):
+        entries.append(Patch(color=style.AIRWAY, label="airway wall"))
+    entries += [
+        Patch(color=style.VESSEL, label="vessel"),
+        Patch(color="#C9C9C9", label="outside the lung"),
+    ]
+    if layers.mask("fissure") is not None:
+        entries.append(Patch(color=style.FISSURE, alpha=0.6, label="fissure"))
+    return entries

@@ -1,0 +1,96 @@
+"""Best cost over time of a search, as a table and as a picture."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.axes import Axes
+
+from anatomy.io.files import atomic_write
+from lungaccess.report import drawing, style
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostPoint:
+    """The state of a search at one moment.
+
+    Parameters
+    ----------
+    elapsed_s : float
+        Planning time since the search began.
+    iteration : int
+    best_cost : float or None
+        Cost of the best plan yet, in the unit of the objective; None before the first plan.
+    """
+
+    elapsed_s: float
+    iteration: int
+    best_cost: float | None
+
+
+def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str]) -> Path:
+    """Write one line a point: elapsed_s, iteration, best_cost (empty before the first plan).
+
+    Raises
+    ------
+    anatomy.errors.FileError
+        If the file cannot be written.
+    """
+    with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["elapsed_s", "iteration", "best_cost"])
+        for point in history:
+            cost = "" if point.best_cost is None else repr(float(point.best_cost))
+            writer.writerow([f"{point.elapsed_s:.6f}", point.iteration, cost])
+    return Path(path)
+
+
+def cost_over_time_png(
+    history: Sequence[CostPoint], path: str | os.PathLike[str], objective: str = "cost"
+) -> Path:
+    """Draw the best cost against planning time; a search without a plan says so.
+
+    Raises
+    ------
+    anatomy.errors.FileError
+        If the file cannot be written.
+    """
+    figure = style.new_figure(8.0, 4.5)
+    axes = figure.add_axes((0.105, 0.135, 0.86, 0.77))
+    found = [point for point in history if point.best_cost is not None]
+    if found:
+        _steps(axes, found, history[-1].elapsed_s, objective)
+    else:
+        axes.text(0.5, 0.5, "no plan was found", ha="center", va="center", transform=axes.transAxes)
+    axes.set_xlabel("planning time (s)")
+    axes.set_ylabel(objective)
+    axes.grid(color="#E6E6E6", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    drawing.title(axes, "Best cost over planning time")
+    return style.save_png(figure, path)
+
+
+def _steps(axes: Axes, found: Sequence[CostPoint], end_s: float, objective: str) -> None:
+    times = [point.elapsed_s for point in found] + [max(end_s, found[-1].elapsed_s)]
+    costs = [float(point.best_cost or 0.0) for point in found]
+    axes.step(times, [*costs, costs[-1]], where="post", color=style.SCOPE, lw=2)
+    better = [n for n in range(len(costs)) if n == 0 or costs[n] < costs[n - 1]]
+    axes.plot([times[n] for n in better], [costs[n] for n in better], "o", color=style.SCOPE, ms=5)
+    _note(axes, times[0], costs[0], f"first plan {times[0]:.2f} s, {costs[0]:.4g}", (12, 2), "left")
+    if costs[-1] < costs[0]:
+        _note(axes, times[-1], costs[-1], f"best {costs[-1]:.4g}", (-4, 8), "right")
+        axes.set_ylim(costs[-1] - 0.08 * (costs[0] - costs[-1]), costs[0] + 0.12 * (costs[0] - costs[-1]))
+    if len(better) > 2 and times[-1] > 50 * max(times[0], 1e-3):
+        axes.set_xscale("log")
+
+
+def _note(axes: Axes, x: float, y: float, text: str, shift: tuple[float, float], side: str) -> None:
+    axes.annotate(
+        text, (x, y), xytext=shift, textcoords="offset points", ha=side, va="bottom",
+        fontsize=9, color=style.INK, path_effects=drawing.halo(3),
+    )  # fmt: skip

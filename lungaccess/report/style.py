@@ -1,0 +1,50 @@
+"""Colours, figures and files of the pictures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+from matplotlib.figure import Figure
+
+from anatomy.io.files import atomic_write
+
+# Okabe and Ito's palette: told apart with every common colour vision, and in grey by lightness.
+SCOPE = "#0072B2"
+TUBE = "#E69F00"
+NEEDLE = "#111111"
+NODULE = "#009E73"
+AIRWAY = "#6FA8CC"
+LUMEN = "#DCEBF5"
+VESSEL = "#C4717A"
+OUTSIDE = "#8D8D8D"
+FISSURE = "#8F6FB8"
+LUNG = "#F7F2EC"
+FORBIDDEN = "#F6D5D0"
+INK = "#222222"
+FAINT_INK = "#6B6B6B"
+
+DPI = 130
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty white figure that belongs to no window."""
+    return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
+
+
+def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write a figure to `path` in one step, so that no half-written picture can be seen.
+
+    Raises
+    ------
+    FileError
+        If the folder is missing or cannot be written.
+    """
+    target = Path(path)
+    with atomic_write(target) as temporary:
+        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": "lungaccess"})
+    return target

@@ -1,0 +1,97 @@
+"""The airway tree over its mask, coloured by generation."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
+from numpy.typing import NDArray
+
+from lungaccess.report import drawing, style
+from lungaccess.report.layers import Layers
+from lungaccess.report.views import STANDARD, View
+
+if TYPE_CHECKING:
+    from anatomy.airway_tree import AirwayTree
+    from anatomy.lung import Lung
+
+Float = NDArray[np.float64]
+
+WIDTH_IN, HEIGHT_IN = 17.0, 6.6
+PANELS_IN = ((0.55, 0.6, 5.4, 5.3), (6.5, 0.6, 5.4, 5.3), (12.4, 0.6, 3.6, 5.3))
+
+
+def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
+    """Draw the airway tree of a patient over the airway mask, from three sides.
+
+    Every branch has the colour of its generation (trachea 0) and a width that follows its radius;
+    the carina and every gap that was bridged are marked.
+
+    Raises
+    ------
+    anatomy.errors.FileError
+        If the file cannot be written.
+    """
+    figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
+    layers = Layers(lung)
+    colours, norm = _generation_colours(int(np.max(lung.tree.generation)))
+    for (left, bottom, width, height), view in zip(PANELS_IN, STANDARD, strict=True):
+        axes = figure.add_axes((left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN))
+        _tree_panel(axes, lung.tree, layers, view, colours, norm)
+    bar_axes = figure.add_axes((16.2 / WIDTH_IN, 0.8 / HEIGHT_IN, 0.16 / WIDTH_IN, 4.9 / HEIGHT_IN))
+    bar = figure.colorbar(ScalarMappable(norm=norm, cmap=colours), cax=bar_axes)
+    generations = np.arange(int(np.max(lung.tree.generation)) + 1)
+    bar.set_ticks(generations.tolist(), labels=[str(g) for g in generations], fontsize=8)
+    bar.set_label("generation (trachea 0)", fontsize=9)
+    figure.text(
+        0.3 / WIDTH_IN, 1 - 0.15 / HEIGHT_IN, va="top", fontsize=14, fontweight="bold", color=style.INK,
+        s=f"Airway tree of {lung.name}: {lung.tree.n_branches} branches, up to generation {generations[-1]}",
+    )  # fmt: skip
+    return style.save_png(figure, path)
+
+
+def _generation_colours(deepest: int) -> tuple[Colormap, BoundaryNorm]:
+    """Return one colour a generation, told apart by lightness too."""
+    shades = matplotlib.colormaps["plasma"](np.linspace(0.0, 0.88, deepest + 1))
+    return ListedColormap(shades), BoundaryNorm(np.arange(deepest + 2) - 0.5, deepest + 1)
+
+
+def _tree_panel(
+    axes: Axes, tree: AirwayTree, layers: Layers, view: View, colours: Colormap, norm: BoundaryNorm
+) -> None:
+    points = view.project(tree.points_lps)
+    lung = layers.footprint("lung", view)
+    drawing.see_through(axes, layers.footprint("airway", view), "#555555", 5.0, 0.45)
+    drawing.outline(axes, lung, "#B9AEA2", 0.8)
+    axes.add_collection(_branches(tree, points, colours, norm))
+    carina = view.project(np.asarray(tree.carina_lps))
+    axes.plot(*carina, marker="*", ms=13, mfc="white", mec=style.INK, mew=1.0, ls="none", zorder=9)
+    for gap in tree.report.gaps_bridged:
+        u, v = view.project(np.asarray(gap.position_lps))
+        axes.plot(u, v, marker="x", ms=7, color="#00A0A0", mew=1.8, ls="none", zorder=9)
+    low, high = points.min(axis=0), points.max(axis=0)
+    if lung is not None:
+        left, right, bottom, top = lung.extent_mm
+        low, high = np.minimum(low, [left, bottom]), np.maximum(high, [right, top])
+    drawing.fit(axes, low - 4.0, high + 4.0)
+    drawing.dress(axes, view, ticks=True)
+    drawing.title(axes, view.name)
+
+
+def _branches(tree: AirwayTree, points: Float, colours: Colormap, norm: BoundaryNorm) -> LineCollection:
+    """Join each point to its parent; deep branches lie on top."""
+    child = np.flatnonzero(np.asarray(tree.parent_point) >= 0)
+    generation = np.asarray(tree.generation)[tree.branch_of_point[child]]
+    child = child[np.argsort(generation, kind="stable")]
+    segments = np.stack([points[tree.parent_point[child]], points[child]], axis=1)
+    lines = LineCollection(list(segments), cmap=colours, norm=norm, zorder=5, capstyle="round")
+    lines.set_array(np.asarray(tree.generation)[tree.branch_of_point[child]])
+    lines.set_linewidth(np.clip(0.35 * np.asarray(tree.radius_mm)[child], 0.9, 3.2).tolist())
+    return lines

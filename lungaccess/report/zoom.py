@@ -1,0 +1,117 @@
+"""Cuts through the anatomy along the plane of a device, with the device true to its width."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
+
+from lungaccess.report import drawing, style
+from lungaccess.report.geometry import needle_polyline, tube_centreline
+from lungaccess.report.layers import Layers
+from lungaccess.report.views import View, plane_view
+
+if TYPE_CHECKING:
+    from lungaccess.plan import Plan
+
+Float = NDArray[np.float64]
+
+PIXELS = 520
+SLAB_MM = (-2.0, -1.0, 1.0, 2.0)
+# Painted in this order; a later layer covers an earlier one.
+PAINT = (
+    ("lung", style.LUNG),
+    ("outside", "#C9C9C9"),
+    ("fissure", style.FISSURE),
+    ("airway", style.AIRWAY),
+    ("lumen", style.LUMEN),
+    ("vessel", style.VESSEL),
+)
+
+
+def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
+    """Draw where the tube leaves the airway, in the plane in which the tube bends."""
+    tube, _ = tube_centreline(plan)
+    exit_lps = np.asarray(plan.tube.exit.point_lps)
+    view = plane_view(_bending_plane(plan, tube), "")
+    shown = np.concatenate([tube, exit_lps[None]])
+    _cut_panel(axes, plan, layers, view, exit_lps, shown, margin_mm=7.0)
+    uv = view.project(exit_lps)
+    axes.plot(uv[0], uv[1], marker="D", ms=6, mfc="white", mec=style.INK, mew=1.4, zorder=13, ls="none")
+    drawing.title(axes, "Exit through the wall (cut in the tube's plane)")
+
+
+def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
+    """Draw the needle's way, in the plane that fits it best."""
+    needle, _ = needle_polyline(plan.needle)
+    target = np.asarray(plan.target_lps)
+    view = plane_view(needle, "")
+    shown = np.concatenate([needle, target[None]])
+    _cut_panel(axes, plan, layers, view, needle.mean(axis=0), shown, margin_mm=6.0)
+    drawing.title(axes, "Needle (cut in its best plane)")
+
+
+def _bending_plane(plan: Plan, tube: Float) -> Float:
+    """Return points that span the plane of a planar tube, also where its bend is slight."""
+    pose = np.asarray(plan.scope.lps_from_scope_tip)
+    angle = plan.tube.rotation_rad
+    sideways = pose[:3, 0] * np.cos(angle) + pose[:3, 1] * np.sin(angle)
+    start, length = pose[:3, 3], float(np.linalg.norm(tube[-1] - tube[0])) + 1.0
+    return np.stack([start, start + length * pose[:3, 2], start + length * sideways])
+
+
+def _cut_panel(
+    axes: Axes, plan: Plan, layers: Layers, view: View, through: Float, shown: Float, *, margin_mm: float
+) -> None:
+    """Paint the cut through a point, then the devices, and show all of `shown`."""
+    uv = view.project(shown)
+    drawing.fit(axes, uv.min(axis=0) - margin_mm, uv.max(axis=0) + margin_mm)
+    _paint_cut(axes, layers, view, through)
+    draw_devices_true_to_width(axes, plan, view)
+    drawing.target_mark(axes, view.project(np.asarray(plan.target_lps)))
+    drawing.dress(axes, view, ticks=False)
+
+
+def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
+    """Draw scope, tubes and needle as bands of their own width."""
+    system = plan.system
+    limits = axes.get_xlim(), axes.get_ylim()
+    tube, arc = tube_centreline(plan)
+    needle, _ = needle_polyline(plan.needle)
+    scope = view.project(np.asarray(plan.scope.points_lps))
+    tube_uv, needle_uv = view.project(tube), view.project(needle)
+    outer = tube_uv[arc <= plan.tube.outer_insertion_mm + 1e-6]
+    drawing.ribbon(axes, scope, system.scope.outer_diameter_mm / 2, style.SCOPE, fill=0.35, order=6)
+    drawing.ribbon(axes, outer, system.tubes.outer.outer_diameter_mm / 2, style.TUBE, fill=0.45, order=7)
+    drawing.ribbon(axes, tube_uv, system.tubes.inner.outer_diameter_mm / 2, style.TUBE, fill=0.9, order=8)
+    drawing.ribbon(axes, needle_uv, system.needle.diameter_mm / 2, style.NEEDLE, fill=0.9, order=9)
+    required = plan.required_clearance_mm
+    drawing.dashed_band(axes, outer, required["outer_tube"], 5)
+    drawing.dashed_band(axes, tube_uv[len(outer) - 1 :], required["inner_tube"], 5)
+    drawing.dashed_band(axes, needle_uv, required["needle"], 5)
+    axes.set_xlim(limits[0])
+    axes.set_ylim(limits[1])
+
+
+def _paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:
+    """Colour each pixel by the structure it lies in; vessels just beside the plane show faintly."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    u = np.linspace(left, right, PIXELS)
+    v = np.linspace(bottom, top, int(PIXELS * (top - bottom) / (right - left)))
+    depth = float(through @ view.towards_viewer) * view.towards_viewer
+    lps = depth + u[None, :, None] * view.right + v[:, None, None] * view.up
+    image = np.ones((len(v), len(u), 3))
+    for name, colour in PAINT:
+        if name == "vessel":
+            beside = np.any([layers.cut(name, lps + d * view.towards_viewer) for d in SLAB_MM], axis=0)
+            image[beside] = 0.65 * image[beside] + 0.35 * np.array(to_rgb(colour))
+        image[layers.cut(name, lps)] = to_rgb(colour)
+    axes.imshow(image, extent=(left, right, bottom, top), origin="lower", aspect="auto", zorder=0)
+    nodule = layers.cut("nodule", lps)
+    if nodule.any():
+        axes.contourf(u, v, nodule, levels=[0.5, 1.5], colors=[style.NODULE], alpha=0.35, zorder=4)
+        axes.contour(u, v, nodule, levels=[0.5], colors=[style.NODULE], linewidths=[1.4], zorder=5)
+    axes.set_aspect("equal", adjustable="box")

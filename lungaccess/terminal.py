@@ -1,0 +1,309 @@
+"""What the command line shows: tables, short panels for errors, and the progress of a search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from rich.console import Console
+from rich.panel import Panel
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from anatomy.errors import LungaccessError
+    from anatomy.lung import Lung
+    from lungaccess.check import CheckReport
+    from lungaccess.noplan import NoPlan
+    from lungaccess.plan import Plan
+    from lungaccess.system import System
+
+console = Console()
+error_console = Console(stderr=True)
+
+Row = tuple[str, ...]
+
+
+def table(title: str, headings: Iterable[str], rows: Iterable[Row]) -> Table:
+    """Return a plain table; its columns after the first are right-aligned where they hold numbers."""
+    listed = list(rows)
+    made = _bare_table(title)
+    for number, heading in enumerate(headings):
+        cells = [row[number] for row in listed]
+        numeric = number > 0 and all(_is_number(cell) for cell in cells if cell)
+        made.add_column(heading, justify="right" if numeric else "left", overflow="fold")
+    for row in listed:
+        made.add_row(*(escaped(cell) for cell in row))
+    return made
+
+
+def _bare_table(title: str) -> Table:
+    return Table(title=title, title_justify="left", title_style="bold", header_style="bold", box=None)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def escaped(text: str) -> str:
+    """Return text in which rich finds no markup."""
+    return text.replace("[", r"\[")
+
+
+def show(tables: Iterable[Table]) -> None:
+    """Print tables with a blank line after each."""
+    for made in tables:
+        console.print(made)
+        console.print()
+
+
+def show_error(error: LungaccessError) -> None:
+    """Print what was found, what was expected and what to do, in a short panel on standard error."""
+    lines = [escaped(error.found.rstrip(".") + ".")]
+    if error.expected:
+        lines.append(f"[dim]expected[/]  {escaped(error.expected)}")
+    if error.remedy:
+        lines.append(f"[dim]remedy[/]    {escaped(error.remedy)}")
+    error_console.print(Panel("\n".join(lines), title="bad input", title_align="left", border_style="red"))
+
+
+def show_no_plan(failure: NoPlan) -> None:
+    """Print why no plan was found: the counted reasons, and what would help."""
+    console.print(Panel(escaped(failure.found), title="no plan", title_align="left", border_style="yellow"))
+    rows = [(reason, f"{count}") for reason, count in failure.reasons.items() if count]
+    if rows:
+        console.print(
+            table("What was looked at, and what was ruled out", ("stage and reason", "count"), rows)
+        )
+    if failure.advice:
+        console.print(f"\n[bold]What would help:[/] {escaped(failure.advice)}")
+
+
+def plan_tables(plan: Plan) -> list[Table]:
+    """Return the stages of a plan, and each distance beside the distance it must keep."""
+    return [
+        table("The three stages", ("stage", "what to do"), _stage_rows(plan)),
+        table(
+            "Least distances (axis to structure)",
+            ("device", "structure", "mm", "at least"),
+            _distances(plan),
+        ),
+    ]
+
+
+def _stage_rows(plan: Plan) -> list[Row]:
+    scope, tube, needle = plan.scope, plan.tube, plan.needle
+    return [
+        (
+            "scope",
+            f"advance {scope.length_from_carina_mm:.1f} mm beyond the carina, to generation "
+            f"{scope.generation} (lumen radius to spare {scope.min_lumen_margin_mm:.2f} mm)",
+        ),
+        (
+            "tubes",
+            f"turn to {np.degrees(tube.rotation_rad):.1f}°, outer tube {tube.outer_insertion_mm:.1f} mm, "
+            f"inner tube {tube.inner_insertion_mm:.1f} mm beyond the scope; through the wall at "
+            f"{np.degrees(tube.exit.wall_angle_rad):.0f}°",
+        ),
+        (
+            "needle",
+            f"steer {needle.length_mm:.1f} mm in {len(needle.arcs)} arc(s), at most "
+            f"{np.degrees(needle.max_angle_from_start_rad):.1f}° from its start",
+        ),
+    ]
+
+
+def _distances(plan: Plan) -> list[Row]:
+    return [
+        (device, structure, f"{value:.2f}", _least(plan, device, structure))
+        for device in ("tube", "needle")
+        for structure, value in plan.clearance_mm[device].items()
+    ]
+
+
+def _least(plan: Plan, device: str, structure: str) -> str:
+    if structure == "fissure" and not plan.fissures_are_obstacles:
+        return ""
+    return f"{plan.required_clearance_mm[{'tube': 'inner_tube'}.get(device, device)]:.2f}"
+
+
+def check_table(report: CheckReport, *, refusals_only: bool = False) -> Table:
+    """Return the findings of an independent check, all of them or those that are not ok."""
+    made = _bare_table("Independent check")
+    for heading in ("", "what"):
+        made.add_column(heading)
+    for heading in ("found", "limit"):
+        made.add_column(heading, justify="right")
+    made.add_column("")
+    shown = (finding for finding in report.findings if not (refusals_only and finding.ok))
+    for finding in shown:
+        mark = "[green]ok[/]" if finding.ok else "[bold red]refused[/]"
+        unit = f" {finding.unit}" if finding.unit else ""
+        made.add_row(
+            mark,
+            escaped(finding.name),
+            _number(finding.value, unit),
+            _number(finding.limit, unit),
+            "" if finding.ok else escaped(finding.detail),
+        )
+    return made
+
+
+def _number(value: object, unit: str) -> str:
+    if value is None:
+        return ""
+    return f"{value:.4g}{unit}" if isinstance(value, (int, float)) else escaped(f"{value}{unit}")
+
+
+def anatomy_tables(lung: Lung) -> list[Table]:
+    """Return what was understood of a patient: structures, airway tree by generation, sources."""
+    made = [
+        table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
+        table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
+        table(
+            "Airway tree",
+            ("generation", "branches", "mean radius, mm", "least radius, mm", "mean length, mm"),
+            _generation_rows(lung),
+        ),
+        table("Repairs of the airway tree", ("repair", "at LPS, mm", "length, mm"), _repair_rows(lung)),
+        table("Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]),
+    ]
+    return [each for each in made if each.row_count]
+
+
+def _patient_rows(lung: Lung) -> list[Row]:
+    rows: list[Row] = [
+        ("working grid", lung.grid.describe()),
+        ("carina, LPS mm", ", ".join(f"{c:.1f}" for c in lung.tree.carina_lps)),
+        ("breath hold", lung.breath_hold or "not stated"),
+        ("fissures", "given" if lung.has_fissures else "not given"),
+        ("cost map", "given" if lung.cost is not None else "not given"),
+        ("start poses, targets", f"{len(lung.starts)}, {len(lung.targets_lps)}"),
+    ]
+    dropped = lung.tree.report.components_dropped
+    if dropped:
+        rows.append(("airway pieces left out", f"{dropped} ({lung.tree.report.voxels_dropped} voxels)"))
+    return rows
+
+
+def _repair_rows(lung: Lung) -> list[Row]:
+    """Return every change the airway tree needed, with its place."""
+    report = lung.tree.report
+    kinds = (
+        ("gap bridged", report.gaps_bridged),
+        ("loop opened", report.loops_opened),
+        ("spur pruned", report.spurs_pruned),
+    )
+    return [
+        (kind, ", ".join(f"{c:.1f}" for c in record.position_lps), f"{record.length_mm:.1f}")
+        for kind, records in kinds
+        for record in records
+    ]
+
+
+def _volume_rows(lung: Lung) -> list[Row]:
+    from anatomy import structures
+
+    outside = np.count_nonzero(lung.labels & structures.OUTSIDE)
+    counts = {"inside the lung": lung.labels.size - outside}
+    for name in ("airway", "lumen", "vessel", "fissure"):
+        counts[name] = np.count_nonzero(lung.labels & structures.BITS[name])
+    if lung.nodules is not None:
+        counts["nodules"] = np.count_nonzero(lung.nodules.array)
+    ml = lung.grid.voxel_volume_mm3 / 1000.0
+    return [(name, f"{count * ml:.1f}", f"{count}") for name, count in counts.items() if count]
+
+
+def _generation_rows(lung: Lung) -> list[Row]:
+    tree = lung.tree
+    rows: list[Row] = []
+    for generation in range(int(tree.generation.max()) + 1):
+        branches = np.flatnonzero(tree.generation == generation)
+        radius = np.asarray(tree.branch_mean_radius_mm)[branches]
+        length = np.asarray(tree.branch_length_mm)[branches]
+        figures = (f"{radius.mean():.2f}", f"{radius.min():.2f}", f"{length.mean():.1f}")
+        rows.append((f"{generation}", f"{len(branches)}", *figures))
+    return rows
+
+
+def preset_table(systems: Mapping[str, System]) -> Table:
+    """Return one line a preset: the sizes that matter, and what it is."""
+    rows = [
+        (
+            name,
+            f"{system.scope.outer_diameter_mm:g}",
+            f"{system.tubes.outer.outer_diameter_mm:g} / {system.tubes.inner.outer_diameter_mm:g}",
+            f"{system.needle.diameter_mm:g}",
+            f"{1.0 / system.needle.max_curvature_per_mm:.0f}",
+            system.description,
+        )
+        for name, system in systems.items()
+    ]
+    headings = ("name", "scope, mm", "tubes, mm", "needle, mm", "least turning radius, mm", "what it is")
+    return table("Systems that ship with lungaccess (diameters)", headings, rows)
+
+
+def objective_words(objective: str) -> str:
+    """Return the words for a cost, with its unit."""
+    words = {
+        "inverse_clearance": "integral of 1/clearance along the needle",
+        "cost_map": "integral of the cost map along the needle (mm)",
+        "length_mm": "length of the needle (mm)",
+    }
+    return words.get(objective, objective)
+
+
+def what_to_look_at(out: Path) -> Panel:
+    """Return a guide to the pictures of a plan."""
+    lines = (
+        f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its",
+        "wall at the diamond, the black needle passes the vessels and ends in the green nodule.",
+        "R and L are the patient's right and left. In the two cuts, no full red or grey reaches the",
+        "dashed lines; in the graph, no curve enters the red area outside the blue one.",
+        f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
+    )
+    return Panel("\n".join(escaped(line) for line in lines), title="what to look at", title_align="left")
+
+
+class SearchDisplay:
+    """Shows a search while it runs: what it does, how much of the budget is used, the best cost."""
+
+    def __init__(self, time_s: float | None, iterations: int | None) -> None:
+        self._time_s, self._iterations = time_s, iterations
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[best]}"),
+            console=console,
+            transient=True,
+        )
+        total = float(iterations) if iterations is not None else time_s
+        self._task = self._progress.add_task("searching", total=total, best="no plan yet")
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
+        """Show the state of the search."""
+        done = float(iteration) if self._iterations is not None else elapsed_s
+        best = "no plan yet" if best_cost is None else f"best cost {best_cost:.4g}"
+        self._progress.update(self._task, description=description, completed=done, best=best)
+
+    def better(self, elapsed_s: float, cost: float) -> None:
+        """Leave a line about a better plan above the bar."""
+        self._progress.console.print(f"  {elapsed_s:8.2f} s   cost {cost:.5g}", highlight=False)

@@ -1,0 +1,225 @@
+"""A small hand-made patient and plan: two ellipsoid lungs, a forked airway, two vessels, one nodule.
+
+What the pictures and the command line show needs no real anatomy.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from anatomy.grid import Grid, Volume
+from lungaccess.plan import (
+    Exemption,
+    NeedleArc,
+    NeedlePath,
+    Plan,
+    ScopeRoute,
+    TubeDeployment,
+    WallExit,
+)
+from lungaccess.report.geometry import arc_step
+from lungaccess.system import load_system, system_fingerprint
+
+LEFT_LUNG_LPS = np.array([60.0, 0.0, 0.0])
+RIGHT_LUNG_LPS = np.array([-60.0, 0.0, 0.0])
+TARGET_LPS = np.array([92.0, -16.0, -8.0])
+SPACING_MM = (1.5, 1.5, 2.0)
+
+
+class _Field:
+    def __init__(self, grid: Grid, mask: np.ndarray) -> None:
+        self._grid = grid
+        self._distance = ndimage.distance_transform_edt(~mask, sampling=SPACING_MM)
+
+    def lower_bound_mm(self, lps: np.ndarray) -> np.ndarray:
+        return ndimage.map_coordinates(self._distance, self._grid.ijk(lps).T, order=1, mode="nearest")
+
+
+def _segment(points: np.ndarray, a: list[float], b: list[float], radius: float) -> np.ndarray:
+    start, axis = np.array(a), np.array(b) - np.array(a)
+    t = np.clip(((points - start) @ axis) / (axis @ axis), 0, 1)
+    return np.linalg.norm(points - start - t[..., None] * axis, axis=-1) <= radius
+
+
+def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
+    """Return what the pictures read of a Lung."""
+    shape = (168, 112, 100)
+    grid = Grid.from_spacing(shape, SPACING_MM, [-126.0, -84.0, -100.0])
+    points = grid.lps(np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1))
+    lung = np.zeros(shape, dtype=bool)
+    for centre in (LEFT_LUNG_LPS, RIGHT_LUNG_LPS):
+        lung |= (((points - centre) / np.array([50.0, 72.0, 88.0])) ** 2).sum(axis=-1) < 1
+    trunk = [([0, 10, 95], [0, 5, 30], 9.0), ([0, 5, 30], [50, 0, 0], 6.0), ([0, 5, 30], [-50, 0, 0], 6.0)]
+    trunk += [([50, 0, 0], [85, -5, 40], 3.5), ([50, 0, 0], [70, 0, -40], 3.5)]
+    lumen = np.zeros(shape, dtype=bool)
+    wall = np.zeros(shape, dtype=bool)
+    for a, b, radius in trunk:
+        lumen |= _segment(points, a, b, radius)
+        wall |= _segment(points, a, b, radius + 1.6)
+    vessel = _segment(points, [40, -40, -10], [95, 20, -20], 2.5) & ~wall
+    vessel |= _segment(points, [40, 20, 10], [80, -60, 30], 3.0) & ~wall
+    sheet = np.abs(points @ np.array([0.0, 0.6, 0.8]) - 22) < 1.2
+    masks = {
+        "airway": wall,
+        "lumen": lumen,
+        "vessel": vessel,
+        "outside": ~(lung | wall),
+        "fissure": (sheet & lung) if fissures else np.zeros(shape, dtype=bool),
+    }
+    ball = np.linalg.norm(points - TARGET_LPS, axis=-1) < 5
+    fields = {
+        name: _Field(grid, masks[key])
+        for name, key in {"airway": "airway", "vessel": "vessel", "pleura": "outside"}.items()
+    }
+    return SimpleNamespace(
+        name="Toy",
+        kind="toy",
+        key="0" * 64,
+        grid=grid,
+        cost=None,
+        has_fissures=fissures,
+        fields=fields,
+        nodules=Volume(grid=grid, array=ball) if nodule else None,
+        mask=lambda name: Volume(grid=grid, array=masks[name]),
+        tree=_tree(trunk),
+        breath_hold=None,
+        warnings=("The toy is [made by hand].",),
+    )
+
+
+def _tree(trunk: list[Any]) -> Any:
+    parent_branch, generation = [-1, 0, 0, 1, 1], [0, 1, 1, 2, 2]
+    points, parents, branches, radii, start = [], [], [], [], [0]
+    for number, (a, b, radius) in enumerate(trunk):
+        t = np.linspace(0, 1, 30)[:, None]
+        joint = -1 if number == 0 else start[parent_branch[number] + 1] - 1
+        parents += [joint, *range(start[-1], start[-1] + 29)]
+        points.append(np.array(a) + t * (np.array(b) - np.array(a)))
+        branches += [number] * 30
+        radii += [radius] * 30
+        start.append(start[-1] + 30)
+    return SimpleNamespace(
+        points_lps=np.concatenate(points),
+        parent_point=np.array(parents),
+        branch_of_point=np.array(branches),
+        generation=np.array(generation),
+        radius_mm=np.array(radii),
+        n_branches=5,
+        carina_lps=np.array([0, 5.0, 30]),
+        report=SimpleNamespace(gaps_bridged=()),
+    )
+
+
+def _pose(position: Any, forward: Any) -> np.ndarray:
+    z = np.array(forward) / np.linalg.norm(forward)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    pose[:3, 3] = position
+    return pose
+
+
+def _advance(pose: np.ndarray, pieces: list[tuple[float, float, float]]) -> np.ndarray:
+    for length, curvature, direction in pieces:
+        pose = pose @ arc_step(curvature, length, direction)
+    return pose
+
+
+def _rolled(pose: np.ndarray, angle: float) -> np.ndarray:
+    roll = np.eye(4)
+    roll[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return pose @ roll
+
+
+def make_plan() -> Plan:
+    """Return a plan with the scope in the left main bronchus and a needle of three arcs."""
+    system = load_system("lung-default")
+    route = np.concatenate(
+        [np.linspace([0, 10, 95], [0, 5, 30], 40), np.linspace([0, 5, 30], [46, 0.4, 2.4], 40)]
+    )
+    tip = _pose(route[-1], route[-1] - route[-2])
+    exit_point = tip[:3, 3] + 8 * tip[:3, 2]
+    # The tubes are moved together: the overlap is bent by the share of the inner tube's stiffness.
+    inner, outer = system.tubes.inner, system.tubes.outer
+    share = inner.bending_stiffness_n_mm2 / (inner.bending_stiffness_n_mm2 + outer.bending_stiffness_n_mm2)
+    bend = 2.3
+    curvature = inner.precurvature_per_mm
+    start = _advance(tip, [(12.0, share * curvature, bend), (12.0, curvature, bend)])
+    arcs = tuple(
+        NeedleArc(length_mm=10.0, roll_rad=roll, curvature_per_mm=k)
+        for roll, k in ((0.4, 0.008), (1.0, 0.0), (-0.5, 0.006))
+    )
+    end = start
+    for arc in arcs:
+        end = _rolled(end, arc.roll_rad) @ arc_step(arc.curvature_per_mm, arc.length_mm)
+    return Plan(
+        software_version="0",
+        patient_name="Toy",
+        lung_key="0" * 24,
+        sources={"airway.nii": "0" * 64},
+        breath_hold=None,
+        system=system,
+        system_fingerprint=system_fingerprint(system),
+        target_lps=end[:3, 3],
+        target_origin="point",
+        fissures_are_obstacles=True,
+        objective="inverse_clearance",
+        scope=ScopeRoute(
+            points_lps=route,
+            lumen_radius_mm=np.full(80, 6.0),
+            branches=np.repeat([0, 1], 40),
+            lps_from_scope_tip=tip,
+            site_point=-1,
+            generation=1,
+            length_mm=118.0,
+            length_from_carina_mm=53.0,
+            min_lumen_margin_mm=3.9,
+        ),
+        tube=TubeDeployment(
+            rotation_rad=bend,
+            outer_insertion_mm=12.0,
+            inner_insertion_mm=24.0,
+            lps_from_tip=start,
+            exit=WallExit(branch=1, point_lps=exit_point, arc_length_mm=8.0, wall_angle_rad=0.9),
+            lateral_sweep_mm=0.4,
+            follow_the_leader_error_mm=0.1,
+        ),
+        needle=NeedlePath(
+            lps_from_start=start,
+            arcs=arcs,
+            end_lps=end[:3, 3],
+            length_mm=30.0,
+            max_angle_from_start_rad=0.14,
+            accumulated_turn_rad=0.14,
+        ),
+        exemption=Exemption(branch=1, exit_point_lps=exit_point, needle_length_mm=5.0),
+        required_clearance_mm={"outer_tube": 1.45, "inner_tube": 1.25, "needle": 1.0},
+        clearance_mm={"tube": {"vessel": 2.2}, "needle": {"airway": 1.3, "vessel": 1.6, "outside": 7.0}},
+        costs={"inverse_clearance": 12.34, "cost_map": 0.0, "length_mm": 30.0},
+        method="atlas",
+        seed=0,
+        iterations=100,
+        timing={"planning_s": 0.3},
+    )
+
+
+@pytest.fixture(scope="session")
+def toy_lung() -> Any:
+    return make_lung()
+
+
+@pytest.fixture(scope="session")
+def bare_lung() -> Any:
+    """A patient without fissures and nodules."""
+    return make_lung(fissures=False, nodule=False)
+
+
+@pytest.fixture(scope="session")
+def toy_plan() -> Plan:
+    return make_plan()

@@ -1,0 +1,260 @@
+"""The airway tree: a rooted tree of centred points with radius, branches and generations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float, read_only
+
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GapBridged:
+    """A break of the lumen across which the tree was continued.
+
+    Parameters
+    ----------
+    position_lps : (3,) float64
+        Middle of the gap, LPS mm.
+    length_mm : float
+        Distance between the two facing voxels, as solid boxes; 0 where they touch by an edge or corner alone.
+    voxels_joined : int
+        Voxels of the piece that was joined (0 where the pieces touch).
+    """
+
+    position_lps: Float
+    length_mm: float
+    voxels_joined: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpurPruned:
+    """A twig that was taken off because it barely leaves the branch it grows from.
+
+    Parameters
+    ----------
+    position_lps : (3,) float64
+        Its tip, LPS mm.
+    length_mm : float
+        Length from the centreline of the parent to the tip.
+    """
+
+    position_lps: Float
+    length_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoopOpened:
+    """A ring of the lumen (two airways that touch, a hole in a wall) that was cut where it is thinnest.
+
+    Parameters
+    ----------
+    position_lps : (3,) float64
+        The cut, LPS mm.
+    length_mm : float
+        Length once around.
+    """
+
+    position_lps: Float
+    length_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TreeReport:
+    """What was changed or left out while the tree was made.
+
+    Parameters
+    ----------
+    gaps_bridged, spurs_pruned, loops_opened : tuple of records
+        Each with `position_lps` and `length_mm`.
+    components_dropped : int
+        Separate pieces of the mask that were left out.
+    voxels_dropped : int
+        Voxels in these pieces.
+    cavity_voxels : int
+        Voxels of holes enclosed in the lumen; the tree runs around them.
+    warnings : tuple of str
+        What a user should look at before trusting the tree.
+    """
+
+    gaps_bridged: tuple[GapBridged, ...] = ()
+    spurs_pruned: tuple[SpurPruned, ...] = ()
+    loops_opened: tuple[LoopOpened, ...] = ()
+    components_dropped: int = 0
+    voxels_dropped: int = 0
+    cavity_voxels: int = 0
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AirwayTree:
+    """Centreline tree of the airway; N points, B branches, parents before children.
+
+    The points of a branch are consecutive.  The first point of a branch hangs on `parent_point`, a
+    point of its parent branch (its last one, or an earlier one where three or more branches part).
+
+    Parameters
+    ----------
+    points_lps : (N, 3) float64
+        LPS mm.
+    radius_mm : (N,) float64
+        Distance from the point to the border of the lumen; 0 in a bridged gap.
+    parent_point : (N,) int64
+        The next point towards the root; -1 at the root.
+    branch_of_point : (N,) int64
+    branch_start : (B + 1,) int64
+        The points of branch b are `branch_start[b]:branch_start[b + 1]`.
+    branch_parent : (B,) int64
+        -1 for the trachea, which is branch 0.
+    generation : (B,) int64
+        0 for the trachea, one more at each branching.
+    distance_from_root_mm : (N,) float64
+        Length of the way along the tree.
+    tangents : (N, 3) float64
+        Unit vectors in LPS that point away from the root.
+    report : TreeReport
+
+    Raises
+    ------
+    AnatomyError
+        If the arrays do not describe one tree.
+    """
+
+    points_lps: Float
+    radius_mm: Float
+    parent_point: Int
+    branch_of_point: Int
+    branch_start: Int
+    branch_parent: Int
+    generation: Int
+    distance_from_root_mm: Float
+    tangents: Float
+    report: TreeReport = field(default_factory=TreeReport)
+
+    def __post_init__(self) -> None:
+        for name in ("points_lps", "radius_mm", "distance_from_root_mm", "tangents"):
+            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.float64)))
+        for name in ("parent_point", "branch_of_point", "branch_start", "branch_parent", "generation"):
+            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.int64)))
+        problem = self._problem()
+        if problem:
+            raise AnatomyError(
+                f"The arrays of an airway tree contradict each other: {problem}",
+                expected="one rooted tree, parents before children",
+                remedy="Make the tree with tree_from_mask or tree_from_graph",
+            )
+
+    def _problem(self) -> str:
+        n, b = len(self.points_lps), len(self.branch_parent)
+        shapes = {
+            "points_lps": (n, 3), "radius_mm": (n,), "parent_point": (n,), "branch_of_point": (n,),
+            "branch_start": (b + 1,), "generation": (b,), "distance_from_root_mm": (n,), "tangents": (n, 3),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                return f"{name} has the shape {getattr(self, name).shape}, not {shape}"
+        if n == 0 or b == 0:
+            return "it has no points"
+        if not all(
+            np.isfinite(getattr(self, name)).all() for name in ("points_lps", "radius_mm", "tangents")
+        ):
+            return "a point, radius or tangent is not finite"
+        if self.branch_start[0] != 0 or self.branch_start[-1] != n or (np.diff(self.branch_start) < 1).any():
+            return "branch_start does not divide the points"
+        if not np.array_equal(self.branch_of_point, np.repeat(np.arange(b), np.diff(self.branch_start))):
+            return "branch_of_point disagrees with branch_start"
+        return self._problem_of_parents()
+
+    def _problem_of_parents(self) -> str:
+        index = np.arange(self.n_points)
+        first = np.zeros(self.n_points, dtype=bool)
+        first[self.branch_start[:-1]] = True
+        if self.parent_point[0] != -1 or (self.parent_point[1:] < 0).any():
+            return "it has not exactly one root"
+        if (self.parent_point >= index).any() or (self.parent_point[~first] != index[~first] - 1).any():
+            return "a point comes before its parent"
+        hangs_on = self.branch_of_point[self.parent_point[self.branch_start[1:-1]]]
+        if self.branch_parent[0] != -1 or not np.array_equal(hangs_on, self.branch_parent[1:]):
+            return "branch_parent disagrees with parent_point"
+        if (
+            self.generation[0] != 0
+            or (self.generation[1:] != self.generation[self.branch_parent[1:]] + 1).any()
+        ):
+            return "generation disagrees with branch_parent"
+        return ""
+
+    @property
+    def n_points(self) -> int:
+        """Number of points, N."""
+        return len(self.points_lps)
+
+    @property
+    def n_branches(self) -> int:
+        """Number of branches, B."""
+        return len(self.branch_parent)
+
+    @cached_property
+    def branch_length_mm(self) -> Float:
+        """Length of each branch from the point it hangs on to its last point, `(B,)` mm."""
+        begin = np.maximum(self.parent_point[self.branch_start[:-1]], 0)
+        end = self.branch_start[1:] - 1
+        return read_only(self.distance_from_root_mm[end] - self.distance_from_root_mm[begin])
+
+    @cached_property
+    def branch_mean_radius_mm(self) -> Float:
+        """Mean radius of the points of each branch, `(B,)` mm."""
+        return read_only(np.add.reduceat(self.radius_mm, self.branch_start[:-1]) / np.diff(self.branch_start))
+
+    @property
+    def carina_point(self) -> int:
+        """Index of the last point of the trachea, where it divides."""
+        return int(self.branch_start[1]) - 1
+
+    @property
+    def carina_lps(self) -> Float:
+        """Position of the carina (the last point of branch 0), `(3,)` LPS mm."""
+        carina: Float = self.points_lps[self.carina_point]
+        return carina
+
+    @cached_property
+    def leaf_branches(self) -> Int:
+        """Branches without children."""
+        return read_only(np.setdiff1d(np.arange(self.n_branches), self.branch_parent[1:]))
+
+    def branch_points(self, branch: int) -> Int:
+        """Return the indices of the points of a branch, from proximal to distal."""
+        self._require(branch, self.n_branches, "branch")
+        return np.arange(self.branch_start[branch], self.branch_start[branch + 1])
+
+    def children(self, branch: int) -> Int:
+        """Return the branches that hang on `branch`."""
+        self._require(branch, self.n_branches, "branch")
+        return np.flatnonzero(self.branch_parent == branch)
+
+    def route(self, point: int) -> Int:
+        """Return the indices of the points from the root to `point`, both included."""
+        self._require(point, self.n_points, "point")
+        indices = [int(point)]
+        while self.parent_point[indices[-1]] >= 0:
+            indices.append(int(self.parent_point[indices[-1]]))
+        return np.array(indices[::-1], dtype=np.int64)
+
+    def nearest_point(self, lps: ArrayLike) -> int:
+        """Return the index of the tree point nearest to a position `(3,)` in LPS mm."""
+        offset = self.points_lps - np.asarray(lps, dtype=np.float64)
+        return int(np.argmin(np.einsum("ij,ij->i", offset, offset)))
+
+    @staticmethod
+    def _require(index: int, count: int, name: str) -> None:
+        if not 0 <= index < count:
+            raise AnatomyError(
+                f"The tree has no {name} {index}",
+                expected=f"an index from 0 to {count - 1}",
+                remedy="Take it from this tree",
+            )

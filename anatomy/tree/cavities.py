@@ -1,0 +1,74 @@
+"""Lead a course around the holes of a lumen mask, through which thinning had laid it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.tree.course import Course, course_of
+from anatomy.tree.depth import inside
+from anatomy.tree.lumen import PreparedLumen
+
+Int = NDArray[np.int64]
+Way = list[tuple[int, ...]]
+
+MARGIN_VOXELS = 6
+
+
+def around_cavities(course: Course, prepared: PreparedLumen) -> Course:
+    """Replace the positions that lie in cavities by ways through the lumen beside them.
+
+    Positions in bridges stay.  A twig that ends in a cavity ends before it.
+    """
+    voxel = np.rint(course.ijk).astype(np.int64)
+    in_cavity = ~inside(prepared.lumen, course.ijk) & ~prepared.bridges[tuple(voxel.T)]
+    if not in_cavity.any():
+        return course
+    ijk: list[tuple[int, ...]] = []
+    parent: list[int] = []
+    new_index = np.full(len(voxel), -1)
+    detours: dict[int, list[int]] = {}
+    for node in range(len(voxel)):
+        if in_cavity[node]:
+            continue
+        before = int(course.parent[node])
+        while before >= 0 and in_cavity[before]:
+            before = int(course.parent[before])
+        last = int(new_index[before]) if before >= 0 else -1
+        if before >= 0 and before != course.parent[node]:
+            known = detours.setdefault(last, [last])
+            way = _way(prepared, [ijk[n] for n in known], tuple(voxel[node].tolist()))
+            if way:
+                last = known[[ijk[n] for n in known].index(way[0])]
+            for step in way[1:-1]:
+                ijk.append(step)
+                parent.append(last)
+                last = len(ijk) - 1
+                known.append(last)
+        ijk.append(tuple(voxel[node].tolist()))
+        parent.append(last)
+        new_index[node] = len(ijk) - 1
+    trunk_end = course.trunk_end
+    while in_cavity[trunk_end]:
+        trunk_end = int(course.parent[trunk_end])
+    return course_of(
+        np.array(ijk, dtype=np.float64), np.array(parent), int(new_index[trunk_end]), prepared.lumen
+    )
+
+
+def _way(prepared: PreparedLumen, begins: Way, end: tuple[int, ...]) -> Way:
+    """Find the way by faces through the middle of the lumen from any of `begins` to `end`."""
+    from skimage.graph import MCP_Geometric
+
+    corners = np.array([*begins, end])
+    low = np.maximum(corners.min(axis=0) - MARGIN_VOXELS, 0)
+    high = corners.max(axis=0) + MARGIN_VOXELS + 1
+    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    depth = prepared.depth_mm[window].astype(np.float64)
+    cost = np.where(prepared.lumen[window], 1.0 / np.maximum(depth, 1e-3) ** 2, -1.0)
+    search = MCP_Geometric(cost, fully_connected=False, sampling=tuple(prepared.grid.spacing_mm))
+    target = tuple((np.array(end) - low).tolist())
+    total, _ = search.find_costs([tuple((np.array(b) - low).tolist()) for b in begins], [target])
+    if not np.isfinite(total[target]):
+        return []
+    return [tuple((np.array(step) + low).tolist()) for step in search.traceback(target)]

@@ -1,0 +1,154 @@
+"""Lay a smooth, centred course through the lumen that never leaves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float
+from anatomy.tree.bridge import face_paths
+from anatomy.tree.depth import segments_inside
+from anatomy.tree.lumen import PreparedLumen
+from anatomy.tree.skeleton import SkeletonTree
+
+Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
+
+ROUNDS = 30
+"""Rounds of centring and smoothing; together they reach about 4 voxels and smooth over about 2 mm."""
+
+CENTRING_STEP_VOXELS = 0.25
+SMOOTHING = 0.5
+HALVINGS = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Course:
+    """A rooted tree of positions, parents before children.
+
+    Parameters
+    ----------
+    ijk : (M, 3) float64
+        Positions in voxel units of the prepared box.
+    parent : (M,) int64
+        -1 at the root.
+    across_gap : (M,) bool
+        The step from the parent to this position leaves the lumen.
+    trunk_end : int
+        Where the trachea divides.
+    """
+
+    ijk: Float
+    parent: Int
+    across_gap: Bool
+    trunk_end: int
+
+
+def rooted_course(tree: SkeletonTree, root: int, trunk_end: int, prepared: PreparedLumen) -> Course:
+    """Hang the skeleton on its root and walk every diagonal step by faces inside the lumen."""
+    ijk: list[Int] = [tree.ijk[root]]
+    parent, course_trunk_end = [-1], 0
+    stack = [(root, -1, 0)]
+    while stack:
+        node, came_from, at = stack.pop()
+        for other in tree.neighbours[node]:
+            if other == came_from:
+                continue
+            last = at
+            for voxel in [*_between(tree.ijk[node], tree.ijk[other], prepared), tree.ijk[other]]:
+                ijk.append(voxel)
+                parent.append(last)
+                last = len(ijk) - 1
+            if other == trunk_end:
+                course_trunk_end = last
+            stack.append((other, node, last))
+    return course_of(np.array(ijk, dtype=np.float64), np.array(parent), course_trunk_end, prepared.lumen)
+
+
+def course_of(ijk: Float, parent: Int, trunk_end: int, lumen: Bool) -> Course:
+    """Make a course and mark the steps that leave the lumen."""
+    across = np.zeros(len(ijk), dtype=bool)
+    across[1:] = ~segments_inside(lumen, ijk[parent[1:]], ijk[1:])
+    return Course(ijk=ijk, parent=parent, across_gap=across, trunk_end=trunk_end)
+
+
+def _between(begin: Int, end: Int, prepared: PreparedLumen) -> list[Int]:
+    """Find the deepest way by faces between two neighbouring voxels, as voxels in between."""
+    for mask in (prepared.lumen, prepared.solid):
+        ways = [[begin + offset for offset in path] for path in face_paths(end - begin)]
+        open_ways = [way for way in ways if all(mask[tuple(v)] for v in way)]
+        if open_ways:
+            return max(open_ways, key=lambda way: sum(float(prepared.depth_mm[tuple(v)]) for v in way))
+    return []
+
+
+def centred_course(course: Course, prepared: PreparedLumen, rounds: int) -> Course:
+    """Move the positions to the middle of the lumen and smooth them, every step staying inside.
+
+    Root, tips and both sides of a gap stay where they are.
+    """
+    fixed = course.across_gap.copy()
+    fixed[course.parent[course.across_gap]] = True
+    fixed[0] = True
+    fixed |= np.bincount(course.parent[1:], minlength=len(fixed)) == 0
+    spacing = prepared.grid.spacing_mm
+    average = _neighbour_average(course.parent)
+    mm = course.ijk * spacing
+    base = mm.copy()
+    for _ in range(rounds):
+        mm += _centring_step(mm, course.parent, prepared.depth_mm, spacing) * ~fixed[:, None]
+        mm += SMOOTHING * (average @ mm - mm) * ~fixed[:, None]
+    return _kept_inside(course, base / spacing, mm / spacing, prepared.lumen)
+
+
+def _neighbour_average(parent: Int) -> Any:
+    """Return the matrix that averages each position's parent and (mean) child."""
+    from scipy.sparse import coo_array
+
+    n = len(parent)
+    child = np.arange(1, n)
+    rows = np.concatenate((child, parent[1:]))
+    columns = np.concatenate((parent[1:], child))
+    children = np.maximum(np.bincount(parent[1:], minlength=n), 1)
+    weights = np.concatenate((np.ones(n - 1), 1.0 / children[parent[1:]]))
+    matrix = coo_array((weights, (rows, columns)), shape=(n, n)).tocsr()
+    total = np.asarray(matrix.sum(axis=1)).ravel()
+    return matrix.multiply(1.0 / np.where(total > 0, total, 1.0)[:, None]).tocsr()
+
+
+def _centring_step(mm: Float, parent: Int, depth_mm: NDArray[np.float32], spacing_mm: Float) -> Float:
+    """Return a small step up the depth, perpendicular to the course."""
+    from scipy.ndimage import map_coordinates
+
+    voxel = float(spacing_mm.min())
+    gradient = np.zeros_like(mm)
+    for axis in range(3):
+        offset = np.zeros(3)
+        offset[axis] = voxel / 2
+        both = np.concatenate((mm + offset, mm - offset)) / spacing_mm
+        value = map_coordinates(depth_mm, both.T, order=1, mode="nearest")
+        gradient[:, axis] = (value[: len(mm)] - value[len(mm) :]) / voxel
+    along = mm - mm[np.maximum(parent, 0)]
+    np.add.at(along, parent[1:], along[1:].copy())
+    along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
+    gradient -= np.einsum("ij,ij->i", gradient, along)[:, None] * along
+    return gradient * (CENTRING_STEP_VOXELS * voxel)
+
+
+def _kept_inside(course: Course, base: Float, wanted: Float, lumen: Bool) -> Course:
+    """Draw positions back towards the skeleton until every step that can be inside is inside."""
+    share = np.ones(len(base))
+    child = np.flatnonzero(~course.across_gap & (course.parent >= 0))
+    parent = course.parent[child]
+    while True:
+        ijk = base + share[:, None] * (wanted - base)
+        bad = ~segments_inside(lumen, ijk[parent], ijk[child])
+        bad &= (share[parent] > 0) | (share[child] > 0)
+        if not bad.any():
+            return replace(course, ijk=ijk)
+        touched = np.unique(np.concatenate((parent[bad], child[bad])))
+        share[touched] /= 2
+        share[share < 0.5**HALVINGS] = 0.0

@@ -1,0 +1,103 @@
+"""Add to a skeleton what thinning has lost.
+
+Thinning keeps a line only where it is one voxel wide when its end is met; a tube of even width can be
+eaten from its end, and with it a whole branch.  So every voxel must be near the skeleton, or a way from
+it to the skeleton is added.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float
+from anatomy.tree.lumen import CONNECT_26, PreparedLumen
+
+Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
+
+SIDE_RADII = 2.0
+"""A flattened airway is up to this many times as wide as its inscribed sphere."""
+
+END_RADII = 1.5
+"""At an end, a flat cap has its rim at 1.4 radii."""
+
+SLACK_VOXELS = 2.0
+MOST_WAYS = 500
+
+
+def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
+    """Return the skeleton voxels `(M, 3)` with ways to all parts of the mask that they do not reach."""
+    from scipy import ndimage
+
+    if len(skeleton) == 0:
+        return skeleton
+    solid = np.argwhere(prepared.solid.T)[:, ::-1]
+    missed = solid[~_reached(solid, skeleton, prepared)]
+    if len(missed) == 0:
+        return skeleton
+    low = missed.min(axis=0)
+    marks = np.zeros(missed.max(axis=0) - low + 1, dtype=bool)
+    marks[tuple((missed - low).T)] = True
+    labels, count = ndimage.label(marks, CONNECT_26)
+    label = labels[tuple((missed - low).T)]
+    for part in range(1, count + 1):
+        open_voxels = missed[label == part]
+        for _ in range(MOST_WAYS):
+            open_voxels = open_voxels[~_reached(open_voxels, skeleton, prepared)]
+            if len(open_voxels) == 0:
+                break
+            skeleton = np.concatenate((skeleton, _way_to_farthest(open_voxels, skeleton, prepared)))
+    return skeleton[np.lexsort(skeleton.T[::-1])]
+
+
+def _reached(voxels: Int, skeleton: Int, prepared: PreparedLumen) -> Bool:
+    """Tell which voxels lie near a skeleton voxel, measured by the depth there."""
+    from scipy.spatial import KDTree
+
+    spacing = prepared.grid.spacing_mm
+    tree = KDTree(skeleton * spacing)
+    voxel = float(spacing.max())
+    neighbours = np.array([len(n) for n in KDTree(skeleton).query_ball_point(skeleton, 1.8)]) - 1
+    radii = np.where(neighbours <= 1, END_RADII, SIDE_RADII)
+    limit = np.maximum(prepared.solid_depth_mm[tuple(skeleton.T)], voxel / 2) * radii + SLACK_VOXELS * voxel
+    reached = np.zeros(len(voxels), dtype=bool)
+    for most in (4, 32, 256):
+        todo = np.flatnonzero(~reached)
+        if len(todo) == 0:
+            break
+        k = min(most, len(skeleton))
+        distance, index = tree.query(voxels[todo] * spacing, k=k)
+        reached[todo] = (distance.reshape(-1, k) <= limit[index.reshape(-1, k)]).any(axis=1)
+    return reached
+
+
+def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -> Int:
+    """Return the new voxels of the way along the middle from the skeleton to the farthest open voxel."""
+    from scipy.spatial import KDTree
+    from skimage.graph import MCP_Geometric
+
+    spacing = prepared.grid.spacing_mm
+    distance, _ = KDTree(skeleton * spacing).query(open_voxels * spacing)
+    target = open_voxels[int(np.argmax(distance))]
+    margin = np.ceil((float(distance.min()) + 2 * float(prepared.solid_depth_mm.max())) / spacing).astype(
+        np.int64
+    )
+    while True:
+        low = np.maximum(open_voxels.min(axis=0) - margin, 0)
+        high = np.minimum(open_voxels.max(axis=0) + margin + 1, prepared.solid.shape)
+        window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        starts = skeleton[((skeleton >= low) & (skeleton < high)).all(axis=1)] - low
+        cost = _cost(prepared.solid_depth_mm[window], prepared.solid[window], spacing)
+        search = MCP_Geometric(cost, fully_connected=True, sampling=tuple(spacing))
+        end = tuple((target - low).tolist())
+        total, _ = search.find_costs([tuple(s) for s in starts.tolist()], [end])
+        if np.isfinite(total[end]) or (np.array(cost.shape) == prepared.solid.shape).all():
+            way: Int = np.array(search.traceback(end)[1:]) + low
+            return way
+        margin = margin * 2
+
+
+def _cost(depth_mm: NDArray[np.float32], solid: Bool, spacing_mm: Float) -> Float:
+    floor = float(spacing_mm.min()) / 4
+    return np.asarray(np.where(solid, 1.0 / np.maximum(depth_mm.astype(np.float64), floor) ** 2, -1.0))

@@ -1,0 +1,148 @@
+"""Prepare a lumen mask for thinning: crop it, keep one piece, bridge short breaks, find cavities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.airway_tree import GapBridged
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float, Grid, Volume
+from anatomy.tree.bridge import Piece, join_pieces
+
+Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
+
+CONNECT_26 = np.ones((3, 3, 3), dtype=bool)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedLumen:
+    """The lumen in its bounding box with an empty layer all around.
+
+    Parameters
+    ----------
+    grid : Grid
+        Grid of the box.
+    lumen : bool array
+        The largest piece and the pieces joined to it, as they are in the mask.
+    solid : bool array
+        `lumen` with bridges across gaps and with its cavities filled: what is thinned.
+    bridges : bool array
+        The voxels of the bridges.
+    depth_mm : float32 array
+        Distance from the voxel centre to the nearest one outside `lumen`.
+    solid_depth_mm : float32 array
+        The same for `solid`, so that a hole in the mask does not make the airway look narrow.
+    """
+
+    grid: Grid
+    lumen: Bool
+    solid: Bool
+    bridges: Bool
+    depth_mm: NDArray[np.float32]
+    solid_depth_mm: NDArray[np.float32]
+    gaps: tuple[GapBridged, ...]
+    components_dropped: int
+    voxels_dropped: int
+    cavity_voxels: int
+
+
+def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
+    """Crop a mask and keep its largest 26-connected piece with what belongs to it.
+
+    Raises
+    ------
+    AnatomyError
+        If the mask is empty.
+    """
+    from scipy import ndimage
+
+    grid, box = crop_to_content(mask)
+    labels, count = ndimage.label(box, CONNECT_26)
+    sizes = np.bincount(labels.ravel(order="K"), minlength=count + 1)
+    main = int(np.argmax(sizes[1:])) + 1
+    lumen = np.asarray(labels == main)
+    bridges = np.zeros_like(lumen)
+    gaps: list[GapBridged] = []
+    if count > 1:
+        pieces = _pieces(labels, sizes, main, grid.spacing_mm)
+        for join in join_pieces(np.argwhere(lumen), pieces, grid.spacing_mm, max_gap_mm):
+            lumen[tuple(join.voxels.T)] = True
+            bridges[tuple(join.bridge.T)] = True
+            gaps.append(
+                GapBridged(
+                    position_lps=grid.lps(join.middle_ijk),
+                    length_mm=join.length_mm,
+                    voxels_joined=len(join.voxels),
+                )
+            )
+    bridges &= ~box
+    solid = fill_cavities(lumen | bridges)
+    cavity_voxels = int(solid.sum()) - int((lumen | bridges).sum())
+    depth = depth_of_centres(lumen, grid.spacing_mm)
+    return PreparedLumen(
+        grid=grid,
+        lumen=lumen,
+        solid=solid,
+        bridges=bridges,
+        depth_mm=depth,
+        solid_depth_mm=depth_of_centres(solid, grid.spacing_mm) if cavity_voxels else depth,
+        gaps=tuple(gaps),
+        components_dropped=count - 1 - len(gaps),
+        voxels_dropped=int(sizes[1:].sum() - lumen.sum()),
+        cavity_voxels=cavity_voxels,
+    )
+
+
+def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
+    """Return grid and array of the bounding box of a mask, with one empty layer all around."""
+    array = np.asarray(mask.array != 0) if mask.array.dtype != bool else mask.array
+    hits = [np.flatnonzero(array.any(axis=other)) for other in ((1, 2), (0, 2), (0, 1))]
+    if len(hits[0]) == 0:
+        raise AnatomyError(
+            "The airway mask is empty",
+            expected="a mask of the airway lumen from the trachea to the bronchi",
+            remedy="Check that the file and the label are those of the airway",
+        )
+    start = np.array([h[0] for h in hits])
+    stop = np.array([h[-1] + 1 for h in hits])
+    inner = array[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
+    box = np.zeros(tuple(stop - start + 2), dtype=bool, order="F")
+    box[1:-1, 1:-1, 1:-1] = inner
+    return mask.grid.crop(start - 1, stop + 1), box
+
+
+def depth_of_centres(mask: Bool, spacing_mm: Float) -> NDArray[np.float32]:
+    """Return the distance of every voxel centre in `mask` to the nearest one outside it, mm."""
+    import edt
+
+    spacing = tuple(float(s) for s in spacing_mm)
+    return np.asarray(edt.edt(mask, anisotropy=spacing, black_border=True, parallel=1))
+
+
+def fill_cavities(mask: Bool) -> Bool:
+    """Return `mask` with every hole that faces do not connect to the array's corner filled."""
+    from scipy import ndimage
+
+    outside, count = ndimage.label(~mask)
+    return mask.copy(order="K") if count < 2 else np.asarray(outside != outside[0, 0, 0])
+
+
+def _pieces(labels: NDArray[np.int32], sizes: Int, main: int, spacing_mm: Float) -> list[Piece]:
+    """List the other pieces that are long enough to have a direction, largest first."""
+    from scipy import ndimage
+
+    boxes = ndimage.find_objects(labels)
+    pieces = []
+    for label in np.argsort(-sizes[1:], kind="stable") + 1:
+        if label == main or sizes[label] < Piece.MIN_VOXELS:
+            continue
+        where = boxes[label - 1]
+        voxels = np.argwhere(labels[where] == label) + [s.start for s in where]
+        extent = (voxels.max(axis=0) - voxels.min(axis=0) + 1) * spacing_mm
+        if float(np.linalg.norm(extent)) >= Piece.MIN_EXTENT_MM:
+            pieces.append(Piece(voxels=voxels))
+    return pieces

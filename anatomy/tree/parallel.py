@@ -1,0 +1,86 @@
+"""Unite lines of a course that run side by side, so that a branching lies where they really part."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.tree.course import Course, course_of
+from anatomy.tree.depth import segments_inside
+
+Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
+
+
+def unite_parallel(course: Course, lumen: Bool) -> Course:
+    """Let the children of a node share their way as long as they run through neighbouring voxels."""
+    parent = course.parent.tolist()
+    children: list[list[int]] = [[] for _ in parent]
+    for node, above in enumerate(parent):
+        if above >= 0:
+            children[above].append(node)
+    on_trunk = set()
+    at = course.trunk_end
+    while at >= 0:
+        on_trunk.add(at)
+        at = parent[at]
+    gone: set[int] = set()
+    farthest, trunk_end = -1, course.trunk_end
+    for node in range(len(parent)):
+        if node in gone or len(children[node]) < 2:
+            continue
+        first, *others = sorted(children[node], key=lambda child: child not in on_trunk)
+        kept = _line(first, children)
+        at_division = node == course.trunk_end
+        for other in others:
+            line = _line(other, children)
+            hook, shared = _shared(course, kept, line, lumen)
+            if shared == 0:
+                continue
+            gone.update(line[:shared])
+            children[node].remove(other)
+            children[kept[hook]].append(line[shared])
+            parent[line[shared]] = kept[hook]
+            farthest = max(farthest, hook) if at_division else farthest
+        if at_division and farthest >= 0:
+            trunk_end = kept[farthest]
+    return _without(course, parent, gone, trunk_end, lumen)
+
+
+def _line(start: int, children: list[list[int]]) -> list[int]:
+    """Follow a line to the next node that is an end or divides, included."""
+    nodes = [start]
+    while len(children[nodes[-1]]) == 1:
+        nodes.append(children[nodes[-1]][0])
+    return nodes
+
+
+def _shared(course: Course, kept: list[int], line: list[int], lumen: Bool) -> tuple[int, int]:
+    """Return where on `kept` a line leaves it, and how many of its nodes run beside it until there."""
+    gap = np.abs(course.ijk[line][:, None] - course.ijk[kept]).max(axis=2)
+    beside = (gap <= 1.0).any(axis=1)
+    most = len(line) - 1 if beside.all() else int(np.argmin(beside))
+    for shared in range(min(most, len(line) - 1), 0, -1):
+        if course.across_gap[line[: shared + 1]].any():
+            continue
+        target = course.ijk[line[shared]]
+        for hook in np.argsort(np.linalg.norm(course.ijk[kept] - target, axis=1), kind="stable")[:4].tolist():
+            if segments_inside(lumen, course.ijk[kept[hook]][None], target[None])[0]:
+                return hook, shared
+    return 0, 0
+
+
+def _without(course: Course, parent: list[int], gone: set[int], trunk_end: int, lumen: Bool) -> Course:
+    """Leave nodes out and sort the others so that parents come first."""
+    children: list[list[int]] = [[] for _ in parent]
+    for node, above in enumerate(parent):
+        if above >= 0 and node not in gone:
+            children[above].append(node)
+    order, stack = [], [0]
+    while stack:
+        node = stack.pop()
+        order.append(node)
+        stack += children[node][::-1]
+    index = {node: at for at, node in enumerate(order)}
+    new_parent = np.array([-1] + [index[parent[node]] for node in order[1:]])
+    return course_of(course.ijk[order], new_parent, index[trunk_end], lumen)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -63,7 +63,7 @@ REACH_MM = 20.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exit:
-    """Where the re-integrated tube leaves the lumen: the last frame in it, and the length there."""
+    """Where the re-integrated tube leaves the lumen: frame, arc length and pierced branch."""
 
     frame: int
     arc_mm: float
@@ -83,6 +83,9 @@ def check_deployment(plan: Plan, lung: Lung, found: Findings) -> Curve | None:
     labels = labels_at(lung, curve.points)
     way_out = _check_exit(plan, lung, curve, labels, found)
     if way_out is not None:
+        curve = shapes.tube_curve(plan.scope.lps_from_scope_tip, tube.rotation_rad, bend, way_out.arc_mm)
+        way_out = replace(way_out, frame=int(np.abs(curve.arc_mm - way_out.arc_mm).argmin()))
+        labels = labels_at(lung, curve.points)
         _check_containment(plan, curve, labels, way_out, found)
         _check_clearance(plan, lung, curve, way_out, sweep_mm, found)
     return curve

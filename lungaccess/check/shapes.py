@@ -144,15 +144,15 @@ def bend_of(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> Bend:
     return Bend(edges_mm=tuple(edges), per_mm=tuple(values))
 
 
-def tube_curve(lps_from_scope_tip: Float, rotation_rad: float, bend: Bend) -> Curve:
-    """Re-integrate the tubes from the tip of the scope."""
+def tube_curve(lps_from_scope_tip: Float, rotation_rad: float, bend: Bend, frame_at_mm: float = 0.0) -> Curve:
+    """Re-integrate the tubes from the tip of the scope, with a frame exactly at `frame_at_mm`."""
     rolls = [rotation_rad] + [0.0] * len(bend.per_mm)
     lengths = np.diff(bend.edges_mm)
     pieces = [
         Piece(length_mm=float(length), roll_rad=roll, curvature_per_mm=curvature)
         for length, roll, curvature in zip(lengths, rolls, bend.per_mm, strict=False)
     ]
-    return integrate(lps_from_scope_tip, pieces)
+    return integrate(lps_from_scope_tip, cut_at(pieces, frame_at_mm))
 
 
 def planar_shape(bend: Bend, step_mm: float) -> Float:

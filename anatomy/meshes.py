@@ -1,0 +1,176 @@
+"""Surface meshes of masks, and exact distances to them with FCL.
+
+Two kinds of mesh, each with a stated bound of its distance from the mask, whose voxels are solid boxes:
+
+`box_surface`
+    The faces between voxels inside and outside the mask.  It is the boundary of the mask: bound 0.
+`smooth_surface`
+    Marching cubes at level 0.5, for pictures.  It cuts corners: its bound is half the diagonal of a voxel.
+    Every vertex is the middle of an edge between an inner and an outer voxel centre, which is the middle of
+    the face they share.  A triangle stays in one cell of eight voxel centres; the middle of such a cell is a
+    corner of all eight voxels, some inside and some outside, hence on the boundary of the mask; no point of
+    the cell is farther from its middle than half a diagonal.  The other way, a point of the boundary in the
+    cell lies on a quarter of a face whose middle is a vertex, so it is nearer than that.
+
+A surface is hollow: what lies wholly inside touches nothing.  Test containment as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float, Grid, Volume, read_only
+
+Int = NDArray[np.int64]
+
+_RING = ((0, 0), (1, 0), (1, 1), (0, 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceMesh:
+    """A triangle mesh, closed, its faces turned outwards.
+
+    Parameters
+    ----------
+    vertices_lps : (V, 3) float64, LPS mm
+    faces : (F, 3) int64
+        Vertices of each triangle.
+    bound_mm : float
+        No point of the mesh is farther than this from the boundary of the mask, nor the boundary from it.
+    """
+
+    vertices_lps: Float
+    faces: Int
+    bound_mm: float
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices_lps, dtype=np.float64).reshape(-1, 3)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int64).reshape(-1, 3)
+        object.__setattr__(self, "vertices_lps", read_only(vertices))
+        object.__setattr__(self, "faces", read_only(faces))
+
+    def to_trimesh(self) -> Any:
+        """Return the mesh as a `trimesh.Trimesh`, unprocessed."""
+        import trimesh
+
+        return trimesh.Trimesh(vertices=self.vertices_lps, faces=self.faces, process=False)
+
+
+def box_surface(mask: NDArray[np.bool_], grid: Grid) -> SurfaceMesh:
+    """Return the exact boundary of the voxels of `mask` as solid boxes.
+
+    Parameters
+    ----------
+    mask : (ni, nj, nk) bool
+        A mask on `grid`; beyond it there is nothing.  An empty mask has an empty surface.
+    grid : Grid
+        Use `Grid.crop` for a region of interest.
+    """
+    padded = np.pad(np.asarray(mask, dtype=bool), 1)
+    quads = [_faces_of(padded, axis, side) for axis in range(3) for side in (0, 1)]
+    corners = np.concatenate(quads)
+    shape = np.asarray(mask.shape) + 1
+    flat = np.ravel_multi_index(tuple(corners.reshape(-1, 3).T), tuple(shape))
+    used, index = np.unique(flat, return_inverse=True)
+    quad = index.reshape(-1, 4)
+    lattice = np.stack(np.unravel_index(used, tuple(shape)), axis=-1).astype(np.float64)
+    return SurfaceMesh(
+        vertices_lps=grid.lps(lattice - 0.5),
+        faces=np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]),
+        bound_mm=0.0,
+    )
+
+
+def _faces_of(padded: NDArray[np.bool_], axis: int, side: int) -> Int:
+    """Return the `(F, 4, 3)` corner indices of the faces towards one side, counted outwards."""
+    inner = padded[1:-1, 1:-1, 1:-1]
+    window = [slice(1, -1)] * 3
+    window[axis] = slice(2, None) if side else slice(0, -2)
+    voxels = np.argwhere(inner & ~padded[tuple(window)])
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    offsets = np.zeros((4, 3), dtype=np.int64)
+    for n, (a, b) in enumerate(_RING if side else _RING[::-1]):
+        offsets[n, [axis, first, second]] = side, a, b
+    return np.asarray(voxels[:, None, :] + offsets, dtype=np.int64)
+
+
+def smooth_surface(volume: Volume) -> SurfaceMesh:
+    """Return a marching cubes surface of a bool volume, for pictures and prints.
+
+    Raises
+    ------
+    AnatomyError
+        If the mask is empty.
+    """
+    from skimage.measure import marching_cubes
+
+    if not volume.array.any():
+        raise AnatomyError("An empty mask has no surface", expected="a mask with at least one voxel")
+    low, high = _bounds(volume.array)
+    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    padded = np.pad(volume.array[window], 1).astype(np.float32)
+    vertices, faces, _, _ = marching_cubes(padded, level=0.5, gradient_direction="ascent")
+    return SurfaceMesh(
+        vertices_lps=volume.grid.lps(vertices + low - 1.0),
+        faces=faces,
+        bound_mm=0.5 * float(np.linalg.norm(volume.grid.spacing_mm)),
+    )
+
+
+def _bounds(mask: NDArray[Any]) -> tuple[Int, Int]:
+    """Return the first index and the index beyond the last of the voxels of `mask`."""
+    along = [np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3)]
+    return np.asarray([hits[0] for hits in along]), np.asarray([hits[-1] + 1 for hits in along])
+
+
+class MeshDistance:
+    """Distances from segments, the axes of capsules, to a mesh (an FCL bounding volume hierarchy).
+
+    A capsule (a ball of radius r swept along a segment) touches the mesh if and only if the segment is not
+    farther than r from it.  The segment enters as a flat triangle: FCL compares triangles in closed form
+    (error about 1e-14 mm), but capsules by iteration (error about 1e-5 mm).
+
+    Parameters
+    ----------
+    mesh : SurfaceMesh
+        May be empty: everything is then infinitely far.
+    """
+
+    def __init__(self, mesh: SurfaceMesh) -> None:
+        self._mesh = _fcl_object(mesh.vertices_lps, mesh.faces) if len(mesh.faces) else None
+
+    def segment_distance_mm(self, starts_lps: ArrayLike, ends_lps: ArrayLike) -> Float:
+        """Return the `(N,)` distances in mm from the segments to the surface, 0 where they cross it.
+
+        Parameters
+        ----------
+        starts_lps, ends_lps : (N, 3) float64, LPS mm
+            Ends of each segment; they may coincide.
+        """
+        starts = np.asarray(starts_lps, dtype=np.float64).reshape(-1, 3)
+        ends = np.asarray(ends_lps, dtype=np.float64).reshape(-1, 3)
+        if self._mesh is None:
+            return np.full(len(starts), np.inf)
+        return np.array([self._distance(a, b) for a, b in zip(starts, ends, strict=True)])
+
+    def _distance(self, start: Float, end: Float) -> float:
+        import fcl
+
+        segment = _fcl_object(np.stack([start, end, 0.5 * (start + end)]), np.array([[0, 1, 2]]))
+        found = fcl.distance(self._mesh, segment, fcl.DistanceRequest(), fcl.DistanceResult())
+        return max(float(found), 0.0)
+
+
+def _fcl_object(vertices: Float, faces: Int) -> Any:
+    import fcl
+
+    model = fcl.BVHModel()
+    model.beginModel(len(vertices), len(faces))
+    model.addSubModel(vertices, faces)
+    model.endModel()
+    return fcl.CollisionObject(model, fcl.Transform())

@@ -1,0 +1,343 @@
+"""A toy patient with a plan made by hand: closed-form shapes and brute-force distances, nothing shared."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from anatomy import structures
+from anatomy.airway_tree import AirwayTree
+from anatomy.grid import Grid, Volume, transform_points
+from lungaccess.plan import Exemption, NeedleArc, NeedlePath, Plan, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.system import System, load_system, system_fingerprint
+
+SPACING_MM = (1.0, 0.9, 1.1)
+SHAPE = (150, 64, 104)
+BRANCH_END = np.array([40.0, 0.0, 12.0])
+CARINA = np.array([0.0, 0.0, 70.0])
+TRACHEA_RADIUS_MM, BRONCHUS_RADIUS_MM, WALL_MM = 6.0, 4.0, 1.0
+SITE_STEP = 48
+OUTER_MM, INNER_MM, ROTATION_RAD = 20.0, 38.0, 0.7
+ARCS = ((6.0, 0.4, 0.0), (10.0, 1.1, 0.008), (9.0, -2.0, 0.004))
+EXEMPT_MM = 5.0
+
+
+def toy_tree() -> AirwayTree:
+    """A trachea and two bronchi, points 0.5 mm apart."""
+    lines = [(np.array([0.0, 0.0, 88.0]), CARINA), (CARINA, BRANCH_END), (CARINA, BRANCH_END * [-1, 1, 1])]
+    points, parents, branches, tangents, radii, start = [], [], [], [], [], [0]
+    for branch, (a, b) in enumerate(lines):
+        count = round(float(np.linalg.norm(b - a)) / 0.5)
+        t = np.arange(0 if branch == 0 else 1, count + 1) / count
+        points.append(a + t[:, None] * (b - a))
+        parents += [-1 if branch == 0 else start[1] - 1, *range(start[-1], start[-1] + len(t) - 1)]
+        branches += [branch] * len(t)
+        tangents.append(np.tile((b - a) / np.linalg.norm(b - a), (len(t), 1)))
+        radii += [TRACHEA_RADIUS_MM if branch == 0 else BRONCHUS_RADIUS_MM] * len(t)
+        start.append(start[-1] + len(t))
+    place = np.concatenate(points)
+    way = np.zeros(len(place))
+    for n, parent in enumerate(parents[1:], start=1):
+        way[n] = way[parent] + np.linalg.norm(place[n] - place[parent])
+    return AirwayTree(
+        points_lps=place,
+        radius_mm=np.array(radii),
+        parent_point=np.array(parents),
+        branch_of_point=np.array(branches),
+        branch_start=np.array(start),
+        branch_parent=np.array([-1, 0, 0]),
+        generation=np.array([0, 1, 1]),
+        distance_from_root_mm=way,
+        tangents=np.concatenate(tangents),
+    )
+
+
+def capsule(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius_mm: float) -> np.ndarray:
+    """Points within `radius_mm` of a segment."""
+    t = np.clip(((points - a) @ (b - a)) / ((b - a) @ (b - a)), 0.0, 1.0)
+    return np.linalg.norm(points - a - t[..., None] * (b - a), axis=-1) <= radius_mm
+
+
+def toy_lung() -> Any:
+    """What the check reads of a lung: two lungs apart, a forked airway with a wall, a vessel, a fissure."""
+    grid = Grid.from_spacing(SHAPE, SPACING_MM, [-58.0, -28.4, -12.0])
+    points = grid.lps(np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), axis=-1))
+    tree = toy_tree()
+    x, y, z = np.moveaxis(points, -1, 0)
+    labels = np.zeros(SHAPE, dtype=np.uint16, order="F")
+    labels[(np.abs(x) < 1.0) | (x > 84) | (x < -52) | (np.abs(y) > 24) | (z < -5) | (z > 80)] = (
+        structures.OUTSIDE
+    )
+    lumen, wall = np.zeros((2, *SHAPE), dtype=bool)
+    for a, b, r in (
+        (np.array([0.0, 0, 96]), CARINA, TRACHEA_RADIUS_MM),
+        (CARINA, BRANCH_END, BRONCHUS_RADIUS_MM),
+        (CARINA, BRANCH_END * [-1, 1, 1], BRONCHUS_RADIUS_MM),
+    ):
+        lumen |= capsule(points, a, b, r)
+        wall |= capsule(points, a, b, r + WALL_MM)
+    vessel = capsule(points, np.array([30.0, 8.0, 60.0]), np.array([80.0, 9.0, 5.0]), 3.0) & ~wall
+    labels[vessel] |= structures.VESSEL
+    labels[(np.abs(z - 6.0) < 0.6) & ~wall & (labels == 0)] |= structures.FISSURE
+    voxels = np.argwhere(wall)
+    gap = np.linalg.norm(grid.lps(voxels)[:, None] - tree.points_lps[None, ::4], axis=2) - tree.radius_mm[::4]
+    branch = tree.branch_of_point[::4][gap.argmin(axis=1)]
+    labels[tuple(voxels.T)] = structures.AIRWAY | ((branch + 1) << structures.BRANCH_SHIFT).astype(np.uint16)
+    labels[lumen] |= structures.LUMEN
+    return SimpleNamespace(
+        name="Toy",
+        kind="toy",
+        key="abc123",
+        grid=grid,
+        labels=labels,
+        tree=tree,
+        cost=None,
+        has_fissures=True,
+        nodules=None,
+        breath_hold="inspiration",
+        sources={"airway.nii.gz": "0" * 64},
+        warnings=(),
+    )
+
+
+def turned(pose: np.ndarray, roll_rad: float) -> np.ndarray:
+    """The pose after a turn about its own z."""
+    c, s = np.cos(roll_rad), np.sin(roll_rad)
+    return pose @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+def arc(length_mm: float, k: float) -> np.ndarray:
+    """Closed form of an arc that bends towards +x."""
+    a = k * length_mm
+    x, z = ((1 - np.cos(a)) / k, np.sin(a) / k) if k else (0.0, length_mm)
+    return np.array(
+        [[np.cos(a), 0, np.sin(a), x], [0, 1, 0, 0], [-np.sin(a), 0, np.cos(a), z], [0, 0, 0, 1.0]]
+    )
+
+
+def follow(
+    pose: np.ndarray, arcs: list[tuple[float, float, float]], step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frames along arcs of (length, roll, curvature), and their arc lengths."""
+    frames, at, travelled = [pose], [0.0], 0.0
+    for length, roll, k in arcs:
+        pose = turned(pose, roll)
+        for s in np.linspace(0, length, max(int(np.ceil(length / step)), 1) + 1)[1:]:
+            frames.append(pose @ arc(s, k))
+            at.append(travelled + s)
+        pose, travelled = pose @ arc(length, k), travelled + length
+    return np.array(frames), np.array(at)
+
+
+def brute_distance(lung: Any, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distances to the voxels of a mask as solid boxes, at most 20 mm, by trying every voxel."""
+    spacing = np.asarray(SPACING_MM)
+    inverse = np.linalg.inv(lung.grid.lps_from_ijk)
+    local = transform_points(inverse, points)
+    low, high = local.min(axis=0) - 20 / spacing - 1, local.max(axis=0) + 20 / spacing + 1
+    voxels = np.argwhere(mask)
+    voxels = voxels[((voxels >= low) & (voxels <= high)).all(axis=1)]
+    out = np.full(len(points), 20.0)
+    for n, p in enumerate(local):
+        near = voxels[np.abs(voxels[:, 0] - p[0]) * spacing[0] < out[n] + 1]
+        gap = np.maximum(np.abs(near - p) - 0.5, 0.0) * spacing
+        out[n] = min(out[n], np.sqrt((gap**2).sum(axis=1).min(initial=400.0)))
+    return out
+
+
+def is_airway_of(labels: np.ndarray, branch: int) -> np.ndarray:
+    """Airway voxels of one branch."""
+    return ((labels & structures.AIRWAY) != 0) & (
+        (labels >> structures.BRANCH_SHIFT).astype(int) - 1 == branch
+    )
+
+
+def toy_plan(lung: Any, system: System, outer_mm: float, inner_mm: float, arcs: Any = ARCS) -> Plan:
+    """The plan, every stated value from closed forms and brute force."""
+    scope = toy_route(lung, system)
+    tube, tube_points, exit_at = toy_tube(lung, system, scope.lps_from_scope_tip, outer_mm, inner_mm)
+    frames, at = follow(tube.lps_from_tip, list(arcs), 0.1)
+    points, tangents = frames[:, :3, 3], frames[:, :3, 2]
+    labels, branch = lung.labels, tube.exit.branch
+    masks = {"vessel": structures.VESSEL, "outside": structures.OUTSIDE, "fissure": structures.FISSURE}
+    clear: dict[str, dict[str, float]] = {"tube": {}, "needle": {}}
+    every = np.full(len(points), np.inf)
+    for name, bit in masks.items():
+        gap = brute_distance(lung, (labels & bit) != 0, points)
+        every = np.minimum(every, gap)
+        clear["needle"][name] = float(gap.min())
+        clear["tube"][name] = float(brute_distance(lung, (labels & bit) != 0, tube_points[:exit_at:-5]).min())
+    airway = (labels & structures.AIRWAY) != 0
+    gap = brute_distance(lung, airway, points)
+    clear["needle"]["airway"] = float(gap[at >= EXEMPT_MM].min())
+    other = airway & ~is_airway_of(labels, branch)
+    clear["tube"]["airway"] = float(brute_distance(lung, other, tube_points[:exit_at:-5]).min())
+    every = np.maximum(np.minimum(every, gap), 0.1)
+    length = float(sum(a[0] for a in arcs))
+    angle = np.arccos(np.clip(tangents @ tangents[0], -1, 1)).max()
+    needle = NeedlePath(
+        lps_from_start=tube.lps_from_tip,
+        end_lps=points[-1],
+        length_mm=length,
+        arcs=tuple(NeedleArc(length_mm=a, roll_rad=b, curvature_per_mm=c) for a, b, c in arcs),
+        max_angle_from_start_rad=float(angle),
+        accumulated_turn_rad=float(sum(a[0] * a[2] for a in arcs)),
+    )
+    margin = system.margins.total_mm
+    return Plan(
+        software_version="0",
+        patient_name=lung.name,
+        lung_key=lung.key,
+        sources=lung.sources,
+        breath_hold=lung.breath_hold,
+        system=system,
+        system_fingerprint=system_fingerprint(system),
+        target_lps=points[-1],
+        target_origin="lps",
+        fissures_are_obstacles=True,
+        objective="inverse_clearance",
+        scope=scope,
+        tube=tube,
+        needle=needle,
+        exemption=Exemption(branch=branch, exit_point_lps=tube.exit.point_lps, needle_length_mm=EXEMPT_MM),
+        required_clearance_mm={
+            "outer_tube": system.tubes.outer.radius_mm + margin,
+            "inner_tube": system.tubes.inner.radius_mm + margin,
+            "needle": system.needle.radius_mm + margin,
+        },
+        clearance_mm=clear,
+        costs={"inverse_clearance": float(np.trapezoid(1 / every, at)), "cost_map": 0.0, "length_mm": length},
+        method="hand",
+        seed=0,
+        iterations=1,
+        timing={"total_s": 1.0},
+    )
+
+
+def toy_route(lung: Any, system: System) -> ScopeRoute:
+    """Down the trachea and some way into the first bronchus."""
+    tree: AirwayTree = lung.tree
+    site = int(tree.branch_start[1]) + SITE_STEP
+    index = tree.route(site)
+    points = tree.points_lps[index]
+    radius = brute_distance(lung, (lung.labels & structures.LUMEN) == 0, points)
+    z = tree.tangents[site]
+    b = np.cross([0.0, 1, 0], z)
+    frame = np.eye(4)
+    frame[:3, :3] = np.column_stack([b / np.linalg.norm(b), np.cross(z, b / np.linalg.norm(b)), z])
+    frame[:3, 3] = points[-1]
+    length = float(tree.distance_from_root_mm[site])
+    return ScopeRoute(
+        points_lps=points,
+        lumen_radius_mm=radius,
+        branches=tree.branch_of_point[index],
+        lps_from_scope_tip=turned(frame, np.pi - ROTATION_RAD),
+        site_point=site,
+        generation=1,
+        length_mm=length,
+        length_from_carina_mm=length - float(tree.distance_from_root_mm[tree.carina_point]),
+        min_lumen_margin_mm=float(radius.min()) - system.scope.radius_mm,
+    )
+
+
+def toy_tube(
+    lung: Any, system: System, tip: np.ndarray, outer_mm: float, inner_mm: float
+) -> tuple[TubeDeployment, np.ndarray, int]:
+    """The tubes from the scope tip, their points 0.005 mm apart, and which of them is the exit."""
+    tubes = system.tubes
+    stiff = [
+        t.youngs_modulus_gpa * (t.outer_diameter_mm**4 - t.inner_diameter_mm**4)
+        for t in (tubes.inner, tubes.outer)
+    ]
+    kappa = tubes.inner.precurvature_per_mm
+    overlap = kappa * stiff[0] / sum(stiff)
+    curved = max(inner_mm - tubes.inner.curved_length_mm, 0.0)
+    pieces = [(curved, ROTATION_RAD, 0.0)] if curved else []
+    pieces += [
+        (outer_mm - curved, 0.0 if curved else ROTATION_RAD, overlap),
+        (inner_mm - outer_mm, 0.0, kappa),
+    ]
+    frames, at = follow(tip, pieces, 0.005)
+    points = frames[:, :3, 3]
+    index = np.rint(lung.grid.ijk(points)).astype(int)
+    labels = lung.labels[tuple(index.T)]
+    last = int(np.flatnonzero((labels & structures.LUMEN) == 0)[0]) - 1
+    centres = lung.grid.lps(np.argwhere((lung.labels & structures.LUMEN) != 0))
+    near = centres[np.linalg.norm(centres - points[last], axis=1) <= 1.5]
+    out = points[last] - near.mean(axis=0)
+    angle = np.arcsin(out @ frames[last, :3, 2] / np.linalg.norm(out))
+    wall_exit = WallExit(
+        branch=int(labels[last] >> structures.BRANCH_SHIFT) - 1,
+        point_lps=points[last],
+        arc_length_mm=float(at[last]),
+        wall_angle_rad=float(angle),
+    )
+    tube = TubeDeployment(
+        rotation_rad=ROTATION_RAD,
+        outer_insertion_mm=outer_mm,
+        inner_insertion_mm=inner_mm,
+        lps_from_tip=frames[-1],
+        exit=wall_exit,
+        lateral_sweep_mm=0.0,
+        follow_the_leader_error_mm=0.0,
+    )
+    return tube, points, last
+
+
+def changed(record: Any, **values: Any) -> Any:
+    """Replace values in nested records, as `changed(plan, tube__exit__branch=2)`; the digest follows."""
+    nested: dict[str, dict[str, Any]] = {}
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        head, _, rest = key.partition("__")
+        if rest:
+            nested.setdefault(head, {})[rest] = value
+        else:
+            flat[head] = value
+    for head, inner in nested.items():
+        flat[head] = changed(getattr(record, head), **inner)
+    return dataclasses.replace(record, **flat)
+
+
+def relabelled(lung: Any, edit: Callable[[np.ndarray, np.ndarray], None]) -> Any:
+    """A copy of the lung after `edit(labels, points_lps)`."""
+    labels = lung.labels.copy(order="F")
+    points = lung.grid.lps(np.stack(np.meshgrid(*map(np.arange, labels.shape), indexing="ij"), axis=-1))
+    edit(labels, points)
+    return SimpleNamespace(**{**vars(lung), "labels": labels})
+
+
+@pytest.fixture(scope="session")
+def system() -> System:
+    return load_system("lung-default")
+
+
+@pytest.fixture(scope="session")
+def lung() -> Any:
+    return toy_lung()
+
+
+@pytest.fixture(scope="session")
+def plan(lung: Any, system: System) -> Plan:
+    return toy_plan(lung, system, OUTER_MM, INNER_MM)
+
+
+@pytest.fixture(scope="session")
+def tools() -> Any:
+    """The helpers of this file."""
+    return SimpleNamespace(
+        changed=changed,
+        relabelled=relabelled,
+        toy_plan=toy_plan,
+        capsule=capsule,
+        follow=follow,
+        arc=arc,
+        brute_distance=brute_distance,
+        turned=turned,
+        Volume=Volume,
+    )

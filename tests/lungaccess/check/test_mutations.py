@@ -1,0 +1,519 @@
+"""Plans that are wrong in one respect, with everything else consistent and a valid digest, are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from anatomy import structures
+from anatomy.grid import Volume
+from anatomy.settings import override
+from lungaccess.check import check
+from lungaccess.plan import Plan
+from lungaccess.system import load_system, system_fingerprint
+
+
+def refusals(plan: Plan, lung: Any, **options: Any) -> set[str]:
+    report = check(plan, lung, **options)
+    assert report.accepted == (not report.refusals)
+    return {finding.name for finding in report.refusals}
+
+
+def moved(plan: Plan, tools: Any, move: Any, pose: Any, turn: float = 1.0) -> Plan:
+    """Apply a map to every point and pose; `turn` multiplies rotations and rolls."""
+    arcs = tuple(dataclasses.replace(a, roll_rad=turn * a.roll_rad) for a in plan.needle.arcs)
+    return tools.changed(
+        plan,
+        scope__points_lps=move(plan.scope.points_lps),
+        scope__lps_from_scope_tip=pose(plan.scope.lps_from_scope_tip),
+        tube__lps_from_tip=pose(plan.tube.lps_from_tip),
+        tube__exit__point_lps=move(plan.tube.exit.point_lps),
+        tube__rotation_rad=turn * plan.tube.rotation_rad,
+        needle__lps_from_start=pose(plan.needle.lps_from_start),
+        needle__end_lps=move(plan.needle.end_lps),
+        needle__arcs=arcs,
+        exemption__exit_point_lps=move(plan.exemption.exit_point_lps),
+    )
+
+
+@pytest.mark.parametrize("with_target", [False, True])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_shifted_by_a_voxel(
+    plan: Plan, lung: Any, tools: Any, axis: int, sign: int, with_target: bool
+) -> None:
+    shift = sign * lung.grid.lps_from_ijk[:3, axis]
+
+    def pose(matrix: np.ndarray) -> np.ndarray:
+        out = matrix.copy()
+        out[:3, 3] += shift
+        return out
+
+    wrong = moved(plan, tools, lambda p: p + shift, pose)
+    if with_target:
+        wrong = tools.changed(wrong, target_lps=plan.target_lps + shift)
+    found = refusals(wrong, lung)
+    assert "scope.start" in found
+    assert ("target.reached" in found) == (not with_target)
+
+
+@pytest.mark.parametrize("with_target", [False, True])
+def test_mirrored_left_right(plan: Plan, lung: Any, tools: Any, with_target: bool) -> None:
+    flip, keep_handed = np.diag([-1.0, 1, 1, 1]), np.diag([1.0, -1, 1, 1])
+    wrong = moved(plan, tools, lambda p: p * [-1, 1, 1], lambda m: flip @ m @ keep_handed, turn=-1.0)
+    if with_target:
+        wrong = tools.changed(wrong, target_lps=plan.target_lps * [-1, 1, 1])
+    found = refusals(wrong, lung)
+    assert not {"tube.tip.position", "needle.end"} & found  # the mirrored kinematics are consistent
+    assert {"scope.branches", "scope.site"} <= found
+
+
+@settings(max_examples=8)
+@given(
+    share=st.floats(0.0, 1.0), phi=st.floats(0.0, 6.3), offset=st.floats(0.0, 0.9), radius=st.floats(1.5, 4.0)
+)
+def test_vessel_put_across_the_needle(
+    plan: Plan, lung: Any, tools: Any, share: float, phi: float, offset: float, radius: float
+) -> None:
+    frames, at = tools.follow(plan.needle.lps_from_start, [_as_tuple(a) for a in plan.needle.arcs], 0.1)
+    frame = frames[int(share * (len(at) - 1))]
+    across = np.cos(phi) * frame[:3, 0] + np.sin(phi) * frame[:3, 1]
+    beside = np.cross(across, frame[:3, 2])
+    centre = frame[:3, 3] + offset * radius * beside
+
+    def edit(labels: np.ndarray, points: np.ndarray) -> None:
+        inside = tools.capsule(points, centre - 12 * across, centre + 12 * across, radius)
+        labels[inside & ((labels & structures.AIRWAY) == 0)] |= structures.VESSEL
+
+    found = refusals(plan, tools.relabelled(lung, edit))
+    assert "needle.clearance.vessel" in found
+
+
+def _as_tuple(arc: Any) -> tuple[float, float, float]:
+    return arc.length_mm, arc.roll_rad, arc.curvature_per_mm
+
+
+def blob(tools: Any, lung: Any, a: np.ndarray, b: np.ndarray, radius: float, bit: int) -> Any:
+    def edit(labels: np.ndarray, points: np.ndarray) -> None:
+        labels[tools.capsule(points, a, b, radius)] |= bit
+
+    return tools.relabelled(lung, edit)
+
+
+def test_start_inside_a_vessel(plan: Plan, lung: Any, tools: Any) -> None:
+    start = plan.needle.lps_from_start[:3, 3]
+    found = refusals(plan, blob(tools, lung, start, start + [0, 0, 1e-3], 2.0, structures.VESSEL))
+    assert {
+        "needle.containment",
+        "tube.containment",
+        "tube.clearance.vessel",
+        "needle.clearance.vessel",
+    } <= found
+
+
+@pytest.mark.parametrize("beyond_exit_mm", [0.0, 1.0, 3.0, 6.0])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_vessel_put_across_the_tube(
+    plan: Plan, lung: Any, tools: Any, beyond_exit_mm: float, side: float
+) -> None:
+    tip = plan.tube.lps_from_tip
+    back = min(plan.tube.inner_insertion_mm - plan.tube.exit.arc_length_mm - beyond_exit_mm, 7.0)
+    centre = tip[:3, 3] - back * tip[:3, 2] + side * 2.0 * tip[:3, 1]
+    crossed = blob(tools, lung, centre - 9 * tip[:3, 0], centre + 9 * tip[:3, 0], 1.5, structures.VESSEL)
+    assert "tube.clearance.vessel" in refusals(plan, crossed)
+
+
+def test_tip_that_looks_back(plan: Plan, lung: Any, tools: Any) -> None:
+    pose = plan.scope.lps_from_scope_tip @ np.diag([1.0, -1.0, -1.0, 1.0])
+    found = refusals(tools.changed(plan, scope__lps_from_scope_tip=pose), lung)
+    assert {"scope.tip.tangent", "scope.tip.forward"} <= found
+
+
+def test_needle_wholly_inside_a_vessel(plan: Plan, lung: Any, tools: Any) -> None:
+    """Nothing is near: the surface of the vessel is more than 5 mm away everywhere."""
+    a, b = plan.needle.lps_from_start[:3, 3], plan.needle.end_lps
+    big = blob(tools, lung, a, b, 9.0, structures.VESSEL)
+    found = refusals(plan, big)
+    assert {"needle.containment", "needle.clearance.vessel", "target.free"} <= found
+
+
+def test_needle_wholly_outside_the_lung(plan: Plan, lung: Any, tools: Any) -> None:
+    a, b = plan.needle.lps_from_start[:3, 3], plan.needle.end_lps
+    found = refusals(plan, blob(tools, lung, a, b, 9.0, structures.OUTSIDE))
+    assert {"needle.in_lung", "needle.clearance.outside", "target.in_lung"} <= found
+
+
+def test_one_voxel_of_vessel_beside_tube_or_needle(plan: Plan, lung: Any, tools: Any) -> None:
+    """The nearest voxel that violates the margin by little is found; the next one outwards is allowed."""
+    frames, _ = tools.follow(plan.needle.lps_from_start, [_as_tuple(a) for a in plan.needle.arcs], 0.02)
+    middle = frames[len(frames) // 2]
+    verdicts = set()
+    for aside in np.arange(0.0, 6.0, 0.5):
+        voxel = np.rint(lung.grid.ijk(middle[:3, 3] + aside * middle[:3, 0])).astype(int)
+        mask = np.zeros(lung.labels.shape, dtype=bool)
+        mask[tuple(voxel)] = True
+        distance = float(tools.brute_distance(lung, mask, frames[:, :3, 3]).min())
+        near = tools.relabelled(
+            lung, lambda labels, _, at=tuple(voxel): labels.__setitem__(at, structures.VESSEL)
+        )
+        refused = "needle.clearance.vessel" in refusals(plan, near)
+        assert refused == (distance < plan.required_clearance_mm["needle"] - 1e-3)
+        verdicts.add(refused)
+    assert verdicts == {True, False}
+
+
+def test_fissure_put_across_the_path(plan: Plan, lung: Any, tools: Any) -> None:
+    middle = 0.5 * (plan.needle.lps_from_start[:3, 3] + plan.needle.end_lps)
+    crossed = blob(tools, lung, middle - [0, 12, 0], middle + [0, 12, 0], 1.5, structures.FISSURE)
+    assert {"needle.containment", "needle.clearance.fissure"} <= refusals(plan, crossed)
+    ignoring = tools.changed(plan, fissures_are_obstacles=False)
+    assert "patient.fissures" in refusals(ignoring, crossed)
+
+
+def test_vessel_on_the_exempt_wall_is_not_exempt(plan: Plan, lung: Any, tools: Any) -> None:
+    out = plan.tube.exit.point_lps
+    found = refusals(plan, blob(tools, lung, out - [0, 2, 0], out + [0, 2, 0], 1.2, structures.VESSEL))
+    assert "tube.clearance.vessel" in found
+
+
+def test_wall_that_belongs_to_another_branch(plan: Plan, lung: Any, tools: Any) -> None:
+    out = plan.tube.exit.point_lps
+
+    def edit(labels: np.ndarray, points: np.ndarray) -> None:
+        near = tools.capsule(points, out, out + [0, 0, 1e-3], 3.0)
+        wall = near & ((labels & structures.AIRWAY) != 0) & ((labels & structures.LUMEN) == 0)
+        labels[wall] = structures.AIRWAY | (3 << structures.BRANCH_SHIFT)
+
+    assert {"tube.clearance.airway", "tube.containment"} & refusals(plan, tools.relabelled(lung, edit))
+
+
+def test_tube_that_enters_another_lumen(plan: Plan, lung: Any, tools: Any) -> None:
+    tip = plan.tube.lps_from_tip[:3, 3] - 0.8 * plan.tube.lps_from_tip[:3, 2]
+    bits = structures.AIRWAY | structures.LUMEN | (2 << structures.BRANCH_SHIFT)
+    found = refusals(plan, blob(tools, lung, tip, tip + [0, 0, 1e-3], 1.2, bits))
+    assert {"tube.one_exit", "needle.not_in_lumen", "needle.clearance.lumen"} & found
+
+
+def test_route_leaves_the_lumen(plan: Plan, lung: Any, tools: Any) -> None:
+    points = plan.scope.points_lps.copy()
+    points[20:30, 1] += 7.0
+    assert {"scope.in_lumen", "scope.on_axis", "scope.fits"} <= refusals(
+        tools.changed(plan, scope__points_lps=points), lung
+    )
+
+
+def test_route_cuts_a_corner_between_its_points(plan: Plan, lung: Any, tools: Any) -> None:
+    """All points are on the axis, but the way between two of them is not."""
+    keep = [0, 1, len(plan.scope.points_lps) - 1]
+    scope = plan.scope
+    wrong = tools.changed(
+        plan,
+        scope__points_lps=scope.points_lps[keep],
+        scope__branches=scope.branches[keep],
+        scope__lumen_radius_mm=scope.lumen_radius_mm[keep],
+    )
+    assert {"scope.connected", "scope.on_axis"} <= refusals(wrong, lung)
+
+
+def test_airway_too_narrow_for_the_scope(plan: Plan, lung: Any, tools: Any) -> None:
+    point = plan.scope.points_lps[60] + [0.0, 2.4, 0.0]
+
+    def edit(labels: np.ndarray, _: np.ndarray) -> None:
+        at = tuple(np.rint(lung.grid.ijk(point)).astype(int))
+        labels[at] &= ~np.uint16(structures.LUMEN)
+
+    assert "scope.fits" in refusals(plan, tools.relabelled(lung, edit))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"lung_key": "other"}, "patient.key"),
+        ({"patient_name": "Other"}, "patient.name"),
+        ({"sources": {"airway.nii.gz": "1" * 64}}, "patient.sources"),
+        ({"breath_hold": "expiration"}, "patient.breath_hold"),
+        ({"system_fingerprint": "0" * 64}, "system.fingerprint"),
+        ({"schema": "lungaccess-plan-0"}, "record.schema"),
+        ({"objective": "beauty"}, "costs.objective"),
+        ({"fissures_are_obstacles": False}, "patient.fissures"),
+        ({"target_lps": np.array([60.0, 0.0, 30.0])}, "target.reached"),
+        ({"target_origin": "nodule"}, "target.in_nodule"),
+        (
+            {"required_clearance_mm": {"outer_tube": 1.45, "inner_tube": 1.25, "needle": 0.9}},
+            "clearance.required.needle",
+        ),
+        (
+            {"costs": {"inverse_clearance": 1.0, "cost_map": 0.0, "length_mm": 25.0}},
+            "costs.inverse_clearance",
+        ),
+        ({"costs": {"inverse_clearance": 1.0, "length_mm": 25.0}}, "costs.names"),
+        ({"clearance_mm": {"tube": {}}}, "clearance.names"),
+        ({"clearance_mm": {"tube": {}, "needle": {"bone": 3.0}}}, "clearance.names"),
+        ({"exemption__branch": 2}, "exemption.branch"),
+        ({"exemption__needle_length_mm": 8.0}, "exemption.length"),
+        ({"exemption__needle_length_mm": -1.0}, "exemption.length.sign"),
+        ({"tube__exit__branch": 2, "exemption__branch": 2}, "tube.exit.branch"),
+        ({"tube__exit__wall_angle_rad": 1.2}, "tube.exit.angle"),
+        ({"tube__exit__arc_length_mm": 29.0}, "tube.exit.arc"),
+        ({"tube__rotation_rad": 0.8}, "tube.tip.position"),
+        ({"tube__inner_insertion_mm": 38.5}, "tube.tip.position"),
+        ({"tube__outer_insertion_mm": 21.0}, "tube.tip.position"),
+        ({"tube__outer_insertion_mm": 39.0}, "record.lengths"),
+        ({"tube__lateral_sweep_mm": 1.5}, "tube.sweep.stated_limit"),
+        ({"scope__generation": 2}, "scope.generation"),
+        ({"scope__length_mm": 30.0}, "scope.length"),
+        ({"scope__length_from_carina_mm": 30.0}, "scope.length_from_carina"),
+        ({"scope__min_lumen_margin_mm": 2.0}, "scope.margin"),
+        ({"scope__site_point": 3}, "scope.site"),
+        ({"needle__length_mm": 24.0}, "needle.length"),
+        ({"needle__accumulated_turn_rad": 0.05}, "needle.turn"),
+        ({"needle__max_angle_from_start_rad": 0.01}, "needle.angle"),
+        ({"needle__end_lps": np.array([60.0, 0.0, 30.0])}, "needle.end"),
+        ({"needle__arcs": ()}, "needle.arcs"),
+    ],
+)
+def test_one_value_edited(plan: Plan, lung: Any, tools: Any, values: dict[str, Any], expected: str) -> None:
+    assert expected in refusals(tools.changed(plan, **values), lung)
+
+
+def test_target_given_is_the_target_planned(plan: Plan, lung: Any) -> None:
+    assert "target.given" in refusals(plan, lung, target_lps=plan.target_lps + [0.0, 0.5, 0.0])
+
+
+@pytest.mark.parametrize("factor", [1.2, 3.0])
+def test_curvature_too_high(plan: Plan, lung: Any, tools: Any, system: Any, factor: float) -> None:
+    """The needle of a tighter plan, consistent in itself, ends where it says."""
+    arcs = tuple((a.length_mm, a.roll_rad, factor * a.curvature_per_mm) for a in plan.needle.arcs)
+    wrong = tools.toy_plan(lung, system, plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm, arcs)
+    assert refusals(wrong, lung) == {"needle.curvature"}
+
+
+def test_turning_limits(plan: Plan, lung: Any, tools: Any) -> None:
+    for key in ("needle.max_angle_from_start_deg", "needle.max_accumulated_turn_deg", "needle.max_length_mm"):
+        strict = override(plan.system, {key: 4.0, "name": "own"})
+        wrong = tools.changed(plan, system=strict, system_fingerprint=system_fingerprint(strict))
+        found = refusals(wrong, lung)
+        assert len(found) == 1
+        assert found <= {"needle.angle.limit", "needle.turn.limit", "needle.length.limit"}
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_roll_of_an_arc_edited(plan: Plan, lung: Any, tools: Any, n: int) -> None:
+    arcs = list(plan.needle.arcs)
+    arcs[n] = dataclasses.replace(arcs[n], roll_rad=arcs[n].roll_rad + 0.1)
+    assert "needle.end" in refusals(tools.changed(plan, needle__arcs=tuple(arcs)), lung)
+
+
+@pytest.mark.parametrize(
+    "where", ["scope__lps_from_scope_tip", "tube__lps_from_tip", "needle__lps_from_start"]
+)
+@pytest.mark.parametrize("kind", ["position", "turn", "tilt", "mirror", "scale"])
+def test_pose_edited(plan: Plan, lung: Any, tools: Any, where: str, kind: str) -> None:
+    stage, name = where.split("__")
+    pose = getattr(getattr(plan, stage), name).copy()
+    if kind == "position":
+        pose[:3, 3] += [0.02, 0.0, 0.0]
+    elif kind == "mirror":
+        pose[:3, 0] *= -1
+    elif kind == "scale":
+        pose[:3, :3] *= 1.01
+    else:
+        angle = 0.02
+        pose = tools.turned(pose, angle) if kind == "turn" else pose @ tools.arc(1e-9, angle / 1e-9)
+    assert refusals(tools.changed(plan, **{where: pose}), lung)
+
+
+def test_margin_edited(plan: Plan, lung: Any, tools: Any, system: Any) -> None:
+    thin = override(system, {"margins.segmentation_margin_mm": 0.1})
+    wrong = tools.changed(plan, system=thin, system_fingerprint=system_fingerprint(thin))
+    assert {"system.preset", "clearance.required.needle"} <= refusals(wrong, lung)
+    wrong = tools.toy_plan(lung, thin, plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm)
+    assert refusals(wrong, lung) == {"system.preset"}
+    renamed = override(thin, {"name": "own"})
+    wrong = tools.toy_plan(lung, renamed, plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm)
+    assert refusals(wrong, lung, system=system) == {"system.given"}
+    assert refusals(wrong, lung, system=renamed) == set()
+
+
+def test_exit_exemption_of_the_system_edited(plan: Plan, lung: Any, tools: Any, system: Any) -> None:
+    long = override(system, {"needle.exit_exemption_mm": 20.0})
+    wrong = tools.changed(
+        plan, system=long, system_fingerprint=system_fingerprint(long), exemption__needle_length_mm=20.0
+    )
+    assert "system.preset" in refusals(wrong, lung)
+
+
+@pytest.mark.parametrize("name", ["scope__length_mm", "needle__end_lps", "tube__lps_from_tip", "target_lps"])
+def test_not_a_number(plan: Plan, lung: Any, tools: Any, name: str) -> None:
+    for value in (np.nan, np.inf):
+        shape = np.shape(_get(plan, name))
+        wrong = tools.changed(plan, **{name: np.full(shape, value) if shape else value})
+        assert refusals(wrong, lung) == {"record.finite"}
+
+
+def _get(plan: Plan, name: str) -> Any:
+    value: Any = plan
+    for part in name.split("__"):
+        value = getattr(value, part)
+    return value
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300, 1e6])
+@pytest.mark.parametrize("name", ["scope__points_lps", "tube__rotation_rad", "needle__end_lps", "target_lps"])
+def test_absurd_numbers(plan: Plan, lung: Any, tools: Any, name: str, value: float) -> None:
+    shape = np.shape(_get(plan, name))
+    wrong = tools.changed(plan, **{name: np.full(shape, value) if shape else value})
+    assert "record.lengths" in refusals(wrong, lung)
+
+
+def test_far_away_from_everything(plan: Plan, lung: Any, tools: Any) -> None:
+    for step in (60.0, 5000.0):
+        away = [0.0, step, 0.0]
+        pose = plan.scope.lps_from_scope_tip.copy()
+        pose[:3, 3] += away
+        wrong = tools.changed(
+            plan, scope__points_lps=plan.scope.points_lps + away, scope__lps_from_scope_tip=pose
+        )
+        assert {"scope.on_axis", "scope.in_lumen", "tube.tip.position"} <= refusals(wrong, lung)
+
+
+def test_sweep_understated(plan: Plan, lung: Any, tools: Any, system: Any) -> None:
+    """4 mm of the curve leave the scope straightened: the tubes move sideways while the inner advances."""
+    outer, inner = plan.tube.outer_insertion_mm, 43.0
+    longer = tools.toy_plan(lung, system, outer, inner, ((12.0, 0.4, 0.0),))
+    sweep = _sweep_by_hand(system, outer, inner)
+    assert 0.2 < sweep < system.tubes.max_lateral_sweep_mm
+    honest = tools.changed(longer, tube__lateral_sweep_mm=sweep, tube__follow_the_leader_error_mm=sweep)
+    assert refusals(honest, lung) == set()
+    for value in (0.0, 0.7 * sweep):
+        assert "tube.sweep.stated" in refusals(tools.changed(honest, tube__lateral_sweep_mm=value), lung)
+    assert "tube.leader.stated" in refusals(tools.changed(honest, tube__follow_the_leader_error_mm=0.0), lung)
+    strict = override(system, {"tubes.max_lateral_sweep_mm": 0.5 * sweep, "name": "own"})
+    wrong = tools.changed(honest, system=strict, system_fingerprint=system_fingerprint(strict))
+    assert {"tube.sweep.limit", "tube.sweep.stated_limit"} <= refusals(wrong, lung)
+
+
+def _sweep_by_hand(system: Any, outer: float, inner: float) -> float:
+    """Largest distance to the final shape while both tubes, then the inner one, advance."""
+    tubes = system.tubes
+    stiff = [
+        t.youngs_modulus_gpa * (t.outer_diameter_mm**4 - t.inner_diameter_mm**4)
+        for t in (tubes.inner, tubes.outer)
+    ]
+    share = stiff[0] / sum(stiff)
+
+    def shape(e2: float, e1: float) -> np.ndarray:
+        s = np.arange(0.0, e1 + 1e-9, 0.02)
+        curved = s >= e1 - tubes.inner.curved_length_mm
+        k = tubes.inner.precurvature_per_mm * np.where(s < e2, share, 1.0) * curved
+        heading = np.cumsum(k) * 0.02
+        return np.cumsum(np.stack([np.sin(heading), np.cos(heading)], axis=1), axis=0) * 0.02
+
+    final = shape(outer, inner)
+    steps = [(e, e) for e in np.linspace(5.0, outer, 8)] + [(outer, e) for e in np.linspace(outer, inner, 24)]
+    worst = 0.0
+    for e2, e1 in steps:
+        points = shape(e2, e1)[::20]
+        worst = max(worst, float(np.sqrt(((points[:, None] - final[None]) ** 2).sum(-1)).min(axis=1).max()))
+    return worst
+
+
+def test_tubes_beyond_their_limits(plan: Plan, lung: Any, tools: Any) -> None:
+    for key, value, name in (
+        ("tubes.max_extension_mm", 37.0, "tube.extension"),
+        ("tubes.inner.length_mm", 650.0, "tube.protrusion"),
+        ("tubes.min_wall_angle_deg", 40.0, "tube.exit.angle.limit"),
+    ):
+        own = override(plan.system, {key: value, "name": "own"})
+        assert name in refusals(
+            tools.changed(plan, system=own, system_fingerprint=system_fingerprint(own)), lung
+        )
+
+
+def test_clearance_overstated(plan: Plan, lung: Any, tools: Any) -> None:
+    for stage in ("tube", "needle"):
+        for name in plan.clearance_mm[stage]:
+            stated = {key: dict(value) for key, value in plan.clearance_mm.items()}
+            true = stated[stage][name]
+            stated[stage][name] = true + 0.1 if true < 19.0 else 0.5
+            found = refusals(tools.changed(plan, clearance_mm=stated), lung)
+            assert any(item.startswith(f"{stage}.clearance.{name}.stated") for item in found)
+
+
+def test_cost_map(plan: Plan, lung: Any, tools: Any) -> None:
+    from types import SimpleNamespace
+
+    cost = np.full(lung.labels.shape, 0.25, dtype=np.float32)
+    mapped = SimpleNamespace(**{**vars(lung), "cost": Volume(grid=lung.grid, array=cost)})
+    assert refusals(plan, mapped) == {"costs.cost_map"}
+    costs = {**plan.costs, "cost_map": 0.25 * plan.needle.length_mm}
+    assert refusals(tools.changed(plan, costs=costs), mapped) == set()
+
+
+def test_nodule_as_target(plan: Plan, lung: Any, tools: Any) -> None:
+    from types import SimpleNamespace
+
+    points = lung.grid.lps(np.stack(np.meshgrid(*map(np.arange, lung.labels.shape), indexing="ij"), axis=-1))
+    ball = np.linalg.norm(points - plan.target_lps, axis=-1) < 4.0
+    with_nodule = SimpleNamespace(**{**vars(lung), "nodules": Volume(grid=lung.grid, array=ball)})
+    aimed = tools.changed(plan, target_origin="nodule")
+    assert refusals(aimed, with_nodule) == set()
+    away = tools.changed(aimed, target_lps=plan.target_lps + [0.0, 6.0, 0.0])
+    assert "target.in_nodule" in refusals(away, with_nodule)
+
+
+PROVENANCE = {"timing", "seed", "iterations", "digest", "system"}
+ALLOWED_TO_BE_CAREFUL = {"lateral_sweep_mm", "follow_the_leader_error_mm"}
+
+
+def numbers(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Paths of all numbers in a JSON value that a user's safety hangs on."""
+    if isinstance(value, dict):
+        return [
+            p
+            for k, v in value.items()
+            if k not in PROVENANCE | ALLOWED_TO_BE_CAREFUL
+            for p in numbers(v, (*path, k))
+        ]
+    if isinstance(value, list):
+        return [p for n, v in enumerate(value) for p in numbers(v, (*path, n))]
+    return [path] if isinstance(value, float | int) and not isinstance(value, bool) else []
+
+
+@settings(max_examples=25)
+@given(data=st.data())
+def test_any_number_edited_is_refused(plan: Plan, lung: Any, data: st.DataObject) -> None:
+    """Pick a number anywhere in the file, change it by a little, make the digest fit: refused."""
+    content = json.loads(plan.to_json())
+    paths = numbers(content)
+    group = data.draw(st.sampled_from(sorted({p[:2] for p in paths}, key=str)))
+    path = data.draw(st.sampled_from([p for p in paths if p[:2] == group]))
+    inner = content
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] += 1 if isinstance(inner[path[-1]], int) else data.draw(st.sampled_from([0.2, 0.5]))
+    content["digest"] = _digest(content)
+    try:
+        wrong = Plan.from_json(json.dumps(content))
+    except Exception as error:
+        raise AssertionError(f"{path} made the file unreadable: {error}") from error
+    careful = path[0] == "clearance_mm" and inner[path[-1]] > 20.0
+    assert careful or not check(wrong, lung).accepted, path
+
+
+def _digest(content: dict[str, Any]) -> str:
+    import hashlib
+
+    kept = {k: v for k, v in content.items() if k not in ("timing", "digest")}
+    text = json.dumps(kept, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def test_preset_is_compared_by_name(plan: Plan) -> None:
+    assert plan.system == load_system(plan.system.name)

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung as Lung
     from lungaccess.atlas import Atlas as Atlas
     from lungaccess.atlas import build_atlas as build_atlas
-    from lungaccess.check import check as check
+    from lungaccess.checking import check as check
     from lungaccess.noplan import NoPlan as NoPlan
     from lungaccess.patients import load_patient as load_patient
-    from lungaccess.plan import Plan as Plan
+    from lungaccess.plans import Plan as Plan
     from lungaccess.planner import plan as plan
     from lungaccess.system import System as System
     from lungaccess.system import load_system as load_system
@@ -41,11 +41,11 @@ _HOME = {
     "Lung": "anatomy.lung",
     "LungaccessError": "anatomy.errors",
     "NoPlan": "lungaccess.noplan",
-    "Plan": "lungaccess.plan",
+    "Plan": "lungaccess.plans",
     "System": "lungaccess.system",
     "Target": "lungaccess.target",
     "build_atlas": "lungaccess.atlas",
-    "check": "lungaccess.check",
+    "check": "lungaccess.checking",
     "load_patient": "lungaccess.patients",
     "load_system": "lungaccess.system",
     "plan": "lungaccess.planner",

@@ -13,7 +13,7 @@ from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import BITS
 from lungaccess import costs
-from lungaccess.plan import (
+from lungaccess.plans import (
     Exemption,
     NeedleArc,
     NeedlePath,

@@ -195,8 +195,8 @@ def check(plan: Path, patient: Path, *, system: str | None = None, cache: Path |
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
-    from lungaccess.check import check as judge
-    from lungaccess.plan import Plan
+    from lungaccess.checking import check as judge
+    from lungaccess.plans import Plan
 
     stored = Plan.load(plan)
     device = None if system is None else _system(system, None)
@@ -291,14 +291,18 @@ def _first_reachable_nodule(lung: Lung, device: System, budget: float, seed: int
 
 def _plan_and_report(lung: Lung, request: SearchRequest, out: Path) -> int:
     """Search, check, write everything to `out`, show it, and return the exit code."""
-    from lungaccess.check import check as judge
+    from lungaccess.checking import check as judge
     from lungaccess.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
     from lungaccess.searching import run_search
+    from lungaccess.target import resolve_target
 
-    found, history = run_search(lung, request, terminal.SearchDisplay(request.time_s, request.iterations))
+    target = resolve_target(lung, request.target, request.nodule)
+    found, history = run_search(
+        lung, target, request, terminal.SearchDisplay(request.time_s, request.iterations)
+    )
     found.save(out / "plan.json")
     with console.status("checking and drawing the plan"):
-        report = judge(found, lung)
+        report = judge(found, lung, system=request.system, target_lps=target.lps_mm)
         overview_png(found, lung, out / "overview.png")
         tree_png(lung, out / "tree.png")
         cost_over_time_csv(history, out / "cost_over_time.csv")

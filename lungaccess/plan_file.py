@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
 import os
 import re
-import tempfile
 import types
 import typing
 from collections.abc import Mapping
@@ -18,9 +16,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from anatomy.errors import FileError, PlanFileError, SettingsError
+from anatomy.errors import PlanFileError, SettingsError
 from anatomy.settings import parse, to_mapping
-from lungaccess.plan import SCHEMA, Plan
+from lungaccess.plans import SCHEMA, Plan
 from lungaccess.system import System
 
 P = TypeVar("P", bound=Plan)
@@ -71,22 +69,11 @@ def from_json(cls: type[P], text: str) -> P:
 
 def save(plan: Plan, path: str | os.PathLike[str]) -> None:
     """Write `plan` beside `path` under a temporary name, then put it in place."""
-    target = Path(path)
+    from anatomy.io.files import atomic_write
+
     text = to_json(plan)
-    temporary = ""
-    try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        with os.fdopen(handle, "w", encoding="ascii", newline="\n") as file:
-            file.write(text)
-        os.replace(temporary, target)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise FileError(
-            f"The plan {target} cannot be written ({error.strerror})",
-            expected="a writable folder",
-            remedy="Choose another output folder",
-        ) from error
+    with atomic_write(os.fspath(path)) as temporary:
+        temporary.write_text(text, encoding="ascii", newline="\n")
 
 
 def load(cls: type[P], path: str | os.PathLike[str]) -> P:

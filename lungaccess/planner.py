@@ -12,7 +12,7 @@ from anatomy.lung import Lung
 from lungaccess.assemble import Task, assemble
 from lungaccess.atlas import Atlas, build_atlas
 from lungaccess.costs import require_objective
-from lungaccess.plan import Plan
+from lungaccess.plans import Plan
 from lungaccess.searches import AtlasSearch, KuntzSearch, Step
 from lungaccess.system import System
 from lungaccess.target import Target

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.plan import Plan
+    from lungaccess.plans import Plan
     from lungaccess.planner import ProgressEvent
     from lungaccess.report import CostPoint
     from lungaccess.system import System
@@ -90,7 +90,9 @@ class CostHistory:
         self.points.append(self._point(elapsed_s=elapsed_s, iteration=self._iteration, best_cost=self._best))
 
 
-def run_search(lung: Lung, request: SearchRequest, display: Display) -> tuple[Plan, list[CostPoint]]:
+def run_search(
+    lung: Lung, target: Target, request: SearchRequest, display: Display
+) -> tuple[Plan, list[CostPoint]]:
     """Search until the budget is spent and return the best plan and the history of its cost.
 
     An interruption from the keyboard ends the search early; the best plan so far is kept.
@@ -99,10 +101,7 @@ def run_search(lung: Lung, request: SearchRequest, display: Display) -> tuple[Pl
     ------
     lungaccess.noplan.NoPlan
         If no plan was found.
-    anatomy.errors.TargetError
-        If the target is not where a target can be.
     """
-    target = _resolve(lung, request.target, request.nodule)
     history = CostHistory(display)
     best: Plan | None = None
     with display:
@@ -132,12 +131,6 @@ def _planner() -> Callable[..., Iterator[Plan]]:
     from lungaccess.planner import plan
 
     return plan
-
-
-def _resolve(lung: Lung, text: str | None, nodule: int | None) -> Target:
-    from lungaccess.target import resolve_target
-
-    return resolve_target(lung, text, nodule)
 
 
 def _ended_silently() -> Exception:

@@ -16,9 +16,9 @@ from rich.table import Table
 if TYPE_CHECKING:
     from anatomy.errors import LungaccessError
     from anatomy.lung import Lung
-    from lungaccess.check import CheckReport
+    from lungaccess.checking import CheckReport
     from lungaccess.noplan import NoPlan
-    from lungaccess.plan import Plan
+    from lungaccess.plans import Plan
     from lungaccess.system import System
 
 console = Console()

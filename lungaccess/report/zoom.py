@@ -15,7 +15,7 @@ from lungaccess.report.layers import Layers
 from lungaccess.report.views import View, plane_view
 
 if TYPE_CHECKING:
-    from lungaccess.plan import Plan
+    from lungaccess.plans import Plan
 
 Float = NDArray[np.float64]
 

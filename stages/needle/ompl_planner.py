@@ -205,14 +205,22 @@ class NeedleProblem:
         self.planner.query = Query(
             np.asarray(lps_from_start), np.array(target, dtype=np.float64), branch, seed, iterations
         )
-        self.setup.clear()
-        self.setup.clearStartStates()
+        definition = base.ProblemDefinition(self._si)
         start = self._si.allocState()
         write_state(start, lps_from_start)
-        self.setup.setStartState(start)
-        self.setup.setGoal(NeedleGoal(self._si, target))
-        self.setup.solve(min(time_s, 1e6))
+        definition.addStartState(start)
+        definition.setGoal(NeedleGoal(self._si, target))
+        self.planner.clear()
+        self.planner.setProblemDefinition(definition)
+        # Not through SimpleSetup.solve, which sets everything up again for each query.
+        self.planner.solve(_termination(time_s))
         return self.planner.path
+
+
+def _termination(time_s: float) -> Any:
+    if math.isinf(time_s):
+        return base.plannerNonTerminatingCondition()
+    return base.timedPlannerTerminationCondition(time_s)
 
 
 def _bounds_of(space: NeedleSpace) -> Any:

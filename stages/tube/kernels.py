@@ -67,7 +67,7 @@ EXACT_REACH_MM = 0.5
 FINE_STEP_MM = 0.05
 WALL_ZONE_MM = 1.0
 OUT_OF_LUMEN_MM = 0.02
-NORMAL_RADIUS_MM = 1.5
+NORMAL_RADIUS_MM = 2.5
 BISECTIONS = 12
 SWEEP_SAMPLES = 24
 
@@ -219,10 +219,12 @@ def _lumen_step(scene, trace, x, y, z, radius, required):
     if depth >= radius:
         trace[HAZARD] = ACCEPTED
         return depth - 0.5 * radius
-    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY_BIT, -1, required)
-    if distance < required:
+    reach = required + EXACT_REACH_MM
+    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY_BIT, -1, reach)
+    if distance - required < FINE_STEP_MM:
         trace[HAZARD] = _reason(label)
-    return max(0.5 * depth, FINE_STEP_MM)
+        return max(0.5 * depth, FINE_STEP_MM)
+    return max(min(0.5 * depth, distance - required), FINE_STEP_MM)
 
 
 @numba.njit(cache=True)

@@ -13,7 +13,7 @@ import pytest
 from scipy import ndimage
 
 from anatomy.grid import Grid, Volume
-from lungaccess.plan import (
+from lungaccess.plans import (
     Exemption,
     NeedleArc,
     NeedlePath,

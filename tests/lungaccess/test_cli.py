@@ -17,7 +17,7 @@ import pytest
 from anatomy.errors import AnatomyError, FrameError
 from lungaccess import cli, searching, terminal
 from lungaccess.noplan import NoPlan
-from lungaccess.plan import Plan
+from lungaccess.plans import Plan
 
 WRITTEN = {"plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv"}
 
@@ -63,7 +63,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
                 "No plan", reasons={"the tube comes too near a vessel": 12}, advice="A thinner scope"
             )
 
-    def judge(plan: Plan, lung: Any, system: Any = None) -> Any:
+    def judge(plan: Plan, lung: Any, system: Any = None, target_lps: Any = None) -> Any:
         seen["judged_with"] = system
         bad = SimpleNamespace(
             name="needle.clearance.vessel", ok=seen["accepted"], value=0.4, limit=1.0, unit="mm", detail="why"
@@ -72,8 +72,11 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
 
     monkeypatch.setattr(cli, "_load", lambda patient, cache: toy_lung)
     monkeypatch.setattr(searching, "_planner", lambda: search)
-    monkeypatch.setattr(searching, "_resolve", lambda lung, text, nodule: (text, nodule))
-    monkeypatch.setattr(import_module("lungaccess.check"), "check", judge)
+    monkeypatch.setattr(
+        "lungaccess.target.resolve_target",
+        lambda lung, text, nodule: SimpleNamespace(named=(text, nodule), lps_mm=toy_plan.target_lps),
+    )
+    monkeypatch.setattr(import_module("lungaccess.checking"), "check", judge)
     return seen
 
 
@@ -204,7 +207,7 @@ def test_targets_are_understood(
     words: list[str], expected: Any, toy_commands: dict[str, Any], tmp_path: Path
 ) -> None:
     cli.main(["plan", "toy", *words, "--out", str(tmp_path)])
-    assert toy_commands["target"] == expected
+    assert toy_commands["target"].named == expected
 
 
 @pytest.mark.usefixtures("no_pictures")

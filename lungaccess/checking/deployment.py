@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from anatomy import structures
 from anatomy.grid import Float
-from lungaccess.check import shapes
-from lungaccess.check.findings import Findings
-from lungaccess.check.poses import POSITION_TOLERANCE_MM, check_rigid, check_same_pose
-from lungaccess.check.shapes import Curve
-from lungaccess.check.space import (
+from lungaccess.checking import shapes
+from lungaccess.checking.findings import Findings
+from lungaccess.checking.poses import POSITION_TOLERANCE_MM, check_rigid, check_same_pose
+from lungaccess.checking.shapes import Curve
+from lungaccess.checking.space import (
     Boxes,
     Select,
     airway_except,
@@ -24,7 +24,7 @@ from lungaccess.check.space import (
     region_around,
     segment_clearance_mm,
 )
-from lungaccess.plan import Plan
+from lungaccess.plans import Plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -35,7 +35,7 @@ CORNER_MM = 0.1
 """An axis that leaves the lumen for less than this cuts the corner of a voxel: not yet an exit."""
 
 WALL_ANGLE_TOLERANCE_RAD = 0.05
-NORMAL_RADIUS_MM = 1.5
+NORMAL_RADIUS_MM = 2.5
 WALL_ZONE_MM = 1.0
 """Behind the exit the axis may cross corners of lumen voxels of the same branch for this length."""
 

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anatomy import structures
-from lungaccess.check import shapes
-from lungaccess.check.poses import angle_between
-from lungaccess.check.space import Boxes, has, labels_at, not_lumen, region_around, segment_clearance_mm
+from lungaccess.checking import shapes
+from lungaccess.checking.poses import angle_between
+from lungaccess.checking.space import Boxes, has, labels_at, not_lumen, region_around, segment_clearance_mm
 
 ARC = st.tuples(st.floats(0.01, 20.0), st.floats(-6.3, 6.3), st.floats(0.0, 0.05))
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lungaccess.check.deployment import check_deployment
-from lungaccess.check.findings import CheckReport, Findings
-from lungaccess.check.record import check_record
-from lungaccess.check.route import check_route
-from lungaccess.check.steering import check_needle
-from lungaccess.plan import Plan
+from lungaccess.checking.deployment import check_deployment
+from lungaccess.checking.findings import CheckReport, Findings
+from lungaccess.checking.record import check_record
+from lungaccess.checking.route import check_route
+from lungaccess.checking.steering import check_needle
+from lungaccess.plans import Plan
 from lungaccess.system import System
 
 if TYPE_CHECKING:

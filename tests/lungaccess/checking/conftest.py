@@ -13,7 +13,7 @@ import pytest
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume, transform_points
-from lungaccess.plan import Exemption, NeedleArc, NeedlePath, Plan, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans import Exemption, NeedleArc, NeedlePath, Plan, ScopeRoute, TubeDeployment, WallExit
 from lungaccess.system import System, load_system, system_fingerprint
 
 SPACING_MM = (1.0, 0.9, 1.1)

@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 
 from anatomy import structures
 from anatomy.grid import Float
-from lungaccess.check.findings import Findings
-from lungaccess.check.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
-from lungaccess.check.shapes import distance_to_polyline
-from lungaccess.check.space import Boxes, labels_at, not_lumen, region_around
-from lungaccess.plan import Plan, ScopeRoute
+from lungaccess.checking.findings import Findings
+from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
+from lungaccess.checking.shapes import distance_to_polyline
+from lungaccess.checking.space import Boxes, labels_at, not_lumen, region_around
+from lungaccess.plans import Plan, ScopeRoute
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree

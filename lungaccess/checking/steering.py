@@ -9,17 +9,17 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.grid import Float
-from lungaccess.check.deployment import CLEARANCE_TOLERANCE_MM, REACH_MM, SPARE, check_stated_clearance
-from lungaccess.check.findings import Findings
-from lungaccess.check.poses import (
+from lungaccess.checking.deployment import CLEARANCE_TOLERANCE_MM, REACH_MM, SPARE, check_stated_clearance
+from lungaccess.checking.findings import Findings
+from lungaccess.checking.poses import (
     ANGLE_TOLERANCE_RAD,
     POSITION_TOLERANCE_MM,
     angle_between,
     check_rigid,
     check_same_pose,
 )
-from lungaccess.check.shapes import TINY_MM, Curve, Piece, cut_at, integrate
-from lungaccess.check.space import (
+from lungaccess.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
+from lungaccess.checking.space import (
     Boxes,
     Region,
     Select,
@@ -30,7 +30,7 @@ from lungaccess.check.space import (
     region_around,
     segment_clearance_mm,
 )
-from lungaccess.plan import Plan
+from lungaccess.plans import Plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

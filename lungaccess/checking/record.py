@@ -12,8 +12,8 @@ import numpy as np
 from anatomy.errors import LungaccessError
 from anatomy.grid import Float
 from anatomy.settings import to_mapping
-from lungaccess.check.findings import Findings
-from lungaccess.plan import SCHEMA, Plan
+from lungaccess.checking.findings import Findings
+from lungaccess.plans import SCHEMA, Plan
 from lungaccess.system import System, load_system, preset_names, system_fingerprint
 
 if TYPE_CHECKING:

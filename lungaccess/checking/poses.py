@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.grid import Float
-from lungaccess.check.findings import Findings
+from lungaccess.checking.findings import Findings
 
 POSITION_TOLERANCE_MM = 1e-3
 ANGLE_TOLERANCE_RAD = 1e-4

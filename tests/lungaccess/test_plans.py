@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from anatomy.errors import FileError, PlanFileError
-from lungaccess.plan import (
+from lungaccess.plans import (
     SCHEMA,
     Exemption,
     NeedleArc,

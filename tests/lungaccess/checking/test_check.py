@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from lungaccess.check import check
-from lungaccess.plan import Plan
+from lungaccess.checking import check
+from lungaccess.plans import Plan
 
 
 def test_the_plan_made_by_hand_is_accepted(plan: Plan, lung: Any, system: Any) -> None:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from anatomy import structures
 from anatomy.grid import Volume
 from anatomy.settings import override
-from lungaccess.check import check
-from lungaccess.plan import Plan
+from lungaccess.checking import check
+from lungaccess.plans import Plan
 from lungaccess.system import load_system, system_fingerprint
 
 

@@ -36,7 +36,10 @@ def _main_reason(search: AtlasSearch) -> str:
         return "the tubes cannot leave the airway safely from any site"
     if not len(search.in_workspace):
         return "the target lies outside the needle's workspace for every deployment"
-    return "every path tried from a deployment that could reach the target is blocked"
+    blocked = search.desk.blocked.copy()
+    del blocked["nothing"], blocked["the needle's limits"]
+    most = f", mostly by {blocked.most_common(1)[0][0]}" if blocked else ""
+    return f"every path tried from a deployment that could reach the target is blocked{most}"
 
 
 def _reasons(search: AtlasSearch) -> dict[str, int]:

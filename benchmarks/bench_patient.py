@@ -1,0 +1,105 @@
+"""From a synthetic patient to a plan: time and memory of every step, on the small and the adult patient."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import lungaccess as la
+from anatomy.build import build_lung
+from anatomy.phantom import phantom
+from anatomy.store import open_lung
+from lungaccess.target import point_target
+from stages.needle.space import needle_space, workspace_lengths
+
+SYSTEM = "ultrathin"
+SEED = 3
+
+
+class Anatomy:
+    """Images to lung, and lung from the cache."""
+
+    params = ("small", "adult")
+    param_names = ("size",)
+    timeout = 300
+
+    def setup(self, size: str) -> None:
+        """Make the patient once and fill a cache."""
+        self.images = phantom(seed=SEED, size=size).images
+        self.cache = Path(tempfile.mkdtemp())
+        open_lung(dict(self.images.sources), lambda: self.images, cache=self.cache)
+
+    def teardown(self, size: str) -> None:
+        """Empty the cache."""
+        shutil.rmtree(self.cache)
+
+    def time_phantom(self, size: str) -> None:
+        """Synthetic patient."""
+        phantom(seed=SEED, size=size)
+
+    def time_build(self, size: str) -> None:
+        """Tree, labels, septum and clearance fields."""
+        build_lung(self.images)
+
+    def time_cached(self, size: str) -> None:
+        """The same from the cache."""
+        open_lung(dict(self.images.sources), lambda: self.images, cache=self.cache)
+
+    def peakmem_build(self, size: str) -> None:
+        """Peak memory of the build."""
+        build_lung(self.images)
+
+
+class Planning:
+    """Atlas, first plan, check, and the two scans that a query consists of."""
+
+    timeout = 300
+
+    def setup_cache(self) -> Any:
+        """Find a target that can be reached."""
+        lung = build_lung(phantom(seed=SEED, size="small").images)
+        return lung.targets_lps[0].tolist()
+
+    def setup(self, target: list[float]) -> None:
+        """Make lung, atlas and plan."""
+        self.lung = build_lung(phantom(seed=SEED, size="small").images)
+        self.system = la.load_system(SYSTEM)
+        self.atlas = la.build_atlas(self.lung, self.system)
+        self.target = point_target(self.lung, np.array(target))
+        self.found = next(self._plans())
+        self.space = needle_space(
+            self.lung, self.system.needle, self.system.margins, with_fissures=self.atlas.with_fissures
+        )
+
+    def _plans(self) -> Any:
+        return la.plan(self.lung, self.system, self.target, atlas=self.atlas)
+
+    def time_atlas(self, target: list[float]) -> None:
+        """Enumerate sites and deployments."""
+        la.build_atlas(self.lung, self.system)
+
+    def track_atlas_entries(self, target: list[float]) -> int:
+        """Accepted deployments."""
+        return self.atlas.deployments.count
+
+    def time_first_plan(self, target: list[float]) -> None:
+        """Query the atlas until the first plan."""
+        next(self._plans())
+
+    def time_500_iterations(self, target: list[float]) -> None:
+        """Improve a plan."""
+        for _ in la.plan(self.lung, self.system, self.target, atlas=self.atlas, iterations=500):
+            pass
+
+    def time_workspace_scan(self, target: list[float]) -> None:
+        """Test every deployment for the target."""
+        entries = self.atlas.deployments
+        workspace_lengths(self.space, entries.positions, entries.tangents, self.target.lps_mm)
+
+    def time_check(self, target: list[float]) -> None:
+        """Judge a plan."""
+        la.check(self.found, self.lung)

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
-from anatomy.fields import DistanceField, UInt16, corner_geometry, distance_corners, distance_field
+from anatomy.fields import (
+    MAX_STORED,
+    DistanceField,
+    UInt16,
+    corner_geometry,
+    distance_corners,
+    distance_field,
+)
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
@@ -22,10 +29,13 @@ from anatomy.sides import septum
 Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
 
-FORMAT = 1
+FORMAT = 2
 """Version of the processing: raise it when the same images give another lung."""
 
 PAD_VOXELS = 2
+
+NEIGHBOURS = 8
+"""Centreline points that are looked at to find the branch of an airway voxel."""
 
 
 def lung_key(sources: Mapping[str, str]) -> str:
@@ -35,7 +45,7 @@ def lung_key(sources: Mapping[str, str]) -> str:
 
 
 class WorkingBox:
-    """The box of all tissue plus a border, and how to cut images to it."""
+    """The box of the lungs and airways plus a border, and how to cut images to it."""
 
     def __init__(self, images: PatientImages) -> None:
         tissue = images.lung.array | images.lumen.array
@@ -153,6 +163,7 @@ def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: 
         inside |= box.cut(images.nodules.array)
     labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
     labels[~inside] = structures.OUTSIDE
+    _close_border(labels)
     labels[_septum(lung, airway, box.grid, warnings)] |= structures.OUTSIDE
     labels[vessels] |= structures.VESSEL
     if images.fissures is not None:
@@ -160,6 +171,13 @@ def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: 
         labels[fissures] |= structures.FISSURE
     _label_airway(labels, airway, lumen, tree, box.grid)
     return labels
+
+
+def _close_border(labels: UInt16) -> None:
+    """Make the outermost voxels OUTSIDE: a vessel or nodule may run on beyond the grid."""
+    for axis in range(3):
+        layers = np.moveaxis(labels, axis, 0)
+        layers[[0, -1]] |= structures.OUTSIDE
 
 
 def _septum(lung: Mask, airway: Mask, grid: Grid, warnings: list[str]) -> Mask:
@@ -177,7 +195,7 @@ def _septum(lung: Mask, airway: Mask, grid: Grid, warnings: list[str]) -> Mask:
 
 
 def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> None:
-    """Set AIRWAY, LUMEN and the branch whose surface is nearest."""
+    """Set AIRWAY, LUMEN and, of the branches nearest by their centreline, the one nearest by its surface."""
     from scipy.spatial import cKDTree
 
     if tree.n_branches > structures.MAX_BRANCHES:
@@ -187,7 +205,7 @@ def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, g
             remedy="Remove noise from the airway mask",
         )
     voxels = np.argwhere(airway)
-    neighbours = min(8, tree.n_points)
+    neighbours = min(NEIGHBOURS, tree.n_points)
     distance, index = cKDTree(tree.points_lps).query(grid.lps(voxels), k=neighbours)
     distance, index = distance.reshape(len(voxels), -1), index.reshape(len(voxels), -1)
     nearest = np.argmin(distance - tree.radius_mm[index], axis=1)
@@ -202,15 +220,13 @@ def _field_arrays(
     labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress
 ) -> Iterator[tuple[str, UInt16]]:
     """Yield the clearance fields one after the other; the unions are minima of the parts."""
-    union: UInt16 | None = None
-    names = ["airway", "vessel", "pleura"]
-    for name in names:
+    shape = tuple(n + 1 for n in grid.shape)
+    union: UInt16 = np.full(shape, MAX_STORED, dtype=np.uint16, order="F")
+    for name in ("airway", "vessel", "pleura"):
         tell(f"clearance to {name}")
         corners = distance_corners((labels & structures.FIELD_BITS[name]) != 0, grid.spacing_mm)
-        union = corners.copy(order="F") if union is None else np.minimum(union, corners, out=union)
+        np.minimum(union, corners, out=union)
         yield name, corners
-    if union is None:
-        return
     yield "obstacle", union
     if has_fissures:
         tell("clearance to fissure")
@@ -219,9 +235,7 @@ def _field_arrays(
         yield "obstacle_fissure", np.minimum(union, corners)
 
 
-def _lumen_depth(
-    lumen: Volume, keep: Callable[[str, NDArray[Any]], NDArray[Any]]
-) -> DistanceField:
+def _lumen_depth(lumen: Volume, keep: Callable[[str, NDArray[Any]], NDArray[Any]]) -> DistanceField:
     """Make the field of the depth inside the lumen, on the lumen's own box."""
     low, high = _bounds(lumen.array)
     grid = lumen.grid.crop(low - 1, high + 2)

@@ -19,6 +19,9 @@ from anatomy.kernels import field as kernel
 UInt16 = NDArray[np.uint16]
 MAX_STORED = np.iinfo(np.uint16).max
 
+ROUNDING_MM = 2e-5
+FLOAT32_ROUNDING = 2.0**-24
+
 
 def corner_geometry(grid: Grid) -> Float:
     """Return the `(3, 5)` array that kernels use to find a point in the corner lattice of `grid`."""
@@ -84,7 +87,9 @@ def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike) -> UInt16:
         return np.asfortranarray(np.full(free.shape, MAX_STORED, dtype=np.uint16))
     np.logical_not(free, out=free)
     distance: NDArray[Any] = edt.edt(free, anisotropy=spacing, order="F", black_border=False, parallel=2)
-    distance -= kernel.ROUNDING_MM
+    # Never too long: the transform adds up float32 voxel sizes, one rounding a voxel, half of it on average.
+    distance *= 1.0 - (max(free.shape) + 16) * FLOAT32_ROUNDING
+    distance -= ROUNDING_MM
     distance *= kernel.UNITS_PER_MM
     np.clip(distance, 0, MAX_STORED, out=distance)
     return distance.astype(np.uint16, order="F")

@@ -13,6 +13,7 @@ from anatomy.errors import FrameError, GridMismatchError
 Float = NDArray[np.float64]
 
 ORTHONORMAL_TOLERANCE = 1e-4
+AFFINE_TOLERANCE = 1e-9
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -42,7 +43,7 @@ class Grid:
     Raises
     ------
     FrameError
-        If the matrix is not finite, sheared, mirrored or of zero size.
+        If the matrix is not finite, not affine, sheared, mirrored or of zero size.
     """
 
     shape: tuple[int, int, int]
@@ -55,6 +56,12 @@ class Grid:
                 "A grid matrix is not a finite 4x4 matrix",
                 expected="lps_from_ijk, which maps voxel indices to LPS mm",
                 remedy="Check the image header",
+            )
+        if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > AFFINE_TOLERANCE:
+            raise FrameError(
+                f"The last row of a grid matrix is {matrix[3].tolist()}",
+                expected="[0, 0, 0, 1]",
+                remedy="The matrix may be transposed: its last column holds the position of the first voxel",
             )
         columns = matrix[:3, :3]
         spacing = np.linalg.norm(columns, axis=0)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
+from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Float, Grid, Volume, read_only
 from anatomy.kernels import field as kernel
@@ -46,6 +48,11 @@ class Lung:
         SHA-256 of every input file.
     warnings : tuple of str
         What was assumed or repaired on the way in.
+
+    Raises
+    ------
+    GridMismatchError
+        If the labels or a field do not fit the grid.
     """
 
     name: str
@@ -65,14 +72,23 @@ class Lung:
     warnings: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        corners = tuple(n + 1 for n in self.grid.shape)
+        wrong = [name for name, field in self.fields.items() if field.corners.shape != corners]
+        if self.labels.shape != self.grid.shape or wrong:
+            raise GridMismatchError(
+                f"The {wrong[0] + ' field' if wrong else 'labels'} of {self.name} do not fit the grid",
+                expected=f"labels of the shape {self.grid.shape}, fields of {corners}",
+            )
         object.__setattr__(self, "labels", read_only(np.asarray(self.labels)))
+        object.__setattr__(self, "fields", MappingProxyType(dict(self.fields)))
+        object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
     @property
     def has_fissures(self) -> bool:
         """Whether a fissure mask came with the patient."""
         return "fissure" in self.fields
 
-    @property
+    @cached_property
     def geometry(self) -> Float:
         """The `(3, 5)` array that maps LPS mm to voxel corners, for kernels."""
         return corner_geometry(self.grid)

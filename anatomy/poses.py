@@ -7,11 +7,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.errors import FrameError
 from anatomy.grid import Float, read_only
 
 ANTERIOR = np.array([0.0, -1.0, 0.0])
 SUPERIOR = np.array([0.0, 0.0, 1.0])
 NEARLY_PARALLEL = 0.9
+SHORTEST = 1e-9
 
 
 def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = None) -> Float:
@@ -29,20 +31,33 @@ def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = 
     Returns
     -------
     (4, 4) float64, read-only
+
+    Raises
+    ------
+    FrameError
+        If a direction has no length or both are parallel.
     """
-    z = np.asarray(forward, dtype=np.float64)
-    z = z / np.linalg.norm(z)
+    z = _unit(np.asarray(forward, dtype=np.float64), "forward")
     if sideways is None:
         sideways = ANTERIOR if abs(float(z @ ANTERIOR)) < NEARLY_PARALLEL else SUPERIOR
     x = np.asarray(sideways, dtype=np.float64)
-    x = x - (x @ z) * z
-    x = x / np.linalg.norm(x)
+    x = _unit(x - (x @ z) * z, "sideways")
     frame = np.eye(4)
     frame[:3, 0] = x
     frame[:3, 1] = np.cross(z, x)
     frame[:3, 2] = z
     frame[:3, 3] = point_lps
     return read_only(frame)
+
+
+def _unit(vector: Float, name: str) -> Float:
+    length = float(np.linalg.norm(vector))
+    if not length > SHORTEST:
+        raise FrameError(
+            f"A pose has no {name} direction: {vector.tolist()}",
+            expected="two directions with a length, not parallel to each other",
+        )
+    return vector / length
 
 
 def bending_directions(frame: Float, rotations_rad: ArrayLike) -> Float:

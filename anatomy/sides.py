@@ -24,7 +24,9 @@ def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
     """Return the voxels on both sides of the border between the two lungs.
 
     The mask without its airways is eroded until its two largest parts come apart side by side; each
-    part then grows back over the mask, and the septum is where they meet.
+    part then grows back over the mask, and the septum is where they meet.  This is done on coarse voxels
+    that are tissue if any voxel in them is: neighbours in the fine mask are then neighbours or the same in
+    the coarse one, so no chain of face neighbours passes from lung to lung without entering the septum.
 
     Parameters
     ----------
@@ -39,21 +41,32 @@ def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
         None if two lungs could not be told apart.
     """
     step = tuple(max(1, round(COARSE_VOXEL_MM / float(s))) for s in grid.spacing_mm)
-    coarse = tuple(slice(None, None, n) for n in step)
-    axes = grid.lps_from_ijk[:3, :3] * step
-    sides = _grow_sides(lung[coarse] & ~airway[coarse], axes)
-    if sides is None:
-        return None
-    return _border(sides, step, lung & ~airway)
+    tissue = lung & ~airway
+    core = ~_pooled(~tissue, step)
+    sides = _grow_sides(core, _pooled(tissue, step), grid.lps_from_ijk[:3, :3] * step)
+    return None if sides is None else _border(sides, step, tissue)
 
 
-def _grow_sides(tissue: Mask, axes: Float) -> NDArray[np.int32] | None:
-    """Label the two lungs 1 and 2 over `tissue`; the columns of `axes` are its voxel axes in LPS mm."""
+def _pooled(mask: Mask, step: tuple[int, ...]) -> Mask:
+    """Unite blocks of `step` voxels: a coarse voxel is True if any voxel in it is."""
+    shape = tuple(-(-n // s) for n, s in zip(mask.shape, step, strict=True))
+    pooled = np.zeros(shape, dtype=bool, order="F")
+    for offset in np.ndindex(*step):
+        part = mask[tuple(slice(first, None, s) for first, s in zip(offset, step, strict=True))]
+        pooled[tuple(slice(0, n) for n in part.shape)] |= part
+    return pooled
+
+
+def _grow_sides(core: Mask, tissue: Mask, axes: Float) -> NDArray[np.int32] | None:
+    """Label the two lungs 1 and 2 over `tissue`, told apart by `core`, the voxels that are all tissue.
+
+    The columns of `axes` are the voxel axes in LPS mm.
+    """
     import edt
     from skimage.segmentation import watershed
 
     spacing = tuple(map(float, np.linalg.norm(axes, axis=0)))
-    depth = edt.edt(np.asfortranarray(tissue), anisotropy=spacing, order="F", black_border=True)
+    depth = edt.edt(core, anisotropy=spacing, order="F", black_border=True)
     for neck in NECK_WIDTHS_MM:
         markers = _two_largest(depth > neck / 2, axes)
         if markers is not None:
@@ -84,7 +97,7 @@ def _two_largest(mask: Mask, axes: Float) -> NDArray[np.int32] | None:
 
 
 def _border(sides: NDArray[np.int32], step: tuple[int, ...], tissue: Mask) -> Mask:
-    """Mark the voxels of `tissue` whose face neighbour lies on the other side."""
+    """Mark the voxels of `tissue` that have a face neighbour in it on the other side."""
     border = np.zeros(tissue.shape, dtype=bool, order="F")
     meeting = np.argwhere(_differs_from_neighbour(sides))
     if not len(meeting):
@@ -98,11 +111,12 @@ def _border(sides: NDArray[np.int32], step: tuple[int, ...], tissue: Mask) -> Ma
     stop = np.minimum(start + near.shape, tissue.shape)
     window = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
     near = near[tuple(slice(0, b - a) for a, b in zip(start, stop, strict=True))]
-    border[window] = _differs_from_neighbour(near) & tissue[window]
+    border[window] = _differs_from_neighbour(near * tissue[window])
     return border
 
 
 def _differs_from_neighbour(sides: NDArray[np.int32]) -> Mask:
+    """Mark both of any two face neighbours that lie on different sides; 0 is no side."""
     differs = np.zeros(sides.shape, dtype=bool)
     for axis in range(3):
         ahead = [slice(None)] * 3

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.build import FORMAT, build_lung, lung_key
-from anatomy.errors import FileError
+from anatomy.errors import FileError, LungaccessError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Float, Grid, Volume, read_only
 from anatomy.lung import Lung
@@ -29,6 +30,8 @@ REPORT_RECORDS: dict[str, Any] = {
     "spurs_pruned": SpurPruned,
     "loops_opened": LoopOpened,
 }
+DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, BadZipFile, LungaccessError)
+"""What reading a damaged folder can raise."""
 FIELD_NAMES = ("airway", "vessel", "pleura", "fissure", "obstacle", "obstacle_fissure")
 
 
@@ -106,9 +109,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         ) from error
     try:
         yield work
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(work, folder)
+        _publish(work, folder)
     except OSError as error:
         raise FileError(
             f"The lung could not be stored in {folder}: {error}",
@@ -116,6 +117,18 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _publish(work: Path, folder: Path) -> None:
+    """Give a complete folder its name, unless another process was first."""
+    if _load(folder) is not None:
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        os.replace(work, folder)
+    except OSError:
+        if _load(folder) is None:
+            raise
 
 
 def _save_rest(lung: Lung, folder: Path) -> None:
@@ -148,13 +161,13 @@ def _save_rest(lung: Lung, folder: Path) -> None:
 
 
 def _load(folder: Path) -> Lung | None:
-    """Read a stored lung; None if there is none of the present format."""
+    """Read a stored lung; None if there is none of the present format, or it is damaged."""
     try:
         meta = json.loads((folder / META).read_text())
         if meta["format"] != FORMAT:
             return None
         return _from_meta(folder, meta)
-    except (OSError, ValueError, KeyError):
+    except DAMAGE:
         return None
 
 

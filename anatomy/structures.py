@@ -1,25 +1,28 @@
 """Names and bits of the structures in a lung's label volume.
 
 Every voxel of a lung carries one `uint16`: a bit for each structure it belongs to and, for airway
-voxels, the number of its branch.
+voxels, the number of its branch.  The bits themselves stand in `anatomy.kernels.labels`.
 """
 
 from __future__ import annotations
 
-AIRWAY = 1
-"""Airway lumen or wall."""
-VESSEL = 2
-"""Artery or vein."""
-OUTSIDE = 4
-"""Not lung: mediastinum, chest wall, diaphragm, the septum between two touching lungs."""
-FISSURE = 8
-"""Between two lobes: crossing it pierces the pleura twice."""
-LUMEN = 16
-"""Airway lumen; such a voxel is AIRWAY too."""
+from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 
-BRANCH_SHIFT = 5
-"""`(label >> BRANCH_SHIFT) - 1` is the branch of an airway voxel in the airway tree, -1 for none."""
-MAX_BRANCHES = (1 << (16 - BRANCH_SHIFT)) - 2
+__all__ = [
+    "AIRWAY",
+    "BITS",
+    "BRANCH_SHIFT",
+    "FIELD_BITS",
+    "FISSURE",
+    "LUMEN",
+    "MAX_BRANCHES",
+    "OBSTACLES",
+    "OUTSIDE",
+    "VESSEL",
+]
+
+MAX_BRANCHES = (1 << (16 - BRANCH_SHIFT)) - 1
+"""Most branches that a label can tell apart."""
 
 OBSTACLES = AIRWAY | VESSEL | OUTSIDE
 """What a needle must always avoid; fissures are added unless they are allowed."""

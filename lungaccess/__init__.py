@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from lungaccess.checking import check as check
     from lungaccess.noplan import NoPlan as NoPlan
     from lungaccess.patients import load_patient as load_patient
-    from lungaccess.plans import Plan as Plan
     from lungaccess.planner import plan as plan
+    from lungaccess.plans import Plan as Plan
     from lungaccess.system import System as System
     from lungaccess.system import load_system as load_system
     from lungaccess.system import preset_names as preset_names
@@ -53,7 +53,23 @@ _HOME = {
     "resolve_target": "lungaccess.target",
 }
 
-__all__ = sorted(_HOME)
+__all__ = [
+    "AirwayTree",
+    "Atlas",
+    "Lung",
+    "LungaccessError",
+    "NoPlan",
+    "Plan",
+    "System",
+    "Target",
+    "build_atlas",
+    "check",
+    "load_patient",
+    "load_system",
+    "plan",
+    "preset_names",
+    "resolve_target",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -89,9 +89,7 @@ def assemble(
         },
         clearance_mm={"tube": _tube_clearance(task, candidate), "needle": _needle_clearance(task, candidate)},
         costs={
-            name: costs.path_cost(
-                lung, candidate.path, name, with_fissures=task.with_fissures, exact=True
-            )
+            name: costs.path_cost(lung, candidate.path, name, with_fissures=task.with_fissures, exact=True)
             for name in costs.OBJECTIVES
         },
         method=task.method,
@@ -157,7 +155,7 @@ def _tube(task: Task, candidate: Candidate) -> TubeDeployment:
 
 
 def _exit_point(task: Task, candidate: Candidate) -> Float:
-    return _tube_points(task, candidate, np.array([candidate.deployment.exit_mm]))[0]
+    return np.asarray(_tube_points(task, candidate, np.array([candidate.deployment.exit_mm]))[0])
 
 
 def _tube_points(task: Task, candidate: Candidate, arc_lengths: Float) -> Float:
@@ -201,7 +199,7 @@ def _needle_clearance(task: Task, candidate: Candidate) -> dict[str, float]:
     From the airway beyond the exempt length; where the needle ends before that, only other branches count.
     """
     points, lengths = candidate.path.sample(SAMPLE_MM)
-    beyond = lengths >= task.system.needle.exit_exemption_mm
+    beyond = lengths >= task.system.needle.exit_exemption_mm - 0.5 * SAMPLE_MM
     out = {}
     for name in _structures(task):
         if name == "airway":

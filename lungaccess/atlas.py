@@ -12,7 +12,13 @@ from anatomy.grid import Float
 from anatomy.lung import Lung
 from lungaccess.system import System
 from stages.scope.sites import Sites, sites
-from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, deployments
+from stages.tube.deployments import (
+    DEFAULT_ROTATIONS,
+    DEFAULT_STOP_MM,
+    Deployments,
+    deployments,
+    tracking_length_mm,
+)
 
 SITE_SPACING_MM = 1.0
 
@@ -70,7 +76,7 @@ def build_atlas(
     """
     began = time.perf_counter()
     with_fissures = lung.has_fissures and not system.fissures_allowed
-    reach = min(system.tubes.inner.curved_length_mm, system.tubes.max_extension_mm)
+    reach = tracking_length_mm(system.tubes)
     places = sites(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
     found = deployments(
         lung,

@@ -8,6 +8,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
+from stages.needle.kernels import CLEARANCE_FLOOR_MM
 from stages.needle.path import ArcPath
 
 OBJECTIVES = ("inverse_clearance", "cost_map", "length_mm")
@@ -15,8 +16,6 @@ OBJECTIVES = ("inverse_clearance", "cost_map", "length_mm")
 SAMPLE_MM = 0.1
 ROUGH_SAMPLE_MM = 0.5
 EXACT_BELOW_MM = 5.0
-CLEARANCE_FLOOR_MM = 0.1
-"""Nearer than this, 1 / clearance stays at its value here, so that the integral is finite."""
 
 
 def require_objective(objective: str) -> None:

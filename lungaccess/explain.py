@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,11 +28,11 @@ def explain(search: AtlasSearch, iterations: int) -> NoPlan:
 def _main_reason(search: AtlasSearch) -> str:
     atlas = search.atlas
     if atlas.sites.count == 0:
+        scope = f"the scope ({search.task.system.scope.outer_diameter_mm:g} mm) has nowhere to stand"
         generation, excess = atlas.sites.narrowest
-        return (
-            f"the scope ({search.task.system.scope.outer_diameter_mm:g} mm) has nowhere to stand; "
-            f"the airway is too narrow at generation {generation}, by {2 * excess:.1f} mm or more"
-        )
+        if generation < 0:
+            return f"{scope}; no airway lies in lung tissue"
+        return f"{scope}; the airway is too narrow at generation {generation}, by {2 * excess:.1f} mm or more"
     if atlas.deployments.count == 0:
         return "the tubes cannot leave the airway safely from any site"
     if not len(search.in_workspace):
@@ -64,22 +65,41 @@ def _reasons(search: AtlasSearch) -> dict[str, int]:
 
 
 def _advice(search: AtlasSearch) -> str:
-    """Name the smallest change, of those tried, that makes the target reachable by a direct arc."""
+    """Name the smallest change, of those tried, that makes the target reachable by a direct arc.
+
+    Where no site or no deployment is left, say which change brings one back, if that is known.
+    """
     atlas, system = search.atlas, search.task.system
     if atlas.sites.count == 0:
-        return "Use a thinner bronchoscope"
+        return _thinner_scope(atlas.sites.widest_scope_mm)
     if atlas.deployments.count == 0:
-        return "Use thinner tubes or another curvature"
+        return ""
+    if _reached_with(search, system.needle):
+        return "The search was too short: a single arc from a deployment of the atlas reaches the target"
     present = system.needle.min_radius_of_curvature_mm
     for radius in (r for r in TIGHTER_RADII_MM if r < present):
         if _reached_with(search, replace(system.needle, max_curvature_per_mm=1.0 / radius)):
-            return f"A needle with a radius of curvature of {radius:g} mm instead of {present:.0f} mm would reach it"
+            return (
+                f"A needle with a radius of curvature of {radius:g} mm instead of {present:.0f} mm "
+                "would reach it"
+            )
     thin = system.needle.diameter_mm / 2
     if _reached_with(search, replace(system.needle, diameter_mm=thin)):
         return f"A needle of {thin:g} mm instead of {system.needle.diameter_mm:g} mm would reach it"
     if atlas.with_fissures and _reached_with(search, system.needle, with_fissures=False):
-        return "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
-    return "No needle of a smaller radius of curvature or diameter helps; try a thinner bronchoscope"
+        return (
+            "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
+        )
+    return (
+        f"Neither a radius of curvature of {TIGHTER_RADII_MM[-1]:g} mm nor a needle half as thick "
+        "reaches it with a single arc"
+    )
+
+
+def _thinner_scope(widest_mm: float) -> str:
+    """Say how thin the scope must be to have a site, rounded down to a tenth."""
+    tenths = math.floor(10.0 * widest_mm)
+    return f"A bronchoscope of {tenths / 10:.1f} mm or less has a place to stand" if tenths else ""
 
 
 def _reached_with(search: AtlasSearch, needle: Needle, *, with_fissures: bool | None = None) -> bool:
@@ -92,14 +112,12 @@ def _reached_with(search: AtlasSearch, needle: Needle, *, with_fissures: bool | 
         with_fissures=task.with_fissures if with_fissures is None else with_fissures,
     )
     entries, target = atlas.deployments, task.target.lps_mm
-    near = np.flatnonzero(
-        np.isfinite(workspace_lengths(space, entries.positions, entries.tangents, target))
-    )
+    near = np.flatnonzero(np.isfinite(workspace_lengths(space, entries.positions, entries.tangents, target)))
     blockers, _lengths, _costs = direct_arcs(
         space,
-        np.ascontiguousarray(entries.positions[near]),
-        np.ascontiguousarray(entries.tangents[near]),
-        np.ascontiguousarray(entries.branch[near]),
+        entries.positions[near],
+        entries.tangents[near],
+        entries.branch[near],
         target,
     )
     return bool((blockers == 0).any())

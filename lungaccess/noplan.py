@@ -8,7 +8,7 @@ from types import MappingProxyType
 from anatomy.errors import LungaccessError
 
 
-class NoPlan(LungaccessError):
+class NoPlan(LungaccessError):  # noqa: N818
     """No plan was found; says why, stage by stage.
 
     Parameters

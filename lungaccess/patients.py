@@ -35,9 +35,10 @@ def load_patient(
     from anatomy.io.patients import load_patient as read_images
     from anatomy.store import open_lung
 
+    folder = Path(path)
     return open_lung(
-        input_hashes(path),
-        lambda: read_images(path),
+        input_hashes(folder),
+        lambda: read_images(folder),
         cache=None if cache is None else Path(cache),
         progress=progress,
     )

@@ -15,7 +15,7 @@ from lungaccess.costs import require_objective
 from lungaccess.plans import Plan
 from lungaccess.searches import AtlasSearch, KuntzSearch, Step
 from lungaccess.system import System
-from lungaccess.target import Target
+from lungaccess.target import Target, require_free
 
 METHODS = {"atlas": AtlasSearch, "kuntz2015": KuntzSearch}
 PROGRESS_EVERY_S = 0.1
@@ -84,14 +84,18 @@ def plan(
     NoPlan
         If the search ends without a plan; counts the reasons.
     SettingsError
-        If objective or method is unknown.
+        If objective or method is unknown, or the atlas belongs to another lung or system.
+    TargetError
+        If the target lies outside the lung or inside an obstacle.
     """
     require_objective(objective)
     if method not in METHODS:
         raise SettingsError(f"There is no method {method!r}", expected=f"one of {', '.join(METHODS)}")
     tell = on_progress or (lambda _event: None)
-    tell(ProgressEvent(iteration=0, elapsed_s=0.0, best_cost=None, phase="atlas", message="deployment atlas"))
-    atlas = atlas or build_atlas(lung, system)
+    require_free(lung, target.lps_mm)
+    if atlas is not None:
+        _require_same(atlas, lung, system)
+    atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(_atlas_event(share)))
     task = Task(
         lung=lung,
         system=system,
@@ -102,6 +106,25 @@ def plan(
         seed=seed,
     )
     return _run(METHODS[method](task, atlas), task, iterations, time_s, tell)
+
+
+def _require_same(atlas: Atlas, lung: Lung, system: System) -> None:
+    if atlas.lung.key != lung.key or atlas.system != system:
+        raise SettingsError(
+            f"The atlas was made for {atlas.lung.name} and {atlas.system.name}",
+            expected=f"one for {lung.name} and {system.name}, with the same masks and settings",
+            remedy="Make it with build_atlas(lung, system)",
+        )
+
+
+def _atlas_event(share: float) -> ProgressEvent:
+    return ProgressEvent(
+        iteration=0,
+        elapsed_s=0.0,
+        best_cost=None,
+        phase="atlas",
+        message=f"deployment atlas, {share:.0%} of the sites",
+    )
 
 
 def _run(

@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
 
 from anatomy.grid import Float
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
@@ -20,7 +20,10 @@ from lungaccess.costs import path_cost
 from stages.needle.path import ArcPath, blocker_on_path, direct_path
 from stages.needle.space import NeedleSpace, direct_arcs, needle_space, workspace_lengths
 from stages.scope.tips import MedialAxis, ScopeTip, looks_ahead, tip_at, walk
-from stages.tube.deployments import Deployment, TubeJudge
+from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
+
+if TYPE_CHECKING:
+    from stages.needle.ompl_planner import NeedleProblem
 
 CHUNK = 1000
 FINALISTS = 20
@@ -57,9 +60,7 @@ class NeedleDesk:
     def cost(self, path: ArcPath, *, exact: bool) -> float:
         """Return the cost of a path under the task's objective."""
         task = self.task
-        return path_cost(
-            task.lung, path, task.objective, with_fissures=task.with_fissures, exact=exact
-        )
+        return path_cost(task.lung, path, task.objective, with_fissures=task.with_fissures, exact=exact)
 
     def reaches(self, lps_from_tip: Float) -> bool:
         """Tell whether the target lies in the workspace of a start pose."""
@@ -73,8 +74,8 @@ class NeedleDesk:
         frame = deployment.lps_from_tip
         blockers, _lengths, _costs = direct_arcs(
             self.space,
-            np.ascontiguousarray(frame[None, :3, 3]),
-            np.ascontiguousarray(frame[None, :3, 2]),
+            frame[None, :3, 3],
+            frame[None, :3, 2],
             np.array([deployment.branch]),
             self.task.target.lps_mm,
         )
@@ -92,14 +93,22 @@ class NeedleDesk:
         )
 
     @cached_property
-    def _problem(self) -> object:
+    def _problem(self) -> NeedleProblem:
         from stages.needle.ompl_planner import NeedleProblem
 
         return NeedleProblem(self.space)
 
     def proved(self, deployment: Deployment, path: ArcPath) -> bool:
-        """Prove the path once more, from the numbers that the plan will state."""
-        return blocker_on_path(self.space.arrays, self.space.limits, path, deployment.branch) == 0
+        """Prove the path once more, from the numbers that the plan will state.
+
+        A voxel of infinite cost may not be entered, whatever the objective is.
+        """
+        if blocker_on_path(self.space, path, deployment.branch) != 0:
+            return False
+        mapped = path_cost(
+            self.task.lung, path, "cost_map", with_fissures=self.task.with_fissures, exact=True
+        )
+        return math.isfinite(mapped)
 
     def count_blockers(self, blockers: NDArray[np.int64]) -> None:
         """Count what stands in the way of direct arcs."""
@@ -134,9 +143,7 @@ class AtlasSearch:
             task.lung, task.system.tubes, task.system.margins, with_fissures=task.with_fissures
         )
         entries = atlas.deployments
-        lengths = workspace_lengths(
-            self.desk.space, entries.positions, entries.tangents, task.target.lps_mm
-        )
+        lengths = workspace_lengths(self.desk.space, entries.positions, entries.tangents, task.target.lps_mm)
         order = np.argsort(lengths, kind="stable")
         self.in_workspace = order[: int(np.isfinite(lengths).sum())]
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
@@ -168,9 +175,9 @@ class AtlasSearch:
             chunk = self.in_workspace[begin : begin + CHUNK]
             blockers, lengths, inverse = direct_arcs(
                 self.desk.space,
-                np.ascontiguousarray(entries.positions[chunk]),
-                np.ascontiguousarray(entries.tangents[chunk]),
-                np.ascontiguousarray(entries.branch[chunk]),
+                entries.positions[chunk],
+                entries.tangents[chunk],
+                entries.branch[chunk],
                 target,
             )
             self.desk.count_blockers(blockers)
@@ -289,8 +296,7 @@ class KuntzSearch(AtlasSearch):
         rng, tubes = self._rng, self.task.system.tubes
         tip = axis.sample(rng)
         rotation = float(rng.uniform(0.0, 2 * math.pi))
-        longest = min(tubes.max_extension_mm, tubes.inner.curved_length_mm)
-        outer, inner = np.sort(rng.uniform(0.0, longest, 2))
+        outer, inner = np.sort(rng.uniform(0.0, tracking_length_mm(tubes), 2))
         seed = int(rng.integers(2**63))
         if not looks_ahead(self.task.lung.tree, tip):
             return Step(iteration=iteration, phase="Algorithm 1")
@@ -299,5 +305,3 @@ class KuntzSearch(AtlasSearch):
             return Step(iteration=iteration, phase="Algorithm 1")
         path = self.desk.search(deployment, seed, RRT_ITERATIONS)
         return self._finish(iteration, "Algorithm 1", tip, deployment, path)
-
-

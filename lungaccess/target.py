@@ -65,7 +65,7 @@ def point_target(lung: Lung, lps_mm: Float, *, origin: str = "point") -> Target:
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise TargetError(f"The target {point.tolist()} is not a point", expected="three finite mm")
-    _require_free(lung, point)
+    require_free(lung, point)
     return Target(lps_mm=read_only(point), origin=origin)
 
 
@@ -88,7 +88,7 @@ def nodule_target(lung: Lung, number: int) -> Target:
     clearance = lung.obstacle_field(with_fissures=True).lower_bound_mm(centres)
     nearest = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
     point = nearest if _is_free(lung, nearest) else centres[int(np.argmax(clearance))]
-    _require_free(lung, point)
+    require_free(lung, point)
     return Target(lps_mm=read_only(point), origin=f"nodule {number}")
 
 
@@ -105,15 +105,15 @@ def _nodule_voxels(nodules: Volume, number: int) -> NDArray[np.int64]:
         )
     sizes = np.bincount(parts.ravel())[1:]
     chosen = int(np.argsort(-sizes, kind="stable")[number - 1]) + 1
-    return np.argwhere(parts == chosen) + low
+    return np.asarray(np.argwhere(parts == chosen) + low, dtype=np.int64)
 
 
 def _is_free(lung: Lung, point: Float) -> bool:
     return lung.label_at(point) & (OUTSIDE | VESSEL | AIRWAY) == 0
 
 
-def _require_free(lung: Lung, point: Float) -> None:
-    """Raise a TargetError that says where the point lies, unless it is in free lung tissue."""
+def require_free(lung: Lung, point: Float) -> None:
+    """Raise a TargetError that says where a point `(3,)` LPS mm lies, unless it is in free lung tissue."""
     place = "LPS ({:.1f}, {:.1f}, {:.1f}) mm".format(*point)
     label = lung.label_at(point)
     if label & OUTSIDE:

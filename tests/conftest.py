@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from anatomy.phantom import Phantom
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
 
@@ -25,3 +30,19 @@ def data_dir() -> Path:
         how = "LUNGACCESS_DATA names" if stated else "LUNGACCESS_DATA is not set and the default is"
         pytest.skip(f"no real anatomy: {how} {folder}, which is not a folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def small_phantom() -> Phantom:
+    """Return a synthetic patient with known truth, at a child's size in coarse voxels."""
+    from anatomy.phantom import phantom
+
+    return phantom(seed=3, size="small")
+
+
+@pytest.fixture(scope="session")
+def small_lung(small_phantom: Phantom) -> Lung:
+    """Return the lung of `small_phantom`."""
+    from anatomy.build import build_lung
+
+    return build_lung(small_phantom.images)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os.path
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,15 +14,21 @@ from anatomy.io.images import image_suffix
 from anatomy.io.own_masks import DESCRIPTION
 
 TEXT_SUFFIXES = (".txt", ".json", ".toml")
+_HEADER_LIMIT = 1 << 20
 
 
 def input_hashes(path: str | Path) -> dict[str, str]:
-    """Return the SHA-256 of every file a patient may be read from, by file name.
+    """Return the SHA-256 of every file a patient may be read from, by its path in the patient's folder.
 
     Parameters
     ----------
     path : str or Path
         What `anatomy.io.load_patient` takes.
+
+    Returns
+    -------
+    dict of str to str
+        Which file was stated as the label map is told apart by an entry of its own.
 
     Raises
     ------
@@ -31,26 +39,57 @@ def input_hashes(path: str | Path) -> dict[str, str]:
     if path.is_dir() and (path / DESCRIPTION).is_file():
         path = path / DESCRIPTION
     if path.is_dir():
-        files = [file for file in sorted(path.iterdir()) if _may_be_read(file)]
-    elif path.suffix == ".toml":
-        files = [require_file(path), *_files_named_in(path)]
-    else:
-        files = [file for file in sorted(require_file(path).parent.iterdir()) if _may_be_read(file)]
-    return {str(file.name): sha256(file) for file in files}
+        return _hashes(path, _files_beside(path))
+    require_file(path)
+    if path.suffix == ".toml":
+        return _hashes(path.parent, {path, *_files_named_in(path)})
+    hashes = _hashes(path.parent, _files_beside(path.parent))
+    return hashes | {f"{path.name} as label map": sha256(path)}
+
+
+def _hashes(folder: Path, files: set[Path]) -> dict[str, str]:
+    files |= {data for file in files for data in _detached_data(file)}
+    return {Path(os.path.relpath(file, folder)).as_posix(): sha256(file) for file in sorted(files)}
+
+
+def _files_beside(folder: Path) -> set[Path]:
+    return {file for file in folder.iterdir() if file.is_file() and _may_be_read(file)}
 
 
 def _may_be_read(path: Path) -> bool:
-    return path.is_file() and (bool(image_suffix(path)) or path.suffix in TEXT_SUFFIXES)
+    return bool(image_suffix(path)) or path.suffix in TEXT_SUFFIXES
 
 
-def _files_named_in(description: Path) -> list[Path]:
+def _detached_data(image: Path) -> set[Path]:
+    """Return the file with the voxels of a MetaImage header; the whole folder if it names no single one."""
+    if image_suffix(image) != ".mhd":
+        return set()
+    with require_file(image).open("rb") as stream:
+        named = re.search(rb"^ElementDataFile\s*=\s*(.*?)\s*$", stream.read(_HEADER_LIMIT), re.MULTILINE)
+    name = named[1].decode("utf-8", errors="replace") if named else "LOCAL"
+    if name.upper() == "LOCAL":
+        return set()
+    data = image.with_name(name)
+    return {data} if data.is_file() else {file for file in image.parent.iterdir() if file.is_file()}
+
+
+def _files_named_in(description: Path) -> set[Path]:
     """Return the files that strings of a description name, itself being judged elsewhere."""
     try:
         values = tomllib.loads(description.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError):
-        return []
-    named = (description.parent / text for text in _strings(values))
-    return sorted(file for file in named if file.is_file())
+        return set()
+    return {file for text in _strings(values) for file in _files_meant(description.parent, text)}
+
+
+def _files_meant(folder: Path, text: str) -> Iterator[Path]:
+    """Yield the file that `file` or `file#label` names, and side-cars that may name its labels."""
+    name, separator, _label = text.rpartition("#")
+    if os.path.isfile(folder / text):
+        yield folder / text
+    elif separator and os.path.isfile(folder / name):
+        yield folder / name
+        yield from (file for file in (folder / name).parent.glob("*.json") if file.is_file())
 
 
 def _strings(value: Any) -> Iterator[str]:

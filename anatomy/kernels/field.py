@@ -1,7 +1,8 @@
 """Distance lookups with a proved error: clearance fields at voxel corners, and exact local search.
 
 A clearance field holds, at every voxel corner, the distance to the nearest obstacle voxel taken as a
-solid box, rounded down to 1/256 mm.  The coordinates `u, v, w` below count corners: voxel `i` spans
+solid box, rounded down to 1/256 mm.  It knows nothing of what lies beyond the grid: the outermost
+voxels of a lung are OUTSIDE.  The coordinates `u, v, w` below count corners: voxel `i` spans
 `i <= u <= i + 1`.
 
 Lower bound.  Let `p` lie in a cell, `t` be its true distance, and `B` the nearest box.  Trilinear
@@ -12,7 +13,10 @@ between `X` and `B` along an axis is either 0 throughout or affine, so
     E[d(X)**2] <= E[d_B(X)**2] <= t**2 + sum of f (1 - f) s**2,
 
 hence `t >= sqrt(interpolated squared distance - sum of f (1 - f) s**2)`.  Equality holds when one
-box corner is nearest from all eight corners of the cell, so little is lost.
+box corner is nearest from all eight corners of the cell.  At most a voxel diagonal and the rounding `q`
+are lost: with `S` for the sum, `d(X) >= t - |X - p|` and Minkowski's inequality give
+
+    sqrt(interpolated squared distance) >= t - sqrt(S) - q,  and  sqrt(S) <= half a voxel diagonal.
 
 `geometry` is `(3, 5)` float64: rows of the affine map from LPS mm to corner coordinates, and the
 squared voxel size of the axis in the last column.
@@ -25,11 +29,14 @@ import math
 import numba
 import numpy as np
 
+from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, OUTSIDE
+
 UNITS_PER_MM = 256.0
-ROUNDING_MM = 2e-5
-AIRWAY_BIT = 1
-OUTSIDE_BIT = 4
-BRANCH_SHIFT = 5
+
+MIN_GAP_MM = 0.005
+"""A proof that walks along a curve gives up where less clearance than this is to spare."""
+EXACT_REACH_MM = 0.5
+"""How far beyond the required clearance such a proof searches voxels: its longest step near obstacles."""
 
 
 @numba.njit(cache=True, inline="never")
@@ -38,13 +45,12 @@ def interpolate_squared(field, geometry, x, y, z):
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
     v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
     w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
-    if not (u >= 0.0 and v >= 0.0 and w >= 0.0):
+    ni, nj, nk = field.shape
+    if not (0.0 <= u < ni - 1 and 0.0 <= v < nj - 1 and 0.0 <= w < nk - 1):
         return 0.0, 0.0
     i = int(u)
     j = int(v)
     k = int(w)
-    if i >= field.shape[0] - 1 or j >= field.shape[1] - 1 or k >= field.shape[2] - 1:
-        return 0.0, 0.0
     fu = u - i
     fv = v - j
     fw = w - k
@@ -72,7 +78,7 @@ def distance_bound(field, geometry, x, y, z):
 
 @numba.njit(cache=True)
 def distance_estimate(field, geometry, x, y, z):
-    """Return a smooth estimate of the distance in mm, within half a voxel diagonal; no bound."""
+    """Return a smooth estimate of the distance in mm, off by less than a voxel diagonal; no bound."""
     total, spread = interpolate_squared(field, geometry, x, y, z)
     return math.sqrt(max(total - 0.5 * spread, 0.0))
 
@@ -83,14 +89,10 @@ def label_at(labels, geometry, x, y, z):
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
     v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
     w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
-    if not (u >= 0.0 and v >= 0.0 and w >= 0.0):
-        return OUTSIDE_BIT
-    i = int(u)
-    j = int(v)
-    k = int(w)
-    if i >= labels.shape[0] or j >= labels.shape[1] or k >= labels.shape[2]:
-        return OUTSIDE_BIT
-    return int(labels[i, j, k])
+    ni, nj, nk = labels.shape
+    if not (0.0 <= u < ni and 0.0 <= v < nj and 0.0 <= w < nk):
+        return OUTSIDE
+    return int(labels[int(u), int(v), int(w)])
 
 
 @numba.njit(cache=True)
@@ -110,13 +112,15 @@ def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
     su = math.sqrt(geometry[0, 4])
     sv = math.sqrt(geometry[1, 4])
     sw = math.sqrt(geometry[2, 4])
-    if not (0.0 <= u <= ni and 0.0 <= v <= nj and 0.0 <= w <= nk):
-        return (0.0, OUTSIDE_BIT) if bits & OUTSIDE_BIT else (cap, 0)
-    if bits & OUTSIDE_BIT:
+    if bits & OUTSIDE:
+        if not (0.0 <= u <= ni and 0.0 <= v <= nj and 0.0 <= w <= nk):
+            return 0.0, OUTSIDE
         edge = min(u * su, (ni - u) * su, v * sv, (nj - v) * sv, w * sw, (nk - w) * sw)
         if edge * edge < best:
             best = edge * edge
-            nearest = OUTSIDE_BIT
+            nearest = OUTSIDE
+    elif not math.isfinite(u + v + w):
+        return cap, 0
     i0 = max(int(math.floor(u - cap / su)), 0)
     i1 = min(int(math.floor(u + cap / su)), ni - 1)
     j0 = max(int(math.floor(v - cap / sv)), 0)
@@ -137,7 +141,7 @@ def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
                 hit = label & bits
                 if hit == 0:
                     continue
-                if hit == AIRWAY_BIT and exempt_branch >= 0 and (label >> BRANCH_SHIFT) - 1 == exempt_branch:
+                if hit == AIRWAY and exempt_branch >= 0 and (label >> BRANCH_SHIFT) - 1 == exempt_branch:
                     continue
                 gu = max(max(i - u, u - i - 1.0), 0.0) * su
                 d2 = g2 + gu * gu

@@ -13,7 +13,14 @@ import math
 import numba
 
 from anatomy.kernels.arcs import any_normal, arc_to_point, point_on_arc, pose_on_arc
-from anatomy.kernels.field import distance_bound, distance_estimate, exact_distance
+from anatomy.kernels.field import (
+    EXACT_REACH_MM,
+    MIN_GAP_MM,
+    distance_bound,
+    distance_estimate,
+    exact_distance,
+)
+from anatomy.kernels.labels import LUMEN
 from anatomy.kernels.random import uniform
 
 KAPPA = 0
@@ -27,12 +34,11 @@ MAX_STEP = 7
 COST_STEP = 8
 N_LIMITS = 9
 
-MIN_GAP_MM = 0.005
-EXACT_REACH_MM = 0.5
-LUMEN_BIT = 16
 CLEARANCE_FLOOR_MM = 0.1
+"""Nearer than this, 1 / clearance stays at its value here, so that the integral is finite."""
 SAMPLE_TRIES = 50
 PROBE_SPACING_MM = 1.5
+MIN_ARC_MM = 1e-6
 TINY = 1e-9
 
 # Columns of a tree node: pose (6), arc from the parent: length, bend (4); path length, accumulated turn.
@@ -44,39 +50,64 @@ NODE_COLUMNS = 13
 
 
 @numba.njit(cache=True)
-def workspace_length(rho, h, limits):
+def shortest_path(rho, h, kappa, max_turn):
     """Return the length of the shortest path to a point `h` ahead and `rho` aside, inf if none.
 
-    Shortest is an arc of the greatest curvature followed by a straight piece [Dubins1957].  It exists
-    unless the point lies inside the circle of that curvature, and no other path turns less, so the
-    limits of the angle are tested on it: the trumpet of [Kuntz2015, fig. 4], exactly.
+    Shortest is an arc of the greatest curvature `kappa` followed by a straight piece [Dubins1957], and
+    no other path turns less.  Points inside the circle of that curvature take a turn of more than 180
+    degrees, which counts as out of reach whatever `max_turn` is.
     """
-    radius = 1.0 / limits[KAPPA]
+    radius = 1.0 / kappa
     if rho < TINY:
-        return max(h, 0.0) if -TINY <= h <= limits[MAX_LENGTH] else math.inf
+        return max(h, 0.0) if h >= -TINY else math.inf
     straight2 = (rho - radius) * (rho - radius) + h * h - radius * radius
-    if straight2 < 0.0:
+    if straight2 < -2.0 * radius * TINY:
         return math.inf
-    straight = math.sqrt(straight2)
+    straight = math.sqrt(max(straight2, 0.0))
     # Both angles are seen from the centre of the circle and counted from the start.
     turn = math.atan2(h, radius - rho) - math.atan2(straight, radius)
     if turn < -TINY:
         turn += 2.0 * math.pi
-    if turn > min(limits[MAX_ANGLE], limits[MAX_TURN]) + TINY:
+    if turn > min(max_turn, math.pi) + TINY:
         return math.inf
-    length = radius * max(turn, 0.0) + straight
+    return radius * max(turn, 0.0) + straight
+
+
+@numba.njit(cache=True)
+def workspace_length(rho, h, limits):
+    """Return the length of the shortest path within all limits, inf outside the workspace.
+
+    The limits hold for every path to the point if they hold for the shortest, which also turns least:
+    the trumpet of [Kuntz2015, fig. 4], exactly.
+    """
+    length = shortest_path(rho, h, limits[KAPPA], min(limits[MAX_ANGLE], limits[MAX_TURN]))
     return length if length <= limits[MAX_LENGTH] else math.inf
 
 
 @numba.njit(cache=True)
-def shortest_length(pose, q, limits):
-    """Return `workspace_length` of the point `q` seen from a pose."""
+def seen_from(pose, q):
+    """Return how far aside of a pose (at least 0) and how far ahead of it a point lies."""
     dx = q[0] - pose[0]
     dy = q[1] - pose[1]
     dz = q[2] - pose[2]
     h = dx * pose[3] + dy * pose[4] + dz * pose[5]
-    rho2 = dx * dx + dy * dy + dz * dz - h * h
-    return workspace_length(math.sqrt(max(rho2, 0.0)), h, limits)
+    rx = dx - h * pose[3]
+    ry = dy - h * pose[4]
+    rz = dz - h * pose[5]
+    return math.sqrt(rx * rx + ry * ry + rz * rz), h
+
+
+@numba.njit(cache=True)
+def least_cosine(forward, aside, turn):
+    """Return the least value of `forward cos a + aside sin a` for `a` from 0 to `turn`.
+
+    With the components of an arc's first tangent and of its bend along a direction, that is the cosine
+    of the largest angle between the arc and the direction.
+    """
+    least = min(forward, forward * math.cos(turn) + aside * math.sin(turn))
+    if math.atan2(aside, forward) + math.pi < turn:
+        least = -math.hypot(forward, aside)
+    return max(least, -1.0)
 
 
 @numba.njit(cache=True)
@@ -121,7 +152,7 @@ def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
             distance, label = exact_distance(labels, geometry, x, y, z, bits, spared, reach)
             gap = distance - required
             if in_exit:
-                lumen, lumen_label = exact_distance(labels, geometry, x, y, z, LUMEN_BIT, -1, reach)
+                lumen, lumen_label = exact_distance(labels, geometry, x, y, z, LUMEN, -1, reach)
                 if lumen - limits[RADIUS] < gap:
                     gap = lumen - limits[RADIUS]
                     label = lumen_label
@@ -153,7 +184,8 @@ def workspace_scan(positions, tangents, target, limits, lengths):
     for n in range(positions.shape[0]):
         x, y, z = positions[n]
         tx, ty, tz = tangents[n]
-        lengths[n] = shortest_length((x, y, z, tx, ty, tz), target, limits)
+        rho, h = seen_from((x, y, z, tx, ty, tz), target)
+        lengths[n] = workspace_length(rho, h, limits)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -189,10 +221,11 @@ def _pose_of(node):
 
 @numba.njit(cache=True)
 def _sample(start, goal, limits, state):
-    """Draw a point of the spindle between start and goal that the start can reach.
+    """Draw a point between start and goal that the start can reach.
 
-    A path of curvature at most 1 / R between two points less than 2 R apart stays within the spindle
-    swept by the arcs of radius R between them [Patil2014].
+    It is drawn from the spindle swept by the arcs of radius R = 1 / curvature between the two, which
+    holds the paths that turn by less than 180 degrees; where start and goal are 2 R apart or more and
+    there is no such arc, from the cylinder of radius R about the line between them.
     """
     radius = 1.0 / limits[KAPPA]
     ax = goal[0] - start[0]
@@ -202,12 +235,14 @@ def _sample(start, goal, limits, state):
     ax, ay, az = ax / distance, ay / distance, az / distance
     bx, by, bz = any_normal(ax, ay, az)
     cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    half = min(0.5 * distance, 0.999 * radius)
-    waist = math.sqrt(radius * radius - half * half)
+    half = 0.5 * distance
     for _ in range(SAMPLE_TRIES):
         along = uniform(state) * distance
-        offset = min(abs(along - 0.5 * distance), half)
-        r = (math.sqrt(radius * radius - offset * offset) - waist) * math.sqrt(uniform(state))
+        widest = radius
+        if half < radius:
+            offset = along - half
+            widest = math.sqrt(radius * radius - offset * offset) - math.sqrt(radius * radius - half * half)
+        r = widest * math.sqrt(uniform(state))
         phi = 2.0 * math.pi * uniform(state)
         u = r * math.cos(phi)
         v = r * math.sin(phi)
@@ -216,7 +251,8 @@ def _sample(start, goal, limits, state):
             start[1] + along * ay + u * by + v * cy,
             start[2] + along * az + u * bz + v * cz,
         )
-        if shortest_length(start, q, limits) < math.inf:
+        rho, h = seen_from(start, q)
+        if workspace_length(rho, h, limits) < math.inf:
             return q, True
     return (goal[0], goal[1], goal[2]), False
 
@@ -244,7 +280,8 @@ def _nearest(nodes, count, q, limits):
 def _extend(space, limits, branch, nodes, parents, count, near, q, goal, max_step):
     """Add an arc from node `near` towards a point, at most `max_step` long; True if it was added.
 
-    Nodes turned too far from the start, or from which the goal cannot be reached, are refused.
+    Arcs that turn too far from the start are refused, and those from whose end no path within the
+    limits leads to the goal.
     """
     node = nodes[near]
     pose = _pose_of(node)
@@ -256,13 +293,19 @@ def _extend(space, limits, branch, nodes, parents, count, near, q, goal, max_ste
     ):
         return False
     length = min(length, max_step)
-    if length < 1e-6:
+    if length < MIN_ARC_MM:
+        return False
+    start = nodes[0]
+    forward = pose[3] * start[3] + pose[4] * start[4] + pose[5] * start[5]
+    aside = bend[1] * start[3] + bend[2] * start[4] + bend[3] * start[5]
+    turn = bend[0] * length
+    if least_cosine(forward, aside, turn) < math.cos(limits[MAX_ANGLE]):
         return False
     end = pose_on_arc(pose, bend, length)
-    start = nodes[0]
-    if end[3] * start[3] + end[4] * start[4] + end[5] * start[5] < math.cos(limits[MAX_ANGLE]):
-        return False
-    ahead = shortest_length(end, goal, limits)
+    angle = math.acos(min(max(forward * math.cos(turn) + aside * math.sin(turn), -1.0), 1.0))
+    turn_left = min(limits[MAX_TURN] - node[PATH_TURN] - turn, limits[MAX_ANGLE] + angle)
+    rho, h = seen_from(end, goal)
+    ahead = shortest_path(rho, h, limits[KAPPA], turn_left)
     if node[PATH_LENGTH] + length + ahead > limits[MAX_LENGTH]:
         return False
     if blocker_on_arc(space, limits, pose, bend, length, node[PATH_LENGTH], branch) != 0:
@@ -274,7 +317,7 @@ def _extend(space, limits, branch, nodes, parents, count, near, q, goal, max_ste
     for m in range(4):
         new[BEND + m] = bend[m]
     new[PATH_LENGTH] = node[PATH_LENGTH] + length
-    new[PATH_TURN] = node[PATH_TURN] + bend[0] * length
+    new[PATH_TURN] = node[PATH_TURN] + turn
     parents[count] = near
     return True
 
@@ -283,7 +326,8 @@ def _extend(space, limits, branch, nodes, parents, count, near, q, goal, max_ste
 def grow_rrt(space, limits, branch, goal, nodes, parents, count, iterations, state):
     """Grow the tree of [Kuntz2015, sec. IV-C] by up to `iterations` samples.
 
-    After every new node, one arc to the goal is tried from it.
+    After every new node, one arc to the goal is tried from it.  A goal nearer than MIN_ARC_MM to the
+    start is no problem to solve: nothing is grown.
 
     Parameters
     ----------
@@ -304,6 +348,9 @@ def grow_rrt(space, limits, branch, goal, nodes, parents, count, iterations, sta
         Rows in use, iterations spent, and whether the last row is the goal.
     """
     start = _pose_of(nodes[0])
+    rho, h = seen_from(start, goal)
+    if math.hypot(rho, h) < MIN_ARC_MM:
+        return count, 0, False
     if count == 1 and _extend(space, limits, branch, nodes, parents, 1, 0, goal, goal, math.inf):
         return 2, 0, True
     for used in range(iterations):

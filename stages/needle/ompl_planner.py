@@ -1,13 +1,15 @@
 """The needle problem in OMPL: an SE(3) control problem, and a planner whose search is a compiled kernel.
 
 The only module that imports OMPL.  Its traps, each with a test: start states are taken through
-`getPlannerInputStates().nextStart()` (`getStartState` hands over ownership); numbers are copied out of
-a path at once (its states die with `clear`); validity functions return a real `bool`; the planner
-refers to no SimpleSetup (it would never be freed), so one problem is reused for many queries.
+`getPlannerInputStates().nextStart()` (`getStartState` hands over ownership); the path that a caller gets
+is made from the kernel's numbers (OMPL's states die with `clear`); validity functions return a real
+`bool`; the planner refers to no SimpleSetup (it would never be freed), and one problem is reused for
+many queries.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -44,7 +46,7 @@ class Query:
     iterations: int
 
 
-class NeedleGoal(base.GoalRegion):  # type: ignore[misc]
+class NeedleGoal(base.GoalRegion):
     """The tip is at the target; its orientation is free."""
 
     def __init__(self, si: Any, target: Float) -> None:
@@ -58,7 +60,7 @@ class NeedleGoal(base.GoalRegion):  # type: ignore[misc]
         return float(np.linalg.norm(tip - self.target))
 
 
-class NeedleRRT(base.Planner):  # type: ignore[misc]
+class NeedleRRT(base.Planner):
     """The RRT of [Kuntz2015, sec. IV-C] as an OMPL planner.
 
     `solve` runs the kernel in slices until it has a path, the termination condition holds, or the
@@ -94,15 +96,14 @@ class NeedleRRT(base.Planner):  # type: ignore[misc]
     def _search(self, query: Query, termination: Any) -> bool:
         state = np.array([query.seed], dtype=np.uint64)
         count, used, solved = 1, 0, False
-        while True:
+        while not termination():
             portion = min(SLICE_ITERATIONS, query.iterations - used)
             count, spent, solved = kernels.grow_rrt(
                 self._space.arrays, self._space.limits, query.branch, query.target,
                 self._nodes, self._parents, count, portion, state,
             )  # fmt: skip
             used += spent
-            full = count + 2 > MAX_NODES
-            if solved or full or used >= query.iterations or spent == 0 or termination():
+            if solved or spent < portion or used >= query.iterations:
                 break
         self.iterations_used = used
         if solved:
@@ -110,9 +111,9 @@ class NeedleRRT(base.Planner):  # type: ignore[misc]
         return bool(solved)
 
     def _hand_over(self) -> None:
-        path = control.PathControl(self._si)
         if self.path is None:
             return
+        path = control.PathControl(self._si)
         # OMPL splits an arc in steps of equal controls, so here the roll is counted from the start.
         roll = 0.0
         for frame, (length, turned, curvature) in zip(self.path.frames(), self.path.arcs, strict=False):
@@ -225,7 +226,7 @@ def _termination(time_s: float) -> Any:
 
 def _bounds_of(space: NeedleSpace) -> Any:
     grid = space.lung.grid
-    corners = grid.lps(np.stack(np.meshgrid(*[(0, n) for n in grid.shape]), axis=-1).reshape(-1, 3))
+    corners = grid.lps(list(itertools.product(*[(-0.5, n - 0.5) for n in grid.shape])))
     bounds = base.RealVectorBounds(3)
     for axis in range(3):
         bounds.setLow(axis, float(corners[:, axis].min()))

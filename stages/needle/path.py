@@ -6,12 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from anatomy import poses as frames
 from anatomy.grid import Float, read_only
 from anatomy.kernels import arcs as arc_kernels
 from stages.needle import kernels
+from stages.needle.space import NeedleSpace
 
 LENGTH, ROLL, CURVATURE = 0, 1, 2
 
@@ -33,6 +34,7 @@ class ArcPath:
     arcs: Float
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "lps_from_start", read_only(np.array(self.lps_from_start, dtype=np.float64)))
         object.__setattr__(self, "arcs", read_only(np.asarray(self.arcs, dtype=np.float64).reshape(-1, 3)))
 
     @property
@@ -47,42 +49,39 @@ class ArcPath:
 
     def frames(self) -> Float:
         """Return the tip frame after each arc, `(A + 1, 4, 4)`, the start first."""
-        out = [np.asarray(self.lps_from_start)]
+        out = [self.lps_from_start]
         for length, roll, curvature in self.arcs:
             out.append(out[-1] @ arc_transform(length, roll, curvature))
         return np.stack(out)
 
     def sample(self, step_mm: float) -> tuple[Float, Float]:
         """Return points `(M, 3)` at most `step_mm` apart and their path lengths `(M,)`, ends included."""
-        points, lengths = [self.lps_from_start[:3, 3]], [0.0]
+        points, lengths = [self.lps_from_start[None, :3, 3]], [np.zeros(1)]
         for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
             count = max(1, math.ceil(length / step_mm))
-            before = lengths[-1]
-            for n in range(1, count + 1):
-                s = length * n / count
-                points.append((frame @ arc_transform(s, roll, curvature))[:3, 3])
-                lengths.append(before + s)
-        return np.array(points), np.array(lengths)
+            s = length * np.arange(1, count + 1) / count
+            half = 0.5 * curvature * s
+            ahead = s * np.sinc(2.0 * half / np.pi)
+            aside = s * np.sin(half) * np.sinc(half / np.pi)
+            bend = bend_direction(frame, roll)
+            points.append(frame[:3, 3] + ahead[:, None] * frame[:3, 2] + aside[:, None] * bend)
+            lengths.append(lengths[-1][-1] + s)
+        return np.concatenate(points), np.concatenate(lengths)
 
     def max_angle_from_start_rad(self) -> float:
-        """Return the largest angle between the tip and its direction at the start.
-
-        Along an arc the cosine is a sinusoid of the turned angle, so its least value lies at an end
-        or where its derivative is zero.
-        """
+        """Return the largest angle between the tip and its direction at the start, on all of the path."""
         start = self.lps_from_start[:3, 2]
-        worst = 0.0
+        least = 1.0
         for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
             forward = float(start @ frame[:3, 2])
-            aside = float(start @ (math.cos(roll) * frame[:3, 0] + math.sin(roll) * frame[:3, 1]))
-            turn = length * curvature
-            angles = [0.0, turn]
-            least = math.atan2(aside, forward) + math.pi
-            angles += [a for a in (least - 2 * math.pi, least) if 0.0 < a < turn]
-            for angle in angles:
-                cosine = math.cos(angle) * forward + math.sin(angle) * aside
-                worst = max(worst, math.acos(min(1.0, max(-1.0, cosine))))
-        return worst
+            aside = float(start @ bend_direction(frame, roll))
+            least = min(least, kernels.least_cosine(forward, aside, length * curvature))
+        return math.acos(least)
+
+
+def bend_direction(frame: Float, roll_rad: float) -> Float:
+    """Return the unit vector towards which an arc bends after a roll in a tip frame."""
+    return np.asarray(math.cos(roll_rad) * frame[:3, 0] + math.sin(roll_rad) * frame[:3, 1])
 
 
 def arc_transform(length_mm: float, roll_rad: float, curvature_per_mm: float) -> Float:
@@ -112,7 +111,7 @@ def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
     )
 
 
-def path_from_tree(lps_from_start: Float, nodes: Float, parents: np.ndarray, last: int) -> ArcPath:
+def path_from_tree(lps_from_start: Float, nodes: Float, parents: NDArray[np.int64], last: int) -> ArcPath:
     """Return the path from the root of a search tree to its node `last`.
 
     Parameters
@@ -137,25 +136,21 @@ def path_from_tree(lps_from_start: Float, nodes: Float, parents: np.ndarray, las
     return ArcPath(lps_from_start=lps_from_start, arcs=np.array(arcs))
 
 
-def blocker_on_path(space: object, limits: Float, path: ArcPath, branch: int) -> int:
+def blocker_on_path(space: NeedleSpace, path: ArcPath, branch: int) -> int:
     """Prove every arc of a path clear; return 0, or the label of the voxel that is too near.
 
     Parameters
     ----------
-    space : tuple
-        `NeedleSpace.arrays`.
-    limits : (9,) float64
+    space : NeedleSpace
     path : ArcPath
     branch : int
-        Pierced branch; -1 for none.
+        Pierced branch, whose wall is exempt at the exit; -1 for none.
     """
     start = 0.0
     for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
-        bend = frame[:3, 0] * math.cos(roll) + frame[:3, 1] * math.sin(roll)
         pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
-        label = kernels.blocker_on_arc(
-            space, limits, pose, (float(curvature), *map(float, bend)), float(length), start, branch
-        )
+        bend = (float(curvature), *(float(v) for v in bend_direction(frame, roll)))
+        label = kernels.blocker_on_arc(space.arrays, space.limits, pose, bend, float(length), start, branch)
         if label:
             return int(label)
         start += float(length)

@@ -75,10 +75,13 @@ def needle_space(lung: Lung, needle: Needle, margins: Margins, *, with_fissures:
     )
 
 
-def workspace_lengths(space: NeedleSpace, positions: ArrayLike, tangents: ArrayLike, target: ArrayLike) -> Float:
+def workspace_lengths(
+    space: NeedleSpace, positions: ArrayLike, tangents: ArrayLike, target: ArrayLike
+) -> Float:
     """Return the shortest path length from each start pose to a target, infinite where there is none.
 
-    The test is exact in free space: curvature, both turning limits, and greatest length.
+    The test is exact in free space for curvature, both turning limits and the greatest length; paths
+    that turn by more than 180 degrees in all are left out.
 
     Parameters
     ----------
@@ -89,20 +92,18 @@ def workspace_lengths(space: NeedleSpace, positions: ArrayLike, tangents: ArrayL
     ----------
     .. [Kuntz2015] fig. 4; [Dubins1957]
     """
-    positions = np.asarray(positions, dtype=np.float64)
-    lengths = np.zeros(len(positions))
-    kernels.workspace_scan(
-        positions,
-        np.asarray(tangents, dtype=np.float64),
-        np.asarray(target, dtype=np.float64),
-        space.limits,
-        lengths,
-    )
+    places = _plain(positions)
+    lengths = np.zeros(len(places))
+    kernels.workspace_scan(places, _plain(tangents), _plain(target), space.limits, lengths)
     return lengths
 
 
 def direct_arcs(
-    space: NeedleSpace, positions: Float, tangents: Float, branches: NDArray[np.int64], target: Float
+    space: NeedleSpace,
+    positions: ArrayLike,
+    tangents: ArrayLike,
+    branches: NDArray[np.int64],
+    target: ArrayLike,
 ) -> tuple[NDArray[np.int64], Float, Float]:
     """Try the single arc to a target from each start pose.
 
@@ -121,9 +122,21 @@ def direct_arcs(
     lengths, inverse_clearance : (E,) float64
         Length in mm, and the estimated integral of 1 / clearance where the arc is clear.
     """
-    blockers = np.zeros(len(positions), dtype=np.int64)
-    costs = np.zeros((len(positions), 2))
+    blockers = np.zeros(len(branches), dtype=np.int64)
+    costs = np.zeros((len(branches), 2))
     kernels.direct_arcs(
-        space.arrays, space.limits, positions, tangents, branches, target, blockers, costs
+        space.arrays,
+        space.limits,
+        _plain(positions),
+        _plain(tangents),
+        np.array(branches, dtype=np.int64),
+        _plain(target),
+        blockers,
+        costs,
     )
     return blockers, costs[:, 0], costs[:, 1]
+
+
+def _plain(array: ArrayLike) -> Float:
+    """Copy to the one kind of array (writeable, contiguous) for which the kernels are compiled."""
+    return np.array(array, dtype=np.float64, order="C")

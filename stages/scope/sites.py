@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Float
 from anatomy.lung import Lung
-from anatomy.structures import OUTSIDE
+from anatomy.structures import AIRWAY, OUTSIDE
 from stages.scope.device import Bronchoscope
 from stages.scope.tips import looks_ahead, tip_at
 
@@ -34,8 +34,8 @@ class Sites:
     poses : (S, 6) float64
         Point and unit tangent, LPS mm: the scope tip looks along the medial axis.
     lumen_radius_mm : (N,) float64
-        For each tree point, the smallest radius of the lumen about the way to it from the root:
-        proved for every point of the way, not only for the tree points.
+        For each tree point, the smallest radius of the lumen on the way to it from the root, proved for
+        every point of the way and not only for the tree points.
     passable : (N,) bool
         Whether the scope fits at each tree point and all the way to it.
     exits_ahead : (N,) bool
@@ -43,6 +43,8 @@ class Sites:
     narrowest : tuple of (int, float)
         Generation at which the most branches become too narrow, and the least excess of the scope's
         radius over the lumen there, in mm; (-1, 0) if every branch is passable.
+    widest_scope_mm : float
+        Outer diameter of the thickest scope that would have a site; 0 if none has.
     """
 
     tree_point: Int
@@ -51,6 +53,7 @@ class Sites:
     passable: Bool
     exits_ahead: Bool
     narrowest: tuple[int, float]
+    widest_scope_mm: float
 
     @property
     def count(self) -> int:
@@ -83,8 +86,9 @@ def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float
     narrowest_so_far = _narrowest_on_the_way(lung)
     passable = narrowest_so_far >= needed
     ahead = _distance_to_exit(tree, _in_lung_tissue(lung)) <= reach_mm
-    spaced = np.flatnonzero(passable & ahead & _every(tree, spacing_mm))
-    chosen = np.array([p for p in spaced if looks_ahead(tree, tip_at(tree, p))], dtype=np.int64)
+    looking = _looking_ahead(tree, np.flatnonzero(ahead & _every(tree, spacing_mm)))
+    chosen = looking[passable[looking]]
+    widest = float(narrowest_so_far[looking].max(initial=0.0))
     return Sites(
         tree_point=chosen,
         poses=np.hstack([tree.points_lps[chosen], tree.tangents[chosen]]),
@@ -92,7 +96,12 @@ def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float
         passable=passable,
         exits_ahead=ahead,
         narrowest=_where_too_narrow(tree, passable, narrowest_so_far, needed),
+        widest_scope_mm=max(2.0 * (widest - scope.lumen_margin_mm), 0.0),
     )
+
+
+def _looking_ahead(tree: AirwayTree, points: Int) -> Int:
+    return np.array([p for p in points if looks_ahead(tree, tip_at(tree, int(p)))], dtype=np.int64)
 
 
 def _narrowest_on_the_way(lung: Lung) -> Float:
@@ -110,22 +119,22 @@ def _narrowest_on_the_way(lung: Lung) -> Float:
     narrowest = np.maximum(depth.min(axis=1) - np.linalg.norm(step, axis=1) / (2 * count), 0.0)
     for point in range(1, tree.n_points):
         narrowest[point] = min(narrowest[point], narrowest[tree.parent_point[point]])
-    return narrowest
+    return np.asarray(narrowest, dtype=np.float64)
 
 
 def _in_lung_tissue(lung: Lung) -> Bool:
-    """Tell at which tree points the tissue beside the airway is lung in some direction."""
+    """Tell at which tree points free lung tissue lies beside the airway, in some direction."""
     tree = lung.tree
     helper = np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)]
     first = np.cross(tree.tangents, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(tree.tangents, first)
-    outside_everywhere = np.ones(tree.n_points, dtype=bool)
+    nowhere = np.ones(tree.n_points, dtype=bool)
     for phi in np.arange(PROBE_DIRECTIONS) * (2 * math.pi / PROBE_DIRECTIONS):
         direction = math.cos(phi) * first + math.sin(phi) * second
         probe = tree.points_lps + (tree.radius_mm + WALL_PROBE_MM)[:, None] * direction
-        outside_everywhere &= (_labels_at(lung, probe) & OUTSIDE) != 0
-    return ~outside_everywhere
+        nowhere &= (_labels_at(lung, probe) & (OUTSIDE | AIRWAY)) != 0
+    return ~nowhere
 
 
 def _labels_at(lung: Lung, points: Float) -> NDArray[np.uint16]:

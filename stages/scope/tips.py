@@ -12,7 +12,6 @@ from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Float
 
-
 TURN_CHORD_MM = 2.0
 MAX_TURN_AT_TIP_RAD = math.radians(45.0)
 """A tip must look where the scope comes from going, within this angle of its last TURN_CHORD_MM."""
@@ -39,7 +38,8 @@ class ScopeTip:
 def step_length_mm(tree: AirwayTree, point: int) -> float:
     """Return the way from a tree point to its parent, 0 at the root."""
     parent = tree.parent_point[point]
-    return 0.0 if parent < 0 else float(tree.distance_from_root_mm[point] - tree.distance_from_root_mm[parent])
+    way = tree.distance_from_root_mm
+    return 0.0 if parent < 0 else float(way[point] - way[parent])
 
 
 def tip_at(tree: AirwayTree, point: int, back_mm: float = 0.0) -> ScopeTip:
@@ -58,9 +58,7 @@ def looks_ahead(tree: AirwayTree, tip: ScopeTip) -> bool:
     """Tell whether a tip points on along its route, and not sideways just behind a fork."""
     position, forward = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
     point = max(int(tree.parent_point[tip.tree_point]), 0)
-    while (
-        np.linalg.norm(position - tree.points_lps[point]) < TURN_CHORD_MM and tree.parent_point[point] >= 0
-    ):
+    while np.linalg.norm(position - tree.points_lps[point]) < TURN_CHORD_MM and tree.parent_point[point] >= 0:
         point = int(tree.parent_point[point])
     chord = position - tree.points_lps[point]
     length = float(np.linalg.norm(chord))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from anatomy import poses as frames
+from anatomy.errors import SettingsError
 from anatomy.grid import Float, read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
@@ -133,9 +134,19 @@ def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
     return constants
 
 
+def tracking_length_mm(tubes: ConcentricTubes) -> float:
+    """Return the greatest insertion in which the tubes follow their own track exactly.
+
+    Curved tubes do so as long as the straight part of the inner one stays in the scope.
+    """
+    if tubes.inner.precurvature_per_mm == 0.0:
+        return tubes.max_extension_mm
+    return min(tubes.inner.curved_length_mm, tubes.max_extension_mm)
+
+
 def insertion_stops(tubes: ConcentricTubes, spacing_mm: float = DEFAULT_STOP_MM) -> Float:
-    """Return insertions from 0 to the curved length, where the tube still follows its own track."""
-    longest = min(tubes.inner.curved_length_mm, tubes.max_extension_mm)
+    """Return insertions from 0 to `tracking_length_mm`, about `spacing_mm` apart."""
+    longest = tracking_length_mm(tubes)
     return np.linspace(0.0, longest, max(1, round(longest / spacing_mm)) + 1)
 
 
@@ -152,8 +163,8 @@ def deployments(
 ) -> Deployments:
     """Enumerate what the tubes can do from many scope tips.
 
-    Only deployments without sideways sweep are enumerated: those whose tip stays within the curved
-    length of the scope tip.
+    Only deployments without sideways sweep are enumerated: those whose tip stays within
+    `tracking_length_mm` of the scope tip.
 
     Parameters
     ----------
@@ -168,8 +179,8 @@ def deployments(
     progress : callable, optional
         Told the share of sites done.
     """
-    tips = np.ascontiguousarray(np.asarray(scope_tips, dtype=np.float64).reshape(-1, 6))
-    angles = np.arange(rotations) * (2 * math.pi / rotations)
+    tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 6)
+    angles: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
     stops = insertion_stops(tubes, stop_spacing_mm)
     scene = scene_of(lung, with_fissures=with_fissures)
     constants = tube_constants(tubes, margins)
@@ -192,16 +203,14 @@ def deployments(
 
     with ThreadPoolExecutor(THREADS) as pool:
         parts = list(pool.map(one_site, range(len(tips))))
-    rows = np.concatenate([part for part, _ in parts] or [np.zeros((0, kernels.ENTRY_COLUMNS))])
-    refused = np.sum([counts for _, counts in parts], axis=0, dtype=np.int64) if parts else np.zeros(
-        kernels.N_REASONS, dtype=np.int64
-    )
-    return _as_deployments(rows, angles, refused, most - rotations, len(tips))
+    rows = np.concatenate([np.zeros((0, kernels.ENTRY_COLUMNS)), *(part for part, _ in parts)])
+    refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
+    for _, counts in parts:
+        refused += counts
+    return _as_deployments(rows, angles, refused, (most - rotations) * len(tips))
 
 
-def _as_deployments(
-    rows: Float, angles: Float, refused: Int, per_site: int, n_sites: int
-) -> Deployments:
+def _as_deployments(rows: Float, angles: Float, refused: Int, candidates: int) -> Deployments:
     tip = kernels.ENTRY_TIP
     return Deployments(
         site=read_only(rows[:, 0].astype(np.int64)),
@@ -213,7 +222,7 @@ def _as_deployments(
         wall_angle_rad=read_only(rows[:, 6].copy()),
         positions=read_only(rows[:, tip : tip + 3].copy()),
         tangents=read_only(rows[:, tip + 3 : tip + 6].copy()),
-        candidates=per_site * n_sites,
+        candidates=candidates,
         refused={REASONS[code]: int(refused[code]) for code in REASONS if refused[code]},
     )
 
@@ -221,9 +230,7 @@ def _as_deployments(
 class TubeJudge:
     """Judges single deployments of one pair of tubes in one lung."""
 
-    def __init__(
-        self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool
-    ) -> None:
+    def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
         self._scene = scene_of(lung, with_fissures=with_fissures)
         self._constants = tube_constants(tubes, margins)
         self._trace = np.zeros(kernels.N_TRACE)
@@ -240,8 +247,18 @@ class TubeJudge:
         rotation_rad : float
             Direction of the bend about +z of the scope tip, counted from its +x.
         outer_mm, inner_mm : float
-            Insertions beyond the scope tip, `inner_mm >= outer_mm`.
+            Insertions beyond the scope tip.
+
+        Raises
+        ------
+        SettingsError
+            If the outer tube would be ahead of the inner one.
         """
+        if not 0.0 <= outer_mm <= inner_mm:
+            raise SettingsError(
+                f"The insertions of outer and inner tube are {outer_mm:g} and {inner_mm:g} mm",
+                expected="0 <= outer <= inner",
+            )
         base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
         normal = frames.bending_directions(lps_from_scope_tip, rotation_rad)[0]
         trace, tip = self._trace, self._tip

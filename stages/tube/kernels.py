@@ -14,7 +14,8 @@ import math
 import numba
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc, sine_length, versine_length
-from anatomy.kernels.field import distance_bound, exact_distance, label_at
+from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
+from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 
 # tubes
 OVERLAP_CURVATURE = 0
@@ -55,15 +56,6 @@ TOO_LONG = 9
 PROTRUDES = 10
 N_REASONS = 11
 
-AIRWAY_BIT = 1
-VESSEL_BIT = 2
-OUTSIDE_BIT = 4
-FISSURE_BIT = 8
-LUMEN_BIT = 16
-BRANCH_SHIFT = 5
-
-MIN_GAP_MM = 0.005
-EXACT_REACH_MM = 0.5
 FINE_STEP_MM = 0.05
 WALL_ZONE_MM = 1.0
 OUT_OF_LUMEN_MM = 0.02
@@ -75,11 +67,11 @@ SWEEP_SAMPLES = 24
 @numba.njit(cache=True)
 def _reason(label):
     """Translate the label of a voxel that is too near into a reason."""
-    if label & VESSEL_BIT:
+    if label & VESSEL:
         return NEAR_VESSEL
-    if label & OUTSIDE_BIT:
+    if label & OUTSIDE:
         return NEAR_PLEURA
-    if label & FISSURE_BIT:
+    if label & FISSURE:
         return NEAR_FISSURE
     return NEAR_OTHER_BRANCH
 
@@ -144,7 +136,7 @@ def _wall_normal(labels, geometry, x, y, z):
             dv = (j + 0.5 - v) * sv
             for i in range(max(int(u - r / su), 0), min(int(u + r / su) + 1, labels.shape[0])):
                 du = (i + 0.5 - u) * su
-                if labels[i, j, k] & LUMEN_BIT and du * du + dv * dv + dw * dw <= r * r:
+                if labels[i, j, k] & LUMEN and du * du + dv * dv + dw * dw <= r * r:
                     mu += du
                     mv += dv
                     mw += dw
@@ -174,7 +166,7 @@ def _leave_lumen(scene, tubes, trace, pose, bend, inside, outside, s0):
     for _ in range(BISECTIONS):
         middle = 0.5 * (inside + outside)
         x, y, z = point_on_arc(pose, bend, middle)
-        if label_at(labels, geometry, x, y, z) & LUMEN_BIT:
+        if label_at(labels, geometry, x, y, z) & LUMEN:
             inside = middle
         else:
             outside = middle
@@ -200,9 +192,9 @@ def _tissue_gap(scene, trace, x, y, z, required):
     distance, label = exact_distance(labels, geometry, x, y, z, bits, int(trace[BRANCH]), reach)
     gap = distance - required
     if trace[PHASE] == IN_TISSUE:
-        lumen, _label = exact_distance(labels, geometry, x, y, z, LUMEN_BIT, -1, reach)
+        lumen, _label = exact_distance(labels, geometry, x, y, z, LUMEN, -1, reach)
         if lumen - OUT_OF_LUMEN_MM < gap:
-            return lumen - OUT_OF_LUMEN_MM, LUMEN_BIT
+            return lumen - OUT_OF_LUMEN_MM, LUMEN
     return gap, label
 
 
@@ -218,9 +210,9 @@ def _lumen_step(scene, trace, x, y, z, radius, required):
     depth = distance_bound(lumen, lumen_geometry, x, y, z)
     if depth >= radius:
         trace[HAZARD] = ACCEPTED
-        return depth - 0.5 * radius
+        return max(depth - radius, FINE_STEP_MM)
     reach = required + EXACT_REACH_MM
-    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY_BIT, -1, reach)
+    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY, -1, reach)
     if distance - required < FINE_STEP_MM:
         trace[HAZARD] = _reason(label)
         return max(0.5 * depth, FINE_STEP_MM)
@@ -243,7 +235,7 @@ def march(scene, tubes, trace, pose, bend, s0, length, radius, clearance):
     while True:
         x, y, z = point_on_arc(pose, bend, s)
         if trace[PHASE] == IN_LUMEN:
-            if label_at(labels, geometry, x, y, z) & LUMEN_BIT:
+            if label_at(labels, geometry, x, y, z) & LUMEN:
                 step = _lumen_step(scene, trace, x, y, z, radius, required)
             elif s0 + s == 0.0:
                 return NO_EXIT
@@ -256,11 +248,11 @@ def march(scene, tubes, trace, pose, bend, s0, length, radius, clearance):
         else:
             gap, label = _tissue_gap(scene, trace, x, y, z, required)
             if gap < MIN_GAP_MM:
-                return REENTERS_LUMEN if label == LUMEN_BIT else _reason(label)
+                return REENTERS_LUMEN if label == LUMEN else _reason(label)
             step = gap
             if trace[PHASE] == IN_WALL:
                 here = label_at(labels, geometry, x, y, z)
-                if here & LUMEN_BIT and (here >> BRANCH_SHIFT) - 1 != int(trace[BRANCH]):
+                if here & LUMEN and (here >> BRANCH_SHIFT) - 1 != int(trace[BRANCH]):
                     return REENTERS_LUMEN
                 zone = trace[LEFT_AT] + WALL_ZONE_MM - s0
                 if s >= zone:

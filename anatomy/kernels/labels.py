@@ -1,0 +1,21 @@
+"""Bits of a voxel's label: the one place where they are defined, for kernels and everybody else.
+
+A label is a `uint16`: a bit for each structure the voxel belongs to and, above them, the number of the
+airway branch.
+"""
+
+from __future__ import annotations
+
+AIRWAY = 1
+"""Airway lumen or wall."""
+VESSEL = 2
+"""Artery or vein."""
+OUTSIDE = 4
+"""Not lung: mediastinum, chest wall, diaphragm, the septum between two touching lungs."""
+FISSURE = 8
+"""Between two lobes: crossing it pierces the pleura twice."""
+LUMEN = 16
+"""Airway lumen; such a voxel is AIRWAY too."""
+
+BRANCH_SHIFT = 5
+"""`(label >> BRANCH_SHIFT) - 1` is the branch of an airway voxel in the airway tree, -1 for none."""

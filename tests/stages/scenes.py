@@ -1,0 +1,156 @@
+"""Lungs made by hand, voxel by voxel, and distances to their voxels found by trying every voxel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.fields import distance_field
+from anatomy.grid import Grid, Volume
+from anatomy.lung import Lung
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, FIELD_BITS, FISSURE, LUMEN, OUTSIDE
+
+
+@dataclass
+class Canvas:
+    """A label volume to draw on, and the position of every voxel centre."""
+
+    grid: Grid
+    labels: np.ndarray
+    points: np.ndarray
+
+    @classmethod
+    def empty(cls, low: Any, high: Any, spacing_mm: Any) -> Canvas:
+        """Return free lung tissue whose outer faces lie at `low` and about at `high`, LPS mm."""
+        spacing = np.broadcast_to(np.asarray(spacing_mm, dtype=float), 3)
+        shape = tuple(int(n) for n in np.rint((np.asarray(high) - np.asarray(low)) / spacing))
+        grid = Grid.from_spacing(shape, spacing, np.asarray(low) + 0.5 * spacing)
+        points = grid.lps(np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1))
+        return cls(grid, np.zeros(shape, dtype=np.uint16, order="F"), points)
+
+    def add(self, where: np.ndarray, bits: int) -> None:
+        """Set bits."""
+        self.labels[where] |= bits
+
+    def airway(self, lumen: np.ndarray, wall: np.ndarray, branch: int) -> None:
+        """Draw an airway with its wall; what lay there before goes."""
+        code = AIRWAY | ((branch + 1) << BRANCH_SHIFT)
+        self.labels[wall & ((self.labels & LUMEN) == 0)] = code
+        self.labels[lumen] = code | LUMEN
+
+    def ball(self, centre: Any, radius_mm: float) -> np.ndarray:
+        """Tell which voxel centres lie in a ball."""
+        return np.linalg.norm(self.points - np.asarray(centre), axis=-1) <= radius_mm
+
+    def capsule(self, a: Any, b: Any, radius_mm: float) -> np.ndarray:
+        """Tell which voxel centres lie within `radius_mm` of a segment."""
+        a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+        t = np.clip(((self.points - a) @ (b - a)) / ((b - a) @ (b - a)), 0.0, 1.0)
+        return np.linalg.norm(self.points - a - t[..., None] * (b - a), axis=-1) <= radius_mm
+
+    def lung(self, tree: AirwayTree | None = None, **more: Any) -> Lung:
+        """Make a `Lung` of what was drawn."""
+        return lung_of(self.labels, self.grid, tree or line_tree([0, 0, 0], [0, 0, -1], 1.0), **more)
+
+
+def lung_of(labels: np.ndarray, grid: Grid, tree: AirwayTree, **more: Any) -> Lung:
+    """Make a `Lung` of a label volume; its outermost voxels become OUTSIDE, as in every lung."""
+    labels = np.array(labels, dtype=np.uint16, order="F")
+    inner = labels[1:-1, 1:-1, 1:-1].copy()
+    labels[:] = OUTSIDE
+    labels[1:-1, 1:-1, 1:-1] = inner
+    has_fissures = bool((labels & FISSURE).any())
+    names = [name for name in FIELD_BITS if has_fissures or "fissure" not in name]
+    values: dict[str, Any] = {
+        "name": "scene", "kind": "scene", "key": "scene", "nodules": None, "cost": None, "starts": (),
+        "targets_lps": (), "breath_hold": None, "sources": {}, "warnings": (),
+    }  # fmt: skip
+    return Lung(
+        grid=grid,
+        labels=labels,
+        fields={name: distance_field(name, (labels & FIELD_BITS[name]) != 0, grid) for name in names},
+        lumen_depth=distance_field("lumen_depth", (labels & LUMEN) == 0, grid),
+        tree=tree,
+        **{**values, **more},
+    )
+
+
+def line_tree(a: Any, b: Any, radius_mm: float, step_mm: float = 0.5) -> AirwayTree:
+    """Return a tree of one straight branch."""
+    return forked_tree([(a, b, radius_mm, -1)], step_mm)
+
+
+def forked_tree(lines: list[tuple[Any, Any, float, int]], step_mm: float = 0.5) -> AirwayTree:
+    """Return a tree of straight branches (from, to, radius, parent branch), each from its parent's end."""
+    points: list[np.ndarray] = []
+    tangents, parents, branches, radii, start = [], [], [], [], [0]
+    generation: list[int] = []
+    for branch, (a, b, radius, parent) in enumerate(lines):
+        begin, way = np.asarray(a, dtype=float), np.asarray(b, dtype=float) - np.asarray(a, dtype=float)
+        count = max(1, round(float(np.linalg.norm(way)) / step_mm))
+        share = np.arange(0 if parent < 0 else 1, count + 1) / count
+        points.append(begin + share[:, None] * way)
+        parents += [-1 if parent < 0 else start[parent + 1] - 1]
+        parents += list(range(start[-1], start[-1] + len(share) - 1))
+        branches += [branch] * len(share)
+        tangents.append(np.tile(way / np.linalg.norm(way), (len(share), 1)))
+        radii += [radius] * len(share)
+        start.append(start[-1] + len(share))
+        generation.append(0 if parent < 0 else generation[parent] + 1)
+    place = np.concatenate(points)
+    distance = np.zeros(len(place))
+    for n, parent in enumerate(parents):
+        if parent >= 0:
+            distance[n] = distance[parent] + np.linalg.norm(place[n] - place[parent])
+    return AirwayTree(
+        points_lps=place,
+        radius_mm=np.array(radii),
+        parent_point=np.array(parents),
+        branch_of_point=np.array(branches),
+        branch_start=np.array(start),
+        branch_parent=np.array([line[3] for line in lines]),
+        generation=np.array(generation),
+        distance_from_root_mm=distance,
+        tangents=np.concatenate(tangents),
+    )
+
+
+def brute_clearance(
+    labels: np.ndarray, grid: Grid, points: np.ndarray, bits: int, cap_mm: float, exempt_branch: int = -1
+) -> np.ndarray:
+    """Return the distances `(N,)` to the nearest solid voxel box with any of `bits`, at most `cap_mm`.
+
+    Voxels of `exempt_branch` that are airway alone (of the structures in `bits`) are passed over.  Beyond
+    the grid all is OUTSIDE.
+    """
+    spacing = grid.spacing_mm
+    local = grid.ijk(points) * spacing
+    hit = labels & bits
+    chosen = hit != 0
+    if exempt_branch >= 0:
+        chosen &= ~((hit == AIRWAY) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == exempt_branch))
+    centres = np.argwhere(chosen) * spacing
+    out = np.full(len(points), float(cap_mm))
+    if len(centres):
+        reach = cap_mm + 0.5 * float(np.linalg.norm(spacing))
+        centres = centres[cKDTree(local).query(centres)[0] <= reach]
+    for begin in range(0, len(points), 200):
+        part = local[begin : begin + 200]
+        gap = np.maximum(np.abs(part[:, None] - centres[None]) - 0.5 * spacing, 0.0)
+        nearest = np.sqrt((gap**2).sum(axis=-1).min(axis=1, initial=cap_mm**2))
+        out[begin : begin + 200] = np.minimum(out[begin : begin + 200], nearest)
+    if bits & OUTSIDE:
+        faces = np.concatenate(
+            [local + 0.5 * spacing, (np.array(grid.shape) - 0.5) * spacing - local], axis=1
+        )
+        out = np.minimum(out, np.maximum(faces.min(axis=1), 0.0))
+    return out
+
+
+def nodules_of(canvas: Canvas, where: np.ndarray) -> Volume:
+    """Return a nodule mask."""
+    return Volume(grid=canvas.grid, array=where)

@@ -1,0 +1,159 @@
+"""Where the scope can stand, on a forked airway of known radii."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from anatomy.lung import Lung
+from anatomy.structures import BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
+from stages.scope.device import Bronchoscope
+from stages.scope.sites import sites
+from tests.stages.scenes import Canvas, brute_clearance, forked_tree, lung_of
+
+CARINA, FORK = np.array([0.0, 0.0, 20.0]), np.array([26.0, 0.0, -4.0])
+LINES = [
+    (np.array([0.0, 0.0, 44.0]), CARINA, 6.0, -1),
+    (CARINA, FORK, 4.0, 0),
+    (CARINA, np.array([-26.0, 0.0, -4.0]), 2.5, 0),
+    (FORK, np.array([40.0, 0.0, -24.0]), 2.0, 1),
+    (FORK, np.array([46.0, 0.0, 4.0]), 3.0, 1),
+]
+MEDIASTINUM_MM = 11.0
+
+
+@pytest.fixture(scope="module")
+def lung() -> Lung:
+    """Trachea (6 mm), left (4) and right (2.5) main bronchus, two more on the left (2 and 3)."""
+    return forked_lung()
+
+
+def forked_lung(mediastinum_mm: float = MEDIASTINUM_MM) -> Lung:
+    canvas = Canvas.empty([-36, -12, -34.2], [54, 12, 49.8], 0.6)
+    canvas.add(np.abs(canvas.points[..., 0]) < mediastinum_mm, OUTSIDE)
+    for branch, (a, b, radius, _parent) in enumerate(LINES):
+        canvas.airway(canvas.capsule(a, b, radius), canvas.capsule(a, b, radius + 1.0), branch)
+    return canvas.lung(forked_tree(LINES))
+
+
+def scope(diameter_mm: float, margin_mm: float = 0.0) -> Bronchoscope:
+    return Bronchoscope(
+        name="test", outer_diameter_mm=diameter_mm, channel_diameter_mm=1.0, lumen_margin_mm=margin_mm,
+        bend_up_deg=180.0, bend_down_deg=130.0,
+    )  # fmt: skip
+
+
+def branches_of(lung: Lung, diameter_mm: float, margin_mm: float = 0.0) -> set[int]:
+    """Branches with a site in their second half: near its root a branch is as wide as its parent."""
+    found = sites(lung, scope(diameter_mm, margin_mm), reach_mm=30.0)
+    halves = [lung.tree.branch_points(b) for b in range(len(LINES))]
+    return {
+        b for b, points in enumerate(halves) if np.isin(points[len(points) // 2 :], found.tree_point).any()
+    }
+
+
+def test_each_branch_opens_at_its_own_diameter(lung: Lung) -> None:
+    """Up to a voxel, 0.6 mm: a circle of voxels is narrower than what was drawn."""
+    assert branches_of(lung, 2.4) == {0, 1, 2, 3, 4}
+    assert branches_of(lung, 3.3) == {0, 1, 2, 4}, "too thick for 2 mm"
+    assert branches_of(lung, 4.3) == {0, 1, 4}, "too thick for 2.5 mm"
+    assert branches_of(lung, 6.05) == {0, 1}, "too thick for 3 mm"
+    assert branches_of(lung, 9.0) == {0}
+    assert branches_of(lung, 12.05) == set()
+
+
+def test_the_lumen_margin_counts_on_both_sides(lung: Lung) -> None:
+    for diameter in (2.4, 3.3, 4.3, 6.05):
+        assert branches_of(lung, diameter - 1.0, 0.5) == branches_of(lung, diameter)
+
+
+def test_behind_a_narrow_place_nothing_is_passable(lung: Lung) -> None:
+    """The way counts: a wide branch behind a ring of wall cannot be reached."""
+    labels = lung.labels.copy(order="F")
+    centres = lung.grid.lps(np.argwhere(labels >= 0)).reshape(*labels.shape, 3)
+    along = (centres - CARINA) @ ((FORK - CARINA) / np.linalg.norm(FORK - CARINA))
+    in_left_bronchus = (labels >> BRANCH_SHIFT) == 2
+    labels[in_left_bronchus & (np.abs(along - 20.0) < 1.0)] &= ~np.uint16(LUMEN)
+    narrowed = lung_of(labels, lung.grid, lung.tree)
+    found = sites(narrowed, scope(2.0), reach_mm=30.0)
+    assert 4 not in set(narrowed.tree.branch_of_point[found.tree_point].tolist())
+    assert not found.passable[narrowed.tree.branch_points(4)].any()
+
+
+def test_radius_of_the_way_is_proved(lung: Lung) -> None:
+    """Never more than the distance to the nearest voxel that is not lumen, anywhere on the way."""
+    found = sites(lung, scope(3.0), reach_mm=30.0)
+    tree = lung.tree
+    lumen = (lung.labels & LUMEN) != 0
+    border = binary_dilation(lumen, np.ones((3, 3, 3))) & ~lumen
+    not_lumen = np.where(border, VESSEL, 0).astype(np.uint16)
+    parent = np.maximum(tree.parent_point, 0)
+    share = np.linspace(0.0, 1.0, 6)[:, None, None]
+    dense = tree.points_lps[parent] + share * (tree.points_lps - tree.points_lps[parent])
+    depth = brute_clearance(not_lumen, lung.grid, dense.reshape(-1, 3), VESSEL, 7.0)
+    truth = depth.reshape(6, -1).min(axis=0)
+    for point in range(1, tree.n_points):
+        truth[point] = min(truth[point], truth[parent[point]])
+    assert (found.lumen_radius_mm <= truth + 1e-9).all()
+    assert (found.lumen_radius_mm >= truth - 0.3).all()
+
+
+def test_airways_in_the_mediastinum_are_left_out(lung: Lung) -> None:
+    found = sites(lung, scope(2.0), reach_mm=1.0)
+    x = np.abs(found.poses[:, 0])
+    radius = lung.tree.radius_mm[found.tree_point]
+    # A probe reaches 2.5 mm beyond the lumen, and the point it is sent from may lie 1 mm ahead.
+    assert (x + radius + 2.5 + 1.0 >= MEDIASTINUM_MM - 0.6).all()
+    assert len(x) > 20
+    everywhere = sites(forked_lung(0.0), scope(2.0), reach_mm=1.0)
+    assert 0 in lung.tree.branch_of_point[everywhere.tree_point]
+    assert 0 not in lung.tree.branch_of_point[found.tree_point]
+
+
+def test_reach_lets_the_tip_stand_before_the_lung(lung: Lung) -> None:
+    distances = []
+    for reach in (1.0, 10.0, 20.0):
+        found = sites(lung, scope(2.0), reach_mm=reach)
+        distances.append(float(np.abs(found.poses[:, 0]).min()))
+        assert found.exits_ahead[found.tree_point].all()
+    assert distances[0] > distances[1] >= distances[2] == 0.0
+
+
+def test_tips_look_along_the_airway(lung: Lung) -> None:
+    found = sites(lung, scope(2.0), reach_mm=30.0)
+    assert np.array_equal(found.poses[:, :3], lung.tree.points_lps[found.tree_point])
+    assert np.array_equal(found.poses[:, 3:], lung.tree.tangents[found.tree_point])
+    assert found.count == len(found.poses) == len(found.tree_point)
+
+
+@pytest.mark.parametrize("spacing", [0.5, 1.0, 3.0])
+def test_spacing(lung: Lung, spacing: float) -> None:
+    found = sites(lung, scope(2.0), reach_mm=100.0, spacing_mm=spacing)
+    way = lung.tree.distance_from_root_mm[found.tree_point]
+    for branch in range(5):
+        on_branch = np.sort(way[lung.tree.branch_of_point[found.tree_point] == branch])
+        assert np.diff(on_branch).mean() == pytest.approx(max(spacing, 0.5), rel=0.3)
+
+
+def test_why_the_others_are_closed(lung: Lung) -> None:
+    assert sites(lung, scope(2.4), reach_mm=30.0).narrowest == (-1, 0.0)
+    generation, excess = sites(lung, scope(3.3), reach_mm=30.0).narrowest
+    assert generation == 2 and 0.0 < excess < 0.6
+    generation, excess = sites(lung, scope(13.0), reach_mm=30.0).narrowest
+    assert generation == 0 and 0.4 < excess < 1.5
+
+
+def test_the_widest_scope_that_has_a_site(lung: Lung) -> None:
+    for margin in (0.0, 0.4):
+        widest = sites(lung, scope(14.0, margin), reach_mm=30.0).widest_scope_mm
+        assert 9.0 < widest < 12.0
+        assert sites(lung, scope(widest - 1e-6, margin), reach_mm=30.0).count > 0
+        assert sites(lung, scope(widest + 1e-6, margin), reach_mm=30.0).count == 0
+
+
+def test_no_airway_in_lung_tissue() -> None:
+    found = sites(forked_lung(200.0), scope(2.0), reach_mm=30.0)
+    assert found.count == 0 and found.widest_scope_mm == 0.0
+    assert found.passable.all() and not found.exits_ahead.any()
+    assert found.poses.shape == (0, 6)

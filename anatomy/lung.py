@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Float, Grid, Volume, read_only
 from anatomy.kernels import field as kernel
+
+if TYPE_CHECKING:
+    from anatomy.meshes import SurfaceMesh
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,6 +114,19 @@ class Lung:
                 f"There is no structure {name!r}", expected=f"one of {', '.join(structures.BITS)}, nodule"
             )
         return Volume(grid=self.grid, array=(self.labels & structures.BITS[name]) != 0)
+
+    def surface(self, name: str) -> SurfaceMesh:
+        """Return the surface mesh of a structure, made anew at each call: exactly the faces of its voxels.
+
+        Parameters
+        ----------
+        name : str
+            See `mask`.
+        """
+        from anatomy.meshes import box_surface
+
+        mask = self.mask(name)
+        return box_surface(mask.array, mask.grid)
 
     def label_at(self, point_lps: Float) -> int:
         """Return the label of the voxel that holds a point; OUTSIDE beyond the grid."""

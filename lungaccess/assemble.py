@@ -28,7 +28,7 @@ from stages.needle.path import ArcPath
 from stages.scope.sites import Sites
 from stages.scope.tips import ScopeTip
 from stages.tube.deployments import Deployment
-from stages.tube.shape import centreline, follow_the_leader_error_mm
+from stages.tube.shape import centreline
 
 CLEARANCE_CAP_MM = 5.0
 SAMPLE_MM = 0.05
@@ -148,9 +148,7 @@ def _tube(task: Task, candidate: Candidate) -> TubeDeployment:
             wall_angle_rad=deployment.wall_angle_rad,
         ),
         lateral_sweep_mm=deployment.lateral_sweep_mm,
-        follow_the_leader_error_mm=follow_the_leader_error_mm(
-            task.system.tubes, deployment.outer_mm, deployment.inner_mm
-        ),
+        follow_the_leader_error_mm=deployment.lateral_sweep_mm,
     )
 
 

@@ -32,7 +32,8 @@ def _main_reason(search: AtlasSearch) -> str:
         generation, excess = atlas.sites.narrowest
         if generation < 0:
             return f"{scope}; no airway lies in lung tissue"
-        return f"{scope}; the airway is too narrow at generation {generation}, by {2 * excess:.1f} mm or more"
+        narrow = f"too narrow at generation {generation}, typically by {2 * excess:.1f} mm"
+        return f"{scope}; the airway is {narrow}"
     if atlas.deployments.count == 0:
         return "the tubes cannot leave the airway safely from any site"
     if not len(search.in_workspace):
@@ -52,7 +53,7 @@ def _reasons(search: AtlasSearch) -> dict[str, int]:
     if closed:
         reasons[
             f"scope: tree points beyond airways too narrow (mostly at generation {generation}, "
-            f"by {2 * excess:.2f} mm or more)"
+            f"typically by {2 * excess:.1f} mm)"
         ] = closed
     reasons["tube: deployments looked at"] = atlas.deployments.candidates
     reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
@@ -77,7 +78,8 @@ def _advice(search: AtlasSearch) -> str:
     if _reached_with(search, system.needle):
         return "The search was too short: a single arc from a deployment of the atlas reaches the target"
     present = system.needle.min_radius_of_curvature_mm
-    for radius in (r for r in TIGHTER_RADII_MM if r < present):
+    radii = [r for r in TIGHTER_RADII_MM if r < present]
+    for radius in radii:
         if _reached_with(search, replace(system.needle, max_curvature_per_mm=1.0 / radius)):
             return (
                 f"A needle with a radius of curvature of {radius:g} mm instead of {present:.0f} mm "
@@ -90,10 +92,8 @@ def _advice(search: AtlasSearch) -> str:
         return (
             "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
         )
-    return (
-        f"Neither a radius of curvature of {TIGHTER_RADII_MM[-1]:g} mm nor a needle half as thick "
-        "reaches it with a single arc"
-    )
+    bent = f"a radius of curvature of {radii[-1]:g} mm or " if radii else ""
+    return f"A needle with {bent}half the diameter does not reach it with a single arc either"
 
 
 def _thinner_scope(widest_mm: float) -> str:

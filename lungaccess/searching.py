@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.plans import Plan
     from lungaccess.planner import ProgressEvent
+    from lungaccess.plans import Plan
     from lungaccess.report import CostPoint
     from lungaccess.system import System
     from lungaccess.target import Target

@@ -14,7 +14,9 @@ from importlinter import cli
 CHECKOUT = Path(__file__).resolve().parents[1]
 OURS = ("anatomy", "stages", "lungaccess")
 KERNELS_MAY_USE = {"__future__", "collections", "math", "numba", "numpy", "typing"}
-CHECK_MAY_USE = ("anatomy.*", "stages.*.device", "lungaccess.plans*", "lungaccess.system", "lungaccess.checking*")
+CHECK_MAY_USE = (
+    "anatomy.*", "stages.*.device", "lungaccess.plans*", "lungaccess.system", "lungaccess.checking*",
+)  # fmt: skip
 NOT_AT_START_UP = (
     "SimpleITK", "casadi", "edt", "fcl", "matplotlib", "networkx", "ompl", "pydicom", "skimage", "trimesh",
 )  # fmt: skip

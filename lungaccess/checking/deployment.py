@@ -52,7 +52,7 @@ UNDERSTATED_MM = 0.25
 """A planner may state its proved lower bound: less than the truth by a voxel's diagonal and this."""
 
 STATED_TOLERANCE_MM = 0.05
-"""A stated clearance is the smallest of samples 0.1 mm apart; between two it may be this much smaller."""
+"""A stated clearance is a lower bound; where it was sampled, it may be this much above the recomputed one."""
 
 STATED_MM = 5.0
 """A clearance beyond this may be stated as no more than this."""

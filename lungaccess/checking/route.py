@@ -26,7 +26,7 @@ REACH_MM = 15.0
 RADIUS_TOLERANCE_MM = 0.05
 """Radii are stated at points; between two points the lumen may be this much narrower."""
 
-MAX_CHORD_ANGLE_RAD = 0.5 * np.pi
+MAX_CHORD_ANGLE_RAD = np.deg2rad(45.0) + 1e-6
 """Between the tip and the last `CHORD_MM` of the route: a tip must look where the scope is going."""
 
 CHORD_MM = 2.0

@@ -41,8 +41,8 @@ class Sites:
     exits_ahead : (N,) bool
         Whether an airway lying in lung tissue, not in the mediastinum, is within reach ahead.
     narrowest : tuple of (int, float)
-        Generation at which the most branches become too narrow, and the least excess of the scope's
-        radius over the lumen there, in mm; (-1, 0) if every branch is passable.
+        Generation at which the most branches become too narrow, and by how much the scope's radius
+        exceeds that of the lumen there, in mm (median); (-1, 0) if every branch is passable.
     widest_scope_mm : float
         Outer diameter of the thickest scope that would have a site; 0 if none has.
     """
@@ -166,11 +166,11 @@ def _every(tree: AirwayTree, spacing_mm: float) -> Bool:
 def _where_too_narrow(
     tree: AirwayTree, passable: Bool, radius_mm: Float, needed_mm: float
 ) -> tuple[int, float]:
-    """Say at which generation most routes end, and by how little."""
+    """Say at which generation most routes end, and by how much (median)."""
     ends = np.flatnonzero(~passable[1:] & passable[tree.parent_point[1:]]) + 1
     if not len(ends):
         return (-1, 0.0) if passable[0] else (0, float(needed_mm - radius_mm[0]))
     generation = tree.generation[tree.branch_of_point[ends]]
     worst = int(np.argmax(np.bincount(generation)))
     shortfall = needed_mm - radius_mm[ends[generation == worst]]
-    return worst, float(shortfall.min())
+    return worst, float(np.median(shortfall))

@@ -12,8 +12,6 @@ from stages.tube import kernels
 from stages.tube.deployments import tube_constants
 from stages.tube.device import ConcentricTubes
 
-TRACK_SAMPLES = 200
-
 
 def centreline(
     tubes: ConcentricTubes,
@@ -44,14 +42,3 @@ def centreline(
     bend = bending_directions(lps_from_scope_tip, rotation_rad)[0]
     forward = lps_from_scope_tip[:3, 2]
     return np.asarray(lps_from_scope_tip[:3, 3] + planar[:, :1] * bend + planar[:, 1:] * forward)
-
-
-def follow_the_leader_error_mm(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> float:
-    """Return the largest distance between the track of the tip and the final shape at equal arc length."""
-    constants = tube_constants(tubes, Margins())
-    worst = 0.0
-    for tip in np.linspace(0.0, inner_mm, TRACK_SAMPLES):
-        track = kernels.planar_point(constants, min(float(tip), outer_mm), float(tip), float(tip))
-        final = kernels.planar_point(constants, float(outer_mm), float(inner_mm), float(tip))
-        worst = max(worst, float(np.hypot(track[0] - final[0], track[1] - final[1])))
-    return worst

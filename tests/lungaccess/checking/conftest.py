@@ -268,7 +268,7 @@ def toy_tube(
     labels = lung.labels[tuple(index.T)]
     last = int(np.flatnonzero((labels & structures.LUMEN) == 0)[0]) - 1
     centres = lung.grid.lps(np.argwhere((lung.labels & structures.LUMEN) != 0))
-    near = centres[np.linalg.norm(centres - points[last], axis=1) <= 1.5]
+    near = centres[np.linalg.norm(centres - points[last], axis=1) <= 2.5]
     out = points[last] - near.mean(axis=0)
     angle = np.arcsin(out @ frames[last, :3, 2] / np.linalg.norm(out))
     wall_exit = WallExit(

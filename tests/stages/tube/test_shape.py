@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.shape import centreline, follow_the_leader_error_mm
+from stages.tube.shape import centreline
 
 OUTER = Tube(outer_diameter_mm=1.6, inner_diameter_mm=1.38, length_mm=640.0)
 INNER = Tube(
@@ -67,14 +66,3 @@ def test_ends() -> None:
     aside = (1 - math.cos(0.5)) / 0.025
     assert np.allclose(local, [aside * math.cos(0.4), aside * math.sin(0.4), math.sin(0.5) / 0.025])
     assert centreline(TUBES, frame, 0.4, 0.0, 20.0, 7.0).shape == (1, 3)
-
-
-@given(inner=st.floats(0.0, 40.0), share=st.floats(0.0, 1.0))
-def test_the_tip_leads_exactly_within_the_curved_length(inner: float, share: float) -> None:
-    assert follow_the_leader_error_mm(TUBES, share * inner, inner) == pytest.approx(0.0, abs=1e-12)
-
-
-def test_beyond_it_the_tip_is_off_its_own_track() -> None:
-    errors = [follow_the_leader_error_mm(TUBES, 10.0, inner) for inner in (40.0, 42.0, 50.0, 60.0)]
-    assert errors[0] == pytest.approx(0.0, abs=1e-12)
-    assert errors[0] < errors[1] < errors[2] < errors[3]

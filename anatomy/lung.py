@@ -80,7 +80,7 @@ class Lung:
         wrong = [name for name, field in self.fields.items() if field.corners.shape != corners]
         if self.labels.shape != self.grid.shape or wrong:
             raise GridMismatchError(
-                f"The {wrong[0] + ' field' if wrong else 'labels'} of {self.name} do not fit the grid",
+                f"The grid does not fit the {wrong[0] + ' field' if wrong else 'labels'} of {self.name}",
                 expected=f"labels of the shape {self.grid.shape}, fields of {corners}",
             )
         object.__setattr__(self, "labels", read_only(np.asarray(self.labels)))

@@ -17,7 +17,11 @@ Mask = NDArray[np.bool_]
 
 COARSE_VOXEL_MM = 1.6
 NECK_WIDTHS_MM = (0.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+
 SMALLER_LUNG_SHARE = 0.1
+"""The smaller of two lungs holds at least this share of the larger one."""
+SMALLEST_REST_SHARE = 0.01
+"""What erosion leaves of the smaller lung is at least this share of all tissue, else it is a crumb."""
 
 
 def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
@@ -67,15 +71,19 @@ def _grow_sides(core: Mask, tissue: Mask, axes: Float) -> NDArray[np.int32] | No
 
     spacing = tuple(map(float, np.linalg.norm(axes, axis=0)))
     depth = edt.edt(core, anisotropy=spacing, order="F", black_border=True)
+    least = SMALLEST_REST_SHARE * float(np.count_nonzero(core))
     for neck in NECK_WIDTHS_MM:
-        markers = _two_largest(depth > neck / 2, axes)
+        markers = _two_largest(depth > neck / 2, axes, least)
         if markers is not None:
             return np.asarray(watershed(-depth, markers, mask=tissue), dtype=np.int32)
     return None
 
 
-def _two_largest(mask: Mask, axes: Float) -> NDArray[np.int32] | None:
-    """Label the two largest parts of `mask` 1 and 2, if they are a lung's size and lie side by side."""
+def _two_largest(mask: Mask, axes: Float, least: float) -> NDArray[np.int32] | None:
+    """Label the two largest parts of `mask` 1 and 2, if they are a lung's size and lie side by side.
+
+    Parts of fewer than `least` voxels are what erosion leaves of one lung.
+    """
     from scipy import ndimage
 
     parts, count = ndimage.label(mask)
@@ -84,7 +92,7 @@ def _two_largest(mask: Mask, axes: Float) -> NDArray[np.int32] | None:
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     order = np.argsort(sizes)[::-1]
-    if sizes[order[1]] < SMALLER_LUNG_SHARE * sizes[order[0]]:
+    if sizes[order[1]] < max(SMALLER_LUNG_SHARE * sizes[order[0]], least):
         return None
     centres = np.array(ndimage.center_of_mass(mask, parts, order[:2]))
     apart = np.abs(axes @ (centres[0] - centres[1]))

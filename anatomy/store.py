@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
@@ -25,6 +26,8 @@ from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 
 META = "lung.json"
+BUILDING = ".building-"
+ABANDONED_AFTER_S = 24 * 3600.0
 REPORT_RECORDS: dict[str, Any] = {
     "gaps_bridged": GapBridged,
     "spurs_pruned": SpurPruned,
@@ -101,7 +104,8 @@ def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder beside `folder` and rename it on success."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=".building-", dir=folder.parent))
+        _remove_abandoned(folder.parent)
+        work = Path(tempfile.mkdtemp(prefix=BUILDING, dir=folder.parent))
     except OSError as error:
         raise FileError(
             f"The cache folder {folder.parent} cannot be written: {error}",
@@ -117,6 +121,13 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _remove_abandoned(cache: Path) -> None:
+    """Remove what builds left behind that were killed."""
+    for left in cache.glob(f"{BUILDING}*"):
+        if time.time() - left.stat().st_mtime > ABANDONED_AFTER_S:
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _publish(work: Path, folder: Path) -> None:

@@ -22,7 +22,7 @@ from lungaccess.terminal import console, error_console
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.searching import SearchRequest
+    from lungaccess.run import SearchRequest
     from lungaccess.system import System
 
 OK, NO_PLAN, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -152,7 +152,7 @@ def plan(
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
-    from lungaccess.searching import SearchRequest
+    from lungaccess.run import SearchRequest
 
     _require_one_target(target, nodule)
     _require_budget(budget, iterations)
@@ -260,7 +260,7 @@ def demo(
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
-    from lungaccess.searching import demo_lung
+    from lungaccess.run import demo_lung
 
     _require_budget(budget, None)
     require_writable_folder(out)
@@ -276,7 +276,7 @@ def demo(
 def _first_reachable_nodule(lung: Lung, device: System, budget: float, seed: int, out: Path) -> int:
     """Plan to the nodules in their order until one can be reached."""
     from lungaccess.noplan import NoPlan
-    from lungaccess.searching import SearchRequest
+    from lungaccess.run import SearchRequest
 
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
@@ -293,7 +293,7 @@ def _plan_and_report(lung: Lung, request: SearchRequest, out: Path) -> int:
     """Search, check, write everything to `out`, show it, and return the exit code."""
     from lungaccess.checking import check as judge
     from lungaccess.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
-    from lungaccess.searching import run_search
+    from lungaccess.run import run_search
     from lungaccess.target import resolve_target
 
     target = resolve_target(lung, request.target, request.nodule)

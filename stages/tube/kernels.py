@@ -266,6 +266,14 @@ def march(scene, tubes, trace, pose, bend, s0, length, radius, clearance):
 
 
 @numba.njit(cache=True)
+def _advance(scene, tubes, trace, pose, normal, kappa, s0, s1, radius, clearance):
+    """March along one arc; return the reason, and pose and bending direction at its end."""
+    bend = (kappa, normal[0], normal[1], normal[2])
+    reason = march(scene, tubes, trace, pose, bend, s0, s1 - s0, radius, clearance)
+    return reason, pose_on_arc(pose, bend, s1 - s0), normal_on_arc(pose, bend, s1 - s0)
+
+
+@numba.njit(cache=True)
 def reset(trace):
     """Put a trace at the scope tip, in the lumen."""
     for m in range(trace.shape[0]):
@@ -296,19 +304,19 @@ def deploy(scene, tubes, base, normal, outer, inner, trace, tip):
         (max(straight, outer), inner, tubes[INNER_CURVATURE], tubes[INNER_RADIUS]),
     )
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])
-    nx, ny, nz = normal[0], normal[1], normal[2]
+    towards = (normal[0], normal[1], normal[2])
     for start, stop, kappa, radius in bounds:
         if stop - start <= 0.0:
             continue
-        bend = (kappa, nx, ny, nz)
-        reason = march(scene, tubes, trace, pose, bend, start, stop - start, radius, clearance)
+        reason, pose, towards = _advance(
+            scene, tubes, trace, pose, towards, kappa, start, stop, radius, clearance
+        )
         if reason != ACCEPTED:
             return reason
-        nx, ny, nz = normal_on_arc(pose, bend, stop - start)
-        pose = pose_on_arc(pose, bend, stop - start)
     for m in range(6):
         tip[m] = pose[m]
-    tip[6], tip[7], tip[8] = nx, ny, nz
+    for m in range(3):
+        tip[6 + m] = towards[m]
     return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
 
 
@@ -319,7 +327,11 @@ ENTRY_COLUMNS = 13
 
 
 @numba.njit(cache=True)
-def _record(entries, row, site, rotation, outer, inner, trace, pose):
+def _record(entries, row, site, rotation, outer, inner, trace, pose, reasons):
+    """Write an accepted deployment; return the number of rows written, 0 if it does not leave the airway."""
+    if trace[PHASE] != IN_TISSUE:
+        reasons[NO_EXIT] += 1
+        return 0
     entry = entries[row]
     entry[0] = site
     entry[1] = rotation
@@ -330,6 +342,7 @@ def _record(entries, row, site, rotation, outer, inner, trace, pose):
     entry[6] = trace[WALL_ANGLE]
     for m in range(6):
         entry[ENTRY_TIP + m] = pose[m]
+    return 1
 
 
 @numba.njit(cache=True, nogil=True)
@@ -366,50 +379,36 @@ def enumerate_site(scene, tubes, base, normals, site, stops, entries, reasons, w
     outer_trace = work[0]
     inner_trace = work[1]
     n_stops = stops.shape[0]
+    margin = tubes[MARGIN]
     for t in range(normals.shape[0]):
         reset(outer_trace)
         pose = (base[0], base[1], base[2], base[3], base[4], base[5])
-        nx, ny, nz = normals[t, 0], normals[t, 1], normals[t, 2]
+        towards = (normals[t, 0], normals[t, 1], normals[t, 2])
         for m in range(n_stops):
             if m > 0:
-                bend = (tubes[OVERLAP_CURVATURE], nx, ny, nz)
-                length = stops[m] - stops[m - 1]
-                reason = march(
-                    scene, tubes, outer_trace, pose, bend, stops[m - 1], length,
-                    tubes[OUTER_RADIUS], tubes[MARGIN],
+                reason, pose, towards = _advance(
+                    scene, tubes, outer_trace, pose, towards, tubes[OVERLAP_CURVATURE],
+                    stops[m - 1], stops[m], tubes[OUTER_RADIUS], margin,
                 )  # fmt: skip
                 if reason != ACCEPTED:
                     reasons[reason] += (n_stops - m) * (n_stops - m + 1) // 2
                     break
-                nx, ny, nz = normal_on_arc(pose, bend, length)
-                pose = pose_on_arc(pose, bend, length)
-                if outer_trace[PHASE] == IN_TISSUE:
-                    _record(entries, count, site, t, stops[m], stops[m], outer_trace, pose)
-                    count += 1
-                else:
-                    reasons[NO_EXIT] += 1
+                count += _record(entries, count, site, t, stops[m], stops[m], outer_trace, pose, reasons)
             for n in range(work.shape[1]):
                 inner_trace[n] = outer_trace[n]
             inner_pose = pose
-            ix, iy, iz = nx, ny, nz
+            inner_towards = towards
             for e in range(m + 1, n_stops):
-                if stops[e] - stops[m] > tubes[MAX_PROTRUSION]:
-                    reasons[PROTRUDES] += n_stops - e
-                    break
-                bend = (tubes[INNER_CURVATURE], ix, iy, iz)
-                length = stops[e] - stops[e - 1]
-                reason = march(
-                    scene, tubes, inner_trace, inner_pose, bend, stops[e - 1], length,
-                    tubes[INNER_RADIUS], tubes[MARGIN],
-                )  # fmt: skip
+                reason = PROTRUDES
+                if stops[e] - stops[m] <= tubes[MAX_PROTRUSION]:
+                    reason, inner_pose, inner_towards = _advance(
+                        scene, tubes, inner_trace, inner_pose, inner_towards, tubes[INNER_CURVATURE],
+                        stops[e - 1], stops[e], tubes[INNER_RADIUS], margin,
+                    )  # fmt: skip
                 if reason != ACCEPTED:
                     reasons[reason] += n_stops - e
                     break
-                ix, iy, iz = normal_on_arc(inner_pose, bend, length)
-                inner_pose = pose_on_arc(inner_pose, bend, length)
-                if inner_trace[PHASE] == IN_TISSUE:
-                    _record(entries, count, site, t, stops[m], stops[e], inner_trace, inner_pose)
-                    count += 1
-                else:
-                    reasons[NO_EXIT] += 1
+                count += _record(
+                    entries, count, site, t, stops[m], stops[e], inner_trace, inner_pose, reasons
+                )
     return count

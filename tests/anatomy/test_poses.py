@@ -73,6 +73,4 @@ def test_roll_is_the_angle_of_a_bending_direction(angle: float, forward: np.ndar
 def test_bending_directions_count_from_x_towards_y() -> None:
     frame = pose((0.0, 0.0, 0.0), (1.0, 1.0, 0.0))
     x, y, _z = frame[:3, :3].T
-    np.testing.assert_allclose(
-        bending_directions(frame, [0.0, math.pi / 2, math.pi]), [x, y, -x], atol=1e-12
-    )
+    np.testing.assert_allclose(bending_directions(frame, [0.0, math.pi / 2, math.pi]), [x, y, -x], atol=1e-12)

@@ -128,7 +128,9 @@ def test_a_thick_bridge_is_cut(half_width_mm: float) -> None:
 @given(
     spacing=st.tuples(*[st.sampled_from([0.5, 0.7, 0.8, 1.0, 1.7])] * 3),
     threads=st.lists(
-        st.tuples(st.floats(-14, 14), st.floats(-14, 14), st.sampled_from([0.0, 0.6, 2.0])), min_size=1, max_size=4
+        st.tuples(st.floats(-14, 14), st.floats(-14, 14), st.sampled_from([0.0, 0.6, 2.0])),
+        min_size=1,
+        max_size=4,
     ),
 )
 def test_no_thread_leaks_from_lung_to_lung(

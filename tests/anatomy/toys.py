@@ -13,7 +13,7 @@ from anatomy.grid import Float, Grid, Volume
 from anatomy.patient import PatientImages
 from tests.anatomy.tubes import Y, distance_to_segment
 
-SPACING_MM = (1.5, 1.5, 2.0)
+SPACING_MM = (2.0, 2.0, 2.0)
 LEFT_LUNG, RIGHT_LUNG = (40.0, 0.0, -30.0), (-40.0, 0.0, -30.0)
 NODULE = (48.0, 8.0, -20.0)
 VESSEL = ((30.0, -15.0, -60.0), (50.0, -15.0, 0.0))

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from anatomy.errors import AnatomyError, FrameError
-from lungaccess import cli, searching, terminal
+from lungaccess import cli, run, terminal
 from lungaccess.noplan import NoPlan
 from lungaccess.plans import Plan
 
@@ -71,7 +71,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         return SimpleNamespace(accepted=seen["accepted"], findings=(bad,))
 
     monkeypatch.setattr(cli, "_load", lambda patient, cache: toy_lung)
-    monkeypatch.setattr(searching, "_planner", lambda: search)
+    monkeypatch.setattr(run, "_planner", lambda: search)
     monkeypatch.setattr(
         "lungaccess.target.resolve_target",
         lambda lung, text, nodule: SimpleNamespace(named=(text, nodule), lps_mm=toy_plan.target_lps),
@@ -187,7 +187,7 @@ def test_an_interruption_keeps_the_best_plan(
         yield toy_plan
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(searching, "_planner", lambda: search)
+    monkeypatch.setattr(run, "_planner", lambda: search)
     assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == cli.OK
     assert (tmp_path / "plan.json").exists()
 

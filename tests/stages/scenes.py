@@ -1,4 +1,4 @@
-"""Lungs made by hand, voxel by voxel, and distances to their voxels found by trying every voxel."""
+"""Lungs made by hand, voxel by voxel, and distances to their voxels without any of the kernels."""
 
 from __future__ import annotations
 
@@ -129,25 +129,35 @@ def brute_clearance(
     """
     spacing = grid.spacing_mm
     local = grid.ijk(points) * spacing
-    hit = labels & bits
+    first = np.floor(grid.ijk(points).min(axis=0) - cap_mm / spacing).astype(int)
+    last = np.ceil(grid.ijk(points).max(axis=0) + cap_mm / spacing).astype(int)
+    first, last = np.maximum(first, 0), np.maximum(last + 1, 0)
+    window = labels[tuple(slice(low, high) for low, high in zip(first, last, strict=True))]
+    hit = window & bits
     chosen = hit != 0
     if exempt_branch >= 0:
-        chosen &= ~((hit == AIRWAY) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == exempt_branch))
-    centres = np.argwhere(chosen) * spacing
-    out = np.full(len(points), float(cap_mm))
-    if len(centres):
-        reach = cap_mm + 0.5 * float(np.linalg.norm(spacing))
-        centres = centres[cKDTree(local).query(centres)[0] <= reach]
-    for begin in range(0, len(points), 200):
-        part = local[begin : begin + 200]
-        gap = np.maximum(np.abs(part[:, None] - centres[None]) - 0.5 * spacing, 0.0)
-        nearest = np.sqrt((gap**2).sum(axis=-1).min(axis=1, initial=cap_mm**2))
-        out[begin : begin + 200] = np.minimum(out[begin : begin + 200], nearest)
+        chosen &= ~((hit == AIRWAY) & ((window >> BRANCH_SHIFT).astype(int) - 1 == exempt_branch))
+    centres = (np.argwhere(chosen) + first) * spacing
+    out = np.minimum(_box_distance(local, centres, spacing), cap_mm)
     if bits & OUTSIDE:
         faces = np.concatenate(
             [local + 0.5 * spacing, (np.array(grid.shape) - 0.5) * spacing - local], axis=1
         )
         out = np.minimum(out, np.maximum(faces.min(axis=1), 0.0))
+    return out
+
+
+def _box_distance(points: np.ndarray, centres: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+    """Return distances to boxes: of the nearest centres so many that no other box can be nearer."""
+    out = np.full(len(points), np.inf)
+    left, wanted = np.arange(len(points)), min(40, len(centres))
+    while len(left) and len(centres):
+        away, index = cKDTree(centres).query(points[left], k=[*range(1, wanted + 1)])
+        gap = np.maximum(np.abs(points[left][:, None] - centres[index]) - 0.5 * spacing, 0.0)
+        out[left] = np.sqrt((gap**2).sum(axis=-1)).min(axis=1)
+        unsure = away[:, -1] - 0.5 * float(np.linalg.norm(spacing)) < out[left]
+        left = left[unsure & (wanted < len(centres))]
+        wanted = min(6 * wanted, len(centres))
     return out
 
 

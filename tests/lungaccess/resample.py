@@ -1,0 +1,189 @@
+"""A plan walked again in steps of 0.02 mm, with closed forms and voxel boxes of its own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from lungaccess.plans import Plan
+from tests.stages.scenes import brute_clearance
+
+STEP_MM = 0.02
+
+
+@dataclass
+class Walk:
+    """Frames `(N, 4, 4)` along a curve and their arc lengths."""
+
+    frames: Float
+    s: Float
+
+    @property
+    def points(self) -> Float:
+        return self.frames[:, :3, 3]
+
+    @property
+    def tangents(self) -> Float:
+        return self.frames[:, :3, 2]
+
+
+def rolled(frame: Float, angle: float) -> Float:
+    c, s = math.cos(angle), math.sin(angle)
+    return frame @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+def arc(kappa: float, length: float) -> Float:
+    a = kappa * length
+    x, z = ((1 - math.cos(a)) / kappa, math.sin(a) / kappa) if kappa > 1e-9 else (0.0, length)
+    return np.array(
+        [
+            [math.cos(a), 0, math.sin(a), x],
+            [0, 1, 0, 0],
+            [-math.sin(a), 0, math.cos(a), z],
+            [0, 0, 0, 1.0],
+        ]
+    )
+
+
+def follow(frame: Float, arcs: list[tuple[float, float, float]], step: float = STEP_MM) -> Walk:
+    """Walk along arcs of (length, roll before it, curvature)."""
+    frames, lengths, done = [frame], [0.0], 0.0
+    for length, roll, kappa in arcs:
+        base = rolled(frame, roll)
+        for s in np.linspace(0.0, length, max(2, math.ceil(length / step) + 1))[1:]:
+            frames.append(base @ arc(kappa, s))
+            lengths.append(done + s)
+        frame, done = base @ arc(kappa, length), done + length
+    return Walk(np.array(frames), np.array(lengths))
+
+
+def needle_walk(plan: Plan) -> Walk:
+    arcs = [(a.length_mm, a.roll_rad, a.curvature_per_mm) for a in plan.needle.arcs]
+    return follow(plan.needle.lps_from_start, arcs)
+
+
+def tube_walk(plan: Plan) -> Walk:
+    """The straight outer tube bends the inner one back by the share of its stiffness."""
+    tubes, outer, inner = plan.system.tubes, plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
+    stiff = [
+        t.youngs_modulus_gpa * (t.outer_diameter_mm**4 - t.inner_diameter_mm**4)
+        for t in (tubes.inner, tubes.outer)
+    ]
+    kappa = tubes.inner.precurvature_per_mm
+    straight = max(inner - tubes.inner.curved_length_mm, 0.0)
+    edges = [0.0, min(straight, outer), outer, max(straight, outer), inner]
+    curvature = [0.0, kappa * stiff[0] / sum(stiff), 0.0, kappa]
+    pieces = [(b - a, 0.0, k) for a, b, k in zip(edges[:-1], edges[1:], curvature, strict=True) if b > a]
+    return follow(rolled(plan.scope.lps_from_scope_tip, plan.tube.rotation_rad), pieces)
+
+
+def labels_at(lung: Lung, points: Float) -> np.ndarray:
+    index = np.rint(lung.grid.ijk(points)).astype(int)
+    inside = ((index >= 0) & (index < lung.labels.shape)).all(axis=1)
+    labels = np.full(len(points), OUTSIDE, dtype=np.uint16)
+    labels[inside] = lung.labels[tuple(index[inside].T)]
+    return labels
+
+
+def forbidden(plan: Plan) -> int:
+    return OBSTACLES | (FISSURE if plan.fissures_are_obstacles else 0)
+
+
+def clearance(lung: Lung, points: Float, bits: int, exempt_branch: int = -1) -> Float:
+    return brute_clearance(lung.labels, lung.grid, points, bits, 2.5, exempt_branch)
+
+
+def problems(plan: Plan, lung: Lung) -> list[str]:
+    """Say in what a plan breaks the rules, walked again in steps of 0.02 mm."""
+    return [*_scope(plan, lung), *_tubes(plan, lung), *_needle(plan, lung)]
+
+
+def _scope(plan: Plan, lung: Lung) -> list[str]:
+    route, out = plan.scope.points_lps, []
+    share = np.linspace(0.0, 1.0, 12)[:, None, None]
+    dense = (route[:-1] + share * (route[1:] - route[:-1])).reshape(-1, 3)
+    if not (labels_at(lung, dense) & LUMEN).all():
+        out.append("the route leaves the lumen")
+    if not np.allclose(route[-1], plan.scope.lps_from_scope_tip[:3, 3]):
+        out.append("the scope tip is not at the end of the route")
+    return out
+
+
+def _tubes(plan: Plan, lung: Lung) -> list[str]:
+    walk, out, system = tube_walk(plan), [], plan.system
+    if np.abs(walk.frames[-1] - plan.tube.lps_from_tip).max() > 1e-6:
+        out.append("the tube tip is elsewhere")
+    if not np.allclose(plan.needle.lps_from_start, plan.tube.lps_from_tip):
+        out.append("the needle does not start at the tube tip")
+    behind = walk.s > plan.tube.exit.arc_length_mm
+    if not (labels_at(lung, walk.points[walk.s < plan.tube.exit.arc_length_mm - 0.2]) & LUMEN).all():
+        out.append("the tube leaves the lumen before its exit")
+    radius = np.where(
+        walk.s[behind] <= plan.tube.outer_insertion_mm - 1e-9,
+        system.tubes.outer.outer_diameter_mm / 2,
+        system.tubes.inner.outer_diameter_mm / 2,
+    )
+    needed = radius + system.margins.total_mm + plan.tube.lateral_sweep_mm
+    gap = clearance(lung, walk.points[behind], forbidden(plan), plan.exemption.branch) - needed
+    if gap.min() < -1e-6:
+        out.append(f"the tube is {-gap.min():.4f} mm too near")
+    return out
+
+
+def _needle(plan: Plan, lung: Lung) -> list[str]:
+    walk, out, needle = needle_walk(plan), [], plan.system.needle
+    required = needle.diameter_mm / 2 + plan.system.margins.total_mm
+    if np.linalg.norm(walk.points[-1] - plan.target_lps) > 1e-6:
+        out.append("the needle does not end at the target")
+    if max(a.curvature_per_mm for a in plan.needle.arcs) > needle.max_curvature_per_mm + 1e-12:
+        out.append("an arc is too tight")
+    if walk.s[-1] > needle.max_length_mm:
+        out.append("the needle is too long")
+    steps = np.arccos(np.clip((walk.tangents[1:] * walk.tangents[:-1]).sum(axis=1), -1, 1))
+    if steps.max() > needle.max_curvature_per_mm * STEP_MM * 1.05 + 1e-6:
+        out.append("the needle has a kink")
+    angle = np.degrees(np.arccos(np.clip(walk.tangents @ walk.tangents[0], -1, 1)))
+    if angle.max() > needle.max_angle_from_start_deg + 1e-6:
+        out.append("the needle turns too far from its start")
+    turn = sum(a.length_mm * a.curvature_per_mm for a in plan.needle.arcs)
+    if math.degrees(turn) > needle.max_accumulated_turn_deg + 1e-6:
+        out.append("the needle turns too much in all")
+    return [*out, *_needle_clearance(plan, lung, walk, required)]
+
+
+def _needle_clearance(plan: Plan, lung: Lung, walk: Walk, required: float) -> list[str]:
+    out = []
+    bits, branch, needle = forbidden(plan), plan.exemption.branch, plan.system.needle
+    at_first = walk.s < needle.exit_exemption_mm - 1e-9
+    gap = clearance(lung, walk.points[at_first], bits, branch)
+    if gap.min() < required - 1e-6:
+        out.append(f"at the exit the needle is {required - gap.min():.4f} mm too near")
+    lumen = clearance(lung, walk.points[at_first], LUMEN)
+    if lumen.min() < needle.diameter_mm / 2 - 1e-6:
+        out.append("the needle touches a lumen")
+    rest = clearance(lung, walk.points[~at_first], bits)
+    if rest.min(initial=np.inf) < required - 1e-6:
+        out.append(f"the needle is {required - rest.min():.4f} mm too near")
+    return out
+
+
+def branch_of(labels: np.ndarray) -> np.ndarray:
+    return np.asarray((labels >> BRANCH_SHIFT).astype(int) - 1)
+
+
+def put_vessel(lung: Lung, point: Float) -> Lung:
+    """A copy of the lung in which the voxel that holds a point is a vessel; only the labels know."""
+    from dataclasses import replace
+
+    labels = lung.labels.copy(order="F")
+    labels[tuple(np.rint(lung.grid.ijk(point)).astype(int))] = VESSEL
+    return replace(lung, labels=labels)
+
+
+def is_free(lung: Lung, point: Float) -> bool:
+    return bool(labels_at(lung, point[None])[0] & (AIRWAY | VESSEL | OUTSIDE) == 0)

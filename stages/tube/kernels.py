@@ -223,7 +223,8 @@ def _lumen_step(scene, trace, x, y, z, radius, required):
 def march(scene, tubes, trace, pose, bend, s0, length, radius, clearance):
     """Follow one arc of the tube, from `s0` mm beyond the scope tip, and judge every point of it.
 
-    In the lumen the axis moves freely.  Where it leaves, the wall is pierced within WALL_ZONE_MM; from
+    In the lumen the axis moves freely, and corners of voxels that it cuts for less than FINE_STEP_MM may
+    go unnoticed.  Where it leaves, the wall is pierced within WALL_ZONE_MM; from
     there on the axis is out of every lumen, and the tube keeps `clearance` from its surface to
     vessels, pleura, fissures and other branches.  Returns a reason, ACCEPTED if there is none.
     """

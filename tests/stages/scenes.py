@@ -127,6 +127,8 @@ def brute_clearance(
     Voxels of `exempt_branch` that are airway alone (of the structures in `bits`) are passed over.  Beyond
     the grid all is OUTSIDE.
     """
+    if not len(points):
+        return np.zeros(0)
     spacing = grid.spacing_mm
     local = grid.ijk(points) * spacing
     first = np.floor(grid.ijk(points).min(axis=0) - cap_mm / spacing).astype(int)

@@ -15,7 +15,7 @@ from anatomy.grid import Float, Grid
 
 Mask = NDArray[np.bool_]
 
-COARSE_VOXEL_MM = 1.6
+COARSE_VOXEL_MM = 2.4
 NECK_WIDTHS_MM = (0.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
 
 SMALLER_LUNG_SHARE = 0.1

@@ -89,7 +89,7 @@ def assemble(
         },
         clearance_mm={"tube": _tube_clearance(task, candidate), "needle": _needle_clearance(task, candidate)},
         costs={
-            name: costs.path_cost(lung, candidate.path, name, with_fissures=task.with_fissures, exact=True)
+            name: costs.path_cost(lung, candidate.path, name, with_fissures=task.with_fissures)
             for name in costs.OBJECTIVES
         },
         method=task.method,

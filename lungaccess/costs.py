@@ -14,7 +14,6 @@ from stages.needle.path import ArcPath
 OBJECTIVES = ("inverse_clearance", "cost_map", "length_mm")
 
 SAMPLE_MM = 0.1
-ROUGH_SAMPLE_MM = 0.5
 EXACT_BELOW_VOXELS = 8.0
 """Nearer than so many of the longest voxel sides, distances are exact; farther, the clearance field's lower
 bound is less than 0.6 % off."""
@@ -28,7 +27,7 @@ def require_objective(objective: str) -> None:
         )
 
 
-def path_cost(lung: Lung, path: ArcPath, objective: str, *, with_fissures: bool, exact: bool) -> float:
+def path_cost(lung: Lung, path: ArcPath, objective: str, *, with_fissures: bool) -> float:
     """Return the cost of a needle path.
 
     Parameters
@@ -41,29 +40,25 @@ def path_cost(lung: Lung, path: ArcPath, objective: str, *, with_fissures: bool,
         line integral of the cost map in mm, 0 without a map.  "length_mm".
     with_fissures : bool
         Whether fissures are obstacles.
-    exact : bool
-        Distances to voxels as solid boxes where they are below eight voxel sides, samples every 0.1 mm;
-        else bounds from the clearance field, samples every 0.5 mm.
     """
     if objective == "length_mm":
         return path.length_mm
-    points, lengths = path.sample(SAMPLE_MM if exact else ROUGH_SAMPLE_MM)
+    points, lengths = path.sample(SAMPLE_MM)
     if objective == "cost_map":
         return _cost_map_integral(lung, points, lengths)
-    clearance = obstacle_clearance_mm(lung, points, with_fissures=with_fissures, exact=exact)
+    clearance = obstacle_clearance_mm(lung, points, with_fissures=with_fissures)
     weight = 1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM)
     return float(np.trapezoid(weight, lengths))
 
 
-def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool, exact: bool) -> Float:
-    """Return the distance `(N,)` in mm from points to the nearest obstacle."""
+def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> Float:
+    """Return the distance `(N,)` in mm from points to the nearest obstacle, voxels as solid boxes."""
     clearance = lung.obstacle_field(with_fissures=with_fissures).lower_bound_mm(points)
-    if exact:
-        exact_below_mm = EXACT_BELOW_VOXELS * float(lung.grid.spacing_mm.max())
-        near = np.flatnonzero(clearance < exact_below_mm)
-        bits = OBSTACLES | (FISSURE if with_fissures else 0)
-        found = lung.exact_clearance_mm(points[near], bits, cap_mm=1.2 * exact_below_mm)
-        clearance[near] = np.maximum(found, clearance[near])
+    exact_below_mm = EXACT_BELOW_VOXELS * float(lung.grid.spacing_mm.max())
+    near = np.flatnonzero(clearance < exact_below_mm)
+    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    found = lung.exact_clearance_mm(points[near], bits, cap_mm=1.2 * exact_below_mm)
+    clearance[near] = np.maximum(found, clearance[near])
     return clearance
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,11 +148,27 @@ def blocker_on_path(space: NeedleSpace, path: ArcPath, branch: int) -> int:
         Pierced branch, whose wall is exempt at the exit; -1 for none.
     """
     start = 0.0
-    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
-        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
-        bend = (float(curvature), *(float(v) for v in bend_direction(frame, roll)))
-        label = kernels.blocker_on_arc(space.arrays, space.limits, pose, bend, float(length), start, branch)
+    for pose, bend, length in _kernel_arcs(path):
+        label = kernels.blocker_on_arc(space.arrays, space.limits, pose, bend, length, start, branch)
         if label:
             return int(label)
-        start += float(length)
+        start += length
     return 0
+
+
+def estimated_inverse_clearance(space: NeedleSpace, path: ArcPath) -> float:
+    """Return the integral of 1 / clearance along a path from the kernel's estimate of distances."""
+    step = space.limits[kernels.COST_STEP]
+    return float(
+        sum(
+            kernels.inverse_clearance_on_arc(space.arrays, step, pose, bend, length)
+            for pose, bend, length in _kernel_arcs(path)
+        )
+    )
+
+
+def _kernel_arcs(path: ArcPath) -> Iterator[tuple[tuple[float, ...], tuple[float, ...], float]]:
+    """Yield each arc as the kernels take it: `pose`, `bend` and length."""
+    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
+        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+        yield pose, (float(curvature), *(float(v) for v in bend_direction(frame, roll))), float(length)

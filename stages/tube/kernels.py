@@ -61,7 +61,7 @@ WALL_ZONE_MM = 1.0
 OUT_OF_LUMEN_MM = 0.02
 NORMAL_RADIUS_MM = 2.5
 BISECTIONS = 12
-SWEEP_SAMPLES = 400
+SWEEP_SAMPLES = 100
 
 
 @numba.njit(cache=True)
@@ -97,6 +97,14 @@ def planar_point(tubes, outer, inner, s):
 
 
 @numba.njit(cache=True)
+def _off_track(tubes, outer, inner, tip):
+    """Return how far the point at arc length `tip` ends up from where the tip first got there, in mm."""
+    x0, z0 = planar_point(tubes, min(tip, outer), tip, tip)
+    x1, z1 = planar_point(tubes, outer, inner, tip)
+    return math.hypot(x1 - x0, z1 - z0)
+
+
+@numba.njit(cache=True)
 def lateral_sweep(tubes, outer, inner):
     """Return the largest distance of a point of the body, at any step, from its final place, in mm.
 
@@ -105,14 +113,15 @@ def lateral_sweep(tubes, outer, inner):
     farthest from its final place when the tip first gets there: the sweep is also the error with which
     the tubes follow their leader.  While the tip is within the curved length of the scope it is 0.
     """
-    if inner <= tubes[CURVED_LENGTH]:
+    curved = tubes[CURVED_LENGTH]
+    if inner <= curved:
         return 0.0
-    worst = 0.0
+    # Largest where the straight part leaves the scope or the outer tube; samples for all the rest.
+    worst = max(
+        _off_track(tubes, outer, inner, curved), _off_track(tubes, outer, inner, min(outer + curved, inner))
+    )
     for m in range(1, SWEEP_SAMPLES + 1):
-        tip = inner * m / SWEEP_SAMPLES
-        x0, z0 = planar_point(tubes, min(tip, outer), tip, tip)
-        x1, z1 = planar_point(tubes, outer, inner, tip)
-        worst = max(worst, math.hypot(x1 - x0, z1 - z0))
+        worst = max(worst, _off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
     return worst
 
 

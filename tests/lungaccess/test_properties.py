@@ -21,7 +21,7 @@ from tests.stages.scenes import lung_of
 
 PRESET = la.load_system("ultrathin")
 SYSTEM = replace(PRESET, name="changed", needle=replace(PRESET.needle, max_curvature_per_mm=1 / 50))
-ANY = settings(max_examples=12, suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow])
+ANY = settings(max_examples=8, suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow])
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_a_vessel_put_on_the_way_is_noticed(
 
 
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=3)
+@settings(max_examples=2)
 def test_a_new_search_goes_around_what_was_put_in_the_way(
     small_lung: Lung, atlas: la.Atlas, seed: int
 ) -> None:

@@ -149,6 +149,8 @@ def _check_exit(
     near = (before >= 0.0) & (before <= BRANCH_ZONE_MM)
     branches = {int(b) for b in branch_of(labels[near])}
     found.true("tube.exit.branch", stated.branch in branches, f"{stated.branch} against {sorted(branches)}")
+    trachea = lung.tree.n_branches > 1 and stated.branch == 0
+    found.true("tube.exit.not_trachea", not trachea, "the trachea lies in the mediastinum")
     detail = f"{exemption.branch} against {stated.branch}"
     found.true("exemption.branch", exemption.branch == stated.branch, detail)
     found.agrees("tube.exit.arc", stated.arc_length_mm, arc_mm, EXIT_TOLERANCE_MM, "mm")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +36,10 @@ REASONS: dict[int, str] = {
     kernels.PROTRUDES: "the inner tube is too short to protrude so far",
 }
 """Why a deployment is refused."""
+
+LEAVES_TRACHEA = "the tube would leave the trachea, which lies in the mediastinum"
+TRACHEA = 0
+"""The branch at the root of every airway tree."""
 
 DEFAULT_ROTATIONS = 36
 DEFAULT_STOP_MM = 2.0
@@ -207,7 +212,25 @@ def deployments(
     refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
     for _, counts in parts:
         refused += counts
-    return _as_deployments(rows, angles, refused, (most - rotations) * len(tips))
+    found = _as_deployments(rows, angles, refused, (most - rotations) * len(tips))
+    return _without_trachea(found) if _has_trachea(lung) else found
+
+
+def _has_trachea(lung: Lung) -> bool:
+    """Tell whether branch 0 is a trachea: in a tree of one branch nothing says so."""
+    return lung.tree.n_branches > 1
+
+
+def _without_trachea(found: Deployments) -> Deployments:
+    """Refuse the exits through the wall of the trachea, whatever the masks hold there."""
+    kept = found.branch != TRACHEA
+    arrays: dict[str, Any] = {
+        f.name: read_only(getattr(found, f.name)[kept])
+        for f in fields(found)
+        if isinstance(getattr(found, f.name), np.ndarray)
+    }
+    count = int((~kept).sum())
+    return replace(found, **arrays, refused=found.refused | ({LEAVES_TRACHEA: count} if count else {}))
 
 
 def _as_deployments(rows: Float, angles: Float, refused: Int, candidates: int) -> Deployments:
@@ -233,6 +256,7 @@ class TubeJudge:
     def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
         self._scene = scene_of(lung, with_fissures=with_fissures)
         self._constants = tube_constants(tubes, margins)
+        self._spared = TRACHEA if _has_trachea(lung) else -1
         self._trace = np.zeros(kernels.N_TRACE)
         self._tip = np.zeros(9)
 
@@ -267,6 +291,8 @@ class TubeJudge:
         )
         if reason != kernels.ACCEPTED:
             return REASONS[reason]
+        if int(trace[kernels.BRANCH]) == self._spared:
+            return LEAVES_TRACHEA
         return Deployment(
             rotation_rad=float(rotation_rad),
             outer_mm=float(outer_mm),

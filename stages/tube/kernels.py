@@ -116,7 +116,7 @@ def lateral_sweep(tubes, outer, inner):
     curved = tubes[CURVED_LENGTH]
     if inner <= curved:
         return 0.0
-    # Largest where the straight part leaves the scope or the outer tube; samples for all the rest.
+    # It peaks sharply where the straight part leaves the scope or the outer tube; elsewhere it is smooth.
     worst = max(
         _off_track(tubes, outer, inner, curved), _off_track(tubes, outer, inner, min(outer + curved, inner))
     )

@@ -10,7 +10,7 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES
-from stages.tube.deployments import insertion_stops
+from stages.tube.deployments import LEAVES_TRACHEA, insertion_stops
 from stages.tube.shape import centreline
 from tests.stages.scenes import brute_clearance
 
@@ -64,6 +64,17 @@ def test_tubes_are_clear_behind_the_exit(atlas: la.Atlas, small_lung: Lung) -> N
         labels = small_lung.labels[tuple(np.rint(small_lung.grid.ijk(points)).astype(int).T)]
         assert (labels[s < found.exit_mm[n] - 0.2] & LUMEN).all()
         assert not (labels[s > found.exit_mm[n] + 1.0] & LUMEN).any()
+
+
+def test_no_tube_leaves_the_trachea(atlas: la.Atlas) -> None:
+    """It lies in the mediastinum, whatever the masks hold beside it."""
+    entries = atlas.deployments
+    through = np.arange(entries.count) % 3 == 0
+    some = replace(entries, branch=np.where(through, TRACHEA, entries.branch))
+    kept = _without_trachea(some)
+    assert (atlas.deployments.branch != TRACHEA).all()
+    assert np.array_equal(kept.positions, entries.positions[~through])
+    assert kept.refused[LEAVES_TRACHEA] == through.sum()
 
 
 def test_the_same_atlas_twice(atlas: la.Atlas, small_lung: Lung) -> None:

@@ -25,6 +25,11 @@ def refusals(plan: Plan, lung: Any, **options: Any) -> set[str]:
     return {finding.name for finding in report.refusals}
 
 
+def test_an_exit_through_the_trachea_is_refused(plan: Plan, lung: Any, tools: Any) -> None:
+    wrong = tools.changed(plan, tube__exit__branch=0, exemption__branch=0)
+    assert "tube.exit.not_trachea" in refusals(wrong, lung)
+
+
 def moved(plan: Plan, tools: Any, move: Any, pose: Any, turn: float = 1.0) -> Plan:
     """Apply a map to every point and pose; `turn` multiplies rotations and rolls."""
     arcs = tuple(dataclasses.replace(a, roll_rad=turn * a.roll_rad) for a in plan.needle.arcs)

@@ -104,7 +104,7 @@ class TestShape:
                 before = kernels.planar_point(NUMBERS, min(tip, outer * inner), tip, s)
                 after = kernels.planar_point(NUMBERS, outer * inner, inner, s)
                 worst = max(worst, math.dist(before, after))
-        assert worst - 1e-6 <= sweep <= worst + 0.25
+        assert worst - 1e-3 <= sweep <= worst + 0.25
 
 
 LOW, HIGH, SPACING = np.array([-12.0, -10.0, -20.0]), np.array([14.0, 10.0, 20.0]), 0.5

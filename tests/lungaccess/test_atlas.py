@@ -10,7 +10,7 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES
-from stages.tube.deployments import LEAVES_TRACHEA, insertion_stops
+from stages.tube.deployments import LEAVES_TRACHEA, TRACHEA, _without_trachea, insertion_stops
 from stages.tube.shape import centreline
 from tests.stages.scenes import brute_clearance
 

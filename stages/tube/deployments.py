@@ -256,7 +256,7 @@ class TubeJudge:
     def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
         self._scene = scene_of(lung, with_fissures=with_fissures)
         self._constants = tube_constants(tubes, margins)
-        self._spared = TRACHEA if _has_trachea(lung) else -1
+        self._forbidden_branch = TRACHEA if _has_trachea(lung) else -1
         self._trace = np.zeros(kernels.N_TRACE)
         self._tip = np.zeros(9)
 
@@ -291,7 +291,7 @@ class TubeJudge:
         )
         if reason != kernels.ACCEPTED:
             return REASONS[reason]
-        if int(trace[kernels.BRANCH]) == self._spared:
+        if int(trace[kernels.BRANCH]) == self._forbidden_branch:
             return LEAVES_TRACHEA
         return Deployment(
             rotation_rad=float(rotation_rad),

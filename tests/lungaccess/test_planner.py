@@ -75,7 +75,8 @@ class TestPlans:
     ) -> None:
         for name in OBJECTIVES:
             best = {other: plans[-1].costs[name] for other, plans in by_objective.items()}
-            assert best[name] <= 1.05 * min(best.values())
+            # A short random search comes this near to the best, no nearer.
+            assert best[name] <= 1.02 * min(best.values())
             assert best[name] < 0.999 * max(best.values())
 
     @pytest.mark.parametrize(

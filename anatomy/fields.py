@@ -1,4 +1,4 @@
-"""Clearance fields: the distance to a structure, exact at voxel corners and bounded in between.
+"""Clearance fields: the distance to a structure, exact at lattice points and bounded in between.
 
 The corner of a voxel lattice nearest to a box of voxels is a corner of that box, so the distance
 from every corner to a union of solid voxel boxes is the Euclidean distance transform of the set of
@@ -19,29 +19,42 @@ from anatomy.kernels import field as kernel
 UInt16 = NDArray[np.uint16]
 MAX_STORED = np.iinfo(np.uint16).max
 
+SOLID = 0.5
+"""Obstacles are voxels as solid boxes."""
+CENTRES = 0.0
+"""Obstacles are the centres of their voxels."""
+
 ROUNDING_MM = 2e-5
 FLOAT32_ROUNDING = 2.0**-24
 
 
-def corner_geometry(grid: Grid) -> Float:
-    """Return the `(3, 5)` array that kernels use to find a point in the corner lattice of `grid`."""
-    geometry = np.zeros((3, 5))
+def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:
+    """Return the `(3, 6)` array by which kernels find a point in `grid`, see `anatomy.kernels.field`.
+
+    Parameters
+    ----------
+    grid : Grid
+    half_voxels : float
+        Half side of an obstacle in voxels: `SOLID` boxes or `CENTRES`.
+    """
+    geometry = np.zeros((3, 6))
     geometry[:, :4] = grid.ijk_from_lps[:3]
     geometry[:, 3] += 0.5
     geometry[:, 4] = grid.spacing_mm**2
+    geometry[:, 5] = half_voxels
     return read_only(geometry)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DistanceField:
-    """The distance to a structure whose voxels are solid boxes.
+    """The distance to a structure whose voxels are solid boxes, or count as their centres.
 
     Parameters
     ----------
     name : str
     corners : (ni + 1, nj + 1, nk + 1) uint16, Fortran-contiguous
         Distance at each voxel corner in 1/256 mm, rounded down, at most 255.99 mm.
-    geometry : (3, 5) float64
+    geometry : (3, 6) float64
         See `corner_geometry`.
     """
 
@@ -77,12 +90,15 @@ def touched_corners(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return corners
 
 
-def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike) -> UInt16:
-    """Return the distance from every voxel corner to the voxels of `mask`, in 1/256 mm rounded down."""
+def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike, half_voxels: float = SOLID) -> UInt16:
+    """Return the distance from every voxel corner to the voxels of `mask`, in 1/256 mm rounded down.
+
+    With `CENTRES`, from every voxel centre to the voxel centres of `mask`.
+    """
     import edt
 
     spacing = tuple(float(s) for s in np.asarray(spacing_mm))
-    free = touched_corners(mask)
+    free = touched_corners(mask) if half_voxels == SOLID else np.array(mask, dtype=bool, order="F")
     if not free.any():
         return np.asfortranarray(np.full(free.shape, MAX_STORED, dtype=np.uint16))
     np.logical_not(free, out=free)
@@ -95,7 +111,9 @@ def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike) -> UInt16:
     return distance.astype(np.uint16, order="F")
 
 
-def distance_field(name: str, mask: NDArray[np.bool_], grid: Grid) -> DistanceField:
-    """Make the field of the distance to `mask`, a bool array on `grid`."""
-    corners = distance_corners(mask, grid.spacing_mm)
-    return DistanceField(name=name, corners=corners, geometry=corner_geometry(grid))
+def distance_field(
+    name: str, mask: NDArray[np.bool_], grid: Grid, half_voxels: float = SOLID
+) -> DistanceField:
+    """Make the field of the distance to `mask`, a bool array on `grid`, as `SOLID` boxes or `CENTRES`."""
+    corners = distance_corners(mask, grid.spacing_mm, half_voxels)
+    return DistanceField(name=name, corners=corners, geometry=corner_geometry(grid, half_voxels))

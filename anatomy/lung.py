@@ -94,7 +94,7 @@ class Lung:
 
     @cached_property
     def geometry(self) -> Float:
-        """The `(3, 5)` array that maps LPS mm to voxel corners, for kernels."""
+        """The `(3, 6)` array that maps LPS mm to voxel corners, for kernels."""
         return corner_geometry(self.grid)
 
     def obstacle_field(self, *, with_fissures: bool) -> DistanceField:

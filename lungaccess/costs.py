@@ -8,7 +8,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
-from stages.needle.kernels import CLEARANCE_FLOOR_MM
+from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM
 from stages.needle.path import ArcPath
 
 OBJECTIVES = ("inverse_clearance", "cost_map", "length_mm")

@@ -18,6 +18,7 @@ from lungaccess.assemble import Candidate, Task
 from lungaccess.atlas import Atlas
 from lungaccess.costs import path_cost
 from stages.needle.path import ArcPath, blocker_on_path, direct_path, estimated_inverse_clearance
+from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace, direct_arcs, needle_space, workspace_lengths
 from stages.scope.tips import MedialAxis, ScopeTip, looks_ahead, tip_at, walk
 from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
@@ -92,13 +93,10 @@ class NeedleDesk:
 
     def search(self, deployment: Deployment, seed: int, iterations: int) -> ArcPath | None:
         """Return a path of the RRT, if it finds one."""
-        return self._problem.plan(
-            deployment.lps_from_tip,
-            self.task.target.lps_mm,
-            branch=deployment.branch,
-            seed=seed,
-            iterations=iterations,
+        query = Query(
+            lps_from_start=deployment.lps_from_tip, target=self.task.target.lps_mm, branch=deployment.branch
         )
+        return self._problem.plan(query, seed=seed, iterations=iterations)
 
     @cached_property
     def _problem(self) -> NeedleProblem:

@@ -18,8 +18,10 @@ are lost: with `S` for the sum, `d(X) >= t - |X - p|` and Minkowski's inequality
 
     sqrt(interpolated squared distance) >= t - sqrt(S) - q,  and  sqrt(S) <= half a voxel diagonal.
 
-`geometry` is `(3, 5)` float64: rows of the affine map from LPS mm to corner coordinates, and the
-squared voxel size of the axis in the last column.
+`geometry` is `(3, 6)` float64: rows of the affine map from LPS mm to corner coordinates, the squared voxel
+size of the axis, and the half side of an obstacle in voxels: 0.5 where voxels are solid boxes, 0 where an
+obstacle is the centre of its voxel.  Then the field is sampled at voxel centres, its bound holds word for
+word with a point for the box, and the distance to the grid's edge still counts as that to a solid.
 """
 
 from __future__ import annotations
@@ -45,6 +47,9 @@ def interpolate_squared(field, geometry, x, y, z):
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
     v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
     w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    u -= 0.5 - geometry[0, 5]
+    v -= 0.5 - geometry[1, 5]
+    w -= 0.5 - geometry[2, 5]
     ni, nj, nk = field.shape
     if not (0.0 <= u < ni - 1 and 0.0 <= v < nj - 1 and 0.0 <= w < nk - 1):
         return 0.0, 0.0
@@ -97,7 +102,7 @@ def label_at(labels, geometry, x, y, z):
 
 @numba.njit(cache=True)
 def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
-    """Search the voxels around a point for the nearest one with any of `bits`, as a solid box.
+    """Search the voxels around a point for the nearest one with any of `bits`, as `geometry` takes them.
 
     Airway voxels of `exempt_branch` count only for their other structures (-1 exempts nothing).
     Space beyond the grid is OUTSIDE.  Returns the distance in mm, at most `cap`, and the label of the
@@ -107,6 +112,7 @@ def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
     v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
     w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
     ni, nj, nk = labels.shape
+    half = geometry[0, 5]
     best = cap * cap
     nearest = 0
     su = math.sqrt(geometry[0, 4])
@@ -128,11 +134,11 @@ def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
     k0 = max(int(math.floor(w - cap / sw)), 0)
     k1 = min(int(math.floor(w + cap / sw)), nk - 1)
     for k in range(k0, k1 + 1):
-        gw = max(max(k - w, w - k - 1.0), 0.0) * sw
+        gw = max(abs(k + 0.5 - w) - half, 0.0) * sw
         if gw * gw >= best:
             continue
         for j in range(j0, j1 + 1):
-            gv = max(max(j - v, v - j - 1.0), 0.0) * sv
+            gv = max(abs(j + 0.5 - v) - half, 0.0) * sv
             g2 = gw * gw + gv * gv
             if g2 >= best:
                 continue
@@ -143,7 +149,7 @@ def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
                     continue
                 if hit == AIRWAY and exempt_branch >= 0 and (label >> BRANCH_SHIFT) - 1 == exempt_branch:
                     continue
-                gu = max(max(i - u, u - i - 1.0), 0.0) * su
+                gu = max(abs(i + 0.5 - u) - half, 0.0) * su
                 d2 = g2 + gu * gu
                 if d2 < best:
                     best = d2

@@ -11,18 +11,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base, control, util
 from scipy.spatial.transform import Rotation
 
 from anatomy.grid import Float
+from anatomy.kernels.field import label_at
 from anatomy.structures import OUTSIDE
-from stages.needle import kernels
-from stages.needle.path import ArcPath, arc_transform, path_from_tree
+from stages.needle.path import ArcPath, arc_transform
+from stages.needle.searches import Query, RestartingRRT, Search
 from stages.needle.space import NeedleSpace
 
 util.setLogLevel(util.LogLevel.LOG_ERROR)
@@ -31,19 +31,7 @@ PROPAGATION_STEP = 0.05
 """Each arc has duration 1, so OMPL propagates it again in 20 steps when it checks a path."""
 
 GOAL_TOLERANCE_MM = 1e-6
-MAX_NODES = 20_000
 SLICE_ITERATIONS = 200
-
-
-@dataclass
-class Query:
-    """One start pose and target, and the effort to spend."""
-
-    lps_from_start: Float
-    target: Float
-    branch: int
-    seed: int
-    iterations: int
 
 
 class NeedleGoal(base.GoalRegion):
@@ -60,55 +48,48 @@ class NeedleGoal(base.GoalRegion):
         return float(np.linalg.norm(tip - self.target))
 
 
-class NeedleRRT(base.Planner):
-    """The RRT of [Kuntz2015, sec. IV-C] as an OMPL planner.
+class NeedlePlanner(base.Planner):
+    """A needle search as an OMPL planner.
 
-    `solve` runs the kernel in slices until it has a path, the termination condition holds, or the
-    iterations of the query are spent.
+    `solve` runs `make_search(query)` in slices until it is finished, the termination condition holds, or
+    the iterations are spent; without `anytime` it stops at the first path.  Each better path is handed to
+    the problem definition at once.
     """
 
-    def __init__(self, si: Any, space: NeedleSpace) -> None:
-        super().__init__(si, "NeedleRRT")
+    def __init__(self, si: Any, make_search: Callable[[Query], Search], name: str = "NeedleRRT") -> None:
+        super().__init__(si, name)
         self._si = si
-        self._space = space
-        self._nodes = np.zeros((MAX_NODES, kernels.NODE_COLUMNS))
-        self._parents = np.zeros(MAX_NODES, dtype=np.int64)
+        self._make_search = make_search
         self.query: Query | None = None
+        self.iterations = 0
+        """Most iterations to spend."""
+        self.anytime = False
         self.path: ArcPath | None = None
         self.iterations_used = 0
 
     def solve(self, termination: Any) -> Any:
-        """Search; hand a path to the problem definition as arcs of duration 1."""
+        """Search; hand paths to the problem definition as arcs of duration 1."""
         self.path = None
+        self.iterations_used = 0
         query = self.query
         start = self.getPlannerInputStates().nextStart()
         if query is None or start is None:
             return base.PlannerStatus(base.PlannerStatus.INVALID_START)
-        self._nodes[0] = 0.0
-        self._nodes[0, :3] = query.lps_from_start[:3, 3]
-        self._nodes[0, 3:6] = query.lps_from_start[:3, 2]
-        solved = self._search(query, termination)
-        if not solved:
-            return base.PlannerStatus(base.PlannerStatus.TIMEOUT)
-        self._hand_over()
-        return base.PlannerStatus(base.PlannerStatus.EXACT_SOLUTION)
-
-    def _search(self, query: Query, termination: Any) -> bool:
-        state = np.array([query.seed], dtype=np.uint64)
-        count, used, solved = 1, 0, False
-        while not termination():
-            portion = min(SLICE_ITERATIONS, query.iterations - used)
-            count, spent, solved = kernels.grow_rrt(
-                self._space.arrays, self._space.limits, query.branch, query.target,
-                self._nodes, self._parents, count, portion, state,
-            )  # fmt: skip
-            used += spent
-            if solved or spent < portion or used >= query.iterations:
+        search = self._make_search(query)
+        left = self.iterations
+        while not (termination() or search.finished):
+            portion = min(SLICE_ITERATIONS, left)
+            if search.advance(portion):
+                self.path = search.path
+                self._hand_over()
+                if not self.anytime:
+                    break
+            left -= portion
+            if left <= 0:
                 break
-        self.iterations_used = used
-        if solved:
-            self.path = path_from_tree(query.lps_from_start, self._nodes, self._parents, count - 1)
-        return bool(solved)
+        self.iterations_used = self.iterations - max(left, 0)
+        found = base.PlannerStatus.TIMEOUT if self.path is None else base.PlannerStatus.EXACT_SOLUTION
+        return base.PlannerStatus(found)
 
     def _hand_over(self) -> None:
         if self.path is None:
@@ -162,6 +143,7 @@ class NeedleProblem:
 
     def __init__(self, space: NeedleSpace) -> None:
         self._space = space
+        self._seed = 1
         self._states = base.SE3StateSpace()
         self._states.setBounds(_bounds_of(space))
         controls = control.RealVectorControlSpace(self._states, 3)
@@ -172,27 +154,15 @@ class NeedleProblem:
         self._si.setMinMaxControlDuration(1, round(1 / PROPAGATION_STEP))
         self.setup.setStatePropagator(_propagate)
         self.setup.setStateValidityChecker(_validity(space))
-        self.planner = NeedleRRT(self._si, space)
+        self.planner = NeedlePlanner(self._si, self._rrt)
         self.setup.setPlanner(self.planner)
 
-    def plan(
-        self,
-        lps_from_start: Float,
-        target: Float,
-        *,
-        branch: int,
-        seed: int,
-        iterations: int,
-        time_s: float = math.inf,
-    ) -> ArcPath | None:
-        """Search a path of arcs from a pose to a point.
+    def plan(self, query: Query, *, seed: int, iterations: int, time_s: float = math.inf) -> ArcPath | None:
+        """Search a path of arcs with the RRT.
 
         Parameters
         ----------
-        lps_from_start : (4, 4) float64
-        target : (3,) float64, LPS mm
-        branch : int
-            Pierced branch, whose wall is exempt at the exit; -1 for none.
+        query : Query
         seed, iterations : int
             The same pair gives the same path, if the time does not run out first.
         time_s : float
@@ -203,19 +173,22 @@ class NeedleProblem:
         ArcPath or None
             A path proved clear and within all limits; None if none was found.
         """
-        self.planner.query = Query(
-            np.asarray(lps_from_start), np.array(target, dtype=np.float64), branch, seed, iterations
-        )
+        self._seed = seed
+        self.planner.query = query
+        self.planner.iterations = iterations
         definition = base.ProblemDefinition(self._si)
         start = self._si.allocState()
-        write_state(start, lps_from_start)
+        write_state(start, query.lps_from_start)
         definition.addStartState(start)
-        definition.setGoal(NeedleGoal(self._si, target))
+        definition.setGoal(NeedleGoal(self._si, query.target))
         self.planner.clear()
         self.planner.setProblemDefinition(definition)
         # Not through SimpleSetup.solve, which sets everything up again for each query.
         self.planner.solve(_termination(time_s))
         return self.planner.path
+
+    def _rrt(self, query: Query) -> Search:
+        return RestartingRRT(self._space, query, seed=self._seed)
 
 
 def _termination(time_s: float) -> Any:
@@ -225,7 +198,7 @@ def _termination(time_s: float) -> Any:
 
 
 def _bounds_of(space: NeedleSpace) -> Any:
-    grid = space.lung.grid
+    grid = space.grid
     corners = grid.lps(list(itertools.product(*[(-0.5, n - 0.5) for n in grid.shape])))
     bounds = base.RealVectorBounds(3)
     for axis in range(3):
@@ -251,10 +224,10 @@ def _propagate(state: Any, u: Any, duration: float, result: Any) -> None:
 
 
 def _validity(space: NeedleSpace) -> Any:
-    lung = space.lung
+    _field, labels, geometry, _bits = space.arrays
 
     def is_valid(state: Any) -> bool:
-        point: NDArray[np.float64] = np.array([state.getX(), state.getY(), state.getZ()])
-        return bool(lung.label_at(point) & OUTSIDE == 0)
+        label = label_at(labels, geometry, state.getX(), state.getY(), state.getZ())
+        return bool(label & OUTSIDE == 0)
 
     return is_valid

@@ -12,7 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from anatomy import poses as frames
 from anatomy.grid import Float, read_only
 from anatomy.kernels import arcs as arc_kernels
-from stages.needle import kernels
+from stages.needle.kernels import limits as index
+from stages.needle.kernels import tree
+from stages.needle.kernels.connections import least_cosine
+from stages.needle.kernels.cost import inverse_clearance_on_arc
+from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.space import NeedleSpace
 
 LENGTH, ROLL, CURVATURE = 0, 1, 2
@@ -76,7 +80,7 @@ class ArcPath:
         for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
             forward = float(start @ frame[:3, 2])
             aside = float(start @ bend_direction(frame, roll))
-            least = min(least, kernels.least_cosine(forward, aside, length * curvature))
+            least = min(least, least_cosine(forward, aside, length * curvature))
         return math.acos(least)
 
 
@@ -117,8 +121,8 @@ def path_from_tree(lps_from_start: Float, nodes: Float, parents: NDArray[np.int6
 
     Parameters
     ----------
-    nodes : (M, 13) float64
-        Tree of `stages.needle.kernels.grow_rrt`.
+    nodes : (M, NODE_COLUMNS) float64
+        See `stages.needle.kernels.tree`.
     parents : (M,) int64
     """
     chain = []
@@ -129,9 +133,9 @@ def path_from_tree(lps_from_start: Float, nodes: Float, parents: NDArray[np.int6
     frame = np.asarray(lps_from_start)
     arcs = []
     for node in reversed(chain):
-        length = float(nodes[node, kernels.ARC_LENGTH])
-        curvature = float(nodes[node, kernels.BEND])
-        roll = frames.roll_towards(frame, nodes[node, kernels.BEND + 1 : kernels.BEND + 4])
+        length = float(nodes[node, tree.ARC_LENGTH])
+        curvature = float(nodes[node, tree.BEND])
+        roll = frames.roll_towards(frame, nodes[node, tree.BEND + 1 : tree.BEND + 4])
         arcs.append((length, roll, curvature))
         frame = frame @ arc_transform(length, roll, curvature)
     return ArcPath(lps_from_start=lps_from_start, arcs=np.array(arcs))
@@ -149,7 +153,7 @@ def blocker_on_path(space: NeedleSpace, path: ArcPath, branch: int) -> int:
     """
     start = 0.0
     for pose, bend, length in _kernel_arcs(path):
-        label = kernels.blocker_on_arc(space.arrays, space.limits, pose, bend, length, start, branch)
+        label = blocker_on_arc(space.arrays, space.limits, pose, bend, length, start, branch)
         if label:
             return int(label)
         start += length
@@ -158,10 +162,10 @@ def blocker_on_path(space: NeedleSpace, path: ArcPath, branch: int) -> int:
 
 def estimated_inverse_clearance(space: NeedleSpace, path: ArcPath) -> float:
     """Return the integral of 1 / clearance along a path from the kernel's estimate of distances."""
-    step = space.limits[kernels.COST_STEP]
+    step = space.limits[index.COST_STEP]
     return float(
         sum(
-            kernels.inverse_clearance_on_arc(space.arrays, step, pose, bend, length)
+            inverse_clearance_on_arc(space.arrays, step, pose, bend, length)
             for pose, bend, length in _kernel_arcs(path)
         )
     )

@@ -1,19 +1,24 @@
-"""What the needle kernels look at: the lung's arrays and the needle's limits as numbers."""
+"""What the needle kernels look at: obstacles as arrays, and the needle's limits as numbers."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from anatomy.grid import Float, read_only
+from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.fields import CENTRES, SOLID, DistanceField, distance_field
+from anatomy.grid import Float, Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import FISSURE, OBSTACLES
-from stages.needle import kernels
 from stages.needle.device import Needle
+from stages.needle.kernels import limits as index
+from stages.needle.kernels import scan
+from stages.needle.objective import Arrays as ObjectiveArrays
+from stages.needle.objective import Objective
 
 Arrays = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int]
 
@@ -23,7 +28,49 @@ COST_STEP_MM = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NeedleSpace:
-    """One needle in one lung.
+    """One needle among obstacles.
+
+    Parameters
+    ----------
+    grid : Grid
+    needle : Needle
+    required_clearance_mm : float
+        Distance that the needle's axis keeps from obstacles.
+    arrays : tuple
+        Clearance field, labels, geometry and obstacle bits, for the kernels.
+    limits : (N_LIMITS,) float64
+        See `stages.needle.kernels.limits`.
+    cost_map : Volume or None
+        Cost of a mm of path at each voxel, on `grid`; infinite is an obstacle.
+    """
+
+    grid: Grid
+    needle: Needle
+    required_clearance_mm: float
+    arrays: Arrays
+    limits: Float
+    cost_map: Volume | None
+    _objectives: dict[Objective, ObjectiveArrays] = field(default_factory=dict, init=False, repr=False)
+
+    def objective_arrays(self, objective: Objective) -> ObjectiveArrays:
+        """Return an objective for the kernels; made once, because the least cost of a map takes a while."""
+        if objective not in self._objectives:
+            costs = None if self.cost_map is None else self.cost_map.array
+            self._objectives[objective] = objective.arrays(costs)
+        return self._objectives[objective]
+
+    @property
+    def goal_tolerance_mm(self) -> float:
+        """How far from the target a path may end."""
+        return float(self.limits[index.GOAL_TOLERANCE])
+
+
+def needle_space(
+    lung: Lung, needle: Needle, margins: Margins, *, with_fissures: bool, goal_tolerance_mm: float = 0.0
+) -> NeedleSpace:
+    """Gather what the kernels need to steer `needle` through `lung`.
+
+    The needle's axis keeps its radius and the margins from obstacles, whose voxels are solid boxes.
 
     Parameters
     ----------
@@ -32,46 +79,98 @@ class NeedleSpace:
     margins : Margins
     with_fissures : bool
         Whether fissures are obstacles.
-    arrays : tuple
-        Clearance field, labels, geometry and obstacle bits, for the kernels.
-    limits : (9,) float64
-        See `stages.needle.kernels`.
+    goal_tolerance_mm : float
+        How far from the target a path may end.
     """
-
-    lung: Lung
-    needle: Needle
-    margins: Margins
-    with_fissures: bool
-    arrays: Arrays
-    limits: Float
-
-    @property
-    def required_clearance_mm(self) -> float:
-        """Distance that the needle's axis keeps from obstacles: its radius and the margins."""
-        return self.needle.radius_mm + self.margins.total_mm
-
-
-def needle_space(lung: Lung, needle: Needle, margins: Margins, *, with_fissures: bool) -> NeedleSpace:
-    """Gather what the kernels need to steer `needle` through `lung`."""
-    field = lung.obstacle_field(with_fissures=with_fissures)
+    clearance = lung.obstacle_field(with_fissures=with_fissures)
     bits = OBSTACLES | (FISSURE if with_fissures else 0)
-    limits = np.zeros(kernels.N_LIMITS)
-    limits[kernels.KAPPA] = needle.max_curvature_per_mm
-    limits[kernels.MAX_LENGTH] = needle.max_length_mm
-    limits[kernels.MAX_ANGLE] = math.radians(needle.max_angle_from_start_deg)
-    limits[kernels.MAX_TURN] = math.radians(needle.max_accumulated_turn_deg)
-    limits[kernels.REQUIRED] = needle.radius_mm + margins.total_mm
-    limits[kernels.RADIUS] = needle.radius_mm
-    limits[kernels.EXEMPT_LENGTH] = needle.exit_exemption_mm
-    limits[kernels.MAX_STEP] = RRT_STEP_MM
-    limits[kernels.COST_STEP] = COST_STEP_MM
+    required = needle.radius_mm + margins.total_mm
+    return _space(lung.grid, needle, required, clearance, lung.labels, bits, lung.cost, goal_tolerance_mm)
+
+
+def space_of_labels(
+    labels: NDArray[np.uint16],
+    grid: Grid,
+    needle: Needle,
+    *,
+    bits: int = OBSTACLES,
+    required_clearance_mm: float,
+    obstacles_as: float = SOLID,
+    goal_tolerance_mm: float = 0.0,
+    cost_map: Volume | None = None,
+) -> NeedleSpace:
+    """Gather the same from a label volume alone.
+
+    Parameters
+    ----------
+    labels : (ni, nj, nk) uint16
+        See `anatomy.structures`.
+    grid : Grid
+    needle : Needle
+    bits : int
+        Structures that are obstacles.  Space beyond the grid is OUTSIDE.
+    required_clearance_mm : float
+        Distance that the needle's axis keeps from obstacles.
+    obstacles_as : float
+        `SOLID`: the clearance is measured to voxels as solid boxes; `CENTRES`: to voxel centres.
+    goal_tolerance_mm : float
+        How far from the target a path may end.
+    cost_map : Volume, optional
+        On `grid`.
+
+    Raises
+    ------
+    GridMismatchError
+        If labels or cost map do not fit the grid.
+    SettingsError
+        If `obstacles_as` is neither, or a length is negative or not finite.
+    """
+    if labels.shape != grid.shape or (cost_map is not None and cost_map.array.shape != grid.shape):
+        raise GridMismatchError(
+            "Labels or cost map do not fit the grid", expected=f"arrays of the shape {grid.shape}"
+        )
+    if obstacles_as not in (SOLID, CENTRES):
+        raise SettingsError(
+            f"Obstacles cannot be taken as {obstacles_as}", expected=f"{SOLID} (boxes) or {CENTRES} (centres)"
+        )
+    labels = np.asfortranarray(labels, dtype=np.uint16)
+    clearance = distance_field("obstacle", (labels & bits) != 0, grid, obstacles_as)
+    return _space(
+        grid, needle, required_clearance_mm, clearance, read_only(labels), bits, cost_map, goal_tolerance_mm
+    )
+
+
+def _space(
+    grid: Grid,
+    needle: Needle,
+    required_mm: float,
+    clearance: DistanceField,
+    labels: NDArray[np.uint16],
+    bits: int,
+    cost_map: Volume | None,
+    goal_tolerance_mm: float,
+) -> NeedleSpace:
+    for name, value in (("required clearance", required_mm), ("goal tolerance", goal_tolerance_mm)):
+        if not 0.0 <= value < math.inf:
+            raise SettingsError(f"The {name} is {value} mm", expected="a finite length of 0 or more")
+    limits = np.zeros(index.N_LIMITS)
+    limits[index.KAPPA] = needle.max_curvature_per_mm
+    limits[index.MAX_LENGTH] = needle.max_length_mm
+    limits[index.MAX_ANGLE] = math.radians(needle.max_angle_from_start_deg)
+    limits[index.MAX_TURN] = math.radians(needle.max_accumulated_turn_deg)
+    limits[index.REQUIRED] = required_mm
+    limits[index.RADIUS] = needle.radius_mm
+    limits[index.EXEMPT_LENGTH] = needle.exit_exemption_mm
+    limits[index.MAX_STEP] = RRT_STEP_MM
+    limits[index.COST_STEP] = COST_STEP_MM
+    limits[index.GOAL_TOLERANCE] = goal_tolerance_mm
     return NeedleSpace(
-        lung=lung,
+        grid=grid,
         needle=needle,
-        margins=margins,
-        with_fissures=with_fissures,
-        arrays=(field.corners, lung.labels, field.geometry, bits),
+        required_clearance_mm=required_mm,
+        arrays=(clearance.corners, labels, clearance.geometry, bits),
         limits=read_only(limits),
+        cost_map=cost_map,
     )
 
 
@@ -80,8 +179,8 @@ def workspace_lengths(
 ) -> Float:
     """Return the shortest path length from each start pose to a target, infinite where there is none.
 
-    The test is exact in free space for curvature, both turning limits and the greatest length; paths
-    that turn by more than 180 degrees in all are left out.
+    The test is exact in free space for curvature and the greatest length, and for turning limits of which
+    either is at most 180 degrees, see `stages.needle.kernels.connections`.
 
     Parameters
     ----------
@@ -94,7 +193,7 @@ def workspace_lengths(
     """
     places = _plain(positions)
     lengths = np.zeros(len(places))
-    kernels.workspace_scan(places, _plain(tangents), _plain(target), space.limits, lengths)
+    scan.workspace_scan(places, _plain(tangents), _plain(target), space.limits, lengths)
     return lengths
 
 
@@ -124,7 +223,7 @@ def direct_arcs(
     """
     blockers = np.zeros(len(branches), dtype=np.int64)
     costs = np.zeros((len(branches), 2))
-    kernels.direct_arcs(
+    scan.direct_arcs(
         space.arrays,
         space.limits,
         _plain(positions),

@@ -14,8 +14,11 @@ from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from stages.needle import kernels
 from stages.needle.device import Needle
+from stages.needle.kernels import connections, proof, rrt, tree
+from stages.needle.kernels import cost as cost_kernels
+from stages.needle.kernels import limits as limits_index
+from stages.needle.objective import SHORTEST
 from stages.needle.path import ArcPath, blocker_on_path, path_from_tree
 from stages.needle.space import NeedleSpace, direct_arcs, needle_space, workspace_lengths
 from tests.stages.scenes import Canvas, brute_clearance, line_tree, lung_of
@@ -26,9 +29,9 @@ RADIUS = 50.0
 def limits_of(**values: float) -> Float:
     """Limits of a needle of 50 mm radius, 90 and 180 degrees, 150 mm."""
     given_values = {"KAPPA": 1 / RADIUS, "MAX_LENGTH": 150.0, "MAX_ANGLE": math.pi / 2, "MAX_TURN": math.pi}
-    limits = np.zeros(kernels.N_LIMITS)
+    limits = np.zeros(limits_index.N_LIMITS)
     for name, value in {**given_values, **values}.items():
-        limits[getattr(kernels, name)] = value
+        limits[getattr(limits_index, name)] = value
     return limits
 
 
@@ -36,41 +39,46 @@ class TestWorkspace:
     """The set of points that the needle reaches in free space."""
 
     def test_straight_ahead(self) -> None:
-        assert kernels.workspace_length(0.0, 40.0, limits_of()) == 40.0
-        assert kernels.workspace_length(0.0, 0.0, limits_of()) == 0.0
+        assert connections.workspace_length(0.0, 40.0, limits_of()) == 40.0
+        assert connections.workspace_length(0.0, 0.0, limits_of()) == 0.0
 
     def test_quarter_circle(self) -> None:
-        assert kernels.workspace_length(RADIUS, RADIUS, limits_of()) == pytest.approx(math.pi * RADIUS / 2)
+        assert connections.workspace_length(RADIUS, RADIUS, limits_of()) == pytest.approx(
+            math.pi * RADIUS / 2
+        )
 
     @pytest.mark.parametrize("limit", ["MAX_ANGLE", "MAX_TURN"])
     def test_either_turning_limit_cuts_the_quarter_circle_off(self, limit: str) -> None:
-        assert kernels.workspace_length(RADIUS, RADIUS, limits_of(**{limit: math.radians(89.9)})) == math.inf
+        assert (
+            connections.workspace_length(RADIUS, RADIUS, limits_of(**{limit: math.radians(89.9)})) == math.inf
+        )
 
     def test_length_limit(self) -> None:
         quarter = math.pi * RADIUS / 2
         within, beyond = limits_of(MAX_LENGTH=quarter + 1e-6), limits_of(MAX_LENGTH=quarter - 1e-6)
-        assert kernels.workspace_length(RADIUS, RADIUS, within) < math.inf
-        assert kernels.workspace_length(RADIUS, RADIUS, beyond) == math.inf
-        assert kernels.workspace_length(0.0, 40.0, limits_of(MAX_LENGTH=39.9)) == math.inf
+        assert connections.workspace_length(RADIUS, RADIUS, within) < math.inf
+        assert connections.workspace_length(RADIUS, RADIUS, beyond) == math.inf
+        assert connections.workspace_length(0.0, 40.0, limits_of(MAX_LENGTH=39.9)) == math.inf
 
     def test_quarter_circle_then_straight(self) -> None:
-        found = kernels.workspace_length(RADIUS + 30.0, RADIUS, limits_of())
+        found = connections.workspace_length(RADIUS + 30.0, RADIUS, limits_of())
         assert found == pytest.approx(math.pi * RADIUS / 2 + 30.0)
 
     @pytest.mark.parametrize("rho", [0.0, 1e-6, 5.0, 60.0, 120.0])
     def test_behind_is_out_of_reach(self, rho: float) -> None:
-        assert kernels.workspace_length(rho, -1.0, limits_of()) == math.inf
+        assert connections.workspace_length(rho, -1.0, limits_of()) == math.inf
 
-    def test_inside_the_tightest_circle_is_out_of_reach(self) -> None:
-        limits = limits_of(MAX_ANGLE=math.pi, MAX_TURN=3 * math.pi, MAX_LENGTH=500.0)
-        assert kernels.workspace_length(RADIUS, 10.0, limits) == math.inf
+    def test_inside_the_tightest_circle_only_a_path_of_more_than_half_a_turn_leads(self) -> None:
+        assert connections.workspace_length(RADIUS, 10.0, limits_of(MAX_LENGTH=500.0)) == math.inf
+        wide = limits_of(MAX_ANGLE=math.pi, MAX_TURN=3 * math.pi, MAX_LENGTH=500.0)
+        assert math.pi * RADIUS < connections.workspace_length(RADIUS, 10.0, wide) < 2.5 * math.pi * RADIUS
 
     @given(angle=st.floats(1e-3, math.pi / 2), share=st.floats(0.05, 1.0))
     def test_ends_of_arcs_within_the_limits_are_in(self, angle: float, share: float) -> None:
         """Also those of the tightest arc, where rounding decides."""
         radius = RADIUS / share
         length = radius * angle
-        found = kernels.workspace_length(
+        found = connections.workspace_length(
             radius * (1 - math.cos(angle)), radius * math.sin(angle), limits_of(MAX_LENGTH=length + 1e-9)
         )
         assert found <= length + 1e-9
@@ -81,7 +89,7 @@ class TestWorkspace:
         limits = limits_of(MAX_ANGLE=math.radians(70.0), MAX_LENGTH=120.0)
         angle = np.linspace(0.0, math.radians(70.0), 20001)
         for rho, h in rng.uniform([0.0, -20.0], [110.0, 120.0], (400, 2)):
-            found = kernels.workspace_length(rho, h, limits)
+            found = connections.workspace_length(rho, h, limits)
             x, z = RADIUS * (1 - np.cos(angle)), RADIUS * np.sin(angle)
             ahead = (rho - x) * np.sin(angle) + (h - z) * np.cos(angle)
             miss = np.abs((rho - x) * np.cos(angle) - (h - z) * np.sin(angle))
@@ -108,7 +116,9 @@ class TestWorkspace:
                 continue
             tested += 1
             x, y, z = path.frames()[-1][:3, 3]
-            assert kernels.workspace_length(math.hypot(x, y), z, limits) <= path.length_mm + 1e-6, path.arcs
+            assert connections.workspace_length(math.hypot(x, y), z, limits) <= path.length_mm + 1e-6, (
+                path.arcs
+            )
         assert tested > 1000
 
     @given(
@@ -120,7 +130,7 @@ class TestWorkspace:
         aside = math.sqrt(1 - forward**2) * math.cos(phase)
         a = np.linspace(0.0, turn, 4001)
         dense = float((forward * np.cos(a) + aside * np.sin(a)).min())
-        assert dense - 1e-5 <= kernels.least_cosine(forward, aside, turn) <= dense + 1e-12
+        assert dense - 1e-5 <= connections.least_cosine(forward, aside, turn) <= dense + 1e-12
 
 
 SPACINGS = st.tuples(*[st.sampled_from([0.5, 0.6, 0.8, 1.1])] * 3)
@@ -143,7 +153,7 @@ def crowded_spaces(draw: Any) -> tuple[Lung, Float, tuple[float, ...], tuple[flo
     lung = lung_of(canvas.labels, canvas.grid, line_tree([0, 0, 0], [0, 0, 1], 1.0))
     radius = draw(st.sampled_from([0.1, 0.3, 0.5]))
     limits = limits_of(REQUIRED=radius + draw(st.sampled_from([0.0, 0.3, 0.6])), RADIUS=radius)
-    limits[kernels.EXEMPT_LENGTH] = draw(st.sampled_from([0.0, 1.0, 3.3]))
+    limits[limits_index.EXEMPT_LENGTH] = draw(st.sampled_from([0.0, 1.0, 3.3]))
     start = np.concatenate([rng.uniform(-2.0, 2.0, 3), np.zeros(3)])
     frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     start[3:] = frame[0]
@@ -165,9 +175,9 @@ def points_of_arc(pose: Any, bend: Any, length: float, step: float) -> tuple[Flo
 
 def spare_clearance(lung: Lung, limits: Float, points: Float, s: Float, branch: int) -> float:
     """The least clearance beyond what is required at the points, voxels as solid boxes, by the rules."""
-    required = limits[kernels.REQUIRED]
+    required = limits[limits_index.REQUIRED]
     cap = required + 1.0
-    in_exit = (s < limits[kernels.EXEMPT_LENGTH]) & (branch >= 0)
+    in_exit = (s < limits[limits_index.EXEMPT_LENGTH]) & (branch >= 0)
 
     def distance(where: Any, bits: int, exempt: int = -1) -> Float:
         return brute_clearance(lung.labels, lung.grid, points[where], bits, cap, exempt)
@@ -175,7 +185,7 @@ def spare_clearance(lung: Lung, limits: Float, points: Float, s: Float, branch: 
     spare = [distance(~in_exit, OBSTACLES) - required] if (~in_exit).any() else []
     if in_exit.any():
         spare.append(distance(in_exit, OBSTACLES, branch) - required)
-        spare.append(distance(in_exit, LUMEN) - limits[kernels.RADIUS])
+        spare.append(distance(in_exit, LUMEN) - limits[limits_index.RADIUS])
     return float(np.concatenate(spare).min())
 
 
@@ -186,7 +196,7 @@ class TestBlocker:
     @settings(max_examples=150)
     def test_without_exemption(self, scene: Any) -> None:
         lung, limits, pose, bend, length = scene
-        label = kernels.blocker_on_arc(arrays(lung), limits, pose, bend, length, 0.0, -1)
+        label = proof.blocker_on_arc(arrays(lung), limits, pose, bend, length, 0.0, -1)
         points, s = points_of_arc(pose, bend, length, 0.02)
         spare = spare_clearance(lung, limits, points, s, -1)
         if label == 0:
@@ -198,14 +208,14 @@ class TestBlocker:
     @settings(max_examples=150)
     def test_with_exemption(self, scene: Any, begun: float, branch: int) -> None:
         lung, limits, pose, bend, length = scene
-        label = kernels.blocker_on_arc(arrays(lung), limits, pose, bend, length, begun, branch)
+        label = proof.blocker_on_arc(arrays(lung), limits, pose, bend, length, begun, branch)
         points, s = points_of_arc(pose, bend, length, 0.02)
         spare = spare_clearance(lung, limits, points, s + begun, branch)
         if label == 0:
             assert spare >= -1e-9
         elif spare >= 0.01 + 0.01:
             # The end of the exemption falls between two samples: only there may the kernel know better.
-            edge = limits[kernels.EXEMPT_LENGTH] - begun
+            edge = limits[limits_index.EXEMPT_LENGTH] - begun
             assert 0.0 <= edge <= length
             at = points_of_arc(pose, bend, max(edge, 1e-9), 1e9)[0][-1:]
             assert spare_clearance(lung, limits, at, np.array([np.inf]), branch) < 0.01
@@ -216,13 +226,10 @@ class TestBlocker:
         lung = canvas.lung()
         limits = limits_of(REQUIRED=1.0, RADIUS=0.5)
         bend = (0.0, 1.0, 0.0, 0.0)
+        assert proof.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 8.0, 0.0, -1) == VESSEL
+        assert proof.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 2.0, 0.0, -1) == 0
         assert (
-            kernels.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 8.0, 0.0, -1) == VESSEL
-        )
-        assert kernels.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 2.0, 0.0, -1) == 0
-        assert (
-            kernels.blocker_on_arc(arrays(lung), limits, (5.0, 0, 0, 0, 0, 1.0), bend, 9.5, 0.0, -1)
-            == OUTSIDE
+            proof.blocker_on_arc(arrays(lung), limits, (5.0, 0, 0, 0, 0, 1.0), bend, 9.5, 0.0, -1) == OUTSIDE
         )
 
     @pytest.mark.parametrize("start", [(0.0, 0.0, 11.0), (math.nan, 0.0, 0.0)])
@@ -230,9 +237,7 @@ class TestBlocker:
         lung = Canvas.empty([-10, -10, -10], [10, 10, 10], 1.0).lung()
         pose = (*start, 0.0, 0.0, 1.0)
         limits = limits_of(REQUIRED=1.0)
-        assert (
-            kernels.blocker_on_arc(arrays(lung), limits, pose, (0.0, 1.0, 0.0, 0.0), 1.0, 0.0, -1) == OUTSIDE
-        )
+        assert proof.blocker_on_arc(arrays(lung), limits, pose, (0.0, 1.0, 0.0, 0.0), 1.0, 0.0, -1) == OUTSIDE
 
 
 class TestExemption:
@@ -247,7 +252,7 @@ class TestExemption:
         lung = canvas.lung()
         values = limits_of(REQUIRED=0.9, RADIUS=0.4, EXEMPT_LENGTH=5.0, **limits)
         pose, bend = (0.0, 0, 0, 0, 0, 1.0), (0.0, 1.0, 0, 0)
-        return int(kernels.blocker_on_arc(arrays(lung), values, pose, bend, length, begun, branch))
+        return int(proof.blocker_on_arc(arrays(lung), values, pose, bend, length, begun, branch))
 
     def test_the_wall_is_exempt_at_first(self) -> None:
         assert self.label(length=4.9) == 0
@@ -269,7 +274,7 @@ class TestExemption:
         values = limits_of(REQUIRED=0.9, RADIUS=0.4, EXEMPT_LENGTH=5.0)
         for gap, clear in ((0.41, True), (0.39, False)):
             pose = (-1.0 + gap, 0.0, 0.0, 0.0, 0.0, 1.0)
-            label = kernels.blocker_on_arc(space, values, pose, (0.0, 1.0, 0, 0), 3.0, 0.0, 0)
+            label = proof.blocker_on_arc(space, values, pose, (0.0, 1.0, 0, 0), 3.0, 0.0, 0)
             assert (label == 0) == clear
             assert clear or label & LUMEN
 
@@ -280,7 +285,7 @@ class TestExemption:
         canvas.add(canvas.ball([0.0, 0.0, 3.0], 0.6), VESSEL)
         values = limits_of(REQUIRED=0.9, RADIUS=0.4, EXEMPT_LENGTH=5.0)
         pose = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-        label = kernels.blocker_on_arc(arrays(canvas.lung()), values, pose, (0.0, 1.0, 0, 0), 4.0, 0.0, 0)
+        label = proof.blocker_on_arc(arrays(canvas.lung()), values, pose, (0.0, 1.0, 0, 0), 4.0, 0.0, 0)
         assert label & VESSEL
 
 
@@ -299,6 +304,7 @@ def ball_space(**changes: float) -> NeedleSpace:
 
 
 GOAL = np.array([0.0, 0.0, 28.0])
+OBJECTIVE = SHORTEST.arrays(None)
 START = np.array([0.0, 0.0, -28.0, 0.0, 0.0, 1.0])
 
 
@@ -306,11 +312,11 @@ def grow(
     space: NeedleSpace, seed: int = 5, goal: Float = GOAL, iterations: int = 20000, size: int = 20000
 ) -> tuple[Float, np.ndarray, int, int, bool]:
     """Run the RRT from START."""
-    nodes, parents = np.zeros((size, kernels.NODE_COLUMNS)), np.zeros(size, dtype=np.int64)
+    nodes, parents = np.zeros((size, tree.NODE_COLUMNS)), np.zeros(size, dtype=np.int64)
     nodes[0, :6] = START
     state = np.array([seed], dtype=np.uint64)
-    count, used, solved = kernels.grow_rrt(
-        space.arrays, space.limits, -1, goal, nodes, parents, 1, iterations, state
+    count, used, solved = rrt.grow_rrt(
+        space.arrays, space.limits, OBJECTIVE, -1, goal, nodes, parents, 1, iterations, 0.5, state, math.inf
     )
     return nodes[:count], parents[:count], count, used, solved
 
@@ -367,7 +373,7 @@ class TestDirectArcs:
         space = needle_space(
             canvas.lung(), Needle(diameter_mm=1.0, max_curvature_per_mm=0.01), Margins(), with_fissures=False
         )
-        cost = kernels.inverse_clearance_on_arc(
+        cost = cost_kernels.inverse_clearance_on_arc(
             space.arrays, 0.5, (0.0, 0, -10, 0, 0, 1.0), (0.0, 1.0, 0, 0), 20.0
         )
         assert cost == pytest.approx(4.0, rel=5e-3)
@@ -387,7 +393,7 @@ class TestRrt:
         assert np.linalg.norm(path.frames()[-1][:3, 3] - GOAL) < 1e-6
         assert blocker_on_path(space, path, -1) == 0
         points, _ = path.sample(0.02)
-        gap = brute_clearance(space.lung.labels, space.lung.grid, points, OBSTACLES, 2.0)
+        gap = brute_clearance(space.arrays[1], space.grid, points, OBSTACLES, 2.0)
         assert gap.min() >= space.required_clearance_mm - 1e-6
 
     @pytest.mark.parametrize(
@@ -412,8 +418,8 @@ class TestRrt:
                 end = path.frames()[-1]
                 assert np.linalg.norm(end[:3, 3] - nodes[last, :3]) < 1e-9
                 assert np.linalg.norm(end[:3, 2] - nodes[last, 3:6]) < 1e-9
-                assert path.length_mm == pytest.approx(nodes[last, kernels.PATH_LENGTH])
-                assert path.accumulated_turn_rad == pytest.approx(nodes[last, kernels.PATH_TURN])
+                assert path.length_mm == pytest.approx(nodes[last, tree.PATH_LENGTH])
+                assert path.accumulated_turn_rad == pytest.approx(nodes[last, tree.PATH_TURN])
                 assert path.arcs[:, 2].max() <= needle.max_curvature_per_mm + 1e-12
                 assert path.length_mm <= needle.max_length_mm + 1e-9
                 assert path.accumulated_turn_rad <= math.radians(needle.max_accumulated_turn_deg) + 1e-9
@@ -430,13 +436,24 @@ class TestRrt:
     def test_slices_grow_the_same_tree_as_one_run(self) -> None:
         space = ball_space(max_length_mm=57.5)
         whole = grow(space, 3, iterations=4000)
-        nodes, parents = np.zeros((20000, kernels.NODE_COLUMNS)), np.zeros(20000, dtype=np.int64)
+        nodes, parents = np.zeros((20000, tree.NODE_COLUMNS)), np.zeros(20000, dtype=np.int64)
         nodes[0, :6] = START
         state = np.array([3], dtype=np.uint64)
         count, used, solved = 1, 0, False
         while used < 4000 and not solved:
-            count, spent, solved = kernels.grow_rrt(
-                space.arrays, space.limits, -1, GOAL, nodes, parents, count, min(77, 4000 - used), state
+            count, spent, solved = rrt.grow_rrt(
+                space.arrays,
+                space.limits,
+                OBJECTIVE,
+                -1,
+                GOAL,
+                nodes,
+                parents,
+                count,
+                min(77, 4000 - used),
+                0.5,
+                state,
+                math.inf,
             )
             used += spent
         assert used == whole[3]
@@ -461,10 +478,10 @@ class TestRrt:
         canvas.add(canvas.ball([0, 0, 0], 5.0), VESSEL)
         needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 40)
         space = needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
-        nodes, parents = np.zeros((5000, kernels.NODE_COLUMNS)), np.zeros(5000, dtype=np.int64)
+        nodes, parents = np.zeros((5000, tree.NODE_COLUMNS)), np.zeros(5000, dtype=np.int64)
         nodes[0, :6] = 0.0, 0.0, -46.0, 0.0, 0.0, 1.0
-        _, _, solved = kernels.grow_rrt(
-            space.arrays, space.limits, -1, np.array([0.0, 0.0, 46.0]), nodes, parents, 1, 20000,
-            np.array([1], dtype=np.uint64),
+        _, _, solved = rrt.grow_rrt(
+            space.arrays, space.limits, OBJECTIVE, -1, np.array([0.0, 0.0, 46.0]), nodes, parents, 1,
+            20000, 0.5, np.array([1], dtype=np.uint64), math.inf,
         )  # fmt: skip
         assert solved

@@ -14,11 +14,13 @@ import pytest
 from ompl import base
 
 from anatomy.grid import Float
+from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import OUTSIDE, VESSEL
 from stages.needle.device import Needle
-from stages.needle.ompl_planner import NeedleGoal, NeedleProblem, Query, read_state, write_state
+from stages.needle.ompl_planner import NeedleGoal, NeedleProblem, read_state, write_state
 from stages.needle.path import ArcPath, blocker_on_path
+from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.scenes import Canvas
 
@@ -26,14 +28,18 @@ GOAL = np.array([0.0, 0.0, 28.0])
 ITERATIONS = 5000
 
 
-@pytest.fixture(scope="module")
-def space() -> NeedleSpace:
+def scene() -> Lung:
     """A vessel ball between start and goal; the lung ends at x = -28."""
     canvas = Canvas.empty([-32, -32, -32], [32, 32, 32], 1.0)
     canvas.add(canvas.ball([0, 0, 0], 4.0), VESSEL)
     canvas.add(canvas.points[..., 0] < -28, OUTSIDE)
+    return canvas.lung()
+
+
+@pytest.fixture(scope="module")
+def space() -> NeedleSpace:
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 30)
-    return needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
+    return needle_space(scene(), needle, Margins(), with_fissures=False)
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +53,13 @@ def start() -> Float:
     return frame
 
 
+def query(branch: int = -1) -> Query:
+    return Query(lps_from_start=start(), target=GOAL, branch=branch)
+
+
 def ask(problem: NeedleProblem, seed: int = 1, **more: Any) -> ArcPath | None:
-    values = {"branch": -1, "seed": seed, "iterations": ITERATIONS, **more}
-    return problem.plan(start(), GOAL, **values)
+    values = {"seed": seed, "iterations": ITERATIONS, **more}
+    return problem.plan(query(), **values)
 
 
 def require(path: ArcPath | None) -> ArcPath:
@@ -59,7 +69,8 @@ def require(path: ArcPath | None) -> ArcPath:
 
 def prepare_setup(problem: NeedleProblem, seed: int = 1) -> None:
     """Put the same question to OMPL's SimpleSetup."""
-    problem.planner.query = Query(start(), GOAL.copy(), -1, seed, ITERATIONS)
+    problem.planner.query = query()
+    problem.planner.iterations = ITERATIONS
     problem.setup.clear()
     problem.setup.clearStartStates()
     state = problem.setup.getSpaceInformation().allocState()
@@ -98,7 +109,7 @@ def test_a_solve_without_query_or_start_is_no_crash(space: NeedleSpace) -> None:
 def test_ompl_propagates_the_arcs_to_the_same_end(space: NeedleSpace) -> None:
     """Its own propagation, in steps of a twentieth of each arc, against the kernel's numbers."""
     needle = replace(space.needle, max_angle_from_start_deg=28.0)
-    problem = NeedleProblem(needle_space(space.lung, needle, Margins(), with_fissures=False))
+    problem = NeedleProblem(needle_space(scene(), needle, Margins(), with_fissures=False))
     deepest = 0
     for seed in range(6):
         path = require(ask(problem, seed))

@@ -14,8 +14,8 @@ from anatomy.grid import Float
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.margins import Margins
 from anatomy.structures import VESSEL
-from stages.needle import kernels
 from stages.needle.device import Needle
+from stages.needle.kernels import tree
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path, direct_path, path_from_tree
 from stages.needle.space import needle_space
 from tests.stages.scenes import Canvas
@@ -143,7 +143,7 @@ def test_half_a_circle_with_small_curvature_is_no_special_case() -> None:
 def test_path_from_tree() -> None:
     """A tree of three nodes and a side branch, made arc by arc with the arc kernels."""
     start = start_frame(4)
-    nodes, parents = np.zeros((6, kernels.NODE_COLUMNS)), np.zeros(6, dtype=np.int64)
+    nodes, parents = np.zeros((6, tree.NODE_COLUMNS)), np.zeros(6, dtype=np.int64)
     nodes[0, :3], nodes[0, 3:6] = start[:3, 3], start[:3, 2]
     goals = np.random.default_rng(0).normal(size=(4, 3)) * 4
     for n, parent in enumerate([0, 1, 0, 2], start=1):
@@ -151,8 +151,8 @@ def test_path_from_tree() -> None:
         q = nodes[parent, :3] + 30 * nodes[parent, 3:6] + goals[n - 1]
         length, bend, _ = arc_to_point(pose, tuple(q))
         nodes[n, :6] = pose_on_arc(pose, bend, length)
-        nodes[n, kernels.ARC_LENGTH] = length
-        nodes[n, kernels.BEND : kernels.BEND + 4] = bend
+        nodes[n, tree.ARC_LENGTH] = length
+        nodes[n, tree.BEND : tree.BEND + 4] = bend
         parents[n] = parent
     for last, arcs in ((1, 1), (2, 2), (3, 1), (4, 3)):
         path = path_from_tree(start, nodes, parents, last)

@@ -1,0 +1,183 @@
+"""Recorded needle queries on Med-RAD patients: their obstacles, poses, and the results of another planner.
+
+Obstacles are the masks as they are: airway, vessels and everything outside the lungs.  A point is free if
+every obstacle voxel's centre is at least the needle's radius and half a voxel diagonal away.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from anatomy.fields import CENTRES
+from anatomy.grid import Float, Grid
+from anatomy.io.frames import LPS_FROM_RAS
+from anatomy.io.med_rad import load_med_rad
+from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
+from stages.needle.device import Needle
+from stages.needle.path import ArcPath
+from stages.needle.space import NeedleSpace, space_of_labels
+
+NEEDLE_DIAMETER_MM = 2.0
+GOAL_TOLERANCE_MM = 1.0
+MAX_LENGTH_MM = 150.0
+RECHECK_MM = 0.02
+BORDER_MM = 30.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Query:
+    """A start pose, a target and a needle's radius of curvature, with what is known of them."""
+
+    name: str
+    patient: int
+    radius_mm: float
+    lps_from_start: Float
+    target_lps: Float
+    exempt_mm: float = 0.0
+    known: dict[str, Any] = field(default_factory=dict)
+    runs: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def needle(self) -> Needle:
+        """The needle of the query."""
+        return Needle(
+            diameter_mm=NEEDLE_DIAMETER_MM,
+            max_curvature_per_mm=1.0 / self.radius_mm,
+            max_length_mm=MAX_LENGTH_MM,
+            max_angle_from_start_deg=90.0,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Obstacles:
+    """The label volume of one patient, and the distance that a needle's axis keeps from voxel centres."""
+
+    labels: NDArray[np.uint16]
+    grid: Grid
+
+    @property
+    def required_mm(self) -> float:
+        """Radius and half a voxel diagonal."""
+        return 0.5 * NEEDLE_DIAMETER_MM + 0.5 * float(np.linalg.norm(self.grid.spacing_mm))
+
+    def space(self, query: Query) -> NeedleSpace:
+        """Return the needle's space: the labels in a box about start and target, less the exempt ball."""
+        ends = np.stack([query.lps_from_start[:3, 3], query.target_lps])
+        border = BORDER_MM + 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
+        corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+        ijk = self.grid.ijk((ends[:, None] + border * corners).reshape(-1, 3))
+        low = np.maximum(np.floor(ijk.min(axis=0)).astype(int), 0)
+        high = np.minimum(np.ceil(ijk.max(axis=0)).astype(int) + 1, self.grid.shape)
+        labels = self.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].copy(order="F")
+        grid = self.grid.crop(low, high)
+        if query.exempt_mm > 0.0:
+            centres = grid.lps(np.argwhere(labels & OBSTACLES).astype(float))
+            near = np.linalg.norm(centres - ends[0], axis=1) <= query.exempt_mm
+            labels[tuple(np.argwhere(labels & OBSTACLES)[near].T)] = 0
+        return space_of_labels(
+            labels,
+            grid,
+            query.needle,
+            required_clearance_mm=self.required_mm,
+            obstacles_as=CENTRES,
+            goal_tolerance_mm=GOAL_TOLERANCE_MM,
+        )
+
+
+def load_obstacles(folder: Path) -> Obstacles:
+    """Read the masks of a Med-RAD patient."""
+    images = load_med_rad(folder)
+    labels = np.zeros(images.grid.shape, dtype=np.uint16, order="F")
+    labels[images.lumen.array] |= AIRWAY
+    labels[images.vessels.array] |= VESSEL
+    labels[~images.lung.array] |= OUTSIDE
+    return Obstacles(labels=labels, grid=images.grid)
+
+
+def hard_queries(folder: Path) -> list[Query]:
+    """Read the queries whose direct arc is blocked, with the other planner's runs."""
+    runs = defaultdict(list)
+    for run in json.loads((folder / "hard_peer.json").read_text())["runs"]:
+        runs[run["id"]].append(run)
+    return [
+        Query(
+            name=known["id"],
+            patient=known["patient"],
+            radius_mm=known["R_mm"],
+            lps_from_start=LPS_FROM_RAS @ np.array(known["start_RAS"]),
+            target_lps=LPS_FROM_RAS[:3, :3] @ np.array(known["target_RAS"]),
+            known=known,
+            runs=tuple(runs[known["id"]]),
+        )
+        for known in json.loads((folder / "hard_queries.json").read_text())["queries"]
+    ]
+
+
+def easy_queries(folder: Path, patients: Path) -> list[Query]:
+    """Read the poses shipped with Med-RAD, each with every radius and exemption that was run."""
+    runs = defaultdict(list)
+    for run in json.loads((folder / "easy_peer.json").read_text())["runs"]:
+        runs[run["patient"], run["start"], run["radius_mm"], run["start_exemption_mm"]].append(run)
+    queries = []
+    for (patient, start, radius, exempt), found in sorted(runs.items()):
+        images = load_med_rad(patients / f"Patient{patient}")
+        queries.append(
+            Query(
+                name=f"P{patient}_start{start}_R{radius}_E{exempt}",
+                patient=patient,
+                radius_mm=float(radius),
+                lps_from_start=images.starts[start - 1],
+                target_lps=images.targets_lps[0],
+                exempt_mm=float(exempt),
+                runs=tuple(found),
+            )
+        )
+    return queries
+
+
+class Judge:
+    """Walks a path again in small steps and measures to every obstacle voxel's centre.
+
+    It shares nothing with the planners but the path's own numbers.
+    """
+
+    def __init__(self, space: NeedleSpace, query: Query) -> None:
+        labels = space.arrays[1]
+        self._tree = cKDTree(space.grid.lps(np.argwhere((labels & OBSTACLES) != 0).astype(float)))
+        self._space = space
+        self._query = query
+
+    def faults(self, path: ArcPath) -> list[str]:
+        """Return what is wrong with a path; nothing if it is valid."""
+        query, needle = self._query, self._query.needle
+        out = []
+        points, _lengths = path.sample(RECHECK_MM)
+        clearance = float(self._tree.query(points)[0].min())
+        if clearance < self._space.required_clearance_mm - 1e-9:
+            out.append(f"{self._space.required_clearance_mm - clearance:.4f} mm too near")
+        if not self._space.grid.contains(points).all():
+            out.append("leaves the box")
+        if np.linalg.norm(points[-1] - query.target_lps) > GOAL_TOLERANCE_MM + 1e-9:
+            out.append("ends off the target")
+        if not np.array_equal(path.lps_from_start, query.lps_from_start):
+            out.append("starts elsewhere")
+        if path.arcs[:, 2].max() > needle.max_curvature_per_mm * (1 + 1e-9):
+            out.append("bends too much")
+        if path.length_mm > needle.max_length_mm + 1e-9:
+            out.append("is too long")
+        if path.max_angle_from_start_rad() > math.radians(needle.max_angle_from_start_deg) + 1e-9:
+            out.append("turns too far")
+        return out
+
+    def miss_mm(self, path: ArcPath) -> float:
+        """Return the distance left to the target."""
+        return float(np.linalg.norm(path.frames()[-1][:3, 3] - self._query.target_lps))

@@ -1,0 +1,148 @@
+"""The RRT of [Patil2014] as used in [Kuntz2015] and [Fu2018]."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from anatomy.kernels.arcs import any_normal, arc_to_point
+from anatomy.kernels.random import uniform
+from stages.needle.kernels.connections import seen_from, workspace_length
+from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_LENGTH, MAX_STEP, MAX_TURN, MIN_ARC_MM
+from stages.needle.kernels.tree import PATH_LENGTH, PATH_TURN, add_arc, add_goal, pose_of, within
+
+SAMPLE_TRIES = 50
+
+
+@numba.njit(cache=True)
+def sample_between(start, goal, limits, state):
+    """Draw a point between start and goal that the start can reach.
+
+    It is drawn from the spindle swept by the arcs of radius R = 1 / curvature between the two, which
+    holds the paths that turn by less than 180 degrees; where start and goal are 2 R apart or more and
+    there is no such arc, from the cylinder of radius R about the line between them.
+    """
+    radius = 1.0 / limits[KAPPA]
+    ax = goal[0] - start[0]
+    ay = goal[1] - start[1]
+    az = goal[2] - start[2]
+    distance = math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax / distance, ay / distance, az / distance
+    bx, by, bz = any_normal(ax, ay, az)
+    cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    half = 0.5 * distance
+    for _ in range(SAMPLE_TRIES):
+        along = uniform(state) * distance
+        widest = radius
+        if half < radius:
+            offset = along - half
+            widest = math.sqrt(radius * radius - offset * offset) - math.sqrt(radius * radius - half * half)
+        r = widest * math.sqrt(uniform(state))
+        phi = 2.0 * math.pi * uniform(state)
+        u = r * math.cos(phi)
+        v = r * math.sin(phi)
+        q = (
+            start[0] + along * ax + u * bx + v * cx,
+            start[1] + along * ay + u * by + v * cy,
+            start[2] + along * az + u * bz + v * cz,
+        )
+        rho, h = seen_from(start, q)
+        if workspace_length(rho, h, limits) < math.inf:
+            return q, True
+    return (goal[0], goal[1], goal[2]), False
+
+
+@numba.njit(cache=True)
+def _nearest(nodes, count, q, limits):
+    """Return the node with the shortest single arc to a point, -1 if none may take it."""
+    best = math.inf
+    nearest = -1
+    for m in range(count):
+        node = nodes[m]
+        length, bend, turn = arc_to_point(pose_of(node), q)
+        if (
+            length < best
+            and bend[0] <= limits[KAPPA]
+            and node[PATH_LENGTH] + length <= limits[MAX_LENGTH]
+            and node[PATH_TURN] + turn <= limits[MAX_TURN]
+        ):
+            best = length
+            nearest = m
+    return nearest
+
+
+@numba.njit(cache=True)
+def random_arc(pose, limits, state):
+    """Draw an arc: any roll, the greatest curvature half of the time and else any, up to the longest step."""
+    roll = 2.0 * math.pi * uniform(state)
+    ax, ay, az = any_normal(pose[3], pose[4], pose[5])
+    bx, by, bz = pose[4] * az - pose[5] * ay, pose[5] * ax - pose[3] * az, pose[3] * ay - pose[4] * ax
+    c, s = math.cos(roll), math.sin(roll)
+    kappa = limits[KAPPA] * min(2.0 * uniform(state), 1.0)
+    length = MIN_ARC_MM + limits[MAX_STEP] * uniform(state)
+    return (kappa, c * ax + s * bx, c * ay + s * by, c * az + s * bz), length
+
+
+@numba.njit(cache=True, nogil=True)
+def grow_rrt(
+    space, limits, objective, branch, goal, nodes, parents, count, iterations, random_share, state, best
+):
+    """Grow the tree of [Kuntz2015, sec. IV-C] by up to `iterations` samples, until it reaches the goal.
+
+    From the root and after every new node, the goal is tried.  A goal nearer than MIN_ARC_MM to the start
+    is no problem to solve: nothing is grown.
+
+    Parameters
+    ----------
+    space, limits, objective : tuple, (N_LIMITS,) float64, tuple
+        See `proof`, `limits` and `cost`.
+    branch : int
+        Pierced branch, whose wall is exempt at the exit; -1 for none.
+    goal : (3,) float64, LPS mm
+    nodes : (M, NODE_COLUMNS) float64, parents : (M,) int64
+        The tree; row 0 is the start pose, `count` rows are in use.
+    iterations : int
+    random_share : float
+        Share of the iterations that extend a random node by a random arc, so that every path has a
+        chance; the others draw a point, and extend the node nearest to it.
+    state : (1,) uint64
+        Random state.
+    best : float
+        Paths that cost as much are not looked for.
+
+    Returns
+    -------
+    count, used, solved : int, int, bool
+        Rows in use, iterations spent, and whether the last row is at the goal.
+    """
+    start = pose_of(nodes[0])
+    rho, h = seen_from(start, goal)
+    if math.hypot(rho, h) < MIN_ARC_MM:
+        return count, 0, False
+    if count == 1:
+        count = add_goal(space, limits, objective, branch, nodes, parents, 1, 0, goal, best, state)
+        if count > 1:
+            return count, 0, True
+    for used in range(iterations):
+        if count + 3 > nodes.shape[0]:
+            return count, used, False
+        if uniform(state) < random_share:
+            near = int(uniform(state) * count)
+            bend, length = random_arc(pose_of(nodes[near]), limits, state)
+        else:
+            q, drawn = sample_between(start, within(goal, limits[GOAL_TOLERANCE], state), limits, state)
+            near = _nearest(nodes, count, q, limits) if drawn else -1
+            if near < 0:
+                continue
+            length, bend, _turn = arc_to_point(pose_of(nodes[near]), q)
+            length = min(length, limits[MAX_STEP])
+        if not add_arc(
+            space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
+        ):
+            continue
+        count += 1
+        rows = add_goal(space, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state)
+        if rows > count:
+            return rows, used + 1, True
+    return count, iterations, False

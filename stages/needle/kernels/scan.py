@@ -1,0 +1,47 @@
+"""Many start poses and one target: the workspace test, and the direct arcs."""
+
+from __future__ import annotations
+
+import numba
+
+from anatomy.kernels.arcs import arc_to_point
+from stages.needle.kernels.connections import seen_from, workspace_length
+from stages.needle.kernels.cost import inverse_clearance_on_arc
+from stages.needle.kernels.limits import COST_STEP, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN
+from stages.needle.kernels.proof import blocker_on_arc
+
+
+@numba.njit(cache=True, nogil=True)
+def workspace_scan(positions, tangents, target, limits, lengths):
+    """Fill `lengths` (N,) with the shortest path length from each pose to `target`, inf outside."""
+    for n in range(positions.shape[0]):
+        x, y, z = positions[n]
+        tx, ty, tz = tangents[n]
+        rho, h = seen_from((x, y, z, tx, ty, tz), target)
+        lengths[n] = workspace_length(rho, h, limits)
+
+
+@numba.njit(cache=True, nogil=True)
+def direct_arcs(space, limits, positions, tangents, branches, target, blockers, costs):
+    """Try the single arc from each pose to `target`.
+
+    `blockers` (N,) gets 0 where the arc is proved clear, the label that blocks it, or -1 where no
+    single arc within the limits exists; `costs` (N, 2) gets its length and, where it is clear, the
+    estimated integral of 1 / clearance.
+    """
+    for n in range(positions.shape[0]):
+        x, y, z = positions[n]
+        tx, ty, tz = tangents[n]
+        pose = (x, y, z, tx, ty, tz)
+        length, bend, turn = arc_to_point(pose, target)
+        costs[n, 0] = length
+        if (
+            bend[0] > limits[KAPPA]
+            or length > limits[MAX_LENGTH]
+            or turn > min(limits[MAX_ANGLE], limits[MAX_TURN])
+        ):
+            blockers[n] = -1
+            continue
+        blockers[n] = blocker_on_arc(space, limits, pose, bend, length, 0.0, branches[n])
+        if blockers[n] == 0:
+            costs[n, 1] = inverse_clearance_on_arc(space, limits[COST_STEP], pose, bend, length)

@@ -1,0 +1,174 @@
+"""A tree of arcs: what every sampling search grows.
+
+A row of `nodes` is a pose, the arc that led to it from its parent, and the length, the accumulated turn
+and the cost of the path from the root (row 0).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc
+from anatomy.kernels.random import uniform
+from stages.needle.kernels.connections import (
+    least_cosine,
+    length_ahead,
+    nearest_turn,
+    seen_from,
+    shortest_legs,
+)
+from stages.needle.kernels.cost import LEAST_RATE, cost_of_arc
+from stages.needle.kernels.limits import (
+    COST_STEP,
+    GOAL_TOLERANCE,
+    KAPPA,
+    MAX_ANGLE,
+    MAX_LENGTH,
+    MAX_TURN,
+    MIN_ARC_MM,
+    TINY,
+)
+from stages.needle.kernels.proof import blocker_on_arc
+
+# Columns: pose (6), arc from the parent: length, bend (4); path length, accumulated turn, path cost.
+ARC_LENGTH = 6
+BEND = 7
+PATH_LENGTH = 11
+PATH_TURN = 12
+PATH_COST = 13
+NODE_COLUMNS = 14
+
+
+@numba.njit(cache=True)
+def pose_of(node):
+    """Return the pose of a node."""
+    return node[0], node[1], node[2], node[3], node[4], node[5]
+
+
+@numba.njit(cache=True)
+def add_arc(space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best):
+    """Add an arc from node `near` as row `count`; True if it was added.
+
+    Refused are arcs that turn too far or are not proved clear, and those from whose end no path within
+    the limits leads to the goal for less than the cost `best`.
+    """
+    node = nodes[near]
+    pose = pose_of(node)
+    turn = bend[0] * length
+    path_length = node[PATH_LENGTH] + length
+    path_turn = node[PATH_TURN] + turn
+    if path_length > limits[MAX_LENGTH] or path_turn > limits[MAX_TURN] + TINY:
+        return False
+    start = nodes[0]
+    forward = pose[3] * start[3] + pose[4] * start[4] + pose[5] * start[5]
+    aside = bend[1] * start[3] + bend[2] * start[4] + bend[3] * start[5]
+    if least_cosine(forward, aside, turn) < math.cos(limits[MAX_ANGLE]) - TINY:
+        return False
+    end = pose_on_arc(pose, bend, length)
+    angle = math.acos(min(max(forward * math.cos(turn) + aside * math.sin(turn), -1.0), 1.0))
+    rho, h = seen_from(end, goal)
+    ahead = 0.0
+    if rho * rho + h * h > limits[GOAL_TOLERANCE] * limits[GOAL_TOLERANCE] + TINY:
+        turn_left = limits[MAX_TURN] - path_turn
+        ahead = length_ahead(rho, h, limits, min(limits[MAX_ANGLE] + angle, math.pi), turn_left)
+    if path_length + ahead > limits[MAX_LENGTH] + limits[GOAL_TOLERANCE]:
+        return False
+    rate = objective[0][LEAST_RATE]
+    if node[PATH_COST] + rate * (length + ahead - limits[GOAL_TOLERANCE]) >= best:
+        return False
+    if blocker_on_arc(space, limits, pose, bend, length, node[PATH_LENGTH], branch) != 0:
+        return False
+    cost = node[PATH_COST] + cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length)
+    if cost + rate * (ahead - limits[GOAL_TOLERANCE]) >= best:
+        return False
+    new = nodes[count]
+    for m in range(6):
+        new[m] = end[m]
+    new[ARC_LENGTH] = length
+    for m in range(4):
+        new[BEND + m] = bend[m]
+    new[PATH_LENGTH] = path_length
+    new[PATH_TURN] = path_turn
+    new[PATH_COST] = cost
+    parents[count] = near
+    return True
+
+
+@numba.njit(cache=True)
+def add_legs(space, limits, objective, branch, nodes, parents, count, near, q, goal, best):
+    """Add the shortest path from node `near` to a point, as one or two rows; return the new `count`.
+
+    All or nothing: if the second leg is refused, the first is dropped.
+    """
+    pose = pose_of(nodes[near])
+    first, first_length, second, second_length = shortest_legs(pose, q, limits[KAPPA])
+    if not first_length + second_length < math.inf:
+        return count
+    at = near
+    rows = count
+    if first_length > MIN_ARC_MM:
+        if not add_arc(
+            space, limits, objective, branch, nodes, parents, rows, at, first, first_length, goal, best
+        ):
+            return count
+        at = rows
+        rows += 1
+    if second_length > MIN_ARC_MM:
+        if not add_arc(
+            space, limits, objective, branch, nodes, parents, rows, at, second, second_length, goal, best
+        ):
+            return count
+        rows += 1
+    return rows
+
+
+@numba.njit(cache=True)
+def aim(pose, goal, limits, state):
+    """Return the point within the goal tolerance to try next, drawn at random if there is a tolerance.
+
+    Half of the time it is the goal itself; where that cannot be reached, the nearest point of the arc of
+    greatest curvature.
+    """
+    if limits[GOAL_TOLERANCE] == 0.0:
+        return goal[0], goal[1], goal[2]
+    if uniform(state) >= 0.5:
+        return within(goal, limits[GOAL_TOLERANCE], state)
+    rho, h = seen_from(pose, goal)
+    turn, miss = nearest_turn(rho, h, limits[KAPPA])
+    radius = 1.0 / limits[KAPPA]
+    if miss <= limits[GOAL_TOLERANCE] and math.hypot(radius - rho, h) < radius:
+        _length, bend, _turn = arc_to_point(pose, goal)
+        return point_on_arc(pose, (limits[KAPPA], bend[1], bend[2], bend[3]), turn * radius)
+    return goal[0], goal[1], goal[2]
+
+
+@numba.njit(cache=True)
+def within(goal, tolerance, state):
+    """Return a point drawn uniformly from the ball of the goal tolerance."""
+    while True:
+        x = 2.0 * uniform(state) - 1.0
+        y = 2.0 * uniform(state) - 1.0
+        z = 2.0 * uniform(state) - 1.0
+        if x * x + y * y + z * z <= 1.0:
+            scale = tolerance * (1.0 - TINY)
+            return goal[0] + scale * x, goal[1] + scale * y, goal[2] + scale * z
+
+
+@numba.njit(cache=True)
+def add_goal(space, limits, objective, branch, nodes, parents, count, near, goal, best, state):
+    """Try to finish from node `near`: by the single arc, else by the shortest path; return the new `count`.
+
+    If rows were added, the last of them is at the goal.
+    """
+    pose = pose_of(nodes[near])
+    q = aim(pose, goal, limits, state)
+    length, bend, _turn = arc_to_point(pose, q)
+    if length < MIN_ARC_MM:
+        return count
+    if bend[0] <= limits[KAPPA] * (1.0 + TINY) and add_arc(
+        space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
+    ):
+        return count + 1
+    return add_legs(space, limits, objective, branch, nodes, parents, count, near, q, goal, best)

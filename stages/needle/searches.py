@@ -1,0 +1,150 @@
+"""Searches for a needle path, each advanced in slices by whoever has the clock."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from anatomy.errors import FrameError
+from anatomy.grid import Float
+from stages.needle.kernels import tree
+from stages.needle.kernels.rrt import grow_rrt
+from stages.needle.objective import SHORTEST, Objective
+from stages.needle.path import ArcPath, path_from_tree
+from stages.needle.space import NeedleSpace
+
+MAX_NODES = 20_000
+RANDOM_SHARE = 0.5
+RESTART_ITERATIONS = 200
+"""Unit of the restart schedule: trees that are lucky are so early."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Query:
+    """A start pose and a target.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+        +z is the direction of insertion.
+    target : (3,) float64, LPS mm
+    branch : int
+        Pierced branch, whose wall is exempt at the exit; -1 for none.
+
+    Raises
+    ------
+    FrameError
+        If there are not so many finite numbers, or the pose is not rigid.
+    """
+
+    lps_from_start: Float
+    target: Float
+    branch: int = -1
+
+    def __post_init__(self) -> None:
+        frame = np.array(self.lps_from_start, dtype=np.float64)
+        target = np.array(self.target, dtype=np.float64)
+        if frame.shape != (4, 4) or target.shape != (3,) or not np.isfinite([*frame.flat, *target]).all():
+            raise FrameError(
+                f"A needle query has a start of shape {frame.shape} and a target of shape {target.shape}",
+                expected="a 4x4 pose and three coordinates, all finite, LPS mm",
+            )
+        rotation = frame[:3, :3]
+        if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+            raise FrameError(
+                "The start of a needle query is not a right-handed rigid pose", expected="a rotation"
+            )
+        object.__setattr__(self, "lps_from_start", frame)
+        object.__setattr__(self, "target", target)
+
+
+class Search(Protocol):
+    """What every search can do.
+
+    Attributes
+    ----------
+    path : ArcPath or None
+        The best path so far, proved clear and within all limits.
+    cost : float
+        Its cost under the objective, as estimated within the search; infinite without a path.
+    finished : bool
+        Nothing is left to be found.
+    """
+
+    path: ArcPath | None
+    cost: float
+    finished: bool
+
+    def advance(self, iterations: int) -> bool:
+        """Spend up to `iterations`; return whether a better path was found, with which the slice ends."""
+
+
+class TreeSearch:
+    """What the searches that grow a tree share: its arrays, random state and best path."""
+
+    def __init__(
+        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+    ) -> None:
+        self.space = space
+        self.query = query
+        self.path: ArcPath | None = None
+        self.cost = math.inf
+        self.finished = False
+        self.iterations = 0
+        """Iterations spent so far."""
+        self.objective = space.objective_arrays(objective)
+        self.state = np.array([seed], dtype=np.uint64)
+        self.nodes, self.parents = np.zeros((MAX_NODES, tree.NODE_COLUMNS)), np.zeros(MAX_NODES, np.int64)
+        self.nodes[0, :3] = query.lps_from_start[:3, 3]
+        self.nodes[0, 3:6] = query.lps_from_start[:3, 2]
+        self.count = 1
+
+    def take(self, last: int) -> None:
+        """Keep the path from the root to the row `last` as the best."""
+        self.path = path_from_tree(self.query.lps_from_start, self.nodes, self.parents, last)
+        self.cost = float(self.nodes[last, tree.PATH_COST])
+
+
+class RestartingRRT(TreeSearch):
+    """The RRT of [Kuntz2015], started anew by the schedule of [Luby1993] and whenever it succeeds.
+
+    Each tree grows only what can be cheaper than the best path so far.
+    """
+
+    def __init__(
+        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+    ) -> None:
+        super().__init__(space, query, seed=seed, objective=objective)
+        self._restarts = 0
+        self._left = RESTART_ITERATIONS
+
+    def advance(self, iterations: int) -> bool:
+        """Grow trees; see `Search`."""
+        query, left = self.query, iterations
+        while True:
+            self.count, used, solved = grow_rrt(
+                self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+                self.nodes, self.parents, self.count, min(left, self._left), RANDOM_SHARE,
+                self.state, self.cost,
+            )  # fmt: skip
+            left -= used
+            self._left -= used
+            self.iterations += used
+            if solved:
+                self.take(self.count - 1)
+            if solved or self._left == 0 or self.count + 3 > MAX_NODES:
+                self._restarts += 1
+                self._left = RESTART_ITERATIONS * luby(self._restarts + 1)
+                self.count = 1
+            if solved or left == 0 or used == 0:
+                return bool(solved)
+
+
+def luby(number: int) -> int:
+    """Return an element of the sequence 1, 1, 2, 1, 1, 2, 4, ... of [Luby1993], counted from 1."""
+    while number & (number + 1):
+        number -= (1 << (number.bit_length() - 1)) - 1
+    return (number + 1) // 2

@@ -1,0 +1,99 @@
+"""An asymptotically optimal search: trees in state and cost, and refinement of the best path."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.needle.kernels import optimal, tree
+from stages.needle.objective import SHORTEST, Objective
+from stages.needle.path import path_from_tree
+from stages.needle.searches import Query, TreeSearch, luby
+from stages.needle.space import NeedleSpace
+
+MAX_VIAS = 64
+RESTART_ITERATIONS = 300
+REFINE_SHARE = 0.7
+"""Share of the iterations, once there is a path, that vary it instead of growing trees."""
+IMPROVEMENT = 1e-6
+"""A path counts as better if its cost is less by this share."""
+
+
+class OptimalSearch(TreeSearch):
+    """Finds a path as the RRT does and makes it cheaper and cheaper.
+
+    Two things take turns.  Trees grow in the space of states and costs, towards samples from the nodes that
+    reach them cheapest or at a drawn cost [HauserZhou2016]; every tree is one of many, and every sequence of
+    arcs has a chance in each, so the best path is found in the limit.  And the best path is varied: its via
+    points are moved, dropped and added, and the path laid anew through them, each leg by the single arc or by
+    the shortest path of greatest curvature.
+    """
+
+    def __init__(
+        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+    ) -> None:
+        super().__init__(space, query, seed=seed, objective=objective)
+        self._restarts = 0
+        self._left = RESTART_ITERATIONS
+        self._vias = np.zeros((MAX_VIAS, optimal.VIA_COLUMNS))
+        self._via_count = 0
+        self._scratch = np.zeros((2 * MAX_VIAS + 2, tree.NODE_COLUMNS))
+        self._scratch[0] = self.nodes[0]
+        self._scratch_parents = np.zeros(2 * MAX_VIAS + 2, dtype=np.int64)
+
+    def advance(self, iterations: int) -> bool:
+        """Grow trees, and refine; see `stages.needle.searches.Search`."""
+        if self.path is None:
+            return self._grow(iterations)
+        tries = int(round(REFINE_SHARE * iterations))
+        better = self._refine(tries)
+        return self._grow(iterations - tries) or better
+
+    def _grow(self, iterations: int) -> bool:
+        query, left = self.query, iterations
+        while True:
+            self.count, used, solved = optimal.grow_optimal(
+                self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+                self.nodes, self.parents, self.count, min(left, self._left), self.state, self.cost,
+            )  # fmt: skip
+            left -= used
+            self._left -= used
+            self.iterations += used
+            if solved:
+                self.take(self.count - 1)
+                self._read_vias(self.count - 1)
+            if solved or self._left == 0 or self.count + 5 > len(self.nodes):
+                self._restarts += 1
+                self._left = RESTART_ITERATIONS * luby(self._restarts + 1)
+                self.count = 1
+            if solved or left == 0 or used == 0:
+                return bool(solved)
+
+    def _read_vias(self, last: int) -> None:
+        """Take the ends of a path's arcs as its via points."""
+        rows = []
+        while last != 0:
+            rows.append(last)
+            last = int(self.parents[last])
+        self._via_count = len(rows)
+        self._vias[: len(rows), :3] = self.nodes[rows[::-1], :3]
+        self._vias[: len(rows), 3] = optimal.ARC
+
+    def _refine(self, tries: int) -> bool:
+        if not 0 < self._via_count <= MAX_VIAS:
+            return False
+        query = self.query
+        arguments = (
+            self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+            self._scratch, self._scratch_parents, self._vias,
+        )  # fmt: skip
+        self._via_count, cost, improved = optimal.refine(
+            *arguments, self._via_count, tries, self.state, self.cost
+        )
+        self.iterations += tries
+        if not improved:
+            return False
+        last = optimal.build(*arguments, self._via_count, np.inf)
+        self.path = path_from_tree(query.lps_from_start, self._scratch, self._scratch_parents, last)
+        better = cost < self.cost * (1.0 - IMPROVEMENT)
+        self.cost = float(cost)
+        return better

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from anatomy.fields import CENTRES
@@ -128,20 +129,27 @@ def easy_queries(folder: Path, patients: Path) -> list[Query]:
     for run in json.loads((folder / "easy_peer.json").read_text())["runs"]:
         runs[run["patient"], run["start"], run["radius_mm"], run["start_exemption_mm"]].append(run)
     queries = []
+    poses = {patient: _poses(patients / f"Patient{patient}") for patient in {key[0] for key in runs}}
     for (patient, start, radius, exempt), found in sorted(runs.items()):
-        images = load_med_rad(patients / f"Patient{patient}")
+        starts, target = poses[patient]
         queries.append(
             Query(
                 name=f"P{patient}_start{start}_R{radius}_E{exempt}",
                 patient=patient,
                 radius_mm=float(radius),
-                lps_from_start=images.starts[start - 1],
-                target_lps=images.targets_lps[0],
+                lps_from_start=starts[start - 1],
+                target_lps=target,
                 exempt_mm=float(exempt),
                 runs=tuple(found),
             )
         )
     return queries
+
+
+def _poses(folder: Path) -> tuple[tuple[Float, ...], Float]:
+    """Read the start poses and the target of a Med-RAD patient."""
+    images = load_med_rad(folder)
+    return images.starts, images.targets_lps[0]
 
 
 class Judge:
@@ -151,8 +159,10 @@ class Judge:
     """
 
     def __init__(self, space: NeedleSpace, query: Query) -> None:
-        labels = space.arrays[1]
-        self._tree = cKDTree(space.grid.lps(np.argwhere((labels & OBSTACLES) != 0).astype(float)))
+        # From outside an obstacle, the nearest of its voxels has a free neighbour.
+        self._solid = (space.arrays[1] & OBSTACLES) != 0
+        surface = self._solid & ~binary_erosion(self._solid, border_value=1)
+        self._tree = cKDTree(space.grid.lps(np.argwhere(surface).astype(float)))
         self._space = space
         self._query = query
 
@@ -161,6 +171,9 @@ class Judge:
         query, needle = self._query, self._query.needle
         out = []
         points, _lengths = path.sample(RECHECK_MM)
+        inside = self._solid[tuple(np.rint(self._space.grid.ijk(points)).astype(int).T)]
+        if inside.any():
+            out.append("enters an obstacle")
         clearance = float(self._tree.query(points)[0].min())
         if clearance < self._space.required_clearance_mm - 1e-9:
             out.append(f"{self._space.required_clearance_mm - clearance:.4f} mm too near")

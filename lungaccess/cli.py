@@ -16,11 +16,12 @@ from rich.panel import Panel
 
 from anatomy.errors import AnatomyError, LungaccessError, SettingsError, TargetError
 from anatomy.io.files import require_writable_folder
-from anatomy.io.frames import parse_point
+from anatomy.io.frames import Frame, parse_point
 from lungaccess import terminal
 from lungaccess.terminal import console, error_console
 
 if TYPE_CHECKING:
+    from anatomy.grid import Float
     from anatomy.lung import Lung
     from lungaccess.run import SearchRequest
     from lungaccess.system import System
@@ -33,6 +34,8 @@ DEMO_SEED = 2
 
 Objective = Literal["inverse-clearance", "cost-map", "length"]
 Method = Literal["atlas", "kuntz2015"]
+NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
+NeedleObjective = Literal["length", "inverse-clearance", "cost-map", "voxel-sum"]
 
 _TOO_LARGE = AnatomyError(
     "There is not enough memory for this patient",
@@ -178,6 +181,93 @@ def plan(
         iterations=iterations,
     )
     return _plan_and_report(lung, request, out)
+
+
+@app.command
+def needle(
+    patient: Path,
+    *,
+    start: str,
+    frame: Frame = "lps",
+    target: str | None = None,
+    nodule: int | None = None,
+    system: str = DEFAULT_SYSTEM,
+    planner: NeedlePlanner = "decide",
+    objective: NeedleObjective = "length",
+    budget: float | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
+    allow_fissures: bool | None = None,
+    cache: Path | None = None,
+) -> int:
+    """Plan the needle alone from a given pose, or prove that no path exists.
+
+    Parameters
+    ----------
+    patient : Path
+        Folder of masks.
+    start : str
+        Number of a start pose that came with the patient, or path of a text file with a 4x4 pose whose +z
+        column is the direction of insertion.
+    frame : str
+        Frame of the numbers in that file.
+    target : str
+        Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
+    nodule : int
+        Go to the centre of this nodule.
+    system : str
+        Preset or TOML file whose needle and margins are used.
+    planner : str
+        decide: a path, or a proof that there is none; rrt; optimal: better and better paths; resolution:
+        the best path of pieces at a resolution, or the statement that it has none.
+    objective : str
+        What to make small: length, integral of 1/clearance, integral of the cost map, or its sum over voxels.
+    budget : float
+        Planning time in seconds; 10 if neither this nor --iterations is given.
+    iterations : int
+        Number of iterations instead of a time.
+    seed : int
+        Seed of the random numbers.
+    allow_fissures : bool
+        Whether fissures may be crossed; as the system says if not given.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.needle import plan_needle
+    from lungaccess.target import resolve_target
+
+    _require_one_target(target, nodule)
+    _require_budget(budget, iterations)
+    device = _system(system, allow_fissures)
+    lung = _load(patient, cache)
+    answer = plan_needle(
+        lung,
+        device,
+        _start_pose(lung, start, frame),
+        resolve_target(lung, target, nodule),
+        planner=planner,
+        objective=objective,
+        seed=seed,
+        iterations=iterations,
+        time_s=DEFAULT_BUDGET_S if budget is None and iterations is None else budget,
+    )
+    terminal.show(terminal.needle_tables(answer))
+    return NO_PLAN if answer.path is None else OK
+
+
+def _start_pose(lung: Lung, start: str, frame: Frame) -> Float:
+    """Return a pose by its number among those of the patient, or from a file."""
+    from anatomy.io.frames import read_pose
+
+    if not start.isdigit():
+        return read_pose(start, frame)
+    number = int(start)
+    if not 1 <= number <= len(lung.starts):
+        raise SettingsError(
+            f"There is no start pose {number}",
+            expected=f"1 to {len(lung.starts)}" if lung.starts else "a file: the patient came with no pose",
+        )
+    return lung.starts[number - 1]
 
 
 @app.command

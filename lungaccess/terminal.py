@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from anatomy.errors import LungaccessError
     from anatomy.lung import Lung
     from lungaccess.checking import CheckReport
+    from lungaccess.needle import NeedleAnswer
     from lungaccess.noplan import NoPlan
     from lungaccess.plans import Plan
     from lungaccess.system import System
@@ -62,6 +63,44 @@ def show(tables: Iterable[Table]) -> None:
     for made in tables:
         console.print(made)
         console.print()
+
+
+def needle_tables(answer: NeedleAnswer) -> list[Table]:
+    """Return what a needle planner found: the outcome, and the path arc by arc."""
+    words = {
+        "path": "a path, proved clear",
+        "no path": "no path exists (proved against the masks)",
+        "nothing found": "nothing found within the limit; no proof either",
+    }
+    rows = [("outcome", words.get(answer.outcome, answer.outcome))]
+    if answer.branch >= 0:
+        rows.append(("taken to have pierced", f"branch {answer.branch}"))
+    from stages.needle.costs import path_costs
+
+    path = answer.path
+    if path is None:
+        return [table("needle", ("", ""), rows)]
+    if answer.first_path_s is not None:
+        rows.append(("first path after", f"{1000.0 * answer.first_path_s:.1f} ms"))
+    rows += [
+        ("length", f"{path.length_mm:.2f} mm"),
+        ("largest angle from the start", f"{np.degrees(path.max_angle_from_start_rad()):.1f} deg"),
+        ("turning in all", f"{np.degrees(path.accumulated_turn_rad):.1f} deg"),
+    ]
+    rows += [(f"cost: {name}", f"{cost:.3f}") for name, cost in path_costs(answer.space, path).items()]
+    arcs = [
+        (
+            f"{n}",
+            f"{np.degrees(roll):.1f}",
+            f"{length:.2f}",
+            f"{1.0 / curvature:.1f}" if curvature else "straight",
+        )
+        for n, (length, roll, curvature) in enumerate(path.arcs, start=1)
+    ]
+    return [
+        table("needle", ("", ""), rows),
+        table("arcs", ("", "roll first, deg", "insert, mm", "radius, mm"), arcs),
+    ]
 
 
 def show_error(error: LungaccessError) -> None:

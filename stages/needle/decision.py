@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 from stages.needle.certificate import NoPathProof
+from stages.needle.kernels.limits import MAX_ANGLE
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.optimal import OptimalSearch
 from stages.needle.path import ArcPath
@@ -34,38 +37,27 @@ class Decision:
         self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
         self.search = OptimalSearch(space, query, seed=seed, objective=objective)
-        self._make_proof = lambda: NoPathProof(space, query)
         self.proof: NoPathProof | None = None
-
-    @property
-    def path(self) -> ArcPath | None:
-        """The best path so far."""
-        return self.search.path
-
-    @property
-    def cost(self) -> float:
-        """Its cost."""
-        return self.search.cost
-
-    @property
-    def outcome(self) -> str:
-        """See the class."""
-        if self.search.path is not None:
-            return "path"
-        return "running" if self.proof is None else self.proof.outcome
-
-    @property
-    def finished(self) -> bool:
-        """Whether there is a proof that there is no path."""
-        return self.outcome == "no path"
+        self.path: ArcPath | None = None
+        self.cost = math.inf
+        self.finished = False
+        self.outcome = "running"
+        # The proof holds only for needles that never turn back.
+        self._provable = bool(space.limits[MAX_ANGLE] <= 0.5 * math.pi) and query.reference is None
+        self._space = space
+        self._query = query
 
     def advance(self, iterations: int) -> bool:
         """Search for so many iterations and, from some number on without a path, prove one step a slice."""
         if self.finished:
             return False
-        if self.search.path is None and self.search.iterations >= FIRST_ITERATIONS:
+        if self._provable and self.path is None and self.search.iterations >= FIRST_ITERATIONS:
             if self.proof is None:
-                self.proof = self._make_proof()
-            if self.proof.advance() and self.finished:
-                return False
-        return self.search.advance(iterations)
+                self.proof = NoPathProof(self._space, self._query)
+            if self.proof.advance():
+                self.outcome = self.proof.outcome
+                self.finished = self.outcome == "no path"
+        if self.finished or not self.search.advance(iterations):
+            return False
+        self.path, self.cost, self.outcome = self.search.path, self.search.cost, "path"
+        return True

@@ -96,4 +96,4 @@ class OptimalSearch(TreeSearch):
         self.path = path_from_tree(query.lps_from_start, self._scratch, self._scratch_parents, last)
         better = cost < self.cost * (1.0 - IMPROVEMENT)
         self.cost = float(cost)
-        return better
+        return bool(better)

@@ -78,7 +78,7 @@ def cases_of(lung: Lung, system: la.System, space: NeedleSpace, count: int, seed
     system = replace(system, name=f"{system.name} with a reserve", needle=needle)
     atlas = la.build_atlas(lung, system)
     cases: list[Case] = []
-    for point in np.random.default_rng(seed).permutation(peripheral_targets(lung, 4 * count, seed)):
+    for point in np.random.default_rng(seed).permutation(peripheral_targets(lung, 10 * count, seed)):
         try:
             found = next(la.plan(lung, system, point_target(lung, point), atlas=atlas, time_s=5.0))
         except la.NoPlan:

@@ -1,22 +1,16 @@
-"""What a needle path costs: 1 / clearance, the cost map, length."""
+"""What a needle path costs in a lung: 1 / clearance, the cost map, length."""
 
 from __future__ import annotations
-
-import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
-from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM
+from stages.needle import costs
 from stages.needle.path import ArcPath
+from stages.needle.space import Arrays
 
 OBJECTIVES = ("inverse_clearance", "cost_map", "length_mm")
-
-SAMPLE_MM = 0.1
-EXACT_BELOW_VOXELS = 8.0
-"""Nearer than so many of the longest voxel sides, distances are exact; farther, the clearance field's lower
-bound is less than 0.6 % off."""
 
 
 def require_objective(objective: str) -> None:
@@ -37,37 +31,26 @@ def path_cost(lung: Lung, path: ArcPath, objective: str, *, with_fissures: bool)
     objective : str
         "inverse_clearance": integral of 1 / clearance over arc length, clearance being that of the
         needle's axis to the nearest obstacle, no less than 0.1 mm [Kuntz2015, eq. 1].  "cost_map":
-        line integral of the cost map in mm, 0 without a map.  "length_mm".
+        line integral of the cost map in mm, 0 without a map.  "voxel_sum": sum of the cost map over the
+        set of voxels crossed, 0 without a map [Fu2018, eq. 1].  "length_mm".
     with_fissures : bool
         Whether fissures are obstacles.
     """
     if objective == "length_mm":
         return path.length_mm
-    points, lengths = path.sample(SAMPLE_MM)
     if objective == "cost_map":
-        return _cost_map_integral(lung, points, lengths)
-    clearance = obstacle_clearance_mm(lung, points, with_fissures=with_fissures)
-    weight = 1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM)
-    return float(np.trapezoid(weight, lengths))
+        return costs.map_integral(lung.cost, path)
+    if objective == "voxel_sum":
+        return costs.voxel_sum(lung.cost, path)
+    return costs.inverse_clearance(_obstacles(lung, with_fissures), path)
 
 
 def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> Float:
     """Return the distance `(N,)` in mm from points to the nearest obstacle, voxels as solid boxes."""
-    clearance = lung.obstacle_field(with_fissures=with_fissures).lower_bound_mm(points)
-    exact_below_mm = EXACT_BELOW_VOXELS * float(lung.grid.spacing_mm.max())
-    near = np.flatnonzero(clearance < exact_below_mm)
+    return costs.obstacle_clearance_mm(_obstacles(lung, with_fissures), points)
+
+
+def _obstacles(lung: Lung, with_fissures: bool) -> Arrays:
+    """Return the arrays of a lung as a `NeedleSpace` holds them."""
     bits = OBSTACLES | (FISSURE if with_fissures else 0)
-    found = lung.exact_clearance_mm(points[near], bits, cap_mm=1.2 * exact_below_mm)
-    clearance[near] = np.maximum(found, clearance[near])
-    return clearance
-
-
-def _cost_map_integral(lung: Lung, points: Float, lengths: Float) -> float:
-    """Integrate the cost map by the midpoint rule on the voxel that holds each midpoint."""
-    if lung.cost is None:
-        return 0.0
-    middle = 0.5 * (points[1:] + points[:-1])
-    ijk = np.floor(lung.grid.ijk(middle) + 0.5).astype(np.int64)
-    if ((ijk < 0) | (ijk >= lung.grid.shape)).any():
-        return float("inf")
-    return float((lung.cost.array[tuple(ijk.T)].astype(np.float64) * np.diff(lengths)).sum())
+    return lung.obstacle_field(with_fissures=with_fissures).corners, lung.labels, lung.geometry, bits

@@ -1,11 +1,12 @@
 """A proof that there is no needle path: over-estimates of all states that a path can pass.
 
-Planes perpendicular to the line from start to target cut every path.  On each plane the states, position
-times direction, lie in cells.  From one plane to the next the cells spread as far as curvature allows and
-more by what a cell is wide; cells vanish from which obstacles, the turning limit or the target's distance
-leave no way.  If none is left on a plane, no path exists: none can slip through, since every step
+First, cubes that lie between start and target and are not certainly blocked are filled from the start on.  If
+that does not part start and target, planes perpendicular to the line between them cut every path.  On each
+plane the states, position times direction, lie in cells.  From one plane to the next the cells spread as far
+as curvature allows and more by what a cell is wide; cells vanish from which obstacles, or the places of start
+and target, leave no way.  If none is left on a plane, no path exists: none can slip through, since every step
 over-estimates.  If some are left, those that lie on a chain of cells from start to target are cut into
-smaller ones and the same is done again.  docs/proofs.md has the inequalities.
+smaller ones and the same is done again.  docs/certificate.md has the inequalities.
 """
 
 from __future__ import annotations
@@ -27,16 +28,19 @@ from stages.needle.space import NeedleSpace
 Bits = NDArray[np.uint64]
 Window = NDArray[np.int64]
 
+CUBES_MM = (0.5, 0.25)
 FIRST_CELL_MM = 0.5
-FIRST_SLOPE_CELL = 0.04
-LEVELS = 6
-DEPTH_SHARE = 0.07
+LARGEST_SLOPE_CELL = 0.17
+LEVELS = 7
+DEPTH_SHARE = 0.1
 """Distance of the planes as a share of the radius of curvature."""
-LEAST_DEPTH_SHARE = 0.02
-SLOPE_CHANGE_EDGES = np.array([0.75, 0.92, 1.0])
+SLOPE_CHANGE_EDGES = np.array([0.5, 0.75, 0.92, 1.0])
 PROBES_PER_DEPTH = 8
-LACK_STEP_MM = 0.05
-DEEPEST_LACK_MM = 2.5
+SLACK_RATIO = 1.08
+"""Of the amounts of missing clearance that are told apart."""
+SLACKS = 48
+STEEPEST = 0.995
+"""Largest sine of the angle between paths and the planes' normal for which planes are tried."""
 MAX_BYTES = 1 << 30
 
 
@@ -51,9 +55,19 @@ class Plane:
         """Return the same without empty rows and columns at the edges."""
         box = np.zeros(8, dtype=np.int64)
         sets.extent(self.bits, box)
-        v0, v1, u0, u1, y0, y1, x0, x1 = (int(n) for n in box)
-        bits = self.bits[v0 : v1 + 1, u0 : u1 + 1, y0 : y1 + 1, x0 // 64 : x1 // 64 + 1]
-        return Plane(np.ascontiguousarray(bits), self.window + np.array([v0, u0, y0, x0]))
+        v0, v1, u0, u1, y0, y1, w0, w1 = (int(n) for n in box)
+        bits = self.bits[v0 : v1 + 1, u0 : u1 + 1, y0 : y1 + 1, w0 : w1 + 1]
+        return Plane(np.ascontiguousarray(bits), self.window + np.array([v0, u0, y0, 64 * w0]))
+
+    @property
+    def ends(self) -> Window:
+        """Cell numbers of the last cell."""
+        nv, nu, rows, words = self.bits.shape
+        return self.window + np.array([nv, nu, rows, 64 * words]) - 1
+
+
+class _TooMuch(Exception):
+    """The states do not fit the memory allowed."""
 
 
 class NoPathProof:
@@ -64,53 +78,59 @@ class NoPathProof:
     space : NeedleSpace
     query : Query
     max_bytes : int
-        Most memory for one set of states.
+        Most memory for states and tables.
 
     Attributes
     ----------
     outcome : str
         "running", "no path" (proved) or "undecided" (paths may exist).
+    reason : str
+        What proves it, or why the end is undecided.
     cell_mm, slope_cell : float
         Sides of the cells of the present level: of position in mm, and of direction as a slope (1 is 45
         degrees).
-    reason : str
-        Why the end is undecided.
 
     Raises
     ------
     SettingsError
-        If the needle may turn by more than 90 degrees from its start: then the tests do not hold.
+        If `max_bytes` is not positive.
 
     Notes
     -----
-    The limits on length and accumulated turning are not used, so a path that only they forbid counts as
-    possible.  Where the exit may touch a pierced branch, that branch does not count as an obstacle.
+    Among the limits, those of curvature and of the angle from the reference count; those of length and of
+    accumulated turn count only in so far as together they forbid turning by more than 180 degrees in all.
+    Without that, nothing is proved.  Where the exit may touch a pierced branch, that branch is no obstacle.
     """
 
     def __init__(self, space: NeedleSpace, query: Query, *, max_bytes: int = MAX_BYTES) -> None:
-        if space.limits[index.MAX_ANGLE] > 0.5 * math.pi + 1e-9:
-            raise SettingsError(
-                f"A needle that turns {math.degrees(space.limits[index.MAX_ANGLE]):.0f} degrees from its start",
-                expected="at most 90 degrees, for a proof that there is no path",
-            )
+        if max_bytes <= 0:
+            raise SettingsError(f"The memory for a proof is {max_bytes} bytes", expected="more than 0")
         self.outcome = "running"
         self.reason = ""
-        self.cell_mm = FIRST_CELL_MM
-        self.slope_cell = FIRST_SLOPE_CELL
+        self.cell_mm = math.inf
+        self.slope_cell = math.inf
         self.states = 0
         """Largest number of states on a plane so far."""
         self._space = space
         self._query = query
         self._max_bytes = max_bytes
-        self._kappa = float(space.limits[index.KAPPA])
+        self._required = float(space.limits[index.REQUIRED])
+        self._exempt_mm = float(space.limits[index.EXEMPT_LENGTH]) - query.inserted_mm
+        self._kappa = float(space.limits[index.KAPPA]) * (1.0 + sets.SPARE)
         self._tolerance = space.goal_tolerance_mm
-        self._prepare()
+        self._planes: list[Plane] = []
+        self._coarse: list[Plane] = []
         self._steps = self._run()
 
     def advance(self) -> bool:
         """Do the next step, a plane of one level; return whether the proof has ended."""
         if self.outcome == "running":
-            next(self._steps, None)
+            try:
+                next(self._steps, None)
+            except _TooMuch:
+                self._end("undecided", "more states than fit the memory allowed")
+            if self.outcome != "running":
+                self._planes, self._coarse = [], []
         return self.outcome != "running"
 
     def run(self) -> str:
@@ -119,185 +139,250 @@ class NoPathProof:
             pass
         return self.outcome
 
-    def _prepare(self) -> None:
-        start, forward = self._query.lps_from_start[:3, 3], self._query.lps_from_start[:3, 2]
-        chord = self._query.target - start
-        self._total = float(np.linalg.norm(chord))
-        self._last = self._total - self._tolerance
-        if self._last <= 0.0:
-            self._end("undecided", "the target lies at the start")
-            return
-        self._normal = chord / self._total
-        axis = np.eye(3)[int(np.argmin(np.abs(self._normal)))]
-        column = np.cross(self._normal, axis)
-        column /= np.linalg.norm(column)
-        self._sides = np.stack([np.cross(self._normal, column), column])
-        along = float(forward @ self._normal)
-        if along <= 0.0:
-            self._end("undecided", "the start looks away from the target")
-            return
-        self._first_slope: Float = self._sides @ forward / along
-
-    def _end(self, outcome: str, reason: str = "") -> None:
+    def _end(self, outcome: str, reason: str) -> None:
         self.outcome, self.reason = outcome, reason
 
     def _run(self) -> Iterator[None]:
-        """Refine level by level, with planes nearer to each other if paths may be too steep for them."""
-        share = DEPTH_SHARE
-        coarse: list[Plane] | None = None
-        level = 0
-        while level < LEVELS:
-            self.cell_mm, self.slope_cell = FIRST_CELL_MM / 2**level, FIRST_SLOPE_CELL / 2**level
-            self._count = max(1, math.ceil(self._last * self._kappa / share))
-            self._depth = self._last / self._count
-            self._too_steep = False
-            planes: list[Plane] = []
-            for plane in self._forward(coarse):
-                if plane is not None:
-                    planes.append(plane)
-                yield
-            if self.outcome != "running":
+        """Try one kind of proof after the other."""
+        self._measure()
+        if self.outcome != "running":
+            return
+        for side in CUBES_MM:
+            yield
+            if self._parted(side):
+                self._end("no path", f"blocked, whatever the curvature, by cubes of {side:g} mm")
                 return
-            if self._too_steep:
-                level += 1
-                continue
-            for _ in self._backward(planes):
+        yield
+        self._aim_planes()
+        if self.outcome == "running":
+            yield from self._refine()
+
+    def _measure(self) -> None:
+        """Set up the line from start to target, and look whether the proof can hold or is already done."""
+        space, query = self._space, self._query
+        start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
+        chord = query.target - start
+        total = float(np.linalg.norm(chord))
+        turn = min(
+            space.limits[index.MAX_TURN] - query.turned_rad,
+            self._kappa * (space.limits[index.MAX_LENGTH] - query.inserted_mm),
+        )
+        if space.limits[index.LOOKUP_STEP] > 0.0:
+            self._end("undecided", "paths of this space need not be clear")
+            return
+        if turn > math.pi + 1e-6:
+            self._end("undecided", "the needle may turn by more than 180 degrees in all")
+            return
+        if total <= self._tolerance + sets.SPARE:
+            self._end("undecided", "the target lies at the start")
+            return
+        normal = chord / total
+        column = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+        column /= np.linalg.norm(column)
+        self._frame = np.stack([start, normal, np.cross(normal, column), column])
+        radius = 1.0 / self._kappa
+        ahead = float(chord @ forward)
+        hope = sets.escape_depth(math.sqrt(max(total**2 - ahead**2, 0.0)), ahead, radius)
+        if hope + self._tolerance + 1e-4 < 0.0:
+            self._end("no path", "the target lies outside the workspace of the start")
+        elif self._clearance_at_most(start) < self._required - sets.SPARE:
+            self._end("no path", "the start is too near to obstacles")
+        self._ends = np.zeros(sets.ENDS_SIZE)
+        self._ends[: sets.SPINDLE_MIDDLE] = total, self._tolerance
+        longest = total + self._tolerance
+        self._ends[sets.SPINDLE_RADIUS] = math.inf
+        self._steepest = 1.0
+        if longest < 2.0 * radius and self._tolerance < total:
+            tilt = math.asin(self._tolerance / total)
+            offset = math.sqrt(radius**2 - 0.25 * longest**2)
+            self._ends[sets.SPINDLE_MIDDLE :] = 0.5 * longest, offset, radius + longest * tilt
+            self._steepest = math.sin(min(math.asin(0.5 * longest / radius) + tilt + 1e-6, 0.5 * math.pi))
+        local = self._frame[1:] @ forward
+        self._scale = np.zeros(sets.SCALE_SIZE)
+        self._scale[sets.FIRST_V : sets.FIRST_U + 1] = local[1:] / local[0] if local[0] != 0.0 else 0.0
+        self._scale[sets.KAPPA] = self._kappa
+        self._along = float(local[0])
+
+    def _clearance_at_most(self, point: Float) -> float:
+        exempt = self._query.branch if self._exempt_mm > 0.0 else -1
+        return float(sets.clearance_above(self._space.arrays, self._required, 0.0, exempt, *point))
+
+    def _parted(self, side: float) -> bool:
+        """Tell whether cubes that no path can pass part the target from the start."""
+        total, tolerance = self._ends[sets.TOTAL], self._ends[sets.TOLERANCE]
+        aside = self._ends[sets.SPINDLE_RADIUS] - self._ends[sets.SPINDLE_OFFSET]
+        if not aside < math.inf or self._along <= 0.0:
+            return False
+        before = math.ceil((self._ends[sets.SPINDLE_RADIUS] + side) / side)
+        before = math.ceil((aside + side) / side) if before > aside / side else before
+        beside = math.ceil((aside + side) / side)
+        beyond = math.ceil((total + 2.0 * tolerance + aside + side) / side)
+        low = np.array([-before, -beside, -beside])
+        shape = np.array([before + beyond, 2 * beside, 2 * beside]) + 1
+        size = int(np.prod(shape))
+        if 5 * size > self._max_bytes or size >= 1 << 31:
+            return False
+        return not sets.flood(
+            self._space.arrays, self._required, self._query.branch, self._exempt_mm, self._scale, self._ends,
+            self._frame, side, low, np.zeros(shape, dtype=np.bool_), np.zeros(size, dtype=np.int32),
+        )  # fmt: skip
+
+    def _aim_planes(self) -> None:
+        """Choose the planes and the first cells."""
+        last = self._ends[sets.TOTAL] - self._tolerance
+        self._count = max(1, math.ceil(last * self._kappa / DEPTH_SHARE))
+        self._depth = last / self._count
+        self._proved_steepest = self._steepest <= STEEPEST
+        sine = self._steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
+        self._scale[sets.TOP_SINE] = sine
+        if self._along <= 0.0 or math.sqrt(1.0 - min(self._along, 1.0) ** 2) >= sine:
+            self._end("undecided", "the start looks away from the target")
+        reference = self._query.reference
+        if reference is None:
+            reference = self._query.lps_from_start[:3, 2]
+        self._reference = self._frame[1:] @ reference
+
+    def _refine(self) -> Iterator[None]:
+        """Go through all planes forward and backward, again and again with smaller cells."""
+        cell = min(FIRST_CELL_MM, 0.5 * LARGEST_SLOPE_CELL * self._depth)
+        for level in range(LEVELS):
+            self.cell_mm = cell / 2**level
+            self.slope_cell = 2.0 * self.cell_mm / self._depth
+            self._scale[sets.CELL], self._scale[sets.SLOPE_CELL] = self.cell_mm, self.slope_cell
+            self._planes = []
+            for number in range(self._count + 1):
+                self._forward(number)
+                if self.outcome != "running":
+                    return
                 yield
-            if self.outcome != "running":
-                return
-            coarse = planes
-            level += 1
+            for number in range(self._count - 1, -1, -1):
+                self._backward(number)
+                if self.outcome != "running":
+                    return
+                yield
+            self._coarse = self._planes
         self._end("undecided", "states are left at the finest level")
 
-    def _forward(self, coarse: list[Plane] | None) -> Iterator[Plane | None]:
-        """Propagate from the start; end the proof if a plane is empty."""
-        plane = Plane(np.ones((1, 1, 1, 1), dtype=np.uint64), np.zeros(4, dtype=np.int64))
-        for number in range(self._count + 1):
-            if number > 0:
-                spread = self._spread(plane, None if coarse is None else coarse[number])
-                if spread is None:
-                    self._end("undecided", "more states than fit the memory allowed")
-                    yield None
-                    return
-                plane = spread
-                if coarse is not None:
-                    sets.keep_refined(plane.bits, plane.window, coarse[number].bits, coarse[number].window)
-            kept, _steep = self._keep_hopeful(plane, number)
-            steep = 0
-            if kept:
-                plane = plane.trimmed()
-                self._keep_clear(plane, number)
-                kept, steep = self._keep_hopeful(plane, number)
-            self.states = max(self.states, kept)
-            if kept == 0:
-                self._end("no path")
-                yield None
-                return
-            if steep and number < self._count:
-                self._too_steep = True
-                yield None
-                return
+    def _forward(self, number: int) -> None:
+        """Add a plane: the states reached from the plane before, or the start."""
+        plane = self._allowed(number)
+        _kept, steepest = sets.keep_hopeful(
+            plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
+            float(self._space.limits[index.MAX_ANGLE]),
+        )  # fmt: skip
+        if number > 0 and plane.bits.any():
             plane = plane.trimmed()
-            yield plane
-
-    def _backward(self, planes: list[Plane]) -> Iterator[None]:
-        """Remove from all planes what does not lead to the last one."""
-        for number in range(self._count - 1, -1, -1):
-            after, here = planes[number + 1], planes[number]
-            bits = np.zeros_like(here.bits)
-            self._step(after, -1, bits, here.window)
-            if sets.keep_both(here.bits, bits) == 0:
-                self._end("no path")
-                yield
+            self._step(self._planes[-1], 1, plane, 2.0 if number > 1 else 1.0)
+        if plane.bits.any():
+            plane = plane.trimmed()
+            self._keep_clear(plane, number)
+        if not plane.bits.any():
+            self._end("no path", f"no state is left {number * self._depth:.1f} mm from the start")
+            return
+        plane = plane.trimmed()
+        self.states = max(self.states, int(np.bitwise_count(plane.bits).sum()))
+        if not self._proved_steepest and not self._coarse and number < self._count:
+            steepest = sets.steepest_of(plane.bits, plane.window, self._scale)
+            if steepest > 1.0 - 2.0 * self._kappa * self._depth:
+                self._end("undecided", "paths may be too steep for the planes")
                 return
-            planes[number] = here.trimmed()
-            yield
+        self._planes.append(plane)
 
-    def _step(self, plane: Plane, way: int, bits: Bits, window: Window) -> None:
-        sets.step_sets(
-            plane.bits, plane.window, self._first_slope, self.cell_mm, self.slope_cell,
-            self._kappa, self._depth, way, SLOPE_CHANGE_EDGES, bits, window,
-        )  # fmt: skip
+    def _backward(self, number: int) -> None:
+        """Remove from a plane what does not lead to the next one."""
+        plane = self._planes[number]
+        self._step(self._planes[number + 1], -1, plane, 2.0)
+        if not plane.bits.any():
+            self._end("no path", f"no state {number * self._depth:.1f} mm from the start leads to the target")
+            return
+        self._planes[number] = plane.trimmed()
 
-    def _spread(self, plane: Plane, coarse: Plane | None) -> Plane | None:
-        """Return the states of the next plane; None if they do not fit the memory."""
-        nv, nu, rows, words = plane.bits.shape
-        low = plane.window.copy()
-        high = low + np.array([nv - 1, nu - 1, rows - 1, 64 * words - 1])
-        used = plane.bits.reshape(nv, nu, -1).any(axis=2)
-        slopes = [
-            self._first_slope[axis] + (low[axis] + np.arange(plane.bits.shape[axis])) * self.slope_cell
-            for axis in (0, 1)
-        ]
-        steepest = float(np.hypot(slopes[0][:, None], slopes[1][None])[used].max())
-        change = sets.largest_slope_change(steepest + self.slope_cell, self._kappa, self._depth)
-        pad = math.ceil(change / self.slope_cell + 2.0)
-        low[:2] -= pad
-        high[:2] += pad
+    def _allowed(self, number: int) -> Plane:
+        """Return all states of a plane that are to be looked at."""
+        if number == 0:
+            return Plane(np.ones((1, 1, 1, 1), dtype=np.uint64), np.zeros(4, dtype=np.int64))
+        if self._coarse:
+            coarse = self._coarse[number]
+            nv, nu, rows, words = (2 * n + 1 for n in coarse.bits.shape)
+            self._require(8 * nv * nu * rows * words)
+            bits = np.zeros((nv, nu, rows, words), dtype=np.uint64)
+            sets.refine(coarse.bits, bits)
+            return Plane(bits, 2 * coarse.window - 1)
+        low, high = self._reached(self._planes[-1], number)
+        shape = np.maximum(high - low + 1, 1)
+        shape[3] = -(-int(shape[3]) // 64)
+        self._require(8 * math.prod(int(n) for n in shape))
+        return Plane(np.full(tuple(shape), sets.ALL, dtype=np.uint64), low)
+
+    def _reached(self, plane: Plane, number: int) -> tuple[Window, Window]:
+        """Return the first and last cell numbers that the states of a plane may reach on the next one."""
+        scale = self._scale
+        reach = sets.largest_reach(scale, self._depth, 2.0, plane.window, *plane.bits.shape[:2])
+        top = scale[sets.TOP_SINE]
+        aside = sets.largest_aside(top, scale, self._depth, 0.0, 1e9) / self.cell_mm + 4.0
+        widest = self._ends[sets.SPINDLE_RADIUS] - self._ends[sets.SPINDLE_OFFSET]
+        low, high = plane.window.copy(), plane.ends
         for axis in (0, 1):
-            ends = self._first_slope[axis] + np.array([low[axis], high[axis]]) * self.slope_cell
-            shift = ends * self._depth / self.cell_mm
-            # A state moves by the mean of two slopes, both between these ends, and by no more than cells.
-            spare = math.ceil(0.25 * change * self._depth / self.cell_mm) + 4
-            low[axis + 2] += math.floor(shift[0]) - spare
-            high[axis + 2] += math.ceil(shift[1]) + spare
-        if coarse is not None:
-            cv, cu, crows, cwords = coarse.bits.shape
-            low = np.maximum(low, 2 * coarse.window - 1)
-            high = np.minimum(high, 2 * (coarse.window + np.array([cv, cu, crows, 64 * cwords]) - 1) + 1)
-        shape = high - low + 1
-        size = int(shape[0] * shape[1] * shape[2]) * (-(-int(shape[3]) // 64)) * 8
-        table = nv * nu * int(shape[2]) * (-(-int(shape[3]) // 64)) * 8 * (nu.bit_length() + 1)
-        if max(size, table) > self._max_bytes:
-            return None
-        bits = np.zeros((*shape[:3], -(-int(shape[3]) // 64)), dtype=np.uint64)
-        self._step(plane, 1, bits, low)
-        return Plane(bits, low)
+            first = scale[sets.FIRST_V + axis]
+            steep = top / math.sqrt(1.0 - top * top)
+            fewest = math.floor((-steep - first) / self.slope_cell) - 1
+            most = math.ceil((steep - first) / self.slope_cell) + 1
+            slopes = low[axis], high[axis]
+            low[axis] = max(low[axis] - reach, fewest)
+            high[axis] = min(high[axis] + reach, most)
+            low[axis + 2] += slopes[0] + low[axis] - math.ceil(aside)
+            high[axis + 2] += slopes[1] + high[axis] + math.ceil(aside)
+            if widest < math.inf:
+                middle = number * self._depth * first
+                least = math.floor((-widest - middle) / self.cell_mm) - 1
+                largest = math.ceil((widest - middle) / self.cell_mm) + 1
+                low[axis + 2] = min(max(low[axis + 2], least), largest)
+                high[axis + 2] = max(min(high[axis + 2], largest), low[axis + 2])
+        return low, high
 
-    def _keep_hopeful(self, plane: Plane, number: int) -> tuple[int, int]:
-        goal = np.array([0.0, 0.0, self._total - number * self._depth])
-        largest_sine = 1.0 - 2.0 * self._kappa * self._depth - 1e-3
-        kept, steep = sets.keep_hopeful(
-            plane.bits, plane.window, self._first_slope, self.cell_mm, self.slope_cell,
-            self._kappa, goal, self._tolerance, largest_sine,
+    def _require(self, size: int) -> None:
+        """Raise if so many bytes more do not fit the memory allowed."""
+        used = sum(plane.bits.nbytes for plane in self._planes + self._coarse)
+        if used + size > self._max_bytes:
+            raise _TooMuch
+
+    def _step(self, plane: Plane, way: int, other: Plane, blur: float) -> None:
+        reach = sets.largest_reach(self._scale, self._depth, blur, other.window, *other.bits.shape[:2])
+        table = math.prod(sets.table_shape(plane.bits, plane.window, reach))
+        self._require(8 * table + 2 * other.bits.nbytes)
+        sets.step_sets(
+            plane.bits, plane.window, self._scale, self._depth, way, blur, SLOPE_CHANGE_EDGES, other.bits,
+            other.window,
         )  # fmt: skip
-        return int(kept), int(steep)
 
     def _keep_clear(self, plane: Plane, number: int) -> None:
         """Test half a slab to either side of a plane."""
         here = number * self._depth
+        last = self._count * self._depth
         probes = self._depth / PROBES_PER_DEPTH * np.arange(-PROBES_PER_DEPTH // 2, PROBES_PER_DEPTH // 2 + 1)
-        probes = probes[(here + probes > -1e-9) & (here + probes < self._last + 1e-9)]
-        boxes = [self._seen_at(plane, float(depth)) for depth in probes]
-        rows = max(y1 - y0 for y0, y1, _x0, _x1 in boxes) + 1
-        words = max((x1 - x0) // 64 for _y0, _y1, x0, x1 in boxes) + 1
-        levels = round(DEEPEST_LACK_MM / LACK_STEP_MM)
-        free = np.zeros((len(boxes), levels, rows, words), dtype=np.uint64)
-        lack = np.zeros((rows, 64 * words))
-        across = self._sides * self.cell_mm
-        start = self._query.lps_from_start[:3, 3]
-        for n, (depth, (y0, _y1, x0, _x1)) in enumerate(zip(probes, boxes, strict=True)):
+        probes = probes[(here + probes > -1e-9) & (here + probes < last + 1e-9)]
+        low, high = plane.window, plane.ends
+        corners = np.zeros((len(probes), 2), dtype=np.int64)
+        shape = np.zeros((len(probes), 2), dtype=np.int64)
+        for axis in (0, 1):
+            move = probes * self.slope_cell / self.cell_mm
+            ends = np.stack([move * low[axis], move * high[axis]])
+            corners[:, axis] = low[axis + 2] + np.floor(ends.min(axis=0)) - 1
+            shape[:, axis] = high[axis + 2] + np.ceil(ends.max(axis=0)) + 2 - corners[:, axis]
+        rows, words = int(shape[:, 0].max()), -(-int(shape[:, 1].max()) // 64)
+        slacks = sets.HALF_DIAGONAL * self.cell_mm * SLACK_RATIO ** np.arange(SLACKS)
+        self._require(len(probes) * rows * words * (8 + 64 + 8 * SLACKS))
+        probed = np.zeros((len(probes), rows, words), dtype=np.uint64)
+        sets.mark_probed(plane.bits, plane.window, self._scale, probes, probed, corners)
+        grades = np.zeros((len(probes), rows, 64 * words), dtype=np.uint8)
+        across = self._frame[2:] * self.cell_mm
+        for n, probe in enumerate(probes):
+            depth = here + float(probe)
             # A path at this depth is at least as long, so beyond the exempt length nothing is spared.
-            exempt = self._query.branch if here + depth < self._space.limits[index.EXEMPT_LENGTH] else -1
-            origin = start + (here + depth) * self._normal + y0 * across[0] + x0 * across[1]
-            sets.lack_of_clearance(
-                self._space.arrays, self._space.limits[index.REQUIRED], exempt, origin, across,
-                DEEPEST_LACK_MM, lack,
-            )  # fmt: skip
-            for q in range(levels):
-                sets.free_within(lack, q * LACK_STEP_MM, free[n, q])
-        corners = np.array([(y0, x0) for y0, _y1, x0, _x1 in boxes], dtype=np.int64)
-        sets.keep_clear(
-            plane.bits, plane.window, self._first_slope, self.cell_mm, self.slope_cell, self._kappa,
-            free, corners, probes, LACK_STEP_MM,
-        )  # fmt: skip
-
-    def _seen_at(self, plane: Plane, depth: float) -> tuple[int, int, int, int]:
-        """Return the rows and columns, first and last, that the tangents of a plane's states meet."""
-        out: list[int] = []
-        for axis, count in ((0, plane.bits.shape[2]), (1, 64 * plane.bits.shape[3])):
-            ends = np.array([0, plane.bits.shape[axis] - 1]) + plane.window[axis]
-            shift = (self._first_slope[axis] + ends * self.slope_cell) * depth / self.cell_mm
-            first = int(plane.window[axis + 2])
-            out += [first + math.floor(shift.min()) - 1, first + count + math.ceil(shift.max())]
-        return out[0], out[1], out[2], out[3]
+            exempt = self._query.branch if depth < self._exempt_mm else -1
+            tangent = self._scale[sets.FIRST_V : sets.FIRST_U + 1] @ self._frame[2:]
+            origin = self._frame[0] + depth * (self._frame[1] + tangent) + corners[n] @ across
+            sets.grade_clearance(
+                self._space.arrays, self._required, exempt, origin, across, probed[n], slacks, grades[n]
+            )
+        sets.keep_clear(plane.bits, plane.window, self._scale, probes, corners, grades, slacks)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from anatomy.errors import FrameError
+from anatomy.errors import FrameError, SettingsError
 from anatomy.grid import Float
 from stages.needle.kernels import tree
 from stages.needle.kernels.rrt import grow_rrt
@@ -33,16 +33,26 @@ class Query:
     target : (3,) float64, LPS mm
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
+    inserted_mm, turned_rad : float
+        Length of the needle behind the start and its accumulated turn: the limits count both, and so does
+        the exemption at the exit.
+    reference : (3,) float64, optional
+        Direction from which the limit of the angle counts; by default that of the start.
 
     Raises
     ------
     FrameError
-        If there are not so many finite numbers, or the pose is not rigid.
+        If there are not so many finite numbers, the pose is not rigid, or the reference has no length.
+    SettingsError
+        If the length or the turn behind the start is negative or not finite.
     """
 
     lps_from_start: Float
     target: Float
     branch: int = -1
+    inserted_mm: float = 0.0
+    turned_rad: float = 0.0
+    reference: Float | None = None
 
     def __post_init__(self) -> None:
         frame = np.array(self.lps_from_start, dtype=np.float64)
@@ -57,8 +67,23 @@ class Query:
             raise FrameError(
                 "The start of a needle query is not a right-handed rigid pose", expected="a rotation"
             )
+        for name, value in (("inserted length", self.inserted_mm), ("accumulated turn", self.turned_rad)):
+            if not 0.0 <= value < math.inf:
+                raise SettingsError(f"The {name} is {value}", expected="a finite number of 0 or more")
         object.__setattr__(self, "lps_from_start", frame)
         object.__setattr__(self, "target", target)
+        if self.reference is not None:
+            object.__setattr__(self, "reference", _unit(np.array(self.reference, dtype=np.float64)))
+
+
+def _unit(direction: Float) -> Float:
+    length = float(np.linalg.norm(direction)) if direction.shape == (3,) else math.nan
+    if not 0.0 < length < math.inf:
+        raise FrameError(
+            f"The reference direction of a needle query is {direction.tolist()}",
+            expected="three finite numbers, not all 0",
+        )
+    return direction / length
 
 
 class Search(Protocol):
@@ -82,6 +107,18 @@ class Search(Protocol):
         """Spend up to `iterations`; return whether a better path was found, with which the slice ends."""
 
 
+def root_of(query: Query) -> Float:
+    """Return the root `(NODE_COLUMNS,)` of a tree of arcs, see `stages.needle.kernels.tree`."""
+    root = np.zeros(tree.NODE_COLUMNS)
+    root[:3] = query.lps_from_start[:3, 3]
+    root[3:6] = query.lps_from_start[:3, 2]
+    root[tree.PATH_LENGTH] = query.inserted_mm
+    root[tree.PATH_TURN] = query.turned_rad
+    if query.reference is not None:
+        root[tree.BEND + 1 : tree.BEND + 4] = query.reference
+    return root
+
+
 class TreeSearch:
     """What the searches that grow a tree share: its arrays, random state and best path."""
 
@@ -98,8 +135,7 @@ class TreeSearch:
         self.objective = space.objective_arrays(objective)
         self.state = np.array([seed], dtype=np.uint64)
         self.nodes, self.parents = np.zeros((MAX_NODES, tree.NODE_COLUMNS)), np.zeros(MAX_NODES, np.int64)
-        self.nodes[0, :3] = query.lps_from_start[:3, 3]
-        self.nodes[0, 3:6] = query.lps_from_start[:3, 2]
+        self.nodes[0] = root_of(query)
         self.count = 1
 
     def take(self, last: int) -> None:

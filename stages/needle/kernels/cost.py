@@ -1,7 +1,13 @@
 """What an arc costs, as estimated within the searches.
 
 `objective` is the tuple (weights, cost map): weights of the integral of 1 / clearance, of the line
-integral of the cost map, and of length; the last weight is the least cost of a mm anywhere.
+integral of the cost map, and of length; then the least cost of a mm anywhere, and the weight of the sum of
+the cost map over the set of voxels crossed.
+
+Voxels are found in closed form.  Along an arc every voxel coordinate is `a + b sin + c cos` of the angle
+turned, so that it is monotone between extrema half a circle apart.  The arc is cut at the extrema of all
+three; in such a piece no voxel is met twice, and the voxels at its two ends say how often each coordinate
+crosses a face, and where is the root of a quadratic equation.
 """
 
 from __future__ import annotations
@@ -9,9 +15,11 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
-from anatomy.kernels.arcs import point_on_arc
+from anatomy.kernels.arcs import SMALL_ANGLE, point_on_arc
 from anatomy.kernels.field import distance_estimate
+from stages.needle.kernels.limits import TINY
 
 CLEARANCE_FLOOR_MM = 0.1
 """Nearer than this, 1 / clearance stays at its value here, so that the integral is finite."""
@@ -20,6 +28,10 @@ INVERSE_CLEARANCE = 0
 MAP_INTEGRAL = 1
 LENGTH = 2
 LEAST_RATE = 3
+VOXEL_SUM = 4
+N_WEIGHTS = 5
+
+OFF_GRID = -1
 
 
 @numba.njit(cache=True)
@@ -36,29 +48,192 @@ def inverse_clearance_on_arc(space, step, pose, bend, length):
 
 
 @numba.njit(cache=True)
-def map_integral_on_arc(costs, geometry, step, pose, bend, length):
-    """Estimate the line integral of the cost map along an arc by the midpoint rule; inf off the grid."""
-    count = max(int(math.ceil(length / step)), 1)
-    ni, nj, nk = costs.shape
-    total = 0.0
-    for m in range(count):
-        x, y, z = point_on_arc(pose, bend, length * (m + 0.5) / count)
-        u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
-        v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
-        w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
-        if not (0.0 <= u < ni and 0.0 <= v < nj and 0.0 <= w < nk):
-            return math.inf
-        total += costs[int(u), int(v), int(w)]
-    return total * length / count
+def _coordinates(geometry, pose, bend, s):
+    """Return the voxel coordinates (corners are whole numbers) of the point at arc length `s`."""
+    x, y, z = point_on_arc(pose, bend, s)
+    return (
+        geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3],
+        geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3],
+        geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3],
+    )
 
 
 @numba.njit(cache=True)
-def cost_of_arc(space, objective, step, pose, bend, length):
-    """Return the weighted cost of an arc."""
+def _directions(geometry, x, y, z):
+    """Return a direction in voxels per mm."""
+    return (
+        geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z,
+        geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z,
+        geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z,
+    )
+
+
+@numba.njit(cache=True)
+def _first_crossing(kappa, slope, bow, change):
+    """Return the arc length, below half a circle, at which a monotone coordinate has changed by `change`.
+
+    The coordinate starts with `slope` along the tangent and `bow` along the normal.  With
+    `x = 2 tan(kappa s / 2) / kappa` it changes by `(slope x + kappa bow x^2 / 2) / (1 + kappa^2 x^2 / 4)`.
+    """
+    if change == 0.0:
+        return 0.0
+    square = slope * slope - kappa * change * (kappa * change - 2.0 * bow)
+    below = slope + math.copysign(math.sqrt(max(square, 0.0)), change)
+    if below == 0.0:
+        return math.inf
+    x = 2.0 * change / below
+    half = 0.5 * kappa * x
+    if abs(half) < SMALL_ANGLE:
+        return x * (1.0 - half * half / 3.0)
+    return 2.0 * math.atan(half) / kappa
+
+
+@numba.njit(cache=True)
+def _next_extremum(kappa, tangents, normals, s, length):
+    """Return the arc length beyond `s` at which some coordinate is extreme, `length` if there is none."""
+    stop = length
+    if kappa > 0.0:
+        angle = kappa * s
+        for axis in range(3):
+            extreme = math.atan2(-tangents[axis], normals[axis])
+            ahead = (extreme - angle) % math.pi
+            if ahead < TINY:
+                ahead += math.pi
+            stop = min(stop, s + ahead / kappa)
+    return stop
+
+
+@numba.njit(cache=True)
+def _voxel(shape, cell):
+    """Return the number of a voxel, the first index running fastest; OFF_GRID beyond the grid."""
+    for axis in range(3):
+        if not 0 <= cell[axis] < shape[axis]:
+            return OFF_GRID
+    return cell[0] + shape[0] * (cell[1] + shape[1] * cell[2])
+
+
+@numba.njit(cache=True)
+def _most_voxels(geometry, bend, length):
+    """Return a number of voxels that an arc cannot exceed: one, and one for every face it can cross."""
+    faces = 0.0
+    for axis in range(3):
+        faces += length / math.sqrt(geometry[axis, 4])
+    pieces = 3.0 * (bend[0] * length / math.pi + 1.0) + 1.0
+    return int(math.ceil(faces + 3.0 * pieces)) + 1
+
+
+@numba.njit(cache=True)
+def voxels_on_arc(shape, geometry, pose, bend, length):
+    """Return the voxels that an arc crosses, in its order.
+
+    They are those that hold one of its ends or more than 1e-9 mm of it.  An end on a face lies in the voxel
+    of the higher index.
+
+    Returns
+    -------
+    voxels : (N,) int64
+        Their numbers, the first index running fastest; OFF_GRID beyond the grid.
+    lengths : (N,) float64
+        Length of arc in each, mm.
+    pieces : int
+        If 1, no voxel is met twice.
+    """
+    kappa = bend[0]
+    most = _most_voxels(geometry, bend, length)
+    voxels = np.zeros(most, dtype=np.int64)
+    lengths = np.zeros(most)
+    tangents = _directions(geometry, pose[3], pose[4], pose[5])
+    normals = _directions(geometry, bend[1], bend[2], bend[3])
+    here = _coordinates(geometry, pose, bend, 0.0)
+    cell = np.zeros(3, dtype=np.int64)
+    last = np.zeros(3, dtype=np.int64)
+    crossing = np.zeros(3)
+    for axis in range(3):
+        cell[axis] = int(math.floor(here[axis]))
+    count = 0
+    pieces = 0
+    entered = 0.0
+    s = 0.0
+    while True:
+        pieces += 1
+        stop = _next_extremum(kappa, tangents, normals, s, length)
+        there = _coordinates(geometry, pose, bend, stop)
+        c, d = math.cos(kappa * s), math.sin(kappa * s)
+        for axis in range(3):
+            last[axis] = int(math.floor(there[axis]))
+            crossing[axis] = -1.0
+        while True:
+            first = -1
+            for axis in range(3):
+                if cell[axis] == last[axis]:
+                    continue
+                if crossing[axis] < 0.0:
+                    face = cell[axis] + 1.0 if last[axis] > cell[axis] else float(cell[axis])
+                    slope = c * tangents[axis] + d * normals[axis]
+                    bow = c * normals[axis] - d * tangents[axis]
+                    at = s + _first_crossing(kappa, slope, bow, face - here[axis])
+                    crossing[axis] = min(max(at, s), stop)
+                if first < 0 or crossing[axis] < crossing[first]:
+                    first = axis
+            if first < 0:
+                break
+            at = max(crossing[first], entered)
+            if at - entered > TINY or count == 0:
+                voxels[count] = _voxel(shape, cell)
+                lengths[count] = at - entered
+                count += 1
+                entered = at
+            cell[first] += 1 if last[first] > cell[first] else -1
+            crossing[first] = -1.0
+        if stop >= length:
+            break
+        s = stop
+        here = there
+    voxels[count] = _voxel(shape, cell)
+    lengths[count] = length - entered
+    return voxels[: count + 1], lengths[: count + 1], pieces
+
+
+@numba.njit(cache=True)
+def map_costs_on_arc(costs, geometry, pose, bend, length, first):
+    """Return the line integral of the cost map along an arc, and its sum over the voxels crossed.
+
+    In the sum each voxel counts once, and that of the start not at all unless the arc is the `first` of its
+    path: so the sums over the arcs of a path count the voxels that hold their joints once, and only a voxel
+    that the path leaves and meets again on another arc counts twice.  Both are infinite if the arc meets a
+    voxel of infinite cost or leaves the grid.
+    """
+    ni, nj, _nk = costs.shape
+    voxels, lengths, pieces = voxels_on_arc(costs.shape, geometry, pose, bend, length)
+    begin = voxels[0]
+    integral = 0.0
+    for m in range(len(voxels)):
+        if voxels[m] == OFF_GRID:
+            return math.inf, math.inf
+        cost = costs[voxels[m] % ni, voxels[m] // ni % nj, voxels[m] // (ni * nj)]
+        if cost == math.inf:
+            return math.inf, math.inf
+        integral += cost * lengths[m]
+    if pieces > 1:
+        voxels.sort()
+    total = 0.0
+    for m in range(len(voxels)):
+        if (m > 0 and voxels[m] == voxels[m - 1]) or (voxels[m] == begin and not first):
+            continue
+        total += costs[voxels[m] % ni, voxels[m] // ni % nj, voxels[m] // (ni * nj)]
+    return integral, total
+
+
+@numba.njit(cache=True)
+def cost_of_arc(space, objective, step, pose, bend, length, first):
+    """Return the weighted cost of an arc; `first` tells whether its path starts with it."""
     weights, costs = objective
     total = weights[LENGTH] * length
     if weights[INVERSE_CLEARANCE] > 0.0:
         total += weights[INVERSE_CLEARANCE] * inverse_clearance_on_arc(space, step, pose, bend, length)
-    if weights[MAP_INTEGRAL] > 0.0:
-        total += weights[MAP_INTEGRAL] * map_integral_on_arc(costs, space[2], step, pose, bend, length)
+    if weights[MAP_INTEGRAL] > 0.0 or weights[VOXEL_SUM] > 0.0:
+        integral, voxel_sum = map_costs_on_arc(costs, space[2], pose, bend, length, first)
+        if integral == math.inf:
+            return math.inf
+        total += weights[MAP_INTEGRAL] * integral + weights[VOXEL_SUM] * voxel_sum
     return total

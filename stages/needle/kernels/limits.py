@@ -16,7 +16,9 @@ EXEMPT_LENGTH = 6
 MAX_STEP = 7
 COST_STEP = 8
 GOAL_TOLERANCE = 9
-N_LIMITS = 10
+LOOKUP_STEP = 10
+"""0: arcs are proved clear.  More: voxels are looked up at steps of so many mm, which proves nothing."""
+N_LIMITS = 11
 
 TINY = 1e-9
 MIN_ARC_MM = 1e-6

@@ -6,12 +6,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numba
 
 from anatomy.kernels.arcs import point_on_arc
-from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
+from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import LUMEN
-from stages.needle.kernels.limits import EXEMPT_LENGTH, RADIUS, REQUIRED, TINY
+from stages.needle.kernels.limits import EXEMPT_LENGTH, LOOKUP_STEP, RADIUS, REQUIRED, TINY
 
 PROBE_SPACING_MM = 1.5
 
@@ -33,6 +35,19 @@ def _early_blocker(space, required, pose, bend, begin, length):
 
 
 @numba.njit(cache=True)
+def _blocker_by_lookup(space, step, pose, bend, length):
+    """Look up the voxels at the ends of steps of an arc [Fu2018, fig. 6, right]: no proof."""
+    _field, labels, geometry, bits = space
+    count = max(int(math.ceil(length / step)), 1)
+    for m in range(count + 1):
+        x, y, z = point_on_arc(pose, bend, length * m / count)
+        label = label_at(labels, geometry, x, y, z)
+        if label & bits:
+            return label
+    return 0
+
+
+@numba.njit(cache=True)
 def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
     """Prove an arc clear of obstacles: 0 if it is, else the label of the voxel that is too near.
 
@@ -40,7 +55,11 @@ def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
     The field's lower bound is tried first, then the exact distance to the voxels as solid boxes.
     The first `limits[EXEMPT_LENGTH]` mm of the needle (this arc starts at `s0`) may be near the
     wall of the pierced `branch` (-1: none), but never nearer than the needle's radius to any lumen.
+
+    With `limits[LOOKUP_STEP]` nothing is proved: see `stages.needle.inflation`.
     """
+    if limits[LOOKUP_STEP] > 0.0:
+        return _blocker_by_lookup(space, limits[LOOKUP_STEP], pose, bend, length)
     field, labels, geometry, bits = space
     required = limits[REQUIRED]
     reach = required + EXACT_REACH_MM

@@ -1,7 +1,9 @@
 """A tree of arcs: what every sampling search grows.
 
 A row of `nodes` is a pose, the arc that led to it from its parent, and the length, the accumulated turn
-and the cost of the path from the root (row 0).
+and the cost of the path from the root (row 0).  The root of a needle that is already on its way starts
+with the length and turn behind it, and its bend's normal is then the direction from which the limit of
+the angle counts.
 """
 
 from __future__ import annotations
@@ -48,11 +50,29 @@ def pose_of(node):
 
 
 @numba.njit(cache=True)
+def reference_of(root):
+    """Return the direction from which the limit of the angle counts: the root's own unless it has another."""
+    if root[BEND + 1] == 0.0 and root[BEND + 2] == 0.0 and root[BEND + 3] == 0.0:
+        return root[3], root[4], root[5]
+    return root[BEND + 1], root[BEND + 2], root[BEND + 3]
+
+
+@numba.njit(cache=True)
+def angle_kept(limits, reference, pose, bend, turn):
+    """Tell whether an arc keeps the limit of the angle to `reference`; return the cosine at its end too."""
+    forward = pose[3] * reference[0] + pose[4] * reference[1] + pose[5] * reference[2]
+    aside = bend[1] * reference[0] + bend[2] * reference[1] + bend[3] * reference[2]
+    kept = least_cosine(forward, aside, turn) >= math.cos(limits[MAX_ANGLE]) - TINY
+    return kept, forward * math.cos(turn) + aside * math.sin(turn)
+
+
+@numba.njit(cache=True)
 def add_arc(space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best):
     """Add an arc from node `near` as row `count`; True if it was added.
 
     Refused are arcs that turn too far or are not proved clear, and those from whose end no path within
-    the limits leads to the goal for less than the cost `best`.
+    the limits leads to the goal for less than the cost `best`.  A path that ends short of the goal, within
+    the tolerance, pays for what is missing, so that ending short gains nothing.
     """
     node = nodes[near]
     pose = pose_of(node)
@@ -61,16 +81,16 @@ def add_arc(space, limits, objective, branch, nodes, parents, count, near, bend,
     path_turn = node[PATH_TURN] + turn
     if path_length > limits[MAX_LENGTH] or path_turn > limits[MAX_TURN] + TINY:
         return False
-    start = nodes[0]
-    forward = pose[3] * start[3] + pose[4] * start[4] + pose[5] * start[5]
-    aside = bend[1] * start[3] + bend[2] * start[4] + bend[3] * start[5]
-    if least_cosine(forward, aside, turn) < math.cos(limits[MAX_ANGLE]) - TINY:
+    kept, cosine = angle_kept(limits, reference_of(nodes[0]), pose, bend, turn)
+    if not kept:
         return False
     end = pose_on_arc(pose, bend, length)
-    angle = math.acos(min(max(forward * math.cos(turn) + aside * math.sin(turn), -1.0), 1.0))
+    angle = math.acos(min(max(cosine, -1.0), 1.0))
     rho, h = seen_from(end, goal)
     ahead = 0.0
-    if rho * rho + h * h > limits[GOAL_TOLERANCE] * limits[GOAL_TOLERANCE] + TINY:
+    missing = math.hypot(rho, h)
+    if missing > limits[GOAL_TOLERANCE] + TINY:
+        missing = 0.0
         turn_left = limits[MAX_TURN] - path_turn
         ahead = length_ahead(rho, h, limits, min(limits[MAX_ANGLE] + angle, math.pi), turn_left)
     if path_length + ahead > limits[MAX_LENGTH] + limits[GOAL_TOLERANCE]:
@@ -80,8 +100,9 @@ def add_arc(space, limits, objective, branch, nodes, parents, count, near, bend,
         return False
     if blocker_on_arc(space, limits, pose, bend, length, node[PATH_LENGTH], branch) != 0:
         return False
-    cost = node[PATH_COST] + cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length)
-    if cost + rate * (ahead - limits[GOAL_TOLERANCE]) >= best:
+    cost = node[PATH_COST] + cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, near == 0)
+    cost += rate * missing
+    if cost + rate * max(ahead - limits[GOAL_TOLERANCE], 0.0) >= best:
         return False
     new = nodes[count]
     for m in range(6):

@@ -1,0 +1,143 @@
+"""What a needle path costs, evaluated exactly: 1 / clearance, the cost map by mm and by voxel, length."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.fields import corner_geometry
+from anatomy.grid import Float, Grid, Volume
+from anatomy.kernels import field as field_kernel
+from stages.needle.kernels import cost as kernel
+from stages.needle.objective import Objective
+from stages.needle.path import ArcPath, _kernel_arcs
+from stages.needle.space import Arrays, NeedleSpace
+
+SAMPLE_MM = 0.1
+EXACT_BELOW_VOXELS = 8.0
+"""Nearer than so many of the longest voxel sides, distances are exact; farther, the clearance field's lower
+bound is less than 0.6 % off."""
+
+
+def obstacle_clearance_mm(arrays: Arrays, points: Float) -> Float:
+    """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle.
+
+    Parameters
+    ----------
+    arrays : tuple
+        See `NeedleSpace`: obstacles are taken as solid boxes or voxel centres as stated there.
+    """
+    field, labels, geometry, bits = arrays
+    places = np.array(points, dtype=np.float64, order="C")
+    clearance = np.zeros(len(places))
+    field_kernel.bounds_at(field, geometry, places, clearance)
+    exact_below_mm = EXACT_BELOW_VOXELS * math.sqrt(geometry[:, 4].max())
+    near = np.flatnonzero(clearance < exact_below_mm)
+    found = np.zeros(len(near))
+    field_kernel.exact_at(labels, geometry, places[near], bits, -1, 1.2 * exact_below_mm, found)
+    clearance[near] = np.maximum(found, clearance[near])
+    return clearance
+
+
+def inverse_clearance(arrays: Arrays, path: ArcPath) -> float:
+    """Return the integral of 1 / clearance over the length of a path [Kuntz2015, eq. 1].
+
+    By the trapezoid rule with steps of at most 0.1 mm; clearance is that of the needle's axis, no less than
+    0.1 mm.
+
+    Parameters
+    ----------
+    arrays : tuple
+        See `NeedleSpace`.
+    """
+    points, lengths = path.sample(SAMPLE_MM)
+    clearance = np.maximum(obstacle_clearance_mm(arrays, points), kernel.CLEARANCE_FLOOR_MM)
+    return float(np.trapezoid(1.0 / clearance, lengths))
+
+
+def voxels_crossed(grid: Grid, path: ArcPath) -> NDArray[np.int64]:
+    """Return the indices `(V, 3)` of the voxels that a path crosses, each once, the first index slowest.
+
+    They are those that hold more than 1e-9 mm of an arc, or an end of one.  What lies beyond the grid is
+    left out.
+    """
+    voxels, _lengths = _crossings(grid, path)
+    inside = np.unique(voxels[voxels != kernel.OFF_GRID])
+    indices = np.stack(np.unravel_index(inside, grid.shape, order="F"), axis=1)
+    return np.asarray(indices[np.lexsort(indices.T[::-1])], dtype=np.int64)
+
+
+def map_integral(cost_map: Volume | None, path: ArcPath) -> float:
+    """Return the line integral of the cost map along a path, in mm: exact, voxel by voxel.
+
+    It is 0 without a map, and infinite if the path meets a voxel of infinite cost or leaves the grid.
+    """
+    if cost_map is None:
+        return 0.0
+    voxels, lengths = _crossings(cost_map.grid, path)
+    costs = _costs_of(cost_map, voxels)
+    return float((costs * lengths).sum()) if np.isfinite(costs).all() else math.inf
+
+
+def voxel_sum(cost_map: Volume | None, path: ArcPath) -> float:
+    """Return the sum of the cost map over the set of voxels that a path crosses [Fu2018, eq. 1].
+
+    Each voxel counts once, however often the path meets it.  The sum depends on the voxel size.  It is 0
+    without a map, and infinite if the path meets a voxel of infinite cost or leaves the grid.
+    """
+    if cost_map is None:
+        return 0.0
+    voxels, _lengths = _crossings(cost_map.grid, path)
+    return float(_costs_of(cost_map, np.unique(voxels)).sum())
+
+
+def path_costs(space: NeedleSpace, path: ArcPath) -> dict[str, float]:
+    """Return every cost of a path by its name, which is that of its weight in `Objective`.
+
+    Lengths in mm, "inverse_clearance" a number, "voxel_sum" in units of the map.
+    """
+    return {
+        "inverse_clearance": inverse_clearance(space.arrays, path),
+        "cost_map": map_integral(space.cost_map, path),
+        "length": path.length_mm,
+        "voxel_sum": voxel_sum(space.cost_map, path),
+    }
+
+
+def objective_cost(space: NeedleSpace, objective: Objective, path: ArcPath) -> float:
+    """Return the weighted sum of costs that `objective` asks for, exactly.
+
+    Raises
+    ------
+    SettingsError
+        If the objective weighs a cost map, and the space has none.
+    """
+    space.objective_arrays(objective)
+    total = objective.length * path.length_mm
+    if objective.inverse_clearance > 0.0:
+        total += objective.inverse_clearance * inverse_clearance(space.arrays, path)
+    if objective.cost_map > 0.0:
+        total += objective.cost_map * map_integral(space.cost_map, path)
+    if objective.voxel_sum > 0.0:
+        total += objective.voxel_sum * voxel_sum(space.cost_map, path)
+    return total
+
+
+def _crossings(grid: Grid, path: ArcPath) -> tuple[NDArray[np.int64], Float]:
+    """Return the voxels of all arcs one after the other, and the length in each, see the kernel."""
+    geometry = corner_geometry(grid)
+    found = [
+        kernel.voxels_on_arc(grid.shape, geometry, pose, bend, length)[:2]
+        for pose, bend, length in _kernel_arcs(path)
+    ]
+    return np.concatenate([voxels for voxels, _ in found]), np.concatenate([lengths for _, lengths in found])
+
+
+def _costs_of(cost_map: Volume, voxels: NDArray[np.int64]) -> Float:
+    """Return the costs of voxels by their numbers, infinite beyond the grid."""
+    inside = voxels != kernel.OFF_GRID
+    costs = np.full(len(voxels), math.inf)
+    costs[inside] = cost_map.array.ravel(order="F")[voxels[inside]]
+    return costs

@@ -1,0 +1,131 @@
+"""Shortest paths from a pose into the ball of the goal tolerance.
+
+With R the smallest radius and r the tolerance: where the shortest path CS to the goal itself has a straight
+piece of at least r, it is that path less its last r mm; else it is the arc C as far as the ball
+(docs/resolution_search.md).  With r = 0 all of this is about the goal itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from anatomy.kernels.arcs import arc_to_point
+from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, shortest_path
+from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MIN_ARC_MM, TINY
+
+
+@numba.njit(cache=True)
+def turn_into_ball(rho, h, kappa, tolerance):
+    """Return the turn (rad) at which the arc C enters the ball about a point, inf if it never does.
+
+    The pose lies outside the ball.
+    """
+    radius = 1.0 / kappa
+    aside = radius - rho
+    centre2 = aside * aside + h * h
+    # The cosine of the angle, seen from the centre of the circle, between the point and the entry.
+    cosine = (radius * radius + centre2 - tolerance * tolerance) / max(2.0 * radius * math.sqrt(centre2), TINY)
+    if cosine > 1.0 + TINY:
+        return math.inf
+    turn = math.atan2(h, aside) - math.acos(min(cosine, 1.0))
+    return turn if turn >= 0.0 else turn + 2.0 * math.pi
+
+
+@numba.njit(cache=True)
+def least_turn_into_ball(rho, h, kappa, tolerance):
+    """Return the least turn (rad) of a path CS into the ball about a point, inf if there is none.
+
+    The straight line onwards passes the point at the distance of the tolerance.
+    """
+    if rho <= tolerance and h >= 0.0:
+        return 0.0
+    radius = 1.0 / kappa
+    centre = math.hypot(radius - rho, h)
+    if centre < radius - tolerance:
+        return math.inf
+    turn = math.atan2(h, radius - rho) - math.acos(min((radius - tolerance) / centre, 1.0))
+    return turn if turn >= -TINY else turn + 2.0 * math.pi
+
+
+@numba.njit(cache=True)
+def least_length(rho, h, limits, cosine, turn_left):
+    """Return a length below which no path leads into the ball, inf if none does within the turning limits.
+
+    Exact where no more than 180 degrees of turn are left, up to turning limits.
+
+    Parameters
+    ----------
+    rho, h : float
+        How far the goal is aside and ahead, mm.
+    limits : (N_LIMITS,) float64
+    cosine : float
+        Cosine of the angle between the tip and the direction from which the limit of the angle counts.
+    turn_left : float
+        What is left of the accumulated turn, rad.
+    """
+    tolerance = limits[GOAL_TOLERANCE]
+    kappa = limits[KAPPA]
+    radius = 1.0 / kappa
+    distance2 = rho * rho + h * h
+    if distance2 <= tolerance * tolerance:
+        return 0.0
+    if distance2 < 2.0 * radius * rho - tolerance * (2.0 * radius - tolerance) - 2.0 * radius * TINY:
+        # Inside the circle and farther from it than the tolerance.
+        if turn_left <= math.pi:
+            return math.inf
+        if tolerance > 0.0:
+            return math.sqrt(distance2) - tolerance
+        return shortest_path(rho, h, kappa, math.pi, turn_left)
+    turn, straight = arc_and_straight(rho, h, kappa)
+    length = turn / kappa + straight - tolerance
+    if not tolerance <= straight < math.inf:
+        turn = turn_into_ball(rho, h, kappa, tolerance)
+        length = turn / kappa
+    if turn <= limits[MAX_ANGLE] and turn <= turn_left or turn_left > math.pi:
+        return length
+    allowed = min(limits[MAX_ANGLE] + math.acos(min(max(cosine, -1.0), 1.0)), turn_left)
+    return length if least_turn_into_ball(rho, h, kappa, tolerance) <= allowed + TINY else math.inf
+
+
+@numba.njit(cache=True)
+def shortest_into_ball(pose, goal, limits):
+    """Return the shortest path from a pose into the ball as two legs: bend and length of each.
+
+    Both legs are empty for a pose in the ball.  A goal inside the circle, farther from it than the
+    tolerance, is reached exactly, by a path CC.
+    """
+    kappa, tolerance = limits[KAPPA], limits[GOAL_TOLERANCE]
+    rho, h = seen_from(pose, goal)
+    first, first_length, second, second_length = shortest_legs(pose, goal, kappa)
+    if rho * rho + h * h <= tolerance * tolerance:
+        return first, 0.0, second, 0.0
+    if tolerance > 0.0:
+        straight = arc_and_straight(rho, h, kappa)[1]
+        turn = turn_into_ball(rho, h, kappa, tolerance)
+        if tolerance <= straight < math.inf:
+            second_length -= tolerance
+        elif turn < math.inf:
+            bend = arc_to_point(pose, goal)[1]
+            first, first_length, second_length = (kappa, bend[1], bend[2], bend[3]), turn / kappa, 0.0
+    return (
+        first,
+        first_length if first_length > MIN_ARC_MM else 0.0,
+        second,
+        second_length if second_length > MIN_ARC_MM else 0.0,
+    )
+
+
+@numba.njit(cache=True)
+def single_into_ball(pose, goal, limits):
+    """Return the single arc towards the goal as far as the ball: bend and length.
+
+    The length is 0 where that arc would be too tight, turn by more than 180 degrees, or be empty.
+    """
+    length, bend, turn = arc_to_point(pose, goal)
+    if bend[0] > limits[KAPPA] * (1.0 + TINY) or turn > math.pi:
+        return bend, 0.0
+    half = 0.5 * bend[0] * limits[GOAL_TOLERANCE]
+    length -= 2.0 * math.asin(min(half, 1.0)) / bend[0] if half > TINY else limits[GOAL_TOLERANCE]
+    return bend, length if length > MIN_ARC_MM else 0.0

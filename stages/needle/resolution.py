@@ -1,0 +1,363 @@
+"""The search that ends: with the best path at its resolution, or with the statement that it has none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from anatomy.kernels import arcs as arc_kernels
+from anatomy.kernels.field import UNITS_PER_MM
+from stages.needle.kernels import limits as index
+from stages.needle.kernels import resolution as kernel
+from stages.needle.kernels import rank_queue, tree
+from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
+from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
+from stages.needle.objective import Arrays as ObjectiveArrays
+from stages.needle.path import ArcPath, path_from_tree
+from stages.needle.searches import Query
+from stages.needle.space import NeedleSpace
+
+Words = tuple[float, Float, Float, NDArray[np.int64], NDArray[np.int64]]
+
+FIRST_NODES = 1024
+FIRST_ENTRIES = 4096
+MOST_STEPS = 128
+MOST_ROLLS = 64
+EQUAL_CELL_MM = 1e-3
+"""Where only equal poses are duplicates, poses are looked for in cells of this size."""
+
+
+class Outcome(StrEnum):
+    """What a search can say."""
+
+    RUNNING = "running"
+    BEST = "best at resolution"
+    NONE = "none at resolution"
+    OUT_OF_MEMORY = "out of memory"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resolution:
+    """The words of a search: pieces of whole steps, in equally spaced directions of bending.
+
+    Parameters
+    ----------
+    coarse_mm, fine_mm : float
+        Length of the longest piece, which is tried first, and of the step, down to which it is halved.
+    coarse_rolls, fine_rolls : int
+        Number of directions of bending that are tried first, and of all.
+
+    Raises
+    ------
+    SettingsError
+        If a number is out of range, or coarse and fine are not a power of two apart.
+    """
+
+    coarse_mm: float = 16.0
+    fine_mm: float = 1.0
+    coarse_rolls: int = 4
+    fine_rolls: int = 16
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.fine_mm <= self.coarse_mm < math.inf and 0 < self.coarse_rolls <= self.fine_rolls):
+            raise SettingsError(f"{self} is no resolution", expected="0 < fine <= coarse")
+        for name, ratio, most in (
+            ("lengths", self.coarse_mm / self.fine_mm, MOST_STEPS),
+            ("rolls", self.fine_rolls / self.coarse_rolls, MOST_ROLLS),
+        ):
+            if ratio != 2.0 ** round(math.log2(ratio)) or ratio > most:
+                raise SettingsError(
+                    f"The {name} of {self} are a factor of {ratio:g} apart",
+                    expected=f"a power of two, at most {most}",
+                )
+        if self.fine_rolls > MOST_ROLLS:
+            raise SettingsError(f"{self} has too many rolls", expected=f"at most {MOST_ROLLS}")
+
+    @property
+    def steps(self) -> int:
+        """Steps of the longest piece."""
+        return round(self.coarse_mm / self.fine_mm)
+
+    def primitives(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return all primitives by level, `(P, 2)` direction and steps, and the first of each level.
+
+        The level counts how often length and roll are halved; the direction `fine_rolls` is straight.
+        """
+        halvings = [_halvings(self.steps, k) for k in range(1, self.steps + 1)]
+        apart = self.fine_rolls // self.coarse_rolls
+        by_level: dict[int, list[tuple[int, int]]] = {}
+        for direction in (self.fine_rolls, *range(self.fine_rolls)):
+            rolled = 0 if direction == self.fine_rolls else _halvings(apart, direction % apart or apart)
+            for k, halved in enumerate(halvings, start=1):
+                by_level.setdefault(rolled + halved, []).append((direction, k))
+        levels = [by_level[level] for level in sorted(by_level)]
+        first = np.cumsum([0, *map(len, levels)])
+        return np.array([p for level in levels for p in level], dtype=np.int64), first.astype(np.int64)
+
+
+def _halvings(whole: int, part: int) -> int:
+    """Return how often a power of two must be halved until a number of such parts makes `part`."""
+    return (whole // (part & -part)).bit_length() - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """Cells of poses: of all that fall into one cell, only the cheapest so far is followed.
+
+    What a search with cells says holds up to them: a path that was not looked for leaves a cell in which
+    a pose at most as dear was followed, in place of its own.
+
+    Parameters
+    ----------
+    position_mm : float
+        Side of a cell, mm.
+    angle_deg : float
+        Side in each component of the tip's direction, as the angle at its centre, degrees.
+
+    Raises
+    ------
+    SettingsError
+        If a size is not positive and finite.
+    """
+
+    position_mm: float = 0.5
+    angle_deg: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.position_mm < math.inf and 0.0 < self.angle_deg < math.inf):
+            raise SettingsError(f"{self} has no size", expected="finite sizes of more than 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counts:
+    """What a search has done.
+
+    Parameters
+    ----------
+    pops : int
+        Entries taken off the queue.
+    nodes : int
+        Poses reached by words that are proved clear.
+    duplicates : int
+        Words dropped because another one, not dearer, ends there.
+    pruned : int
+        Words dropped because no path within the limits leads on to the goal for less than the best.
+    refused : int
+        Words dropped because their last piece is not proved clear.
+    """
+
+    pops: int
+    nodes: int
+    duplicates: int
+    pruned: int
+    refused: int
+
+
+class ResolutionSearch:
+    """The search over words of arcs and straight pieces, from coarse to fine [Fu2021, Fu2022].
+
+    See docs/resolution_search.md; it is a `searches.Search`.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    query : Query
+        The directions of bending count from +x of the start pose.
+    resolution : Resolution
+    objective : Objective
+    duplicates : Cells, optional
+        Poses that count as one; by default only those that are equal up to rounding, so that nothing is lost.
+    max_memory_mb : float
+        The search ends before its arrays take more.
+
+    Attributes
+    ----------
+    path, cost, finished
+        See `searches.Search`.
+    outcome : Outcome
+        Once it is BEST or NONE, no path of the resolution is cheaper than the best one, or none exists; up
+        to `duplicates`, and up to a share of 1e-9 of the cost.
+    """
+
+    def __init__(
+        self,
+        space: NeedleSpace,
+        query: Query,
+        *,
+        resolution: Resolution | None = None,
+        objective: Objective = SHORTEST,
+        duplicates: Cells | None = None,
+        max_memory_mb: float = 1000.0,
+    ) -> None:
+        self.space = space
+        self.query = query
+        self.path: ArcPath | None = None
+        self.cost = math.inf
+        self.finished = False
+        self.outcome = Outcome.RUNNING
+        self.resolution = resolution or Resolution()
+        self.duplicates = duplicates
+        self.max_memory_mb = max_memory_mb
+        self.objective = _tight(space.objective_arrays(objective), space)
+        self._merge = (EQUAL_CELL_MM, EQUAL_CELL_MM, False)
+        if duplicates is not None:
+            self._merge = (duplicates.position_mm, math.radians(duplicates.angle_deg), True)
+        start = query.lps_from_start
+        self._reference = start[:3, 2].copy() if query.reference is None else query.reference
+        self._words = _words(self.resolution, float(space.limits[index.KAPPA]))
+        self._counts = np.zeros(kernel.COUNTS, dtype=np.int64)
+        self._counts[kernel.NODES] = 1
+        self._state = np.zeros(rank_queue.STATE_SIZE, dtype=np.int64)
+        self._state[rank_queue.FREE] = -1
+        self._best = np.zeros(kernel.BEST_SIZE)
+        self._make_arrays()
+        root = self._store[0][0]
+        root[:3], root[3:6], root[kernel.NORMAL : kernel.NORMAL + 3] = start[:3, 3], start[:3, 2], start[:3, 0]
+        root[kernel.PATH_LENGTH], root[kernel.PATH_TURN] = query.inserted_mm, query.turned_rad
+
+    def _make_arrays(self) -> None:
+        n = self.resolution.fine_rolls + 1
+        proved = np.zeros((FIRST_NODES, n, 2), dtype=np.uint8)
+        proved[0, :, kernel.USELESS] = self.resolution.steps + 1
+        links = np.zeros((FIRST_NODES, kernel.LINK_COLUMNS), dtype=np.int32)
+        links[0] = -1, -1, 0, 0
+        self._store = (
+            np.zeros((FIRST_NODES, kernel.NODE_COLUMNS)), links, proved, np.zeros(4 * FIRST_NODES, np.int32),
+        )  # fmt: skip
+        left = self.space.limits[index.MAX_LENGTH] - self.query.inserted_mm
+        per_piece = len(self._words[4])
+        ranks = np.zeros((max(int(left / self.resolution.fine_mm), 0) * per_piece + 2 * per_piece, 2), np.int32)
+        ranks[:, 0] = -1
+        self._queue = (
+            np.zeros(FIRST_ENTRIES), np.zeros((FIRST_ENTRIES, rank_queue.ENTRY_COLUMNS), np.int32),
+            np.zeros(FIRST_ENTRIES), np.zeros(FIRST_ENTRIES, np.int32), ranks,
+        )  # fmt: skip
+
+    @property
+    def counts(self) -> Counts:
+        """What the search has done so far."""
+        c = self._counts
+        return Counts(
+            pops=int(c[kernel.POPS]),
+            nodes=int(c[kernel.NODES]),
+            duplicates=int(c[kernel.DUPLICATES]),
+            pruned=int(c[kernel.PRUNED]),
+            refused=int(c[kernel.REFUSED]),
+        )
+
+    @property
+    def memory_mb(self) -> float:
+        """Size of the search's arrays."""
+        return sum(array.nbytes for array in (*self._store, *self._queue)) / 1e6
+
+    def advance(self, iterations: int) -> bool:
+        """Take up to `iterations` entries off the queue; see `searches.Search`."""
+        stop = self._counts[kernel.POPS] + iterations
+        while not self.finished and self._counts[kernel.POPS] < stop:
+            reason, self.cost = kernel.search_words(
+                self.space.arrays, self.space.limits, self.objective, self.query.branch, self.query.target,
+                self._reference, self._words, self._merge, self._store, self._queue, self._state, self._counts,
+                self._best, self.cost, stop - self._counts[kernel.POPS],
+            )  # fmt: skip
+            if reason == kernel.BETTER:
+                self.path = self._best_path()
+                return True
+            if reason == kernel.EXHAUSTED:
+                self._end(Outcome.NONE if self.path is None else Outcome.BEST)
+            elif reason != kernel.SPENT:
+                self._grow(reason)
+        return False
+
+    def _end(self, outcome: Outcome) -> None:
+        self.outcome = outcome
+        self.finished = True
+
+    def _grow(self, reason: int) -> None:
+        """Double the arrays that are full, or end."""
+        arrays = self._store if reason == kernel.FULL_OF_NODES else self._queue[:4]
+        if self.memory_mb + sum(array.nbytes for array in arrays) / 1e6 > self.max_memory_mb:
+            self._end(Outcome.OUT_OF_MEMORY)
+            return
+        if reason == kernel.FULL_OF_ENTRIES:
+            f, entries, heap_f, heap, ranks = self._queue
+            self._queue = (_doubled(f), _doubled(entries), _doubled(heap_f), _doubled(heap), ranks)
+            return
+        nodes, links, proved, seen = self._store
+        larger = np.zeros(2 * len(seen), dtype=np.int32)
+        kernel.rehash(nodes, self._merge, seen, larger)
+        self._store = (_doubled(nodes), _doubled(links), _doubled(proved), larger)
+
+    def _best_path(self) -> ArcPath:
+        """Return the path to the best node and on to the goal."""
+        nodes, links = self._store[:2]
+        fine_mm, rolls = self._words[:2]
+        chain = []
+        at = int(self._best[kernel.BEST_NODE])
+        while at != 0:
+            chain.append(at)
+            at = int(links[at, kernel.PARENT])
+        rows = [np.zeros(tree.NODE_COLUMNS)]
+        for at in reversed(chain):
+            parent, direction, steps = links[at, : kernel.NODE_RANK]
+            bend = kernel.bend_of(nodes, rolls, self.space.limits[index.KAPPA], int(parent), int(direction))
+            rows.append(_row(fine_mm * steps, bend))
+        for leg in range(2):
+            length, *bend = self._best[kernel.BEST_LEGS + kernel.LEG_SIZE * leg :][: kernel.LEG_SIZE]
+            if length > 0.0:
+                rows.append(_row(length, bend))
+        parents = np.arange(-1, len(rows) - 1)
+        return path_from_tree(self.query.lps_from_start, np.stack(rows), parents, len(rows) - 1)
+
+
+def _row(length_mm: float, bend: ArrayLike) -> Float:
+    """Return a row of a tree as far as `path_from_tree` reads it."""
+    row = np.zeros(tree.NODE_COLUMNS)
+    row[tree.ARC_LENGTH] = length_mm
+    row[tree.BEND : tree.BEND + 4] = bend
+    return row
+
+
+def _doubled(array: np.ndarray) -> np.ndarray:
+    """Return a copy with twice as many rows, the new ones 0."""
+    larger = np.zeros((2 * len(array), *array.shape[1:]), dtype=array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+def _words(resolution: Resolution, kappa: float) -> Words:
+    """Return what the kernel has to know of a resolution, see `kernels.resolution.search_words`."""
+    lengths = resolution.fine_mm * np.arange(resolution.steps + 1)
+    arcs = [
+        (
+            arc_kernels.sine_length(kappa, s),
+            arc_kernels.versine_length(kappa, s),
+            math.cos(kappa * s),
+            math.sin(kappa * s),
+        )
+        for s in lengths
+    ]
+    rolls = 2.0 * math.pi * np.arange(resolution.fine_rolls) / resolution.fine_rolls
+    primitives, first = resolution.primitives()
+    return (
+        resolution.fine_mm,
+        np.stack([np.cos(rolls), np.sin(rolls)], axis=1),
+        np.array(arcs),
+        primitives,
+        first,
+    )
+
+
+def _tight(objective: ObjectiveArrays, space: NeedleSpace) -> ObjectiveArrays:
+    """Return an objective whose least cost of a mm counts the largest clearance there is in this space."""
+    weights, costs = objective
+    if weights[INVERSE_CLEARANCE] > 0.0:
+        largest = max(float(space.arrays[0].max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
+        weights = weights.copy()
+        weights[LEAST_RATE] += weights[INVERSE_CLEARANCE] * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
+    return weights, costs

@@ -32,10 +32,9 @@ DEFAULT_BUDGET_S = 10.0
 # The first nodule of this synthetic patient can be reached.
 DEMO_SEED = 2
 
-Objective = Literal["inverse-clearance", "cost-map", "length"]
+Objective = Literal["inverse-clearance", "cost-map", "voxel-sum", "length"]
 Method = Literal["atlas", "kuntz2015"]
 NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
-NeedleObjective = Literal["length", "inverse-clearance", "cost-map", "voxel-sum"]
 
 _TOO_LARGE = AnatomyError(
     "There is not enough memory for this patient",
@@ -43,7 +42,12 @@ _TOO_LARGE = AnatomyError(
     remedy="Close other programs, or resample the masks to 1 mm voxels",
 )
 
-OBJECTIVES = {"inverse-clearance": "inverse_clearance", "cost-map": "cost_map", "length": "length_mm"}
+OBJECTIVES = {
+    "inverse-clearance": "inverse_clearance",
+    "cost-map": "cost_map",
+    "voxel-sum": "voxel_sum",
+    "length": "length_mm",
+}
 
 
 def _version() -> str:
@@ -145,7 +149,8 @@ def plan(
     seed : int
         Seed of the random numbers.
     objective : str
-        What to make small: integral of 1/clearance, integral of the patient's cost map, or length.
+        What to make small: integral of 1/clearance, integral of the patient's cost map, its sum over the
+        voxels crossed, or length.
     method : str
         Search over the deployment atlas, or Algorithm 1 of Kuntz et al. 2015.
     allow_fissures : bool
@@ -162,10 +167,10 @@ def plan(
     require_writable_folder(out)
     device = _system(system, allow_fissures)
     lung = _load(patient, cache)
-    if objective == "cost-map" and lung.cost is None:
+    if objective in ("cost-map", "voxel-sum") and lung.cost is None:
         raise SettingsError(
             f"Patient {lung.name} has no cost map",
-            expected="a cost map among the patient's files for --objective cost-map",
+            expected=f"a cost map among the patient's files for --objective {objective}",
             remedy="Choose inverse-clearance or length",
         )
     if budget is None and iterations is None:
@@ -193,7 +198,7 @@ def needle(
     nodule: int | None = None,
     system: str = DEFAULT_SYSTEM,
     planner: NeedlePlanner = "decide",
-    objective: NeedleObjective = "length",
+    objective: Objective = "length",
     budget: float | None = None,
     iterations: int | None = None,
     seed: int = 0,

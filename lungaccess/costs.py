@@ -10,7 +10,7 @@ from stages.needle import costs
 from stages.needle.path import ArcPath
 from stages.needle.space import Arrays
 
-OBJECTIVES = ("inverse_clearance", "cost_map", "length_mm")
+OBJECTIVES = ("inverse_clearance", "cost_map", "voxel_sum", "length_mm")
 
 
 def require_objective(objective: str) -> None:

@@ -64,7 +64,7 @@ def plan(
     system : System
     target : Target
     objective : str
-        "inverse_clearance" [Kuntz2015, eq. 1], "cost_map" or "length_mm".
+        "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1] or "length_mm".
     method : str
         "atlas": direct arcs from every deployment of the atlas, then random refinement of the best and
         RRTs from the others.  "kuntz2015": Algorithm 1 of that paper.

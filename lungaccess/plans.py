@@ -228,7 +228,8 @@ class Plan(_Record):
         For "tube" and "needle": smallest distance of the axis from each structure ("airway", "vessel",
         "outside", "fissure"; voxels as solid boxes) where it must be kept.  A structure may be left out.
     costs : mapping of str to float
-        "inverse_clearance", "cost_map" and "length_mm" of the needle.
+        "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle; a plan of an earlier
+        version may lack "voxel_sum".
     method : str
     seed, iterations : int
     timing : mapping of str to float

@@ -41,7 +41,7 @@ class SearchRequest:
     nodule : int or None
         Number of a nodule, from 1.
     objective : str
-        "inverse_clearance", "cost_map" or "length_mm".
+        "inverse_clearance", "cost_map", "voxel_sum" or "length_mm".
     method : str
         "atlas" or "kuntz2015".
     seed : int

@@ -69,7 +69,7 @@ class NeedleDesk:
         """Tell from an estimate, a hundred times faster than the cost, whether a path may be better."""
         if self.task.objective == "inverse_clearance":
             return estimated_inverse_clearance(self.space, path) <= ESTIMATE_SLACK * best_cost
-        return self.task.objective == "cost_map" or path.length_mm < best_cost
+        return self.task.objective != "length_mm" or path.length_mm < best_cost
 
     def reaches(self, lps_from_tip: Float) -> bool:
         """Tell whether the target lies in the workspace of a start pose."""

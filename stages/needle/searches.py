@@ -158,9 +158,13 @@ class RestartingRRT(TreeSearch):
         self._left = RESTART_ITERATIONS
 
     def advance(self, iterations: int) -> bool:
-        """Grow trees; see `Search`."""
+        """Grow trees; see `Search`.  The tree that found a path is kept until the next call."""
         query, left = self.query, iterations
         while True:
+            if self._left == 0 or self.count + 3 > MAX_NODES:
+                self._restarts += 1
+                self._left = RESTART_ITERATIONS * luby(self._restarts + 1)
+                self.count = 1
             self.count, used, solved = grow_rrt(
                 self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
                 self.nodes, self.parents, self.count, min(left, self._left), RANDOM_SHARE,
@@ -171,10 +175,7 @@ class RestartingRRT(TreeSearch):
             self.iterations += used
             if solved:
                 self.take(self.count - 1)
-            if solved or self._left == 0 or self.count + 3 > MAX_NODES:
-                self._restarts += 1
-                self._left = RESTART_ITERATIONS * luby(self._restarts + 1)
-                self.count = 1
+                self._left = 0
             if solved or left == 0 or used == 0:
                 return bool(solved)
 

@@ -138,5 +138,5 @@ def test_without_a_cost_map_it_costs_nothing(lung: Lung, name: str) -> None:
 def test_objectives() -> None:
     for name in OBJECTIVES:
         require_objective(name)
-    with pytest.raises(SettingsError, match="inverse_clearance, cost_map, length_mm"):
+    with pytest.raises(SettingsError, match="inverse_clearance, cost_map, voxel_sum, length_mm"):
         require_objective("length")

@@ -17,6 +17,7 @@ from anatomy.settings import override
 from lungaccess.checking import check
 from lungaccess.plans import Plan
 from lungaccess.system import load_system, system_fingerprint
+from stages.needle.path import ArcPath
 
 
 def refusals(plan: Plan, lung: Any, **options: Any) -> set[str]:
@@ -459,6 +460,21 @@ def test_cost_map(plan: Plan, lung: Any, tools: Any) -> None:
     assert refusals(plan, mapped) == {"costs.cost_map"}
     costs = {**plan.costs, "cost_map": 0.25 * plan.needle.length_mm}
     assert refusals(tools.changed(plan, costs=costs), mapped) == set()
+    crossed = len(voxels_on(plan, lung))
+    costs["voxel_sum"] = 0.25 * crossed
+    assert refusals(tools.changed(plan, costs=costs), mapped) == set()
+    for wrong in (0.25 * crossed + 2.0, 0.25 * crossed - 2.0):
+        costs["voxel_sum"] = wrong
+        assert refusals(tools.changed(plan, costs=costs), mapped) == {"costs.voxel_sum"}
+
+
+def voxels_on(plan: Plan, lung: Any) -> set[tuple[int, ...]]:
+    """The voxels of samples of the needle's axis, 1e-3 mm apart."""
+    path = ArcPath(
+        lps_from_start=plan.needle.lps_from_start,
+        arcs=np.array([[a.length_mm, a.roll_rad, a.curvature_per_mm] for a in plan.needle.arcs]),
+    )
+    return {tuple(v) for v in np.rint(lung.grid.ijk(path.sample(1e-3)[0])).astype(int).tolist()}
 
 
 def test_nodule_as_target(plan: Plan, lung: Any, tools: Any) -> None:

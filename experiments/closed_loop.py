@@ -80,7 +80,9 @@ def cases_of(lung: Lung, system: la.System, space: NeedleSpace, count: int, seed
     cases: list[Case] = []
     for point in np.random.default_rng(seed).permutation(peripheral_targets(lung, 10 * count, seed)):
         try:
-            found = next(la.plan(lung, system, point_target(lung, point), atlas=atlas, time_s=5.0))
+            found = next(
+                la.plan(lung, system, point_target(lung, point), atlas=atlas, iterations=100, time_s=60.0)
+            )
         except la.NoPlan:
             continue
         start = found.needle.lps_from_start

@@ -217,7 +217,7 @@ def _estimate(nodes, row, rate, goal, limits, reference):
 
 @numba.njit(cache=True)
 def _push_level(limits, rate, goal, reference, words, merge, store, queue, state, counts, at, level, f, most):
-    """Push the primitives of a level from node `at`, and an entry for the next level.
+    """Push the primitives of a level from node `at`, and an entry for the next level, as good as the best of them.
 
     Passed over are those from whose end no path within the limits leads to the goal for less than `most`,
     with all longer ones; those longer than a refused one; and, where a cell's poses count as one, those that
@@ -231,6 +231,7 @@ def _push_level(limits, rate, goal, reference, words, merge, store, queue, state
     least = math.cos(limits[MAX_ANGLE])
     rank = links[at, NODE_RANK] + 1 + level
     barred = links[at, DIRECTION] if links[at, STEPS] < full else -1
+    best_estimate = math.inf
     for m in range(first[level], first[level + 1]):
         direction, steps = primitives[m, 0], primitives[m, 1]
         if direction == barred or steps >= proved[at, direction, USELESS]:
@@ -256,7 +257,9 @@ def _push_level(limits, rate, goal, reference, words, merge, store, queue, state
             counts[DUPLICATES] += 1
         else:
             push(queue, state, estimate, at, direction * (full + 1) + steps, rank)
+            best_estimate = min(best_estimate, estimate)
     if level + 2 < first.shape[0]:
+        f = best_estimate if best_estimate < math.inf else f
         push(queue, state, f, at, -(level + 1), rank + 1)
 
 
@@ -437,6 +440,8 @@ def search_words(
             f = entry_f[entry]
             at, primitive = np.int64(entries[entry, FIRST]), np.int64(entries[entry, SECOND])
             level = max(-primitive, 0)
+            if level > 0:
+                f = _estimate(nodes, at, rate, goal, limits, reference)
             if f >= most:
                 counts[PRUNED] += 1
                 f = math.inf

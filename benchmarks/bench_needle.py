@@ -1,0 +1,119 @@
+"""The needle stage on a made-up scene, and what compiling it costs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+
+from anatomy.grid import Grid
+from anatomy.structures import VESSEL
+from stages.needle.certificate import NoPathProof
+from stages.needle.device import Needle
+from stages.needle.optimal import OptimalSearch
+from stages.needle.resolution import ResolutionSearch
+from stages.needle.searches import Query, RestartingRRT
+from stages.needle.space import NeedleSpace, space_of_labels
+
+RADIUS_MM = 60.0
+SIDE = 96
+BALLS = 160
+COLD_RUN = """
+from benchmarks.bench_needle import query, scene
+from stages.needle.certificate import NoPathProof
+from stages.needle.optimal import OptimalSearch
+from stages.needle.resolution import ResolutionSearch
+from stages.needle.searches import RestartingRRT
+space = scene(0)
+for kind in (RestartingRRT, OptimalSearch, ResolutionSearch):
+    kind(space, query()).advance(500)
+proof = NoPathProof(space, query())
+for _ in range(4):
+    proof.advance()
+"""
+
+
+def scene(seed: int, balls: int = BALLS) -> NeedleSpace:
+    """Return a cube of tissue with balls of vessel, none at start and target."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((SIDE, SIDE, SIDE), dtype=np.uint16, order="F")
+    index = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1)
+    for centre, radius in zip(rng.uniform(0, SIDE, (balls, 3)), rng.uniform(2, 6, balls), strict=True):
+        labels[((index - centre) ** 2).sum(axis=-1) < radius**2] = VESSEL
+    for end in (8, SIDE - 8):
+        labels[((index - (SIDE / 2, SIDE / 2, end)) ** 2).sum(axis=-1) < 8**2] = 0
+    grid = Grid.from_spacing(labels.shape, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1.0 / RADIUS_MM)
+    return space_of_labels(labels, grid, needle, required_clearance_mm=0.5)
+
+
+def query() -> Query:
+    """Return the query along the middle of the cube."""
+    frame = np.eye(4)
+    frame[:3, 3] = SIDE / 2, SIDE / 2, 8.0
+    return Query(lps_from_start=frame, target=np.array([SIDE / 2, SIDE / 2, SIDE - 8.0]))
+
+
+class Searches:
+    """From one pose to one target."""
+
+    def setup(self) -> None:
+        """Make scenes, and compile."""
+        self.scenes = [scene(seed) for seed in range(8)]
+        self.query = query()
+        self.time_first_paths()
+        self.time_refine()
+        self.time_resolution()
+        self.time_proof()
+
+    def time_first_paths(self) -> None:
+        """The RRT's first path in eight scenes, at most 20,000 iterations each."""
+        for space in self.scenes:
+            RestartingRRT(space, self.query).advance(20_000)
+
+    def time_refine(self) -> None:
+        """20,000 iterations of the optimal search."""
+        search = OptimalSearch(self.scenes[0], self.query)
+        while search.iterations < 20_000:
+            search.advance(1000)
+
+    def track_length_after_20000_iterations(self) -> float:
+        """Length in mm that the optimal search has reached."""
+        search = OptimalSearch(self.scenes[0], self.query)
+        while search.iterations < 20_000:
+            search.advance(1000)
+        return float("nan") if search.path is None else search.path.length_mm
+
+    def time_resolution(self) -> None:
+        """20,000 iterations of the resolution search."""
+        ResolutionSearch(self.scenes[0], self.query).advance(20_000)
+
+    def time_proof(self) -> None:
+        """Eight planes of the proof that no path exists."""
+        proof = NoPathProof(self.scenes[0], self.query)
+        for _ in range(8):
+            proof.advance()
+
+
+class Compile:
+    """All kernels of the stage in a new process, without and with cached ones."""
+
+    params = (True, False)
+    param_names = ("cold",)
+    timeout = 300
+    number = 1
+    repeat = 1
+    warmup_time = 0.0
+
+    def setup(self, cold: bool) -> None:
+        """Choose an empty or a filled kernel cache."""
+        self.environment = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
+        if not cold:
+            self.time_all_searches(cold)
+
+    def time_all_searches(self, cold: bool) -> None:
+        """A few steps of every search."""
+        subprocess.run([sys.executable, "-c", COLD_RUN], check=True, env=self.environment)

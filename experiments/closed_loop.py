@@ -27,14 +27,14 @@ from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.phantom import phantom
 from lungaccess.target import point_target
-from stages.needle.closed_loop import TOLERANCE_MM, Outcome
-from stages.needle.insertion_study import Study, Summary, study, summary
+from stages.needle.insertion.closed_loop import TOLERANCE_MM, Outcome
+from stages.needle.insertion.replanning import ITERATIONS, Replanner, ReplanSettings, with_reserve
+from stages.needle.insertion.study import Study, Summary, study, summary
+from stages.needle.insertion.truth import Errors, tilt
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform
-from stages.needle.replanning import ITERATIONS, Replanner, ReplanSettings, with_reserve
 from stages.needle.searches import Query, RestartingRRT
 from stages.needle.space import NeedleSpace, needle_space
-from stages.needle.truth import Errors, tilt
 
 OBJECTIVE = Objective(inverse_clearance=1.0)
 PLANNING_ITERATIONS = 3000

@@ -14,8 +14,8 @@ from anatomy.grid import Float
 from anatomy.kernels import arcs as arc_kernels
 from anatomy.kernels.field import UNITS_PER_MM
 from stages.needle.kernels import limits as index
-from stages.needle.kernels import resolution as kernel
 from stages.needle.kernels import rank_queue, tree
+from stages.needle.kernels import resolution as kernel
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
 from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
 from stages.needle.objective import Arrays as ObjectiveArrays
@@ -218,7 +218,11 @@ class ResolutionSearch:
         self._best = np.zeros(kernel.BEST_SIZE)
         self._make_arrays()
         root = self._store[0][0]
-        root[:3], root[3:6], root[kernel.NORMAL : kernel.NORMAL + 3] = start[:3, 3], start[:3, 2], start[:3, 0]
+        root[:3], root[3:6], root[kernel.NORMAL : kernel.NORMAL + 3] = (
+            start[:3, 3],
+            start[:3, 2],
+            start[:3, 0],
+        )
         root[kernel.PATH_LENGTH], root[kernel.PATH_TURN] = query.inserted_mm, query.turned_rad
 
     def _make_arrays(self) -> None:
@@ -232,7 +236,9 @@ class ResolutionSearch:
         )  # fmt: skip
         left = self.space.limits[index.MAX_LENGTH] - self.query.inserted_mm
         per_piece = len(self._words[4])
-        ranks = np.zeros((max(int(left / self.resolution.fine_mm), 0) * per_piece + 2 * per_piece, 2), np.int32)
+        ranks = np.zeros(
+            (max(int(left / self.resolution.fine_mm), 0) * per_piece + 2 * per_piece, 2), np.int32
+        )
         ranks[:, 0] = -1
         self._queue = (
             np.zeros(FIRST_ENTRIES), np.zeros((FIRST_ENTRIES, rank_queue.ENTRY_COLUMNS), np.int32),

@@ -26,7 +26,9 @@ def turn_into_ball(rho, h, kappa, tolerance):
     aside = radius - rho
     centre2 = aside * aside + h * h
     # The cosine of the angle, seen from the centre of the circle, between the point and the entry.
-    cosine = (radius * radius + centre2 - tolerance * tolerance) / max(2.0 * radius * math.sqrt(centre2), TINY)
+    cosine = (radius * radius + centre2 - tolerance * tolerance) / max(
+        2.0 * radius * math.sqrt(centre2), TINY
+    )
     if cosine > 1.0 + TINY:
         return math.inf
     turn = math.atan2(h, aside) - math.acos(min(cosine, 1.0))

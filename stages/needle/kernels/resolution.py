@@ -431,7 +431,10 @@ def search_words(
         if counts[POPS] == 0:
             f = _estimate(nodes, at, rate, goal, limits, reference)
             bend = bend_of(nodes, words[1], limits[KAPPA], at, words[1].shape[0])
-            if blocker_on_arc(space, limits, _pose(nodes, at), bend, 0.0, nodes[at, PATH_LENGTH], branch) != 0:
+            if (
+                blocker_on_arc(space, limits, _pose(nodes, at), bend, 0.0, nodes[at, PATH_LENGTH], branch)
+                != 0
+            ):
                 f = math.inf
         elif state[WAITING] == 0:
             return EXHAUSTED, cost

@@ -319,7 +319,9 @@ def step_sets(now, now_window, scale, depth, way, blur, edges, out, out_window):
             wide[allowed[0] : allowed[1] + 1] = 0
             for c in range(edges.shape[0]):
                 low = edges[c - 1] if c > 0 else 0.0
-                disc = largest_aside(sine, scale, depth, low * change, edges[c] * change) / scale[CELL] + SPARE
+                disc = (
+                    largest_aside(sine, scale, depth, low * change, edges[c] * change) / scale[CELL] + SPARE
+                )
                 far = int(math.ceil(square + disc))
                 limits[0] = max(allowed[0] - far - move_y, 0)
                 limits[1] = min(allowed[1] + far - move_y, mid_rows - 1)

@@ -194,7 +194,9 @@ def arcs(frames: Float, rolls: Float, kappas: Float, lengths: Float) -> Curves:
     normal = np.stack([np.cos(rolls), np.sin(rolls), np.zeros_like(rolls)], axis=-1)
     axis = np.stack([-np.sin(rolls), np.cos(rolls), np.zeros_like(rolls)], axis=-1)
     local = aside[..., None] * normal[:, None] + ahead[..., None] * np.array([0.0, 0.0, 1.0])
-    direction = np.sin(angle)[..., None] * normal[:, None] + np.cos(angle)[..., None] * np.array([0.0, 0.0, 1.0])
+    direction = np.sin(angle)[..., None] * normal[:, None] + np.cos(angle)[..., None] * np.array(
+        [0.0, 0.0, 1.0]
+    )
     rotation = frames[:, :3, :3]
     points = frames[:, None, :3, 3] + np.einsum("nij,nsj->nsi", rotation, local)
     ends = np.zeros_like(frames)

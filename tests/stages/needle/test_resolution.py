@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
 import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from anatomy.errors import SettingsError
-from anatomy.grid import Volume
 from anatomy.structures import OBSTACLES
-from stages.needle.kernels import goal_ball
-from stages.needle.kernels import resolution as kernel
-from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path
-from stages.needle.resolution import Cells, Outcome, Resolution, ResolutionSearch
-from stages.needle.space import NeedleSpace, workspace_lengths
-from tests.stages.needle import mazes
+from stages.needle.resolution import Resolution, ResolutionSearch
+from stages.needle.space import NeedleSpace
 from tests.stages.needle.mazes import CLEARANCE_MM, Maze
 from tests.stages.scenes import brute_clearance
 

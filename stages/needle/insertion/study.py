@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from anatomy.errors import SettingsError
-from stages.needle.closed_loop import GAIN, STEP_MM, TOLERANCE_MM, Insertion, Outcome, simulate
+from stages.needle.insertion.closed_loop import GAIN, STEP_MM, TOLERANCE_MM, Insertion, Outcome, simulate
+from stages.needle.insertion.replanning import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
+from stages.needle.insertion.truth import Errors
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
-from stages.needle.replanning import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace
-from stages.needle.truth import Errors
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""

@@ -15,13 +15,9 @@ import numpy as np
 from anatomy.errors import SettingsError
 from anatomy.grid import Float, read_only
 from anatomy.kernels.field import bounds_at, exact_at
-from stages.needle.escaping import structure_name, with_limit
-from stages.needle.kernels import limits as index
-from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import LENGTH, ROLL, ArcPath, arc_transform, bend_direction
-from stages.needle.reaiming import pose_at
-from stages.needle.replanning import (
+from stages.needle.insertion.escaping import structure_name, with_limit
+from stages.needle.insertion.reaiming import pose_at
+from stages.needle.insertion.replanning import (
     DEFAULT_SETTINGS,
     ITERATIONS,
     Failure,
@@ -29,9 +25,13 @@ from stages.needle.replanning import (
     Replanner,
     ReplanSettings,
 )
+from stages.needle.insertion.truth import Errors, Truth, tilt
+from stages.needle.kernels import limits as index
+from stages.needle.kernels.proof import blocker_on_arc
+from stages.needle.objective import SHORTEST, Objective
+from stages.needle.path import LENGTH, ROLL, ArcPath, arc_transform, bend_direction
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace
-from stages.needle.truth import Errors, Truth, tilt
 
 STEP_MM = 0.25
 TOLERANCE_MM = 2.0

@@ -16,14 +16,14 @@ from anatomy.errors import SettingsError
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL
-from stages.needle.closed_loop import Insertion, Outcome, simulate
 from stages.needle.device import Needle
-from stages.needle.insertion_study import Study, study, summary, wilson_interval
+from stages.needle.insertion.closed_loop import Insertion, Outcome, simulate
+from stages.needle.insertion.replanning import Failure, ReplanSettings, with_reserve
+from stages.needle.insertion.study import Study, study, summary, wilson_interval
+from stages.needle.insertion.truth import Errors, Truth
 from stages.needle.path import ArcPath, arc_transform, direct_path
-from stages.needle.replanning import Failure, ReplanSettings, with_reserve
 from stages.needle.searches import Query, RestartingRRT
 from stages.needle.space import NeedleSpace, needle_space
-from stages.needle.truth import Errors, Truth
 from tests.stages.scenes import Canvas, brute_clearance
 
 KAPPA = 1 / 40

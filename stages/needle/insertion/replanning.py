@@ -14,13 +14,28 @@ from anatomy.grid import Float
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.field import MIN_GAP_MM
 from anatomy.settings import quantity, settings
-from stages.needle.escaping import blocker_at, roots_of_tip, structure_name, tip_clearance, with_limit
+from stages.needle.insertion.escaping import (
+    blocker_at,
+    roots_of_tip,
+    structure_name,
+    tip_clearance,
+    with_limit,
+)
+from stages.needle.insertion.reaiming import (
+    Root,
+    Source,
+    Trials,
+    Way,
+    as_point,
+    plan_ahead,
+    pose_at,
+    ways_ahead,
+)
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import length_ahead, nearest_turn, seen_from
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import CURVATURE, ArcPath
-from stages.needle.reaiming import Root, Source, Trials, Way, as_point, plan_ahead, pose_at, ways_ahead
 from stages.needle.searches import Query, root_of
 from stages.needle.space import NeedleSpace
 

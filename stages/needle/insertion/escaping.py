@@ -12,11 +12,11 @@ from anatomy.grid import read_only
 from anatomy.kernels.arcs import pose_on_arc
 from anatomy.kernels.field import EXACT_REACH_MM, exact_distance
 from anatomy.structures import BITS, LUMEN
+from stages.needle.insertion.reaiming import Bend, Root, Source, Trials, as_point, pose_at, root_after
 from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import Arrays as ObjectiveArrays
 from stages.needle.path import bend_direction
-from stages.needle.reaiming import Bend, Root, Source, Trials, as_point, pose_at, root_after
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace
 

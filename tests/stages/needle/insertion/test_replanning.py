@@ -17,11 +17,11 @@ from anatomy.margins import Margins
 from anatomy.poses import pose, roll_towards
 from anatomy.structures import OBSTACLES, VESSEL
 from stages.needle.device import Needle
+from stages.needle.insertion.reaiming import LEAST_GAIN, Root, Source, Trials
+from stages.needle.insertion.replanning import Failure, Replan, Replanner, ReplanSettings, with_reserve
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path, direct_path
-from stages.needle.reaiming import LEAST_GAIN, Root, Source, Trials
-from stages.needle.replanning import Failure, Replan, Replanner, ReplanSettings, with_reserve
 from stages.needle.searches import Query, RestartingRRT, root_of
 from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.scenes import Canvas, brute_clearance, line_tree

@@ -29,21 +29,16 @@ from needle_queries import Judge, Obstacles, Query, easy_queries, hard_queries, 
 from anatomy.io.files import atomic_write
 from stages.needle import searches
 from stages.needle.decision import Decision
-from stages.needle.optimal import OptimalSearch
+from stages.needle.planners import PLANNERS, MakeSearch
 from stages.needle.resolution import Resolution, ResolutionSearch
-from stages.needle.searches import RestartingRRT, Search
+from stages.needle.searches import RestartingRRT
 from stages.needle.space import NeedleSpace
 
 MARKS_S = (0.01, 0.1, 1.0, 10.0)
 SLICE = 200
 UNIT = Resolution(fine_mm=1.0, fine_rolls=16)
 
-Make = Callable[[NeedleSpace, searches.Query, int], Search]
-PLANNERS: dict[str, Make] = {
-    "rrt": lambda space, query, seed: RestartingRRT(space, query, seed=seed),
-    "optimal": lambda space, query, seed: OptimalSearch(space, query, seed=seed),
-    "resolution": lambda space, query, seed: ResolutionSearch(space, query, resolution=UNIT),
-}
+NAMES = ("rrt", "optimal", "resolution")
 
 
 def asked(query: Query) -> searches.Query:
@@ -52,7 +47,7 @@ def asked(query: Query) -> searches.Query:
 
 
 def run(
-    make: Make, space: NeedleSpace, query: Query, seed: int, time_s: float, judge: Judge
+    make: MakeSearch, space: NeedleSpace, query: Query, seed: int, time_s: float, judge: Judge
 ) -> dict[str, Any]:
     """Run one planner for some CPU time; return when it had which length, and its paths' faults."""
     began = time.process_time()
@@ -144,8 +139,8 @@ def problems_of(queries: list[Query], patients: Path) -> Iterator[tuple[Query, N
 
 def warm_up(space: NeedleSpace, query: Query) -> None:
     """Compile or load the kernels."""
-    for make in PLANNERS.values():
-        make(space, asked(query), 1).advance(SLICE)
+    for name in NAMES:
+        PLANNERS[name](space, asked(query), 1).advance(SLICE)
 
 
 def print_summary(results: list[dict[str, Any]], names: list[str], peers: Callable[[float], str]) -> None:
@@ -196,7 +191,7 @@ def main() -> int:
     )
     parser.add_argument("data", type=Path)
     parser.add_argument("--set", choices=("hard", "easy"), default="hard")
-    parser.add_argument("--planners", nargs="+", default=list(PLANNERS), choices=list(PLANNERS))
+    parser.add_argument("--planners", nargs="+", default=list(NAMES), choices=NAMES)
     parser.add_argument("--time", type=float, default=1.0, help="CPU seconds a run")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--decide", type=float, default=10.0, help="CPU seconds a decision, 0 for none")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from anatomy.errors import SettingsError, TargetError
@@ -13,12 +12,10 @@ from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT
 from lungaccess.system import System
 from lungaccess.target import Target
-from stages.needle.decision import Decision
 from stages.needle.objective import Objective
-from stages.needle.optimal import OptimalSearch
 from stages.needle.path import ArcPath
-from stages.needle.resolution import ResolutionSearch
-from stages.needle.searches import Query, RestartingRRT, Search
+from stages.needle.planners import PLANNERS
+from stages.needle.searches import Query, Search
 from stages.needle.space import NeedleSpace, needle_space
 
 SLICE = 500
@@ -30,15 +27,6 @@ OBJECTIVES = {
     "cost-map": Objective(cost_map=1.0),
     "voxel-sum": Objective(voxel_sum=1.0),
     "length": Objective(length=1.0),
-}
-
-PLANNERS: dict[str, Callable[[NeedleSpace, Query, int, Objective], Search]] = {
-    "decide": lambda space, query, seed, objective: Decision(space, query, seed=seed, objective=objective),
-    "rrt": lambda space, query, seed, objective: RestartingRRT(space, query, seed=seed, objective=objective),
-    "optimal": lambda space, query, seed, objective: OptimalSearch(
-        space, query, seed=seed, objective=objective
-    ),
-    "resolution": lambda space, query, _seed, objective: ResolutionSearch(space, query, objective=objective),
 }
 
 
@@ -93,8 +81,7 @@ def plan_needle(
         +z is the direction of insertion.
     target : Target
     planner : str
-        "decide" (a path or a proof that there is none), "rrt", "optimal" (better and better), or
-        "resolution" (the best at a resolution, then ends).
+        One of `stages.needle.planners.PLANNERS`.
     objective : str
         One of `OBJECTIVES`.
     seed : int

@@ -27,8 +27,9 @@ from stages.needle.kernels import limits as index
 from stages.needle.kernels import states, tree
 from stages.needle.objections import SAME_MM, objection
 from stages.needle.path import ArcPath, arc_transform
+from stages.needle.planners import PLANNERS
 from stages.needle.runs import Outcome, PlannerRuns, log_with_outcomes, summary
-from stages.needle.searches import Query, RestartingRRT, Search, TreeSearch
+from stages.needle.searches import Query, Search, TreeSearch
 from stages.needle.space import NeedleSpace
 
 util.setLogLevel(util.LogLevel.LOG_ERROR)
@@ -312,7 +313,8 @@ class NeedleProblem:
     ----------
     space : NeedleSpace
     searches : mapping of names to callables, optional
-        Each makes a search of a space, a query and a seed.  The first is the default; without any, "rrt".
+        Each makes a search of a space, a query and a seed.  The first is the default; without any,
+        all of `stages.needle.planners`.
 
     Attributes
     ----------
@@ -324,7 +326,7 @@ class NeedleProblem:
 
     def __init__(self, space: NeedleSpace, searches: Mapping[str, SearchFactory] | None = None) -> None:
         self.space = space
-        self._searches = dict(searches or {"rrt": restarting_rrt})
+        self._searches = dict(searches or PLANNERS)
         self._question = Question()
         self._own: dict[str, NeedlePlanner] = {}
         self._tolerance_mm = 0.0
@@ -486,11 +488,6 @@ def seed_ompl(seed: int) -> None:
             expected="a number of 1 or more, before OMPL has drawn its first",
             remedy="Call it first in a new process",
         )
-
-
-def restarting_rrt(space: NeedleSpace, query: Query, seed: int) -> Search:
-    """Make the search that is the default."""
-    return RestartingRRT(space, query, seed=seed)
 
 
 def _termination(time_s: float) -> Any:

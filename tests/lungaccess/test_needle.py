@@ -13,10 +13,11 @@ from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose
 from lungaccess.cli import BAD_INPUT, OK, main
-from lungaccess.needle import PLANNERS, pierced_branch, plan_needle
+from lungaccess.needle import pierced_branch, plan_needle
 from lungaccess.system import System, load_system
 from lungaccess.target import nodule_target
 from stages.needle.path import blocker_on_path
+from stages.needle.planners import PLANNERS
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,9 @@ def grow_optimal(space, limits, objective, branch, goal, nodes, parents, count, 
     if math.hypot(rho, h) < MIN_ARC_MM:
         return count, 0, False
     if count == 1:
-        count = add_goal(space, limits, objective, branch, nodes, parents, 1, 0, goal, best, state)
+        count = add_goal(
+            space, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
+        )
         if count > 1:
             return count, 0, True
     rate = objective[0][LEAST_RATE]

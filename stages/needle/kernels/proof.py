@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
@@ -16,6 +17,10 @@ from anatomy.kernels.labels import LUMEN
 from stages.needle.kernels.limits import EXEMPT_LENGTH, LOOKUP_STEP, RADIUS, REQUIRED, TINY
 
 PROBE_SPACING_MM = 1.5
+
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+_LUMEN = np.int64(LUMEN)
 
 
 @numba.njit(cache=True)
@@ -27,7 +32,7 @@ def _early_blocker(space, required, pose, bend, begin, length):
         for m in range(count):
             x, y, z = point_on_arc(pose, bend, begin + (length - begin) * (m + 0.5) / count)
             if distance_bound(field, geometry, x, y, z) < required:
-                distance, label = exact_distance(labels, geometry, x, y, z, bits, -1, required)
+                distance, label = exact_distance(labels, geometry, x, y, z, bits, _NOBODY, required)
                 if distance < required:
                     return label
         count *= 2
@@ -77,7 +82,7 @@ def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
             distance, label = exact_distance(labels, geometry, x, y, z, bits, spared, reach)
             gap = distance - required
             if in_exit:
-                lumen, lumen_label = exact_distance(labels, geometry, x, y, z, LUMEN, -1, reach)
+                lumen, lumen_label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
                 if lumen - limits[RADIUS] < gap:
                     gap = lumen - limits[RADIUS]
                     label = lumen_label

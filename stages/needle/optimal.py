@@ -7,18 +7,17 @@ import numpy as np
 from stages.needle.kernels import optimal, tree
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import path_from_tree
-from stages.needle.searches import Query, TreeSearch, luby
+from stages.needle.searches import Query, RestartingRRT
 from stages.needle.space import NeedleSpace
 
 MAX_VIAS = 64
-RESTART_ITERATIONS = 300
 REFINE_SHARE = 0.7
 """Share of the iterations, once there is a path, that vary it instead of growing trees."""
 IMPROVEMENT = 1e-6
 """A path counts as better if its cost is less by this share."""
 
 
-class OptimalSearch(TreeSearch):
+class OptimalSearch(RestartingRRT):
     """Finds a path as the RRT does and makes it cheaper and cheaper.
 
     Two things take turns.  Trees grow in the space of states and costs, towards samples from the nodes that
@@ -32,8 +31,6 @@ class OptimalSearch(TreeSearch):
         self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
         super().__init__(space, query, seed=seed, objective=objective)
-        self._restarts = 0
-        self._left = RESTART_ITERATIONS
         self._vias = np.zeros((MAX_VIAS, optimal.VIA_COLUMNS))
         self._via_count = 0
         self._scratch = np.zeros((2 * MAX_VIAS + 2, tree.NODE_COLUMNS))
@@ -41,32 +38,28 @@ class OptimalSearch(TreeSearch):
         self._scratch_parents = np.zeros(2 * MAX_VIAS + 2, dtype=np.int64)
 
     def advance(self, iterations: int) -> bool:
-        """Grow trees, and refine; see `stages.needle.searches.Search`."""
+        """Find a path as the RRT does; then grow trees, and refine.  See `stages.needle.searches.Search`."""
         if self.path is None:
-            return self._grow(iterations)
-        tries = int(round(REFINE_SHARE * iterations))
-        better = self._refine(tries)
-        return self._grow(iterations - tries) or better
+            found = super().advance(iterations)
+        else:
+            tries = round(REFINE_SHARE * iterations)
+            better = self._refine(tries)
+            found = super().advance(iterations - tries)
+            if not found:
+                return better
+        if found:
+            self._read_vias(self.count - 1)
+        return found
 
-    def _grow(self, iterations: int) -> bool:
-        query, left = self.query, iterations
-        while True:
-            self.count, used, solved = optimal.grow_optimal(
-                self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
-                self.nodes, self.parents, self.count, min(left, self._left), self.state, self.cost,
-            )  # fmt: skip
-            left -= used
-            self._left -= used
-            self.iterations += used
-            if solved:
-                self.take(self.count - 1)
-                self._read_vias(self.count - 1)
-            if solved or self._left == 0 or self.count + 5 > len(self.nodes):
-                self._restarts += 1
-                self._left = RESTART_ITERATIONS * luby(self._restarts + 1)
-                self.count = 1
-            if solved or left == 0 or used == 0:
-                return bool(solved)
+    def grow(self, iterations: int) -> tuple[int, int, bool]:
+        """Grow by the RRT up to the first path, then in state and cost."""
+        if self.path is None:
+            return super().grow(iterations)
+        query = self.query
+        return optimal.grow_optimal(  # type: ignore[no-any-return]
+            self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+            self.nodes, self.parents, self.count, iterations, self.state, self.cost,
+        )  # fmt: skip
 
     def _read_vias(self, last: int) -> None:
         """Take the ends of a path's arcs as its via points."""

@@ -159,17 +159,13 @@ class RestartingRRT(TreeSearch):
 
     def advance(self, iterations: int) -> bool:
         """Grow trees; see `Search`.  The tree that found a path is kept until the next call."""
-        query, left = self.query, iterations
+        left = iterations
         while True:
-            if self._left == 0 or self.count + 3 > MAX_NODES:
+            if self._left == 0 or self.count + tree.ROWS_PER_STEP > MAX_NODES:
                 self._restarts += 1
                 self._left = RESTART_ITERATIONS * luby(self._restarts + 1)
                 self.count = 1
-            self.count, used, solved = grow_rrt(
-                self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
-                self.nodes, self.parents, self.count, min(left, self._left), RANDOM_SHARE,
-                self.state, self.cost,
-            )  # fmt: skip
+            self.count, used, solved = self.grow(min(left, self._left))
             left -= used
             self._left -= used
             self.iterations += used
@@ -178,6 +174,14 @@ class RestartingRRT(TreeSearch):
                 self._left = 0
             if solved or left == 0 or used == 0:
                 return bool(solved)
+
+    def grow(self, iterations: int) -> tuple[int, int, bool]:
+        """Grow the tree; return its rows, the iterations spent, and whether the last row is at the goal."""
+        query = self.query
+        return grow_rrt(  # type: ignore[no-any-return]
+            self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+            self.nodes, self.parents, self.count, iterations, RANDOM_SHARE, self.state, self.cost,
+        )  # fmt: skip
 
 
 def luby(number: int) -> int:

@@ -24,6 +24,7 @@ from stages.needle.kernels.tree import (
     PATH_COST,
     PATH_LENGTH,
     PATH_TURN,
+    ROWS_PER_STEP,
     add_arc,
     add_goal,
     add_legs,
@@ -88,7 +89,7 @@ def grow_optimal(space, limits, objective, branch, goal, nodes, parents, count, 
             return count, 0, True
     rate = objective[0][LEAST_RATE]
     for used in range(iterations):
-        if count + 5 > nodes.shape[0]:
+        if count + ROWS_PER_STEP > nodes.shape[0]:
             return count, used, False
         before = count
         if uniform(state) < RANDOM_SHARE:

@@ -10,7 +10,15 @@ from anatomy.kernels.arcs import any_normal, arc_to_point
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import seen_from, workspace_length
 from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_LENGTH, MAX_STEP, MAX_TURN, MIN_ARC_MM
-from stages.needle.kernels.tree import PATH_LENGTH, PATH_TURN, add_arc, add_goal, pose_of, within
+from stages.needle.kernels.tree import (
+    PATH_LENGTH,
+    PATH_TURN,
+    ROWS_PER_STEP,
+    add_arc,
+    add_goal,
+    pose_of,
+    within,
+)
 
 SAMPLE_TRIES = 50
 
@@ -127,7 +135,7 @@ def grow_rrt(
         if count > 1:
             return count, 0, True
     for used in range(iterations):
-        if count + 3 > nodes.shape[0]:
+        if count + ROWS_PER_STEP > nodes.shape[0]:
             return count, used, False
         if uniform(state) < random_share:
             near = int(uniform(state) * count)

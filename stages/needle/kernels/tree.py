@@ -41,6 +41,8 @@ PATH_LENGTH = 11
 PATH_TURN = 12
 PATH_COST = 13
 NODE_COLUMNS = 14
+ROWS_PER_STEP = 5
+"""Rows that a step of any search adds at most, with one to spare."""
 
 
 @numba.njit(cache=True)

@@ -31,7 +31,9 @@ Window = NDArray[np.int64]
 CUBES_MM = (0.5, 0.25)
 FIRST_CELL_MM = 0.5
 LARGEST_SLOPE_CELL = 0.17
-LEVELS = 7
+LEVELS = 9
+CELLS_PER_BOW = 16.0
+"""Planes are moved nearer to each other where curvature times their distance squared is more."""
 DEPTH_SHARE = 0.1
 """Distance of the planes as a share of the radius of curvature."""
 SLOPE_CHANGE_EDGES = np.array([0.5, 0.75, 0.92, 1.0])
@@ -63,10 +65,11 @@ class Plane:
     def ends(self) -> Window:
         """Cell numbers of the last cell."""
         nv, nu, rows, words = self.bits.shape
-        return self.window + np.array([nv, nu, rows, 64 * words]) - 1
+        last: Window = self.window + np.array([nv, nu, rows, 64 * words]) - 1
+        return last
 
 
-class _TooMuch(Exception):
+class _TooMuchError(Exception):
     """The states do not fit the memory allowed."""
 
 
@@ -127,7 +130,7 @@ class NoPathProof:
         if self.outcome == "running":
             try:
                 next(self._steps, None)
-            except _TooMuch:
+            except _TooMuchError:
                 self._end("undecided", "more states than fit the memory allowed")
             if self.outcome != "running":
                 self._planes, self._coarse = [], []
@@ -244,11 +247,19 @@ class NoPathProof:
 
     def _refine(self) -> Iterator[None]:
         """Go through all planes forward and backward, again and again with smaller cells."""
-        cell = min(FIRST_CELL_MM, 0.5 * LARGEST_SLOPE_CELL * self._depth)
+        self.cell_mm = min(FIRST_CELL_MM, 0.5 * LARGEST_SLOPE_CELL * self._depth)
         for level in range(LEVELS):
-            self.cell_mm = cell / 2**level
+            self._split = False
+            if level > 0:
+                # Halving positions and depth leaves the cells of directions as they are.
+                self._split = self._kappa * self._depth**2 > CELLS_PER_BOW * self.cell_mm
+                self.cell_mm *= 0.5
+                self._depth *= 0.5 if self._split else 1.0
+                self._count *= 2 if self._split else 1
             self.slope_cell = 2.0 * self.cell_mm / self._depth
             self._scale[sets.CELL], self._scale[sets.SLOPE_CELL] = self.cell_mm, self.slope_cell
+            if not self._proved_steepest:
+                self._scale[sets.TOP_SINE] = 1.0 - self._kappa * self._depth
             self._planes = []
             for number in range(self._count + 1):
                 self._forward(number)
@@ -266,7 +277,7 @@ class NoPathProof:
     def _forward(self, number: int) -> None:
         """Add a plane: the states reached from the plane before, or the start."""
         plane = self._allowed(number)
-        _kept, steepest = sets.keep_hopeful(
+        sets.keep_hopeful(
             plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
             float(self._space.limits[index.MAX_ANGLE]),
         )  # fmt: skip
@@ -301,59 +312,87 @@ class NoPathProof:
         """Return all states of a plane that are to be looked at."""
         if number == 0:
             return Plane(np.ones((1, 1, 1, 1), dtype=np.uint64), np.zeros(4, dtype=np.int64))
+        if self._coarse and not (self._split and number % 2):
+            coarse = self._coarse[number // 2 if self._split else number]
+            halved = np.array([not self._split, not self._split, True, True])
+            shape = np.where(halved, 2 * np.array(coarse.bits.shape) + 1, coarse.bits.shape)
+            self._require(8 * math.prod(int(n) for n in shape))
+            bits = np.zeros(tuple(shape), dtype=np.uint64)
+            sets.refine(coarse.bits, not self._split, bits)
+            return Plane(bits, np.where(halved, 2 * coarse.window - 1, coarse.window))
+        low, high = self._reached(self._planes[-1].window, self._planes[-1].ends, 1, number)
         if self._coarse:
-            coarse = self._coarse[number]
-            nv, nu, rows, words = (2 * n + 1 for n in coarse.bits.shape)
-            self._require(8 * nv * nu * rows * words)
-            bits = np.zeros((nv, nu, rows, words), dtype=np.uint64)
-            sets.refine(coarse.bits, bits)
-            return Plane(bits, 2 * coarse.window - 1)
-        low, high = self._reached(self._planes[-1], number)
-        shape = np.maximum(high - low + 1, 1)
+            after = self._coarse[number // 2 + 1]
+            # Cells of position, halved, overlap one more to either side.
+            twice, more = np.array([1, 1, 2, 2]), np.array([0, 0, 1, 1])
+            back = self._reached(after.window * twice - more, after.ends * twice + more, -1, number)
+            low = np.maximum(low, back[0])
+            high = np.maximum(np.minimum(high, back[1]), low)
+        shape = high - low + 1
         shape[3] = -(-int(shape[3]) // 64)
         self._require(8 * math.prod(int(n) for n in shape))
         return Plane(np.full(tuple(shape), sets.ALL, dtype=np.uint64), low)
 
-    def _reached(self, plane: Plane, number: int) -> tuple[Window, Window]:
-        """Return the first and last cell numbers that the states of a plane may reach on the next one."""
+    def _reached(self, low: Window, high: Window, way: int, number: int) -> tuple[Window, Window]:
+        """Return the first and last cell numbers on a plane that states between others may reach.
+
+        `way` is 1 from the plane before and -1 from the one after.
+        """
         scale = self._scale
-        reach = sets.largest_reach(scale, self._depth, 2.0, plane.window, *plane.bits.shape[:2])
+        reach = sets.largest_reach(scale, self._depth, 2.0, low, *(high - low + 1)[:2])
         top = scale[sets.TOP_SINE]
-        aside = sets.largest_aside(top, scale, self._depth, 0.0, 1e9) / self.cell_mm + 4.0
+        steep = top / math.sqrt(1.0 - top * top)
+        aside = math.ceil(sets.largest_aside(top, scale, self._depth, 0.0, 1e9) / self.cell_mm + 4.0)
         widest = self._ends[sets.SPINDLE_RADIUS] - self._ends[sets.SPINDLE_OFFSET]
-        low, high = plane.window.copy(), plane.ends
+        least, most = low.copy(), high.copy()
         for axis in (0, 1):
             first = scale[sets.FIRST_V + axis]
-            steep = top / math.sqrt(1.0 - top * top)
-            fewest = math.floor((-steep - first) / self.slope_cell) - 1
-            most = math.ceil((steep - first) / self.slope_cell) + 1
-            slopes = low[axis], high[axis]
-            low[axis] = max(low[axis] - reach, fewest)
-            high[axis] = min(high[axis] + reach, most)
-            low[axis + 2] += slopes[0] + low[axis] - math.ceil(aside)
-            high[axis + 2] += slopes[1] + high[axis] + math.ceil(aside)
+            least[axis] = max(low[axis] - reach, math.floor((-steep - first) / self.slope_cell) - 1)
+            most[axis] = max(
+                min(high[axis] + reach, math.ceil((steep - first) / self.slope_cell) + 1), least[axis]
+            )
+            moves = way * (low[axis] + least[axis]), way * (high[axis] + most[axis])
+            least[axis + 2] += min(moves) - aside
+            most[axis + 2] += max(moves) + aside
             if widest < math.inf:
                 middle = number * self._depth * first
-                least = math.floor((-widest - middle) / self.cell_mm) - 1
-                largest = math.ceil((widest - middle) / self.cell_mm) + 1
-                low[axis + 2] = min(max(low[axis + 2], least), largest)
-                high[axis + 2] = max(min(high[axis + 2], largest), low[axis + 2])
-        return low, high
+                least[axis + 2] = max(least[axis + 2], math.floor((-widest - middle) / self.cell_mm) - 1)
+                most[axis + 2] = min(most[axis + 2], math.ceil((widest - middle) / self.cell_mm) + 1)
+                most[axis + 2] = max(most[axis + 2], least[axis + 2])
+        return least, most
 
     def _require(self, size: int) -> None:
         """Raise if so many bytes more do not fit the memory allowed."""
         used = sum(plane.bits.nbytes for plane in self._planes + self._coarse)
         if used + size > self._max_bytes:
-            raise _TooMuch
+            raise _TooMuchError
 
     def _step(self, plane: Plane, way: int, other: Plane, blur: float) -> None:
-        reach = sets.largest_reach(self._scale, self._depth, blur, other.window, *other.bits.shape[:2])
-        table = math.prod(sets.table_shape(plane.bits, plane.window, reach))
-        self._require(8 * table + 2 * other.bits.nbytes)
-        sets.step_sets(
-            plane.bits, plane.window, self._scale, self._depth, way, blur, SLOPE_CHANGE_EDGES, other.bits,
-            other.window,
-        )  # fmt: skip
+        """Keep of another plane what a plane's states reach, as many rows of directions at once as fit."""
+        nv, nu, rows, words = other.bits.shape
+        reach = sets.largest_reach(self._scale, self._depth, blur, other.window, nv, nu)
+        chunk = nv
+        while True:
+            part = plane.bits[: chunk + 2 * reach]
+            try:
+                self._require(8 * math.prod(sets.table_shape(part, reach)) + 2 * other.bits.nbytes)
+                break
+            except _TooMuchError:
+                if chunk == 1:
+                    raise
+                chunk = (chunk + 1) // 2
+        for first in range(0, nv, chunk):
+            target = other.bits[first : first + chunk]
+            offset = int(other.window[0] - plane.window[0]) + first
+            low, high = max(offset - reach, 0), max(offset + chunk + reach, 0)
+            source = plane.bits[low:high]
+            if source.shape[0] == 0:
+                target[:] = 0
+                continue
+            sets.step_sets(
+                source, plane.window + np.array([low, 0, 0, 0]), self._scale, self._depth, way, blur,
+                SLOPE_CHANGE_EDGES, target, other.window + np.array([first, 0, 0, 0]),
+            )  # fmt: skip
 
     def _keep_clear(self, plane: Plane, number: int) -> None:
         """Test half a slab to either side of a plane."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,12 +20,15 @@ from stages.needle.kernels import rank_queue, tree
 from stages.needle.kernels import resolution as kernel
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
 from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
-from stages.needle.objective import Arrays as ObjectiveArrays
 from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace
 
-Words = tuple[float, Float, Float, NDArray[np.int64], NDArray[np.int64]]
+T = TypeVar("T", bound=np.generic)
+Ints = NDArray[np.int64]
+Words = tuple[float, Float, Float, Ints, Ints]
+Store = tuple[Float, NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32]]
+Queue = tuple[Float, NDArray[np.int32], Float, NDArray[np.int32], NDArray[np.int32]]
 
 FIRST_NODES = 1024
 FIRST_ENTRIES = 4096
@@ -84,7 +89,7 @@ class Resolution:
         """Steps of the longest piece."""
         return round(self.coarse_mm / self.fine_mm)
 
-    def primitives(self) -> tuple[np.ndarray, np.ndarray]:
+    def primitives(self) -> tuple[Ints, Ints]:
         """Return all primitives by level, `(P, 2)` direction and steps, and the first of each level.
 
         The level counts how often length and roll are halved; the direction `fine_rolls` is straight.
@@ -162,27 +167,30 @@ class Counts:
 class ResolutionSearch:
     """The search over words of arcs and straight pieces, from coarse to fine [Fu2021, Fu2022].
 
-    See docs/resolution_search.md; it is a `searches.Search`.
+    See docs/resolution_search.md; it is a `searches.Search`.  Nothing in it is random.
 
     Parameters
     ----------
     space : NeedleSpace
     query : Query
         The directions of bending count from +x of the start pose.
-    resolution : Resolution
+    resolution : Resolution, optional
     objective : Objective
     duplicates : Cells, optional
         Poses that count as one; by default only those that are equal up to rounding, so that nothing is lost.
     max_memory_mb : float
         The search ends before its arrays take more.
 
+    Raises
+    ------
+    SettingsError
+        If the space is one in which arcs are looked up instead of proved.
+
     Attributes
     ----------
     path, cost, finished
         See `searches.Search`.
     outcome : Outcome
-        Once it is BEST or NONE, no path of the resolution is cheaper than the best one, or none exists; up
-        to `duplicates`, and up to a share of 1e-9 of the cost.
     """
 
     def __init__(
@@ -195,6 +203,11 @@ class ResolutionSearch:
         duplicates: Cells | None = None,
         max_memory_mb: float = 1000.0,
     ) -> None:
+        if space.limits[index.LOOKUP_STEP] > 0.0:
+            raise SettingsError(
+                "The resolution search is asked for a space whose arcs are looked up, not proved",
+                expected="a space with a clearance field, because the search goes on from what is proved",
+            )
         self.space = space
         self.query = query
         self.path: ArcPath | None = None
@@ -204,100 +217,97 @@ class ResolutionSearch:
         self.resolution = resolution or Resolution()
         self.duplicates = duplicates
         self.max_memory_mb = max_memory_mb
-        self.objective = _tight(space.objective_arrays(objective), space)
+        self.objective = space.objective_arrays(objective)
+        self._rates = _rates(self.objective[0], space)
         self._merge = (EQUAL_CELL_MM, EQUAL_CELL_MM, False)
         if duplicates is not None:
             self._merge = (duplicates.position_mm, math.radians(duplicates.angle_deg), True)
-        start = query.lps_from_start
-        self._reference = start[:3, 2].copy() if query.reference is None else query.reference
         self._words = _words(self.resolution, float(space.limits[index.KAPPA]))
-        self._counts = np.zeros(kernel.COUNTS, dtype=np.int64)
-        self._counts[kernel.NODES] = 1
+        self._reference = np.array(
+            query.lps_from_start[:3, 2] if query.reference is None else query.reference, dtype=np.float64
+        )
+        self._store = self._first_store()
+        left = space.limits[index.MAX_LENGTH] - query.inserted_mm
+        pieces = max(int(left / self.resolution.fine_mm), 0) + 2
+        self._queue = _first_queue(pieces * len(self._words[4]) + rank_queue.LOOK_AHEAD + 1)
         self._state = np.zeros(rank_queue.STATE_SIZE, dtype=np.int64)
         self._state[rank_queue.FREE] = -1
+        self._counts = np.zeros(kernel.COUNTS, dtype=np.int64)
+        self._counts[kernel.NODES] = 1
         self._best = np.zeros(kernel.BEST_SIZE)
-        self._make_arrays()
-        root = self._store[0][0]
-        root[:3], root[3:6], root[kernel.NORMAL : kernel.NORMAL + 3] = (
-            start[:3, 3],
-            start[:3, 2],
-            start[:3, 0],
-        )
-        root[kernel.PATH_LENGTH], root[kernel.PATH_TURN] = query.inserted_mm, query.turned_rad
 
-    def _make_arrays(self) -> None:
-        n = self.resolution.fine_rolls + 1
-        proved = np.zeros((FIRST_NODES, n, 2), dtype=np.uint8)
-        proved[0, :, kernel.USELESS] = self.resolution.steps + 1
+    def _first_store(self) -> Store:
+        nodes = np.zeros((FIRST_NODES, kernel.NODE_COLUMNS))
         links = np.zeros((FIRST_NODES, kernel.LINK_COLUMNS), dtype=np.int32)
+        proved = np.zeros((FIRST_NODES, self.resolution.fine_rolls + 1, 2), dtype=np.uint8)
+        start, root = self.query.lps_from_start, nodes[0]
+        root[:6] = *start[:3, 3], *start[:3, 2]
+        root[kernel.NORMAL : kernel.NORMAL + 3] = start[:3, 0]
+        root[kernel.PATH_LENGTH], root[kernel.PATH_TURN] = self.query.inserted_mm, self.query.turned_rad
         links[0] = -1, -1, 0, 0
-        self._store = (
-            np.zeros((FIRST_NODES, kernel.NODE_COLUMNS)), links, proved, np.zeros(4 * FIRST_NODES, np.int32),
-        )  # fmt: skip
-        left = self.space.limits[index.MAX_LENGTH] - self.query.inserted_mm
-        per_piece = len(self._words[4])
-        ranks = np.zeros(
-            (max(int(left / self.resolution.fine_mm), 0) * per_piece + 2 * per_piece, 2), np.int32
-        )
-        ranks[:, 0] = -1
-        self._queue = (
-            np.zeros(FIRST_ENTRIES), np.zeros((FIRST_ENTRIES, rank_queue.ENTRY_COLUMNS), np.int32),
-            np.zeros(FIRST_ENTRIES), np.zeros(FIRST_ENTRIES, np.int32), ranks,
-        )  # fmt: skip
+        proved[0, :, kernel.USELESS] = self.resolution.steps + 1
+        return nodes, links, proved, np.zeros(4 * FIRST_NODES, dtype=np.int32)
 
     @property
     def counts(self) -> Counts:
         """What the search has done so far."""
-        c = self._counts
         return Counts(
-            pops=int(c[kernel.POPS]),
-            nodes=int(c[kernel.NODES]),
-            duplicates=int(c[kernel.DUPLICATES]),
-            pruned=int(c[kernel.PRUNED]),
-            refused=int(c[kernel.REFUSED]),
+            pops=int(self._counts[kernel.POPS]),
+            nodes=int(self._counts[kernel.NODES]),
+            duplicates=int(self._counts[kernel.DUPLICATES]),
+            pruned=int(self._counts[kernel.PRUNED]),
+            refused=int(self._counts[kernel.REFUSED]),
         )
 
     @property
     def memory_mb(self) -> float:
         """Size of the search's arrays."""
-        return sum(array.nbytes for array in (*self._store, *self._queue)) / 1e6
+        return _megabytes((*self._store, *self._queue))
 
     def advance(self, iterations: int) -> bool:
         """Take up to `iterations` entries off the queue; see `searches.Search`."""
-        stop = self._counts[kernel.POPS] + iterations
+        stop = int(self._counts[kernel.POPS]) + iterations
         while not self.finished and self._counts[kernel.POPS] < stop:
             reason, self.cost = kernel.search_words(
-                self.space.arrays, self.space.limits, self.objective, self.query.branch, self.query.target,
-                self._reference, self._words, self._merge, self._store, self._queue, self._state, self._counts,
-                self._best, self.cost, stop - self._counts[kernel.POPS],
+                self.space.arrays, self.space.limits, self.objective, self._rates, self.query.branch,
+                self.query.target, self._reference, self._words, self._merge, self._store, self._queue,
+                self._state, self._counts, self._best, self.cost, stop - int(self._counts[kernel.POPS]),
             )  # fmt: skip
             if reason == kernel.BETTER:
                 self.path = self._best_path()
+                if self._state[rank_queue.WAITING] == 0:
+                    self._end(Outcome.BEST)
                 return True
             if reason == kernel.EXHAUSTED:
                 self._end(Outcome.NONE if self.path is None else Outcome.BEST)
-            elif reason != kernel.SPENT:
-                self._grow(reason)
+            elif reason == kernel.FULL_OF_NODES:
+                self._more_nodes()
+            elif reason == kernel.FULL_OF_ENTRIES:
+                self._more_entries()
         return False
 
     def _end(self, outcome: Outcome) -> None:
         self.outcome = outcome
         self.finished = True
 
-    def _grow(self, reason: int) -> None:
-        """Double the arrays that are full, or end."""
-        arrays = self._store if reason == kernel.FULL_OF_NODES else self._queue[:4]
-        if self.memory_mb + sum(array.nbytes for array in arrays) / 1e6 > self.max_memory_mb:
+    def _may_double(self, arrays: tuple[NDArray[Any], ...]) -> bool:
+        """Tell whether arrays may take twice their memory; end if not."""
+        fits = self.memory_mb + _megabytes(arrays) <= self.max_memory_mb
+        if not fits:
             self._end(Outcome.OUT_OF_MEMORY)
-            return
-        if reason == kernel.FULL_OF_ENTRIES:
-            f, entries, heap_f, heap, ranks = self._queue
-            self._queue = (_doubled(f), _doubled(entries), _doubled(heap_f), _doubled(heap), ranks)
-            return
-        nodes, links, proved, seen = self._store
-        larger = np.zeros(2 * len(seen), dtype=np.int32)
-        kernel.rehash(nodes, self._merge, seen, larger)
-        self._store = (_doubled(nodes), _doubled(links), _doubled(proved), larger)
+        return fits
+
+    def _more_nodes(self) -> None:
+        if self._may_double(self._store):
+            nodes, links, proved, seen = self._store
+            larger = np.zeros(2 * len(seen), dtype=np.int32)
+            kernel.rehash(nodes, self._merge, seen, larger)
+            self._store = _doubled(nodes), _doubled(links), _doubled(proved), larger
+
+    def _more_entries(self) -> None:
+        f, entries, heap_f, heap, ranks = self._queue
+        if self._may_double((f, entries, heap_f, heap)):
+            self._queue = _doubled(f), _doubled(entries), _doubled(heap_f), _doubled(heap), ranks
 
     def _best_path(self) -> ArcPath:
         """Return the path to the best node and on to the goal."""
@@ -310,8 +320,8 @@ class ResolutionSearch:
             at = int(links[at, kernel.PARENT])
         rows = [np.zeros(tree.NODE_COLUMNS)]
         for at in reversed(chain):
-            parent, direction, steps = links[at, : kernel.NODE_RANK]
-            bend = kernel.bend_of(nodes, rolls, self.space.limits[index.KAPPA], int(parent), int(direction))
+            parent, direction, steps = (int(v) for v in links[at, : kernel.NODE_RANK])
+            bend = kernel.bend_of(nodes, rolls, self.space.limits[index.KAPPA], parent, direction)
             rows.append(_row(fine_mm * steps, bend))
         for leg in range(2):
             length, *bend = self._best[kernel.BEST_LEGS + kernel.LEG_SIZE * leg :][: kernel.LEG_SIZE]
@@ -319,6 +329,18 @@ class ResolutionSearch:
                 rows.append(_row(length, bend))
         parents = np.arange(-1, len(rows) - 1)
         return path_from_tree(self.query.lps_from_start, np.stack(rows), parents, len(rows) - 1)
+
+
+def _first_queue(ranks: int) -> Queue:
+    lists = np.zeros((ranks, 2), dtype=np.int32)
+    lists[:, rank_queue.HEAD] = -1
+    entries = np.zeros((FIRST_ENTRIES, rank_queue.ENTRY_COLUMNS), dtype=np.int32)
+    heap = np.zeros(FIRST_ENTRIES, dtype=np.int32)
+    return np.zeros(FIRST_ENTRIES), entries, np.zeros(FIRST_ENTRIES), heap, lists
+
+
+def _megabytes(arrays: Iterable[NDArray[Any]]) -> float:
+    return sum(array.nbytes for array in arrays) / 1e6
 
 
 def _row(length_mm: float, bend: ArrayLike) -> Float:
@@ -329,7 +351,7 @@ def _row(length_mm: float, bend: ArrayLike) -> Float:
     return row
 
 
-def _doubled(array: np.ndarray) -> np.ndarray:
+def _doubled(array: NDArray[T]) -> NDArray[T]:
     """Return a copy with twice as many rows, the new ones 0."""
     larger = np.zeros((2 * len(array), *array.shape[1:]), dtype=array.dtype)
     larger[: len(array)] = array
@@ -359,11 +381,12 @@ def _words(resolution: Resolution, kappa: float) -> Words:
     )
 
 
-def _tight(objective: ObjectiveArrays, space: NeedleSpace) -> ObjectiveArrays:
-    """Return an objective whose least cost of a mm counts the largest clearance there is in this space."""
-    weights, costs = objective
-    if weights[INVERSE_CLEARANCE] > 0.0:
-        largest = max(float(space.arrays[0].max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
-        weights = weights.copy()
-        weights[LEAST_RATE] += weights[INVERSE_CLEARANCE] * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
-    return weights, costs
+def _rates(weights: Float, space: NeedleSpace) -> tuple[float, float]:
+    """Return the least cost of a mm in this space, and what a mm costs by which a path ends short.
+
+    The former counts the largest clearance that there is, where an objective knows none.
+    """
+    least = float(weights[LEAST_RATE])
+    largest = max(float(space.arrays[0].max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
+    gain = weights[INVERSE_CLEARANCE] * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
+    return least + max(float(gain), 0.0), least

@@ -93,40 +93,42 @@ def least_length(rho, h, limits, cosine, turn_left):
 
 @numba.njit(cache=True)
 def shortest_into_ball(pose, goal, limits):
-    """Return the shortest path from a pose into the ball as two legs: bend and length of each.
+    """Return the shortest path from a pose into the ball as two legs, and how far the second leads on.
 
-    Both legs are empty for a pose in the ball.  A goal inside the circle, farther from it than the
+    A leg is a bend and a length, which may be 0; both are for a pose in the ball.  The goal lies straight
+    ahead of the second leg if the third length is not 0.  A goal inside the circle, farther from it than the
     tolerance, is reached exactly, by a path CC.
     """
     kappa, tolerance = limits[KAPPA], limits[GOAL_TOLERANCE]
     rho, h = seen_from(pose, goal)
     first, first_length, second, second_length = shortest_legs(pose, goal, kappa)
+    ahead = 0.0
     if rho * rho + h * h <= tolerance * tolerance:
-        return first, 0.0, second, 0.0
+        return first, 0.0, second, 0.0, ahead
     if tolerance > 0.0:
         straight = arc_and_straight(rho, h, kappa)[1]
         turn = turn_into_ball(rho, h, kappa, tolerance)
         if tolerance <= straight < math.inf:
             second_length -= tolerance
+            ahead = tolerance
         elif turn < math.inf:
             bend = arc_to_point(pose, goal)[1]
             first, first_length, second_length = (kappa, bend[1], bend[2], bend[3]), turn / kappa, 0.0
-    return (
-        first,
-        first_length if first_length > MIN_ARC_MM else 0.0,
-        second,
-        second_length if second_length > MIN_ARC_MM else 0.0,
-    )
+    if first_length < MIN_ARC_MM:
+        first_length = 0.0
+    if second_length + ahead < MIN_ARC_MM:
+        second_length = 0.0
+    return first, first_length, second, second_length, ahead
 
 
 @numba.njit(cache=True)
 def single_into_ball(pose, goal, limits):
-    """Return the single arc towards the goal as far as the ball: bend and length.
+    """Return the single arc towards the goal as far as the ball, bend and length.
 
-    The length is 0 where that arc would be too tight, turn by more than 180 degrees, or be empty.
+    The length is 0 where there is none, or it would be too tight, turn by more than 180 degrees, or be empty.
     """
     length, bend, turn = arc_to_point(pose, goal)
-    if bend[0] > limits[KAPPA] * (1.0 + TINY) or turn > math.pi:
+    if bend[0] > limits[KAPPA] * (1.0 + TINY) or turn > math.pi or length == math.inf:
         return bend, 0.0
     half = 0.5 * bend[0] * limits[GOAL_TOLERANCE]
     length -= 2.0 * math.asin(min(half, 1.0)) / bend[0] if half > TINY else limits[GOAL_TOLERANCE]

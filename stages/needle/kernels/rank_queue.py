@@ -4,14 +4,15 @@ Taken first is the smallest f among the lowest rank that has an entry and the ne
 Those entries are in one binary heap; the others wait in a list for each rank.  An entry is never pushed at a
 rank below the lowest one.
 
-The queue is a tuple: f of each entry, (M,) float64; `entries`, (M, ENTRY_COLUMNS) int32; the heap's copy of f,
-(M,) float64, and its entries, (M,) int32; `ranks`, (K, 2) int32, with the first entry of each rank's list
+The queue is a tuple: f of each entry, (M,) float64; `entries`, (M, ENTRY_COLUMNS) int32; the heap's copy of
+f, (M,) float64, and its entries, (M,) int32; `ranks`, (K, 2) int32, with the first entry of each rank's list
 (-1: none) and the number of its entries.  Ranks K - LOOK_AHEAD and above have none.
 """
 
 from __future__ import annotations
 
 import numba
+import numpy as np
 
 LOOK_AHEAD = 3
 
@@ -101,7 +102,7 @@ def push(queue, state, f, first, second, rank):
 
 @numba.njit(cache=True)
 def pop(queue, state):
-    """Take the next entry; there is one, WAITING > 0.  It can be read until the next is pushed."""
+    """Take the next entry, of which there is one: return its f, its two numbers and its rank."""
     entry_f, entries, heap_f, heap, ranks = queue
     while ranks[state[LOWEST], COUNT] == 0:
         state[LOWEST] += 1
@@ -117,4 +118,5 @@ def pop(queue, state):
     state[WAITING] -= 1
     entries[entry, NEXT] = state[FREE]
     state[FREE] = entry
-    return entry
+    first, second = np.int64(entries[entry, FIRST]), np.int64(entries[entry, SECOND])
+    return entry_f[entry], first, second, np.int64(entries[entry, RANK])

@@ -12,16 +12,26 @@ from __future__ import annotations
 import math
 
 import numba
-import numpy as np
 
 from anatomy.kernels.arcs import pose_on_arc
 from stages.needle.kernels.connections import seen_from
-from stages.needle.kernels.cost import LEAST_RATE, cost_of_arc
+from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.goal_ball import least_length, shortest_into_ball, single_into_ball
-from stages.needle.kernels.limits import COST_STEP, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN, TINY
+from stages.needle.kernels.limits import (
+    COST_STEP,
+    GOAL_TOLERANCE,
+    KAPPA,
+    MAX_ANGLE,
+    MAX_LENGTH,
+    MAX_TURN,
+    TINY,
+)
 from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.kernels.rank_queue import FIRST, RANK, SECOND, WAITING, pop, push
+from stages.needle.kernels.rank_queue import WAITING, pop, push
 from stages.needle.kernels.tree import angle_kept
+
+inner_kernel = numba.njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""For what only kernels call: without the entrances from Python it takes less time to compile."""
 
 ROUNDING = 1e-9
 """Share of the best cost by which a path must be cheaper to be looked for."""
@@ -68,7 +78,7 @@ FULL_OF_NODES = 3
 FULL_OF_ENTRIES = 4
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _pose(nodes, at):
     return nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3], nodes[at, 4], nodes[at, 5]
 
@@ -89,9 +99,9 @@ def bend_of(nodes, rolls, kappa, at, direction):
     )
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _follow(nodes, words, bend, at, direction, steps, row):
-    """Fill a row with the pose and the first direction of bending, carried without twist, after a primitive."""
+    """Fill a row with the pose after a primitive, and the first direction of bending carried there."""
     fine_mm, rolls, arcs = words[0], words[1], words[2]
     if direction == rolls.shape[0]:
         length = steps * fine_mm
@@ -124,27 +134,44 @@ def _follow(nodes, words, bend, at, direction, steps, row):
         nodes[row, NORMAL + m] *= scale
 
 
-@numba.njit(cache=True)
-def _hash(nodes, row, cell_mm, cell_tangent):
-    """Return a number, at least 0, of the cell that holds a node's pose."""
+@inner_kernel
+def _hash(nodes, row, merge, across):
+    """Return a number, at least 0, of the cell that holds a node's pose.
+
+    Of the cell across the nearest face instead, along each axis whose bit is set in `across`.
+    """
     h = 0
     for m in range(6):
-        cell = int(math.floor(nodes[row, m] / (cell_mm if m < 3 else cell_tangent)))
-        h = (h ^ cell) * 0x2545F4914F6CDD1D
+        size = merge[0] if m < 3 else merge[1]
+        cell = math.floor(nodes[row, m] / size)
+        if across >> m & 1:
+            cell += 1.0 if nodes[row, m] / size - cell > 0.5 else -1.0
+        h = (h ^ int(cell)) * 0x2545F4914F6CDD1D
         h ^= h >> 29
     return h & 0x7FFFFFFFFFFFFFFF
 
 
-@numba.njit(cache=True)
-def _in_one_cell(nodes, a, b, cell_mm, cell_tangent):
+@inner_kernel
+def _at_faces(nodes, row, merge):
+    """Return the axes, as bits, along which an equal pose may lie in the next cell."""
+    bits = 0
     for m in range(6):
-        size = cell_mm if m < 3 else cell_tangent
+        size = merge[0] if m < 3 else merge[1]
+        if math.floor((nodes[row, m] - SAME) / size) != math.floor((nodes[row, m] + SAME) / size):
+            bits |= 1 << m
+    return bits
+
+
+@inner_kernel
+def _in_one_cell(nodes, a, b, merge):
+    for m in range(6):
+        size = merge[0] if m < 3 else merge[1]
         if math.floor(nodes[a, m] / size) != math.floor(nodes[b, m] / size):
             return False
     return True
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _equal(nodes, a, b, n_rolls):
     """Tell whether two poses are equal up to rounding, and their directions of bending are the same set."""
     for m in range(6):
@@ -159,7 +186,7 @@ def _equal(nodes, a, b, n_rolls):
     return abs(rolls - round(rolls)) < n_rolls * SAME
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _no_worse(nodes, a, b):
     """Tell whether what can follow node `b` can follow node `a` at no more cost; their poses are equal."""
     return (
@@ -169,27 +196,37 @@ def _no_worse(nodes, a, b):
     )
 
 
-@numba.njit(cache=True)
-def find_duplicate(nodes, seen, merge, n_rolls, row):
-    """Look for a node that makes a row superfluous: return a slot of the hash table, and whether there is one.
-
-    The slot is the row's own: free, or that of a node which the row makes superfluous.  See `search_words`.
-    """
-    cell_mm, cell_tangent, whole_cells = merge
-    last = seen.shape[0] - 1
-    slot = _hash(nodes, row, cell_mm, cell_tangent) & last
+@inner_kernel
+def _in_chain(nodes, seen, merge, n_rolls, row, slot):
+    """Look through the nodes that the hash table holds from a slot on; see `find_duplicate`."""
     while seen[slot] != 0:
         kept = seen[slot] - 1
-        if whole_cells:
-            if _in_one_cell(nodes, kept, row, cell_mm, cell_tangent):
+        if merge[2]:
+            if _in_one_cell(nodes, kept, row, merge):
                 return slot, nodes[kept, PATH_COST] <= nodes[row, PATH_COST] * (1.0 + ROUNDING)
         elif _equal(nodes, kept, row, n_rolls):
             if _no_worse(nodes, kept, row):
                 return slot, True
             if _no_worse(nodes, row, kept):
                 return slot, False
-        slot = (slot + 1) & last
+        slot = (slot + 1) & (seen.shape[0] - 1)
     return slot, False
+
+
+@numba.njit(cache=True)
+def find_duplicate(nodes, seen, merge, n_rolls, row):
+    """Return the slot of a row in the hash table, and whether a node there makes the row superfluous.
+
+    Else the slot is free, or that of a node which the row makes superfluous.  See `search_words`.
+    """
+    last = seen.shape[0] - 1
+    slot, duplicate = _in_chain(nodes, seen, merge, n_rolls, row, _hash(nodes, row, merge, 0) & last)
+    faces = 0 if merge[2] or duplicate else _at_faces(nodes, row, merge)
+    for across in range(1, faces + 1):
+        if across & ~faces == 0 and not duplicate:
+            begin = _hash(nodes, row, merge, across) & last
+            duplicate = _in_chain(nodes, seen, merge, n_rolls, row, begin)[1]
+    return slot, duplicate
 
 
 @numba.njit(cache=True)
@@ -198,26 +235,29 @@ def rehash(nodes, merge, seen, larger):
     last = larger.shape[0] - 1
     for m in range(seen.shape[0]):
         if seen[m] != 0:
-            slot = _hash(nodes, seen[m] - 1, merge[0], merge[1]) & last
+            slot = _hash(nodes, seen[m] - 1, merge, 0) & last
             while larger[slot] != 0:
                 slot = (slot + 1) & last
             larger[slot] = seen[m]
 
 
-@numba.njit(cache=True)
-def _estimate(nodes, row, rate, goal, limits, reference):
+@inner_kernel
+def _estimate(nodes, row, rates, goal, limits, reference):
     """Return a cost below which no path within the limits leads by a node to the goal; inf if none does."""
     rho, h = seen_from(_pose(nodes, row), goal)
     cosine = nodes[row, 3] * reference[0] + nodes[row, 4] * reference[1] + nodes[row, 5] * reference[2]
     ahead = least_length(rho, h, limits, cosine, limits[MAX_TURN] - nodes[row, PATH_TURN])
     if nodes[row, PATH_LENGTH] + ahead > limits[MAX_LENGTH] + TINY:
         return math.inf
-    return nodes[row, PATH_COST] + rate * ahead
+    missing = limits[GOAL_TOLERANCE] if ahead > 0.0 else math.hypot(rho, h)
+    return nodes[row, PATH_COST] + rates[0] * ahead + rates[1] * missing
 
 
-@numba.njit(cache=True)
-def _push_level(limits, rate, goal, reference, words, merge, store, queue, state, counts, at, level, f, most):
-    """Push the primitives of a level from node `at`, and an entry for the next level, as good as the best of them.
+@inner_kernel
+def _push_level(
+    limits, rates, goal, reference, words, merge, store, queue, state, counts, at, level, f, most
+):
+    """Push the primitives of a level from node `at`, and as good as the best of them one for the next level.
 
     Passed over are those from whose end no path within the limits leads to the goal for less than `most`,
     with all longer ones; those longer than a refused one; and, where a cell's poses count as one, those that
@@ -241,7 +281,7 @@ def _push_level(limits, rate, goal, reference, words, merge, store, queue, state
         turn = bend[0] * length
         nodes[row, PATH_LENGTH] = nodes[at, PATH_LENGTH] + length
         nodes[row, PATH_TURN] = nodes[at, PATH_TURN] + turn
-        nodes[row, PATH_COST] = nodes[at, PATH_COST] + rate * length
+        nodes[row, PATH_COST] = nodes[at, PATH_COST] + rates[0] * length
         within = nodes[row, PATH_TURN] <= limits[MAX_TURN] + TINY
         # The cosine of an angle falls by no more than the arc turns.
         if within and forward - turn < least:
@@ -249,7 +289,7 @@ def _push_level(limits, rate, goal, reference, words, merge, store, queue, state
         estimate = math.inf
         if within:
             _follow(nodes, words, bend, at, direction, steps, row)
-            estimate = _estimate(nodes, row, rate, goal, limits, reference)
+            estimate = _estimate(nodes, row, rates, goal, limits, reference)
         if estimate >= most:
             counts[PRUNED] += 1
             proved[at, direction, USELESS] = steps
@@ -263,10 +303,11 @@ def _push_level(limits, rate, goal, reference, words, merge, store, queue, state
         push(queue, state, f, at, -(level + 1), rank + 1)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _add(
-    space, limits, objective, branch, goal, reference, words, merge, store, counts, at, primitive, rank, most
-):
+    space, limits, objective, rates, branch, goal, reference, words, merge, store, counts, at, primitive,
+    rank, most,
+):  # fmt: skip
     """Make the node at the end of a primitive from node `at`; return its estimate, inf if there is none.
 
     The primitive is proved clear as a whole, or is the first part of one that was.
@@ -274,7 +315,6 @@ def _add(
     nodes, links, proved, seen = store
     fine_mm, rolls, arcs = words[0], words[1], words[2]
     n_rolls, full, row = rolls.shape[0], arcs.shape[0] - 1, counts[NODES]
-    rate = objective[0][LEAST_RATE]
     direction, steps = primitive // (full + 1), primitive % (full + 1)
     if steps >= proved[at, direction, USELESS]:
         return math.inf
@@ -283,7 +323,7 @@ def _add(
     _follow(nodes, words, bend, at, direction, steps, row)
     nodes[row, PATH_LENGTH] = nodes[at, PATH_LENGTH] + length
     nodes[row, PATH_TURN] = nodes[at, PATH_TURN] + bend[0] * length
-    nodes[row, PATH_COST] = nodes[at, PATH_COST] + rate * length
+    nodes[row, PATH_COST] = nodes[at, PATH_COST] + rates[0] * length
     slot, duplicate = find_duplicate(nodes, seen, merge, n_rolls, row)
     if duplicate:
         counts[DUPLICATES] += 1
@@ -296,13 +336,13 @@ def _add(
             return math.inf
         proved[at, direction, CLEAR] = steps
     cost = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, at == 0)
-    if cost > rate * length:
+    if cost > rates[0] * length:
         nodes[row, PATH_COST] = nodes[at, PATH_COST] + cost
         slot, duplicate = find_duplicate(nodes, seen, merge, n_rolls, row)
         if duplicate:
             counts[DUPLICATES] += 1
             return math.inf
-    estimate = _estimate(nodes, row, rate, goal, limits, reference)
+    estimate = _estimate(nodes, row, rates, goal, limits, reference)
     if estimate >= most:
         counts[PRUNED] += 1
         return math.inf
@@ -318,64 +358,68 @@ def _add(
     return estimate
 
 
-@numba.njit(cache=True)
-def _cost_by(space, limits, objective, branch, reference, nodes, at, first, first_length, second, rest, most):
-    """Return the cost of the path by a node and on by two legs; inf if it is refused or not below `most`."""
-    pose = _pose(nodes, at)
-    middle = pose_on_arc(pose, first, first_length)
-    cost, length = nodes[at, PATH_COST], nodes[at, PATH_LENGTH]
-    turn = nodes[at, PATH_TURN] + first[0] * first_length + second[0] * rest
-    if not (
-        length + first_length + rest <= limits[MAX_LENGTH] + TINY
-        and turn <= limits[MAX_TURN] + TINY
-        and cost + objective[0][LEAST_RATE] * (first_length + rest) < most
-        and angle_kept(limits, reference, pose, first, first[0] * first_length)[0]
-        and angle_kept(limits, reference, middle, second, second[0] * rest)[0]
-    ):
-        return math.inf
-    is_start = at == 0
-    for leg in range(2):
-        if leg == 1:
-            pose, first, first_length = middle, second, rest
-        if first_length == 0.0:
-            continue
-        if blocker_on_arc(space, limits, pose, first, first_length, length, branch) != 0:
-            return math.inf
-        cost += cost_of_arc(space, objective, limits[COST_STEP], pose, first, first_length, is_start)
-        length += first_length
-        is_start = False
-    return cost if cost < most else math.inf
+@inner_kernel
+def _connect(space, limits, objective, rates, branch, goal, reference, nodes, best, at, cost):
+    """Try the goal from a node; keep a path cheaper than `cost` in `best`, and return the least cost.
 
-
-@numba.njit(cache=True)
-def _connect(space, limits, objective, branch, goal, reference, nodes, best, at, cost):
-    """Try the goal from a node; keep a path cheaper than `cost` in `best`, and return the least cost."""
-    pose = _pose(nodes, at)
-    first, first_length, second, rest = shortest_into_ball(pose, goal, limits)
-    for _ in range(2):
+    A path ends where it first is within the goal tolerance, or goes on to the goal where that costs no more.
+    """
+    start = _pose(nodes, at)
+    for single in range(2):
+        first, first_length, second, second_length, ahead = shortest_into_ball(start, goal, limits)
+        if single:
+            first, first_length = single_into_ball(start, goal, limits)
+            second_length, ahead = 0.0, 0.0
+            if first_length == 0.0:
+                break
         most = cost * (1.0 - ROUNDING)
-        found = _cost_by(
-            space, limits, objective, branch, reference, nodes, at, first, first_length, second, rest, most
-        )
-        if found < most:
-            cost = found
+        found, total, missing = nodes[at, PATH_COST], math.inf, 0.0
+        begun, turn = nodes[at, PATH_LENGTH], nodes[at, PATH_TURN]
+        pose, bend, length, is_start = start, first, first_length, at == 0
+        for leg in range(3):
+            if length > 0.0:
+                turn += bend[0] * length
+                within = begun + length <= limits[MAX_LENGTH] + TINY and turn <= limits[MAX_TURN] + TINY
+                if not (
+                    within
+                    and found + rates[0] * length < most
+                    and angle_kept(limits, reference, pose, bend, bend[0] * length)[0]
+                    and blocker_on_arc(space, limits, pose, bend, length, begun, branch) == 0
+                ):
+                    break
+                paid = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, is_start)
+                if leg == 2:
+                    if paid <= rates[1] * missing * (1.0 + ROUNDING):
+                        total = found + paid
+                        second_length += length
+                    break
+                found += paid
+                begun += length
+                is_start = False
+                pose = pose_on_arc(pose, bend, length)
+            bend, length = second, second_length
+            if leg == 1:
+                rho, h = seen_from(pose, goal)
+                missing = math.hypot(rho, h)
+                total = found + rates[1] * missing
+                if total >= most:
+                    break
+                length = ahead
+        if total < most:
+            cost = total
             best[BEST_NODE] = at
             best[BEST_LEGS] = first_length
-            best[BEST_LEGS + LEG_SIZE] = rest
+            best[BEST_LEGS + LEG_SIZE] = second_length
             for m in range(4):
                 best[BEST_LEGS + 1 + m] = first[m]
                 best[BEST_LEGS + LEG_SIZE + 1 + m] = second[m]
-        first, first_length = single_into_ball(pose, goal, limits)
-        rest = 0.0
-        if first_length == 0.0:
-            break
     return cost
 
 
 @numba.njit(cache=True, nogil=True)
 def search_words(
-    space, limits, objective, branch, goal, reference, words, merge, store, queue, state, counts, best, cost,
-    pops,
+    space, limits, objective, rates, branch, goal, reference, words, merge, store, queue, state, counts, best,
+    cost, pops,
 ):  # fmt: skip
     """Go on with the search for up to `pops` entries, or until a cheaper path is found.
 
@@ -383,6 +427,9 @@ def search_words(
     ----------
     space, limits, objective : tuple, (N_LIMITS,) float64, tuple
         See `proof`, `limits` and `cost`.
+    rates : tuple of float
+        Least cost of a mm of path, and what each mm costs by which the path ends short of the goal; no
+        more than the former.
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
     goal : (3,) float64, LPS mm
@@ -415,8 +462,7 @@ def search_words(
     reason, cost : int, float
         SPENT, BETTER, EXHAUSTED, or which arrays have to grow; cost of the best path.
     """
-    nodes, entry_f, entries = store[0], queue[0], queue[1]
-    rate = objective[0][LEAST_RATE]
+    nodes, entries = store[0], queue[1]
     room = words[3].shape[0] + 1
     stop = counts[POPS] + pops
     better = False
@@ -429,41 +475,39 @@ def search_words(
         most = cost * (1.0 - ROUNDING)
         at, level = 0, 0
         if counts[POPS] == 0:
-            f = _estimate(nodes, at, rate, goal, limits, reference)
+            f = _estimate(nodes, at, rates, goal, limits, reference)
             bend = bend_of(nodes, words[1], limits[KAPPA], at, words[1].shape[0])
-            if (
-                blocker_on_arc(space, limits, _pose(nodes, at), bend, 0.0, nodes[at, PATH_LENGTH], branch)
-                != 0
-            ):
+            begun = nodes[at, PATH_LENGTH]
+            if blocker_on_arc(space, limits, _pose(nodes, at), bend, 0.0, begun, branch) != 0:
                 f = math.inf
+            slot, _duplicate = find_duplicate(nodes, store[3], merge, words[1].shape[0], at)
+            store[3][slot] = at + 1
         elif state[WAITING] == 0:
             return EXHAUSTED, cost
         else:
-            entry = pop(queue, state)
-            f = entry_f[entry]
-            at, primitive = np.int64(entries[entry, FIRST]), np.int64(entries[entry, SECOND])
+            f, at, primitive, rank = pop(queue, state)
             level = max(-primitive, 0)
             if level > 0:
-                f = _estimate(nodes, at, rate, goal, limits, reference)
+                f = _estimate(nodes, at, rates, goal, limits, reference)
             if f >= most:
                 counts[PRUNED] += 1
                 f = math.inf
             elif primitive >= 0:
                 f = _add(
-                    space, limits, objective, branch, goal, reference, words, merge, store, counts, at,
-                    primitive, np.int64(entries[entry, RANK]), most,
+                    space, limits, objective, rates, branch, goal, reference, words, merge, store, counts, at,
+                    primitive, rank, most,
                 )  # fmt: skip
                 at = counts[NODES] - 1
         counts[POPS] += 1
         if f == math.inf:
             continue
         if level == 0:
-            found = _connect(space, limits, objective, branch, goal, reference, nodes, best, at, cost)
+            found = _connect(space, limits, objective, rates, branch, goal, reference, nodes, best, at, cost)
             better = found < cost
             cost = found
             most = cost * (1.0 - ROUNDING)
         if f < most:
             _push_level(
-                limits, rate, goal, reference, words, merge, store, queue, state, counts, at, level, f, most
+                limits, rates, goal, reference, words, merge, store, queue, state, counts, at, level, f, most
             )
     return BETTER if better else SPENT, cost

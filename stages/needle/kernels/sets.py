@@ -1,7 +1,7 @@
 """Sets of needle states on planes, as bitmaps: the moves of `stages.needle.certificate`.
 
 A plane's states are cells of direction and lateral position: `bits[v, u, y, word]`, with directions in rows v
-and columns u, positions in rows y and columns x, of which 64 share a word.  `window` (4,) int64 holds the cell
+and columns u, positions in rows y and columns x, of which 64 share a word.  `window` (4,) holds the cell
 numbers (v, u, y, x) of the first cell.  Direction (v, u) is the slope `first slope + (v, u) * slope cell`;
 position (y, x) lies `(y, x) * cell` beside the tangent of the start.  Cells are `2 cell / slope cell` apart
 in depth, so that half a slab with a slope (v, u) moves a position by (v, u) cells and nothing is rounded.
@@ -28,7 +28,7 @@ KAPPA = 4
 TOP_SINE = 5
 SCALE_SIZE = 6
 
-# What `ends` holds: distance from start to target, goal tolerance, and of the spindle the depth of the middle,
+# What `ends` holds: distance from start to target, goal tolerance; of the spindle the depth of its middle,
 # how far aside of it the centres of its arcs lie, and their radius (infinite: no spindle), all in mm.
 TOTAL = 0
 TOLERANCE = 1
@@ -128,7 +128,7 @@ def spread(target, source, first, last, width, shift, scratch):
 
 @numba.njit(cache=True)
 def dilate(target, source, box, square, disc, dy, dx, scratch, row):
-    """OR a bitmap into another, moved by whole cells and dilated by a square of half side `square` and a disc.
+    """OR a bitmap into another, moved by whole cells, dilated by a square of half side `square` and a disc.
 
     Both in cells, any fraction.  A cell is reached if its centre is: the caller adds what a cell is wide.
 
@@ -233,7 +233,7 @@ def largest_aside(sine, scale, depth, low, high):
 
 
 @numba.njit(cache=True)
-def table_shape(now, now_window, reach):
+def table_shape(now, reach):
     """Return the shape of the table of `step_sets`: levels, directions, rows and words half-way."""
     nv, nu, rows, words = now.shape
     levels = 1
@@ -280,7 +280,7 @@ def step_sets(now, now_window, scale, depth, way, blur, edges, out, out_window):
     nv, nu = now.shape[0], now.shape[1]
     to_v, to_u, rows, words = out.shape
     most = largest_reach(scale, depth, blur, out_window, to_v, to_u)
-    levels, _nv, _nu, mid_rows, mid_words = table_shape(now, now_window, most)
+    levels, _nv, _nu, mid_rows, mid_words = table_shape(now, most)
     table = np.zeros((levels, nv, nu, mid_rows, mid_words), np.uint64)
     boxes = np.zeros((levels, nv, nu, 4), np.int64)
     boxes[..., 1] = -1
@@ -414,7 +414,7 @@ def hope_of_place(h, y, x, scale, ends):
 
 @numba.njit(cache=True)
 def _hope_of_state(h, y, x, slope_v, slope_u, blur, scale, ends):
-    """Return the same for a state; `blur` is the angle by which a cell's directions differ from its centre's."""
+    """Return the same for a state; `blur` is the angle between a cell's directions and its centre's."""
     radius = 1.0 / scale[KAPPA]
     norm = math.sqrt(1.0 + slope_v * slope_v + slope_u * slope_u)
     aside2 = y * y + x * x
@@ -446,13 +446,6 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
         row and column.
     max_angle : float
         That limit, rad.
-
-    Returns
-    -------
-    kept : int
-        States kept.
-    steepest : float
-        Largest sine in their cells.
     """
     nv, nu, rows, words = states.shape
     cell = scale[CELL]
@@ -465,8 +458,7 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
             side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
             hope = hope_of_place(depth, side_y, side_x, scale, ends) + HALF_DIAGONAL * cell
             x = _set_run(possible[y], x, hope, cell)
-    kept = 0
-    steepest = 0.0
+    box = np.zeros(4, np.int64)
     row = np.zeros(words, np.uint64)
     for v in range(nv):
         for u in range(nu):
@@ -478,37 +470,36 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
             if least > top or math.acos(max(min(cosine, 1.0), -1.0)) - blur > max_angle + SPARE:
                 states[v, u] = 0
                 continue
-            here = 0
             for y in range(rows):
-                first = -1
-                last = -1
                 for w in range(words):
                     states[v, u, y, w] &= possible[y, w]
-                    if states[v, u, y, w] != 0:
-                        last = w
-                        if first < 0:
-                            first = w
-                if first < 0:
-                    continue
-                row[first : last + 1] = 0
+            if not find_box(states[v, u], box):
+                continue
+            # All of the box may be decided by the hope at its middle.
+            middle_y = (0.5 * (box[0] + box[1]) + window[2]) * cell + depth * scale[FIRST_V]
+            middle_x = (32.0 * (box[2] + box[3] + 1) - 0.5 + window[3]) * cell + depth * scale[FIRST_U]
+            away = 0.5 * cell * math.hypot(box[1] - box[0], 64.0 * (box[3] - box[2] + 1))
+            hope = _hope_of_state(depth, middle_y, middle_x, slope_v, slope_u, blur, scale, ends)
+            if hope >= (1.0 + blur) * away:
+                continue
+            if hope < -(1.0 + blur) * away:
+                states[v, u] = 0
+                continue
+            for y in range(box[0], box[1] + 1):
+                row[box[2] : box[3] + 1] = 0
                 side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
-                x = 64 * first
-                while x < 64 * (last + 1):
+                x = 64 * box[2]
+                while x < 64 * (box[3] + 1):
                     side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
                     hope = _hope_of_state(depth, side_y, side_x, slope_v, slope_u, blur, scale, ends)
-                    x = _set_run(row[: last + 1], x, hope, (1.0 + blur) * cell)
-                for w in range(first, last + 1):
+                    x = _set_run(row[: box[3] + 1], x, hope, (1.0 + blur) * cell)
+                for w in range(box[2], box[3] + 1):
                     states[v, u, y, w] &= row[w]
-                    here += _count(states[v, u, y, w])
-            if here > 0:
-                kept += here
-                steepest = max(steepest, slope + HALF_DIAGONAL * scale[SLOPE_CELL])
-    return kept, steepest / math.sqrt(1.0 + steepest * steepest)
 
 
 @numba.njit(cache=True)
 def _set_run(row, x, hope, step):
-    """Set the bits from `x` on to whether there is hope, as far as it cannot change sign; return where that is.
+    """Set the bits from `x` on to whether there is hope, as far as its sign is sure; return where that ends.
 
     Hope changes by at most `step` from bit to bit.
     """
@@ -524,15 +515,6 @@ def _set_run(row, x, hope, step):
             value &= ALL >> np.uint64(64 * (w + 1) - end)
         row[w] |= value
     return end
-
-
-@numba.njit(cache=True)
-def _count(word):
-    """Return the number of bits set."""
-    word = word - ((word >> ONE) & np.uint64(0x5555555555555555))
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
 @numba.njit(cache=True)
@@ -681,10 +663,11 @@ def extent(states, out):
 
 
 @numba.njit(cache=True)
-def refine(coarse, out):
+def refine(coarse, halve_slopes, out):
     """Set the cells that overlap or touch a cell, twice as wide, that is set in `coarse` (V, U, Y, W).
 
-    `out` is (2 V + 1, 2 U + 1, 2 Y + 1, 2 W + 1) and starts at twice the cell number less one.
+    `out` is (2 V + 1, 2 U + 1, 2 Y + 1, 2 W + 1) and starts at twice the cell number less one.  Unless
+    `halve_slopes`, the cells of directions stay, and so do the first two numbers of shape and start.
     """
     nv, nu, rows, words = coarse.shape
     box = np.zeros(4, np.int64)
@@ -702,8 +685,8 @@ def refine(coarse, out):
                     for to in range(2 * y, 2 * y + 3):
                         wide[to, w] |= value
                         wide[to, w + 1] |= beyond
-            for to_v in range(2 * v, 2 * v + 3):
-                for to_u in range(2 * u, 2 * u + 3):
+            for to_v in range(2 * v if halve_slopes else v, 2 * v + 3 if halve_slopes else v + 1):
+                for to_u in range(2 * u if halve_slopes else u, 2 * u + 3 if halve_slopes else u + 1):
                     for y in range(2 * box[0], 2 * box[1] + 3):
                         for w in range(2 * box[2], 2 * box[3] + 3):
                             out[to_v, to_u, y, w] |= wide[y, w]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,9 +20,9 @@ from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 
 CLEARANCE_MM = 1.0
-SAMPLE_MM = 0.05
+SAMPLE_MM = 0.1
 SURE_MM = 0.5 * SAMPLE_MM + 0.01
-"""Clearance to spare at samples that rules out any refusal: half their distance, and what a proof gives up."""
+"""Clearance to spare at samples that rules out a refusal: half their distance, and what a proof gives up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,16 +120,36 @@ def wall(z_mm: float, hole: tuple[float, float, float, float] | None = None) -> 
     ]
 
 
-HOLES = {-10.0: (2.0, 5.5, -2.0, 2.0), 4.0: (-3.0, 0.5, -2.0, 2.0), 16.0: (-1.5, 2.0, -2.0, 2.0)}
-"""Holes of the three walls of a maze, by their height."""
+WAY = ((0.0, 12.0), (math.pi, 24.0), (None, 4.0), (0.0, 8.0))
+"""Roll in rad (None: straight) and length in mm of the pieces of the one way through the winding maze."""
+HOLE_MM = 2.5
+"""Half a hole of the winding maze."""
 
 
-def winding_maze(closed: float | None = None) -> Maze:
-    """Return a maze whose only way leads through three holes that lie aside of each other."""
-    blocks = []
-    for z, hole in HOLES.items():
-        blocks += wall(z, None if z == closed else hole)
-    return in_box(blocks)
+def winding_maze(closed: int | None = None) -> tuple[Maze, list[tuple[float, tuple[float, ...]]]]:
+    """Return a maze whose only way leads through three holes aside of each other, and its walls with holes.
+
+    The holes lie about the points where WAY is after 16, 28 and 44 mm; the target, 6 mm straight ahead of
+    its end.  One of the walls may be `closed`.
+    """
+    maze = in_box([])
+    frames = maze.start[None]
+    points = []
+    for roll, length in WAY:
+        kappa = 0.0 if roll is None else maze.needle.max_curvature_per_mm
+        part = arcs(frames, np.full(1, roll or 0.0), np.full(1, kappa), np.full(1, length))
+        points.append(part.points[0, 1:])
+        frames = part.frames
+    way = np.concatenate(points)
+    per_mm = len(way) / sum(length for _roll, length in WAY)
+    blocks, walls = [], []
+    for number, at in enumerate((16.0, 28.0, 44.0)):
+        x, y, z = np.round(2.0 * way[round(at * per_mm)]) / 2.0
+        hole = (x - HOLE_MM, x + HOLE_MM, y - HOLE_MM, y + HOLE_MM)
+        walls.append((float(z), hole))
+        blocks += wall(float(z), None if number == closed else hole)
+    end = frames[0]
+    return replace(in_box(blocks), target=end[:3, 3] + 6.0 * end[:3, 2]), walls
 
 
 CostAt = Callable[[Float], Float]
@@ -270,7 +290,7 @@ class Paths:
     def follow(
         self, maze: Maze, curves: Curves, lengths: Float, last: np.ndarray, cost_at: CostAt | None
     ) -> Paths:
-        """Go on by curves as far as `lengths`, sample `last`; those that break a limit have nothing to spare."""
+        """Go on by curves as far as `lengths`, sample `last`; those that break a limit spare nothing."""
         on = np.arange(curves.points.shape[1]) <= last[:, None]
         gap = np.where(on, maze.clearance(curves.points), np.inf).min(axis=1) - CLEARANCE_MM
         ahead = np.where(on, curves.tangents @ maze.start[:3, 2], 1.0).min(axis=1)
@@ -295,7 +315,12 @@ class Paths:
 
 
 def enumerate_words(
-    maze: Maze, fine_mm: float, rolls: int, most_steps: int, cost_at: CostAt | None = None
+    maze: Maze,
+    fine_mm: float,
+    rolls: int,
+    most_steps: int,
+    cost_at: CostAt | None = None,
+    least: float = 1.0,
 ) -> Enumeration:
     """Try the goal from the end of every word of up to `most_steps` single steps.
 
@@ -309,6 +334,8 @@ def enumerate_words(
     most_steps : int
     cost_at : function, optional
         Cost of a mm at points `(..., 3)`; by default 1.
+    least : float
+        What a mm costs by which a path ends short of the target.
     """
     kappa = maze.needle.max_curvature_per_mm
     paths = Paths(maze.start[None], np.zeros(1), np.zeros(1), np.zeros(1), np.full(1, np.inf))
@@ -319,8 +346,10 @@ def enumerate_words(
         for curves in connections(paths.frames, maze.target, kappa, maze.needle.max_length_mm):
             lengths, last = into_ball(curves, maze.target, maze.goal_tolerance_mm)
             ends = paths.follow(maze, curves, lengths, last, cost_at)
-            possible = min(possible, float(ends.cost[ends.spare >= 0.0].min(initial=math.inf)))
-            sure = min(sure, float(ends.cost[ends.spare >= SURE_MM].min(initial=math.inf)))
+            missing = np.linalg.norm(paths.frames[:, :3, 3] - maze.target, axis=-1)
+            costs = ends.cost + least * np.minimum(missing, maze.goal_tolerance_mm)
+            possible = min(possible, float(costs[ends.spare >= 0.0].min(initial=math.inf)))
+            sure = min(sure, float(costs[ends.spare >= SURE_MM].min(initial=math.inf)))
         if step < most_steps:
             paths = _longer(paths, maze, fine_mm, rolls, cost_at)
     return Enumeration(sure, possible, words)

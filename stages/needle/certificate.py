@@ -41,6 +41,11 @@ PROBES_PER_DEPTH = 8
 SLACK_RATIO = 1.08
 """Of the amounts of missing clearance that are told apart."""
 SLACKS = 48
+LARGEST_DEPTH_MM = 12.5
+LEAST_KAPPA = 1e-5
+"""In 1/mm; what bends less is taken to bend so much, for the sake of rounding."""
+LEAST_WAY_MM = 1e-3
+ROUNDING = 1e-8
 STEEPEST = 0.995
 """Largest sine of the angle between paths and the planes' normal for which planes are tried."""
 MAX_BYTES = 1 << 30
@@ -119,10 +124,11 @@ class NoPathProof:
         self._max_bytes = max_bytes
         self._required = float(space.limits[index.REQUIRED])
         self._exempt_mm = float(space.limits[index.EXEMPT_LENGTH]) - query.inserted_mm
-        self._kappa = float(space.limits[index.KAPPA]) * (1.0 + sets.SPARE)
-        self._tolerance = space.goal_tolerance_mm
+        self._kappa = max(float(space.limits[index.KAPPA]) * (1.0 + ROUNDING), LEAST_KAPPA)
+        self._tolerance = space.goal_tolerance_mm + sets.SPARE
         self._planes: list[Plane] = []
         self._coarse: list[Plane] = []
+        self._too_steep = False
         self._steps = self._run()
 
     def advance(self) -> bool:
@@ -166,79 +172,90 @@ class NoPathProof:
         start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
         chord = query.target - start
         total = float(np.linalg.norm(chord))
-        turn = min(
-            space.limits[index.MAX_TURN] - query.turned_rad,
-            self._kappa * (space.limits[index.MAX_LENGTH] - query.inserted_mm),
-        )
+        length = float(space.limits[index.MAX_LENGTH]) - query.inserted_mm + sets.SPARE
+        turn = min(float(space.limits[index.MAX_TURN]) - query.turned_rad, self._kappa * length)
         if space.limits[index.LOOKUP_STEP] > 0.0:
             self._end("undecided", "paths of this space need not be clear")
-            return
-        if turn > math.pi + 1e-6:
+        elif turn > math.pi * (1.0 + ROUNDING):
             self._end("undecided", "the needle may turn by more than 180 degrees in all")
-            return
-        if total <= self._tolerance + sets.SPARE:
+        elif total <= self._tolerance + LEAST_WAY_MM:
             self._end("undecided", "the target lies at the start")
-            return
-        normal = chord / total
-        column = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-        column /= np.linalg.norm(column)
-        self._frame = np.stack([start, normal, np.cross(normal, column), column])
-        radius = 1.0 / self._kappa
-        ahead = float(chord @ forward)
-        hope = sets.escape_depth(math.sqrt(max(total**2 - ahead**2, 0.0)), ahead, radius)
-        if hope + self._tolerance + 1e-4 < 0.0:
-            self._end("no path", "the target lies outside the workspace of the start")
+        elif total - self._tolerance > length:
+            self._end("no path", "the target is farther than the needle is long")
         elif self._clearance_at_most(start) < self._required - sets.SPARE:
             self._end("no path", "the start is too near to obstacles")
-        self._ends = np.zeros(sets.ENDS_SIZE)
-        self._ends[: sets.SPINDLE_MIDDLE] = total, self._tolerance
-        longest = total + self._tolerance
-        self._ends[sets.SPINDLE_RADIUS] = math.inf
-        self._steepest = 1.0
-        if longest < 2.0 * radius and self._tolerance < total:
-            tilt = math.asin(self._tolerance / total)
-            offset = math.sqrt(radius**2 - 0.25 * longest**2)
-            self._ends[sets.SPINDLE_MIDDLE :] = 0.5 * longest, offset, radius + longest * tilt
-            self._steepest = math.sin(min(math.asin(0.5 * longest / radius) + tilt + 1e-6, 0.5 * math.pi))
-        local = self._frame[1:] @ forward
-        self._scale = np.zeros(sets.SCALE_SIZE)
-        self._scale[sets.FIRST_V : sets.FIRST_U + 1] = local[1:] / local[0] if local[0] != 0.0 else 0.0
-        self._scale[sets.KAPPA] = self._kappa
-        self._along = float(local[0])
+        else:
+            ahead = float(chord @ forward)
+            aside = math.sqrt(max(total**2 - ahead**2, 0.0))
+            if sets.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_WAY_MM:
+                self._end("no path", "the target lies outside the workspace of the start")
+        if self.outcome == "running":
+            normal = chord / total
+            column = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+            column /= np.linalg.norm(column)
+            self._frame = np.stack([start, normal, np.cross(normal, column), column])
+            self._bound(total, length)
 
     def _clearance_at_most(self, point: Float) -> float:
         exempt = self._query.branch if self._exempt_mm > 0.0 else -1
         return float(sets.clearance_above(self._space.arrays, self._required, 0.0, exempt, *point))
 
+    def _bound(self, total: float, length: float) -> None:
+        """Bound the places and the angle to the line that a path of at most `length` mm can have."""
+        radius = 1.0 / self._kappa
+        widest = total + self._tolerance
+        self._ends = np.zeros(sets.ENDS_SIZE)
+        self._ends[: sets.LONGEST] = total, self._tolerance
+        self._ends[sets.SPINDLE_RADIUS] = math.inf
+        self._steepest = 1.0
+        longest = length
+        if widest < 2.0 * radius:
+            half = math.asin(0.5 * widest / radius)
+            tilt = math.asin(self._tolerance / total)
+            offset = radius * math.cos(half)
+            self._ends[sets.SPINDLE_MIDDLE :] = 0.5 * widest, offset, radius + widest * tilt
+            self._steepest = math.sin(min(half + tilt + ROUNDING, 0.5 * math.pi))
+            longest = min(longest, 2.0 * half * radius)
+        longest += self._tolerance
+        self._ends[sets.LONGEST] = longest
+        self._aside = 0.5 * math.sqrt(longest**2 - total**2) + sets.SPARE
+        self._before = 0.5 * (longest - total) + sets.SPARE
+        if widest < 2.0 * radius:
+            self._aside = min(self._aside, radius + widest * tilt - offset)
+        local = self._frame[1:] @ self._query.lps_from_start[:3, 2]
+        self._along = float(local[0])
+        self._scale = np.zeros(sets.SCALE_SIZE)
+        self._scale[sets.KAPPA] = self._kappa
+        if self._along > 0.0:
+            self._scale[sets.FIRST_V : sets.FIRST_U + 1] = local[1:] / local[0]
+
     def _parted(self, side: float) -> bool:
         """Tell whether cubes that no path can pass part the target from the start."""
-        total, tolerance = self._ends[sets.TOTAL], self._ends[sets.TOLERANCE]
-        aside = self._ends[sets.SPINDLE_RADIUS] - self._ends[sets.SPINDLE_OFFSET]
-        if not aside < math.inf or self._along <= 0.0:
+        if self._along <= 0.0:
             return False
-        before = math.ceil((self._ends[sets.SPINDLE_RADIUS] + side) / side)
-        before = math.ceil((aside + side) / side) if before > aside / side else before
-        beside = math.ceil((aside + side) / side)
-        beyond = math.ceil((total + 2.0 * tolerance + aside + side) / side)
-        low = np.array([-before, -beside, -beside])
-        shape = np.array([before + beyond, 2 * beside, 2 * beside]) + 1
-        size = int(np.prod(shape))
+        beside = math.ceil(self._aside / side) + 1
+        before = math.ceil(self._before / side) + 1
+        shape = (
+            np.array([before + math.ceil(self._ends[sets.TOTAL] / side) + before, 2 * beside, 2 * beside]) + 1
+        )
+        size = math.prod(int(n) for n in shape)
         if 5 * size > self._max_bytes or size >= 1 << 31:
             return False
         return not sets.flood(
             self._space.arrays, self._required, self._query.branch, self._exempt_mm, self._scale, self._ends,
-            self._frame, side, low, np.zeros(shape, dtype=np.bool_), np.zeros(size, dtype=np.int32),
+            self._frame, side, np.array([-before, -beside, -beside]), np.zeros(shape, dtype=np.bool_),
+            np.zeros(size, dtype=np.int32),
         )  # fmt: skip
 
     def _aim_planes(self) -> None:
-        """Choose the planes and the first cells."""
-        last = self._ends[sets.TOTAL] - self._tolerance
-        self._count = max(1, math.ceil(last * self._kappa / DEPTH_SHARE))
+        """Choose the planes and the direction from which the limit of the angle counts."""
+        last = float(self._ends[sets.TOTAL]) - self._tolerance
+        self._count = math.ceil(last / min(DEPTH_SHARE / self._kappa, LARGEST_DEPTH_MM))
         self._depth = last / self._count
         self._proved_steepest = self._steepest <= STEEPEST
         sine = self._steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
         self._scale[sets.TOP_SINE] = sine
-        if self._along <= 0.0 or math.sqrt(1.0 - min(self._along, 1.0) ** 2) >= sine:
+        if self._along <= 0.0 or math.sqrt(max(1.0 - self._along**2, 0.0)) >= sine:
             self._end("undecided", "the start looks away from the target")
         reference = self._query.reference
         if reference is None:
@@ -293,10 +310,11 @@ class NoPathProof:
         plane = plane.trimmed()
         self.states = max(self.states, int(np.bitwise_count(plane.bits).sum()))
         if not self._proved_steepest and not self._coarse and number < self._count:
-            steepest = sets.steepest_of(plane.bits, plane.window, self._scale)
-            if steepest > 1.0 - 2.0 * self._kappa * self._depth:
-                self._end("undecided", "paths may be too steep for the planes")
-                return
+            sine = sets.steepest_of(plane.bits, plane.window, self._scale)
+            self._too_steep = self._too_steep or sine > 1.0 - 2.0 * self._kappa * self._depth
+        if self._too_steep:
+            self._end("undecided", "paths may be too steep for the planes")
+            return
         self._planes.append(plane)
 
     def _backward(self, number: int) -> None:
@@ -343,7 +361,6 @@ class NoPathProof:
         top = scale[sets.TOP_SINE]
         steep = top / math.sqrt(1.0 - top * top)
         aside = math.ceil(sets.largest_aside(top, scale, self._depth, 0.0, 1e9) / self.cell_mm + 4.0)
-        widest = self._ends[sets.SPINDLE_RADIUS] - self._ends[sets.SPINDLE_OFFSET]
         least, most = low.copy(), high.copy()
         for axis in (0, 1):
             first = scale[sets.FIRST_V + axis]
@@ -354,11 +371,10 @@ class NoPathProof:
             moves = way * (low[axis] + least[axis]), way * (high[axis] + most[axis])
             least[axis + 2] += min(moves) - aside
             most[axis + 2] += max(moves) + aside
-            if widest < math.inf:
-                middle = number * self._depth * first
-                least[axis + 2] = max(least[axis + 2], math.floor((-widest - middle) / self.cell_mm) - 1)
-                most[axis + 2] = min(most[axis + 2], math.ceil((widest - middle) / self.cell_mm) + 1)
-                most[axis + 2] = max(most[axis + 2], least[axis + 2])
+            middle = number * self._depth * first
+            least[axis + 2] = max(least[axis + 2], math.floor((-self._aside - middle) / self.cell_mm) - 1)
+            most[axis + 2] = min(most[axis + 2], math.ceil((self._aside - middle) / self.cell_mm) + 1)
+            most[axis + 2] = max(most[axis + 2], least[axis + 2])
         return least, most
 
     def _require(self, size: int) -> None:

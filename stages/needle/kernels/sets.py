@@ -28,14 +28,16 @@ KAPPA = 4
 TOP_SINE = 5
 SCALE_SIZE = 6
 
-# What `ends` holds: distance from start to target, goal tolerance; of the spindle the depth of its middle,
-# how far aside of it the centres of its arcs lie, and their radius (infinite: no spindle), all in mm.
+# What `ends` holds: distance from start to target, goal tolerance, longest way from start to target by way of
+# any point of a path; of the spindle the depth of its middle, how far aside of it the centres of its arcs lie,
+# and their radius (infinite: no spindle), all in mm.
 TOTAL = 0
 TOLERANCE = 1
-SPINDLE_MIDDLE = 2
-SPINDLE_OFFSET = 3
-SPINDLE_RADIUS = 4
-ENDS_SIZE = 5
+LONGEST = 2
+SPINDLE_MIDDLE = 3
+SPINDLE_OFFSET = 4
+SPINDLE_RADIUS = 5
+ENDS_SIZE = 6
 
 ONE = np.uint64(1)
 ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -406,6 +408,8 @@ def hope_of_place(h, y, x, scale, ends):
     aside2 = y * y + x * x
     rho = math.sqrt(max(h * h + aside2 - ahead * ahead, 0.0))
     hope = escape_depth(rho, ahead, radius)
+    way = math.sqrt(h * h + aside2) + math.sqrt((ends[TOTAL] - h) ** 2 + aside2)
+    hope = min(hope, 0.5 * (ends[LONGEST] - way))
     if ends[SPINDLE_RADIUS] < math.inf:
         from_centre = math.hypot(math.sqrt(aside2) + ends[SPINDLE_OFFSET], h - ends[SPINDLE_MIDDLE])
         hope = min(hope, ends[SPINDLE_RADIUS] - from_centre)

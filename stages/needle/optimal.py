@@ -57,7 +57,7 @@ class OptimalSearch(RestartingRRT):
             return super().grow(iterations)
         query = self.query
         return optimal.grow_optimal(  # type: ignore[no-any-return]
-            self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
             self.nodes, self.parents, self.count, iterations, self.state, self.cost,
         )  # fmt: skip
 
@@ -76,7 +76,7 @@ class OptimalSearch(RestartingRRT):
             return False
         query = self.query
         arguments = (
-            self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
             self._scratch, self._scratch_parents, self._vias,
         )  # fmt: skip
         self._via_count, cost, improved = optimal.refine(

@@ -21,7 +21,7 @@ from stages.needle.kernels import resolution as kernel
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
 from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
-from stages.needle.searches import Query
+from stages.needle.searches import Query, root_of
 from stages.needle.space import NeedleSpace
 
 T = TypeVar("T", bound=np.generic)
@@ -223,9 +223,7 @@ class ResolutionSearch:
         if duplicates is not None:
             self._merge = (duplicates.position_mm, math.radians(duplicates.angle_deg), True)
         self._words = _words(self.resolution, float(space.limits[index.KAPPA]))
-        self._reference = np.array(
-            query.lps_from_start[:3, 2] if query.reference is None else query.reference, dtype=np.float64
-        )
+        self._reference = tree.reference_of(root_of(query))
         self._store = self._first_store()
         left = space.limits[index.MAX_LENGTH] - query.inserted_mm
         pieces = max(int(left / self.resolution.fine_mm), 0) + 2
@@ -270,7 +268,7 @@ class ResolutionSearch:
         while not self.finished and self._counts[kernel.POPS] < stop:
             reason, self.cost = kernel.search_words(
                 self.space.arrays, self.space.limits, self.objective, self._rates, self.query.branch,
-                self.query.target, self._reference, self._words, self._merge, self._store, self._queue,
+                self.query.goal, self._reference, self._words, self._merge, self._store, self._queue,
                 self._state, self._counts, self._best, self.cost, stop - int(self._counts[kernel.POPS]),
             )  # fmt: skip
             if reason == kernel.BETTER:

@@ -54,6 +54,12 @@ class Query:
     turned_rad: float = 0.0
     reference: Float | None = None
 
+    @property
+    def goal(self) -> tuple[float, float, float]:
+        """The target as the kernels take it."""
+        x, y, z = self.target.tolist()
+        return x, y, z
+
     def __post_init__(self) -> None:
         frame = np.array(self.lps_from_start, dtype=np.float64)
         target = np.array(self.target, dtype=np.float64)
@@ -179,7 +185,7 @@ class RestartingRRT(TreeSearch):
         """Grow the tree; return its rows, the iterations spent, and whether the last row is at the goal."""
         query = self.query
         return grow_rrt(  # type: ignore[no-any-return]
-            self.space.arrays, self.space.limits, self.objective, query.branch, query.target,
+            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
             self.nodes, self.parents, self.count, iterations, RANDOM_SHARE, self.state, self.cost,
         )  # fmt: skip
 

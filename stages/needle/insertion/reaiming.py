@@ -179,17 +179,17 @@ class Trials:
         query = self.root.query
         rows = tree.add_goal(
             self._space.arrays, self._space.limits, self._objective, query.branch, self._nodes, self._parents,
-            count, count - 1, query.target, self.wanted, self._state,
+            count, count - 1, query.goal, self.wanted, self._state,
         )  # fmt: skip
         self._keep(count, rows, source)
 
     def by_legs(self) -> None:
         """Try the shortest path in free space."""
-        self._keep(1, self._legs(1, as_point(self.root.query.target)), Source.LEGS)
+        self._keep(1, self._legs(1, self.root.query.goal), Source.LEGS)
 
     def by_arc(self, bend: Bend, length: float, source: Source) -> None:
         """Try one arc whose own end counts as the goal."""
-        end = np.array(pose_on_arc(tree.pose_of(self._nodes[0]), bend, length)[:3])
+        end = pose_on_arc(tree.pose_of(self._nodes[0]), bend, length)[:3]
         self._keep(1, 1 + self._arc(1, bend, length, end), source)
 
     def search(self, iterations: int, seed: int, objective: Objective) -> int:
@@ -214,13 +214,13 @@ class Trials:
         if length < index.MIN_ARC_MM:
             return count
         if bend[0] <= self._space.limits[index.KAPPA] and self._arc(
-            count, bend, length, self.root.query.target
+            count, bend, length, self.root.query.goal
         ):
             return count + 1
         rows = self._legs(count, point)
         return rows if rows > count else 0
 
-    def _arc(self, count: int, bend: Bend, length: float, goal: Float) -> bool:
+    def _arc(self, count: int, bend: Bend, length: float, goal: tuple[float, float, float]) -> bool:
         added = tree.add_arc(
             self._space.arrays, self._space.limits, self._objective, self.root.query.branch, self._nodes,
             self._parents, count, count - 1, bend, float(length), goal, self.wanted,
@@ -231,7 +231,7 @@ class Trials:
         query = self.root.query
         rows = tree.add_legs(
             self._space.arrays, self._space.limits, self._objective, query.branch, self._nodes, self._parents,
-            count, count - 1, point, query.target, self.wanted,
+            count, count - 1, point, query.goal, self.wanted,
         )  # fmt: skip
         return int(rows)
 

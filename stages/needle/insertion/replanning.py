@@ -26,7 +26,6 @@ from stages.needle.insertion.reaiming import (
     Source,
     Trials,
     Way,
-    as_point,
     plan_ahead,
     pose_at,
     ways_ahead,
@@ -324,7 +323,7 @@ class Replanner:
         kappa = float(self._space.limits[index.KAPPA])
         for root in roots:
             trials = Trials(self._space, self._objective_arrays, root)
-            pose, target = pose_at(root.query.lps_from_start), as_point(query.target)
+            pose, target = pose_at(root.query.lps_from_start), query.goal
             turn, miss = nearest_turn(*seen_from(pose, target), kappa)
             if turn > index.MIN_ARC_MM * kappa and miss < least:
                 _length, bend, _turn = arc_to_point(pose, target)
@@ -343,7 +342,7 @@ class Replanner:
             return Failure.OUT_OF_LENGTH, f"All of the needle ({limits[index.MAX_LENGTH]:g} mm) is inserted"
         tolerance = self._space.goal_tolerance_mm
         if tolerance == 0.0:
-            at_target = (*as_point(query.target), 0.0, 0.0, 1.0)
+            at_target = (*query.goal, 0.0, 0.0, 1.0)
             label = blocker_at(self._space, at_target, math.inf, -1)
             if label:
                 required, name = self._space.required_clearance_mm, structure_name(label)
@@ -352,7 +351,7 @@ class Replanner:
         angle = math.acos(float(np.clip(np.dot(pose[3:], reference), -1.0, 1.0)))
         turn_left = float(limits[index.MAX_TURN]) - query.turned_rad
         length = length_ahead(
-            *seen_from(pose, as_point(query.target)), limits,
+            *seen_from(pose, query.goal), limits,
             min(float(limits[index.MAX_ANGLE]) + angle, math.pi), turn_left,
         )  # fmt: skip
         if not length < math.inf:

@@ -12,11 +12,12 @@ import math
 import numba
 
 from anatomy.kernels.arcs import arc_to_point
+from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, shortest_path
 from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MIN_ARC_MM, TINY
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def turn_into_ball(rho, h, kappa, tolerance):
     """Return the turn (rad) at which the arc C enters the ball about a point, inf if it never does.
 
@@ -35,7 +36,7 @@ def turn_into_ball(rho, h, kappa, tolerance):
     return turn if turn >= 0.0 else turn + 2.0 * math.pi
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def least_turn_into_ball(rho, h, kappa, tolerance):
     """Return the least turn (rad) of a path CS into the ball about a point, inf if there is none.
 

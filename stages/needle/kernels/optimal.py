@@ -7,6 +7,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import arc_to_point
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import length_ahead, seen_from
 from stages.needle.kernels.cost import LEAST_RATE
@@ -119,7 +120,7 @@ def grow_optimal(space, limits, objective, branch, goal, nodes, parents, count, 
     return count, iterations, False
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _extend(space, limits, objective, branch, nodes, parents, count, near, q, goal, best, state):
     """Go from a node to a point, by legs or by an arc of at most the longest step; return the new `count`."""
     if uniform(state) < 0.5:
@@ -159,7 +160,7 @@ def build(space, limits, objective, branch, goal, nodes, parents, vias, count, b
     return last
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _is_promising(nodes, vias, count, limits, rate, best):
     """Tell whether the path through via points could cost less than `best`, by its length alone."""
     total = nodes[0, PATH_COST]
@@ -173,7 +174,7 @@ def _is_promising(nodes, vias, count, limits, rate, best):
     return total < best
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _mutate(vias, trial, count, goal, limits, state):
     """Write a variation of via points to `trial`; return how many it has.
 

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import LUMEN
 from stages.needle.kernels.limits import EXEMPT_LENGTH, LOOKUP_STEP, RADIUS, REQUIRED, TINY
@@ -23,7 +24,7 @@ _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _early_blocker(space, required, pose, bend, begin, length):
     """Look for an obstacle at a few points of an arc, the middle first; 0 if none is met."""
     field, labels, geometry, bits = space
@@ -39,7 +40,7 @@ def _early_blocker(space, required, pose, bend, begin, length):
     return 0
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _blocker_by_lookup(space, step, pose, bend, length):
     """Look up the voxels at the ends of steps of an arc [Fu2018, fig. 6, right]: no proof."""
     _field, labels, geometry, bits = space

@@ -14,6 +14,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inner_kernel
+
 LOOK_AHEAD = 3
 
 # Columns of `entries`: two numbers of the user's, rank, next entry of a list.
@@ -37,7 +39,7 @@ LOWEST = 4
 STATE_SIZE = 5
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _into_heap(entry_f, heap_f, heap, state, entry):
     f = entry_f[entry]
     at = state[HEAPED]
@@ -53,7 +55,7 @@ def _into_heap(entry_f, heap_f, heap, state, entry):
     heap[at] = entry
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _off_heap(heap_f, heap, state):
     """Take the entry with the smallest f off the heap."""
     top = heap[0]

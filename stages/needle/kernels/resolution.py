@@ -12,8 +12,10 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 from anatomy.kernels.arcs import pose_on_arc
+from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.goal_ball import least_length, shortest_into_ball, single_into_ball
@@ -30,11 +32,11 @@ from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.kernels.rank_queue import WAITING, pop, push
 from stages.needle.kernels.tree import angle_kept
 
-inner_kernel = numba.njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-"""For what only kernels call: without the entrances from Python it takes less time to compile."""
-
 ROUNDING = 1e-9
 """Share of the best cost by which a path must be cheaper to be looked for."""
+# A type of its own: for each literal argument a function would be compiled anew.
+_NOT_ACROSS = np.int64(0)
+
 SAME = 1e-6
 """Poses that differ by less than this, in mm and in each component of a direction, are equal."""
 
@@ -220,7 +222,9 @@ def find_duplicate(nodes, seen, merge, n_rolls, row):
     Else the slot is free, or that of a node which the row makes superfluous.  See `search_words`.
     """
     last = seen.shape[0] - 1
-    slot, duplicate = _in_chain(nodes, seen, merge, n_rolls, row, _hash(nodes, row, merge, 0) & last)
+    slot, duplicate = _in_chain(
+        nodes, seen, merge, n_rolls, row, _hash(nodes, row, merge, _NOT_ACROSS) & last
+    )
     faces = 0 if merge[2] or duplicate else _at_faces(nodes, row, merge)
     for across in range(1, faces + 1):
         if across & ~faces == 0 and not duplicate:
@@ -235,7 +239,7 @@ def rehash(nodes, merge, seen, larger):
     last = larger.shape[0] - 1
     for m in range(seen.shape[0]):
         if seen[m] != 0:
-            slot = _hash(nodes, seen[m] - 1, merge, 0) & last
+            slot = _hash(nodes, seen[m] - 1, merge, _NOT_ACROSS) & last
             while larger[slot] != 0:
                 slot = (slot + 1) & last
             larger[slot] = seen[m]
@@ -473,7 +477,7 @@ def search_words(
         if state[WAITING] + room > entries.shape[0]:
             return FULL_OF_ENTRIES, cost
         most = cost * (1.0 - ROUNDING)
-        at, level = 0, 0
+        at, level = counts[NODES] - 1, 0
         if counts[POPS] == 0:
             f = _estimate(nodes, at, rates, goal, limits, reference)
             bend = bend_of(nodes, words[1], limits[KAPPA], at, words[1].shape[0])

@@ -7,6 +7,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import any_normal, arc_to_point
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import seen_from, workspace_length
 from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_LENGTH, MAX_STEP, MAX_TURN, MIN_ARC_MM
@@ -23,7 +24,7 @@ from stages.needle.kernels.tree import (
 SAMPLE_TRIES = 50
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def sample_between(start, goal, limits, state):
     """Draw a point between start and goal that the start can reach.
 
@@ -80,7 +81,7 @@ def _nearest(nodes, count, q, limits):
     return nearest
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def random_arc(pose, limits, state):
     """Draw an arc: any roll, the greatest curvature half of the time and else any, up to the longest step."""
     roll = 2.0 * math.pi * uniform(state)

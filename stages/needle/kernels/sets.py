@@ -16,6 +16,7 @@ import math
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import exact_distance, interpolate_squared
 
 # What `scale` holds: sides of cells in mm and as a slope, slope of the start (v, u), curvature in 1/mm, and
@@ -28,9 +29,9 @@ KAPPA = 4
 TOP_SINE = 5
 SCALE_SIZE = 6
 
-# What `ends` holds: distance from start to target, goal tolerance, longest way from start to target by way of
-# any point of a path; of the spindle the depth of its middle, how far aside of it the centres of its arcs lie,
-# and their radius (infinite: no spindle), all in mm.
+# What `ends` holds: distance from start to target, goal tolerance, longest way from start to target by way
+# of any point of a path; of the spindle the depth of its middle, how far aside of it the centres of its arcs
+# lie, and their radius (infinite: no spindle), all in mm.
 TOTAL = 0
 TOLERANCE = 1
 LONGEST = 2
@@ -38,6 +39,9 @@ SPINDLE_MIDDLE = 3
 SPINDLE_OFFSET = 4
 SPINDLE_RADIUS = 5
 ENDS_SIZE = 6
+
+# With a type of its own a constant is no literal, for each of which what is called would be compiled anew.
+_FIRST_BIT = np.int64(0)
 
 ONE = np.uint64(1)
 ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -128,7 +132,7 @@ def spread(target, source, first, last, width, shift, scratch):
         target[to] = value
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def dilate(target, source, box, square, disc, dy, dx, scratch, row):
     """OR a bitmap into another, moved by whole cells, dilated by a square of half side `square` and a disc.
 
@@ -173,7 +177,7 @@ def dilate(target, source, box, square, disc, dy, dx, scratch, row):
                     target[below, w] |= row[w]
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def find_box(bitmap, box):
     """Fill `box` (4,) with the first and last row and word in use; return whether there is any bit."""
     rows, words = bitmap.shape
@@ -188,7 +192,7 @@ def find_box(bitmap, box):
     return box[1] >= 0
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def slope_of(v, u, window, scale):
     """Return the slope (v, u) at the centre of a cell of directions."""
     return (
@@ -197,21 +201,21 @@ def slope_of(v, u, window, scale):
     )
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def steepest_sine(slope_v, slope_u, scale):
     """Return the largest sine in a cell of directions that a path can have."""
     slope = math.hypot(slope_v, slope_u) + HALF_DIAGONAL * scale[SLOPE_CELL]
     return min(slope / math.sqrt(1.0 + slope * slope), scale[TOP_SINE])
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def largest_second_derivative(sine, scale):
     """Return kappa / cos^3(theta), which bounds the second derivative of a path over depth."""
     sine = min(sine, scale[TOP_SINE])
     return scale[KAPPA] / (1.0 - sine * sine) ** 1.5
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def largest_slope_change(sine, scale, depth):
     """Return by how much the slope of a path may change over a slab, from the largest sine at one end."""
     top = min(sine + scale[KAPPA] * depth, scale[TOP_SINE])
@@ -343,7 +347,7 @@ def step_sets(now, now_window, scale, depth, way, blur, edges, out, out_window):
                     out[tv, tu, y, w] &= wide[y, w]
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _or_box(target, target_box, source, box):
     """OR one bitmap into another within the box of the first, which is added to that of the other."""
     if box[1] < box[0]:
@@ -352,14 +356,15 @@ def _or_box(target, target_box, source, box):
         for w in range(box[2], box[3] + 1):
             target[y, w] |= source[y, w]
     if target_box[1] < target_box[0]:
-        target_box[:] = box
+        for m in range(4):
+            target_box[m] = box[m]
         return
     for m in range(0, 4, 2):
         target_box[m] = min(target_box[m], box[m])
         target_box[m + 1] = max(target_box[m + 1], box[m + 1])
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _gather(target, target_box, limits, table, boxes, v, u, reach):
     """OR the bitmaps of all directions within `reach` cells of (v, u), as far as the box `limits` goes."""
     nv, nu = table.shape[1], table.shape[2]
@@ -396,7 +401,7 @@ def escape_depth(rho, h, radius):
     return -min(math.hypot(rho, h), 2.0 * radius - rho)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def hope_of_place(h, y, x, scale, ends):
     """Return by how much a place may be moved before no path leads through it, in mm; below 0 if none does.
 
@@ -416,7 +421,7 @@ def hope_of_place(h, y, x, scale, ends):
     return hope + SPARE
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _hope_of_state(h, y, x, slope_v, slope_u, blur, scale, ends):
     """Return the same for a state; `blur` is the angle between a cell's directions and its centre's."""
     radius = 1.0 / scale[KAPPA]
@@ -457,7 +462,7 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
     possible = np.zeros((rows, words), np.uint64)
     for y in range(rows):
         side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
-        x = 0
+        x = _FIRST_BIT
         while x < 64 * words:
             side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
             hope = hope_of_place(depth, side_y, side_x, scale, ends) + HALF_DIAGONAL * cell
@@ -501,7 +506,7 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
                     states[v, u, y, w] &= row[w]
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _set_run(row, x, hope, step):
     """Set the bits from `x` on to whether there is hope, as far as its sign is sure; return where that ends.
 
@@ -521,7 +526,7 @@ def _set_run(row, x, hope, step):
     return end
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _probed_at(v, u, window, scale, depth):
     """Return the whole cells (y, x) by which a tangent has moved at a depth, and what that leaves in mm."""
     move = depth * scale[SLOPE_CELL] / scale[CELL]
@@ -575,6 +580,15 @@ def clearance_above(space, required, spare, exempt_branch, x, y, z):
     return exact_distance(labels, geometry, x, y, z, bits, exempt_branch, required)[0]
 
 
+@inner_kernel
+def _grade_of(slacks, value):
+    """Return which of the rising `slacks` is the first not below a value; their number if none is."""
+    for q in range(slacks.shape[0]):
+        if slacks[q] >= value:
+            return q
+    return slacks.shape[0]
+
+
 @numba.njit(cache=True)
 def grade_clearance(space, required, exempt_branch, origin, across, probed, slacks, grades):
     """Fill `grades` (Y, 64 W) uint8 with the first of the `slacks` that a cell's lack of clearance is within.
@@ -595,7 +609,7 @@ def grade_clearance(space, required, exempt_branch, origin, across, probed, slac
                 origin[1] + y * across[0, 1] + x * across[1, 1],
                 origin[2] + y * across[0, 2] + x * across[1, 2],
             )  # fmt: skip
-            grades[y, x] = np.searchsorted(slacks, required - above - SPARE)
+            grades[y, x] = _grade_of(slacks, required - above - SPARE)
 
 
 @numba.njit(cache=True)
@@ -627,7 +641,7 @@ def keep_clear(states, window, scale, depths, corners, grades, slacks):
                 half = 0.5 * (scale[CELL] + scale[SLOPE_CELL] * depth)
                 bound = largest_second_derivative(sine + scale[KAPPA] * depth, scale)
                 slack = math.hypot(half + left_y, half + left_x) + 0.5 * bound * depth * depth + SPARE
-                q = np.searchsorted(slacks, slack)
+                q = _grade_of(slacks, slack)
                 if q == slacks.shape[0]:
                     continue
                 if not made[d, q]:
@@ -638,7 +652,7 @@ def keep_clear(states, window, scale, depths, corners, grades, slacks):
                 )
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _free_within(grades, most, out):
     """Set the bits of the cells whose grade is at most `most`."""
     for y in range(grades.shape[0]):
@@ -696,7 +710,7 @@ def refine(coarse, halve_slopes, out):
                             out[to_v, to_u, y, w] |= wide[y, w]
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _every_other(word):
     """Return the lower 32 bits of a word, moved to its even places."""
     word &= np.uint64(0xFFFFFFFF)

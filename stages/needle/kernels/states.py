@@ -13,6 +13,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import any_normal, point_on_arc
+from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.limits import MAX_ANGLE, MAX_LENGTH, TINY
 from stages.needle.kernels.proof import blocker_on_arc
 
@@ -61,7 +62,7 @@ def axes(state):
     )
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def inserted_at(state, origin):
     """Return a length that the needle's length at a state is never below."""
     straight = math.sqrt(

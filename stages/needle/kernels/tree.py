@@ -13,6 +13,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import (
     least_cosine,
@@ -59,7 +60,7 @@ def reference_of(root):
     return root[BEND + 1], root[BEND + 2], root[BEND + 3]
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def angle_kept(limits, reference, pose, bend, turn):
     """Tell whether an arc keeps the limit of the angle to `reference`; return the cosine at its end too."""
     forward = pose[3] * reference[0] + pose[4] * reference[1] + pose[5] * reference[2]

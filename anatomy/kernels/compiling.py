@@ -1,0 +1,8 @@
+"""How kernels are compiled that only other kernels call."""
+
+from __future__ import annotations
+
+import numba
+
+inner_kernel = numba.njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Compile a function without the entrances that calls from Python would need: that takes less time."""

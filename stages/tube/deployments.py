@@ -17,8 +17,8 @@ from anatomy.grid import Float, read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import FISSURE, OBSTACLES
-from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
+from stages.tube.kernels import deployment as kernels
 
 Int = NDArray[np.int64]
 Scene = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int, NDArray[np.uint16], Float]
@@ -119,7 +119,7 @@ def scene_of(lung: Lung, *, with_fissures: bool) -> Scene:
 
 
 def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
-    """Return the `(10,)` array of `stages.tube.kernels`, lengths in mm, angles in rad.
+    """Return the `(10,)` array of `stages.tube.kernels.deployment`, lengths in mm, angles in rad.
 
     Inside the outer tube the precurvature is shared in proportion to bending stiffness [Rucker2010].
     """

@@ -3,14 +3,46 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, NamedTuple
+
+from pydantic import Field
 
 from anatomy.settings import impossible, quantity, settings
 
 
 @settings
+class BentPiece:
+    """A piece of a tube that is an arc at rest.
+
+    Parameters
+    ----------
+    length_mm : float
+        Length along the tube, mm.
+    precurvature_per_mm : float
+        Curvature at rest, 1/mm; 0 for a straight piece.
+    direction_deg : float
+        Direction of the bend about the tube's axis, degrees; pieces of one direction lie in a plane.
+    """
+
+    length_mm: Annotated[float, quantity("length of the piece", above=0.0, at_most=500.0)]
+    precurvature_per_mm: Annotated[float, quantity("curvature at rest", at_least=0.0, at_most=1.0)]
+    direction_deg: Annotated[
+        float, quantity("direction of the bend about the axis", at_least=-360.0, at_most=360.0)
+    ] = 0.0
+
+
+class Bend(NamedTuple):
+    """A piece of a tube of one precurvature, by arc lengths from the tube's rear end."""
+
+    from_mm: float
+    to_mm: float
+    curvature_per_mm: float
+    direction_rad: float
+
+
+@settings
 class Tube:
-    """One superelastic tube: straight, with a curved distal part of constant precurvature.
+    """One superelastic tube: straight, with a curved distal part.
 
     Parameters
     ----------
@@ -22,6 +54,9 @@ class Tube:
         Length of the precurved distal part, mm; 0 for a straight tube.
     precurvature_per_mm : float
         Curvature of that part at rest, 1/mm; 0 for a straight tube.
+    bent_pieces : tuple of BentPiece
+        Instead of these two, for a distal part of several curvatures or out of one plane: its pieces, the
+        rearmost first.
     youngs_modulus_gpa : float
         Young's modulus, GPa.
     poisson_ratio : float
@@ -46,6 +81,9 @@ class Tube:
     precurvature_per_mm: Annotated[
         float, quantity("curvature of the distal part at rest, 0 if straight", at_least=0.0, at_most=1.0)
     ] = 0.0
+    bent_pieces: Annotated[
+        tuple[BentPiece, ...], Field(description="pieces of the distal part, if it is no single arc")
+    ] = ()
     youngs_modulus_gpa: Annotated[float, quantity("Young's modulus", above=0.0, at_most=1000.0)] = 60.0
     poisson_ratio: Annotated[float, quantity("Poisson's ratio", at_least=0.0, below=0.5)] = 0.3
 
@@ -62,6 +100,13 @@ class Tube:
                 self.curved_length_mm,
                 f"at most length_mm = {self.length_mm:g}",
             )
+        pieces_mm = sum(piece.length_mm for piece in self.bent_pieces)
+        if self.bent_pieces and self.curved_length_mm > 0.0:
+            raise impossible(
+                "curved_length_mm", self.curved_length_mm, "0 where bent_pieces say how the tube is curved"
+            )
+        if pieces_mm > self.length_mm:
+            raise impossible("bent_pieces", pieces_mm, f"in all at most length_mm = {self.length_mm:g} long")
         if (self.curved_length_mm > 0.0) != (self.precurvature_per_mm > 0.0):
             raise impossible(
                 "precurvature_per_mm",
@@ -86,9 +131,35 @@ class Tube:
         return 1e3 * self.youngs_modulus_gpa * self.second_moment_mm4
 
     @property
+    def torsional_stiffness_n_mm2(self) -> float:
+        """Torsional stiffness G J = E I / (1 + nu), N mm^2, since J = 2 I and G = E / 2 (1 + nu)."""
+        return self.bending_stiffness_n_mm2 / (1.0 + self.poisson_ratio)
+
+    @property
+    def bends(self) -> tuple[Bend, ...]:
+        """The curved pieces, the rearmost first; none of a straight tube."""
+        pieces = self.bent_pieces
+        if self.curved_length_mm > 0.0:
+            arc = BentPiece(length_mm=self.curved_length_mm, precurvature_per_mm=self.precurvature_per_mm)
+            pieces = (arc,)
+        found = []
+        at = self.length_mm - sum(piece.length_mm for piece in pieces)
+        for piece in pieces:
+            end = at + piece.length_mm
+            if piece.precurvature_per_mm > 0.0:
+                found.append(Bend(at, end, piece.precurvature_per_mm, math.radians(piece.direction_deg)))
+            at = end
+        return tuple(found)
+
+    @property
+    def max_precurvature_per_mm(self) -> float:
+        """Largest curvature at rest, 1/mm."""
+        return max((bend.curvature_per_mm for bend in self.bends), default=0.0)
+
+    @property
     def rest_strain(self) -> float:
         """Largest strain when the precurved part is held straight (dimensionless)."""
-        return self.precurvature_per_mm * self.radius_mm
+        return self.max_precurvature_per_mm * self.radius_mm
 
 
 @settings
@@ -130,17 +201,21 @@ class ConcentricTubes:
 
     def __post_init__(self) -> None:
         self._check_nesting()
-        if self.outer.precurvature_per_mm > 0.0:
+        if self.outer.bends:
             raise impossible(
                 "outer.precurvature_per_mm",
-                self.outer.precurvature_per_mm,
-                "0; only a straight outer tube is supported",
+                self.outer.max_precurvature_per_mm,
+                "0; plans need a straight outer tube",
+            )
+        if self.inner.bent_pieces:
+            raise impossible(
+                "inner.bent_pieces", len(self.inner.bent_pieces), "none; plans need an inner tube of one arc"
             )
         for name, tube in (("outer", self.outer), ("inner", self.inner)):
             if tube.rest_strain > self.max_strain:
                 raise impossible(
                     f"{name}.precurvature_per_mm",
-                    tube.precurvature_per_mm,
+                    tube.max_precurvature_per_mm,
                     f"at most 2 max_strain / outer_diameter_mm = "
                     f"{self.max_strain / tube.radius_mm:.6g}; the strain is {tube.rest_strain:.4g}, "
                     f"max_strain is {self.max_strain:g}",

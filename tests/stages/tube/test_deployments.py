@@ -12,7 +12,6 @@ from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import FISSURE, LUMEN, VESSEL
-from stages.tube import kernels
 from stages.tube.deployments import (
     REASONS,
     Deployment,
@@ -23,6 +22,7 @@ from stages.tube.deployments import (
     tube_constants,
 )
 from stages.tube.device import ConcentricTubes, Tube
+from stages.tube.kernels import deployment as kernels
 from tests.stages.scenes import Canvas
 
 OUTER = Tube(outer_diameter_mm=1.6, inner_diameter_mm=1.38, length_mm=640.0)

@@ -70,7 +70,7 @@ def test_impossible_tubes_are_refused(changes: dict[str, float], key: str) -> No
         ({"max_strain": 0.018}, r"inner\.precurvature_per_mm = 0\.025"),
         (
             {"outer": replace(OUTER, curved_length_mm=10.0, precurvature_per_mm=0.001)},
-            "only a straight outer tube",
+            "plans need a straight outer tube",
         ),
         ({"max_extension_mm": 0.0}, "max_extension_mm"),
         (

@@ -15,9 +15,9 @@ from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from stages.tube import kernels
 from stages.tube.deployments import Deployment, TubeJudge, scene_of, tube_constants
 from stages.tube.device import ConcentricTubes, Tube
+from stages.tube.kernels import deployment as kernels
 from tests.stages.scenes import Canvas, brute_clearance
 
 KAPPA = 0.025

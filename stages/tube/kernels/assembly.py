@@ -1,0 +1,144 @@
+"""Where nested tubes begin, end and bend: the pieces in which their mechanics is smooth.
+
+Units mm, N, rad.  A `design` is the tuple of `stiffness` (n, 2) float64, bending and torsional stiffness in
+N mm^2 of each tube, innermost first; `lengths` (n,) float64; and `bends` (m, 5) float64: tube, begin and end
+by arc length from the tube's rear end, precurvature in 1/mm, its direction in rad.  `beta` (n,) float64 is
+where the tubes' rear ends are, 0 or less; the front plate is at 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.compiling import inner_kernel
+
+SHORTEST_PIECE_MM = 1e-9
+
+# Columns of `pieces`: arc lengths of both ends; the tubes whose shift moves them (-1: none); 1 / the sum of
+# bending stiffnesses; how many tubes are bent here; the only one if it is one; number of steps.
+NEAR = 0
+FAR = 1
+NEAR_OWNER = 2
+FAR_OWNER = 3
+SOFTNESS = 4
+BENT = 5
+BENT_TUBE = 6
+STEPS = 7
+PIECE_COLUMNS = 8
+
+
+@inner_kernel
+def _breakpoints(lengths, bends, beta, found):
+    """Fill `found` (B, 2) with arc lengths, rising, and the tubes that move them; return how many."""
+    count = 1
+    found[0, 0] = 0.0
+    found[0, 1] = -1.0
+    for m in range(lengths.shape[0] + 2 * bends.shape[0]):
+        tube = m
+        along = 0.0
+        if m < lengths.shape[0]:
+            along = lengths[m]
+        else:
+            bend = (m - lengths.shape[0]) // 2
+            tube = int(bends[bend, 0])
+            along = bends[bend, 1 + (m - lengths.shape[0]) % 2]
+        s = beta[tube] + along
+        if s <= SHORTEST_PIECE_MM:
+            continue
+        at = count
+        while found[at - 1, 0] > s:
+            found[at, 0] = found[at - 1, 0]
+            found[at, 1] = found[at - 1, 1]
+            at -= 1
+        found[at, 0] = s
+        found[at, 1] = tube
+        count += 1
+    return count
+
+
+@numba.njit(cache=True)
+def cut(design, beta, step, pieces, moments, directions):
+    """Cut the tubes ahead of the front plate into pieces; return their number and that of all steps.
+
+    Parameters
+    ----------
+    design, beta
+        See the module.
+    step : float
+        Largest angle, in rad of the fastest torsional oscillation of a piece, that one step may span.
+    pieces : (1 + n + 2 m, PIECE_COLUMNS) float64
+        Is filled, the nearest piece first.
+    moments, directions : (1 + n + 2 m, n) float64
+        Are filled: bending stiffness times precurvature in N mm of each tube in each piece, 0 where it is
+        straight or not there, and the direction of the precurvature in rad.
+    """
+    stiffness, lengths, bends = design
+    n = lengths.shape[0]
+    found = np.zeros((1 + n + 2 * bends.shape[0], 2))
+    n_found = _breakpoints(lengths, bends, beta, found)
+    count = 0
+    last = 0
+    for m in range(1, n_found):
+        if found[m, 0] - found[last, 0] < SHORTEST_PIECE_MM:
+            continue
+        piece = pieces[count]
+        piece[NEAR], piece[NEAR_OWNER] = found[last, 0], found[last, 1]
+        piece[FAR], piece[FAR_OWNER] = found[m, 0], found[m, 1]
+        last = m
+        middle = 0.5 * (piece[NEAR] + piece[FAR])
+        total = 0.0
+        for i in range(n):
+            moments[count, i] = directions[count, i] = 0.0
+            if beta[i] + lengths[i] > middle:
+                total += stiffness[i, 0]
+        if total == 0.0:
+            break
+        for b in range(bends.shape[0]):
+            i = int(bends[b, 0])
+            if beta[i] + bends[b, 1] < middle < beta[i] + bends[b, 2]:
+                moments[count, i] = stiffness[i, 0] * bends[b, 3]
+                directions[count, i] = bends[b, 4]
+        piece[SOFTNESS] = 1.0 / total
+        count += 1
+    steps = _count_steps(stiffness, pieces, moments, count, step)
+    return count, steps
+
+
+@inner_kernel
+def _count_steps(stiffness, pieces, moments, count, step):
+    """Choose the number of steps of each piece by how fast torsion can change there; return their sum."""
+    n = moments.shape[1]
+    total = 0
+    rate = 0.0
+    fastest = 0.0
+    for k in range(count - 1, -1, -1):
+        piece = pieces[k]
+        length = piece[FAR] - piece[NEAR]
+        stiffest = 0.0
+        turning = 0.0
+        piece[BENT] = 0.0
+        for i in range(n):
+            if moments[k, i] == 0.0:
+                continue
+            piece[BENT] += 1.0
+            piece[BENT_TUBE] = i
+            coupling = 0.0
+            own = 0.0
+            for j in range(n):
+                if j != i:
+                    pull = piece[SOFTNESS] * moments[k, i] * moments[k, j]
+                    coupling += pull * (1.0 / stiffness[i, 1] + 1.0 / stiffness[j, 1])
+                    own += pull / stiffness[i, 1]
+            stiffest = max(stiffest, coupling)
+            turning = max(turning, own)
+        fastest = max(fastest, stiffest)
+        # No tube twists faster than this: what all pieces so far can give, and what their energy allows.
+        rate = min(rate + turning * length, 2.0 * math.sqrt(fastest))
+        piece[STEPS] = 1.0
+        if piece[BENT] > 1.0:
+            piece[STEPS] = math.ceil(length * max(math.sqrt(stiffest), rate) / step)
+        total += int(piece[STEPS])
+    return total

@@ -1,0 +1,335 @@
+"""Equilibria of tubes whose rear ends are held at given angles, and whether they are stable.
+
+With psi_i(0) - beta_i u_i(0) as the angle alpha_i of the rear end (the part behind the front plate is held
+straight, so its torsion is constant), alpha is a smooth function of the angles psi_tip at the tip, and its
+derivative J both drives Newton's method and tells stability: an equilibrium is stable if
+det d psi(s) / d psi_tip stays above 0 from the tip to the rearmost end [Gilbert2016, Dupont2010].
+
+As turning all tubes together turns everything, only derivatives by the angles of all tubes but the last are
+carried; those of each row sum up to 1.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.compiling import inner_kernel
+from stages.tube.kernels.assembly import PIECE_COLUMNS, cut
+from stages.tube.kernels.pose import lay, turned
+from stages.tube.kernels.torsion import twist
+
+TOLERANCE = 1e-12
+LARGEST_TURN = 0.8
+"""Of the angles between tubes in one step of Newton's method, rad."""
+NEWTON_STEPS = 25
+LEAST_STRIDE = 1e-3
+ROUND = 12
+"""Angles tried all round for each tube but the last."""
+# With a type of its own it is no literal, for each of which a function would be compiled anew.
+_PLATE = np.float64(0.0)
+SHARES = 8
+"""Places at which the determinant is looked at between two rear ends, for four tubes or more."""
+
+# Columns of a result: converged, stable, least determinant, residual (rad), then the tip frame as a pose.
+CONVERGED = 0
+STABLE = 1
+LEAST_DETERMINANT = 2
+RESIDUAL = 3
+TIP = 4
+RESULT_COLUMNS = 16
+
+
+@inner_kernel
+def _solve(matrix, right):
+    """Solve a small linear system in place; return the determinant, 0 if it is singular."""
+    n = right.shape[0]
+    determinant = 1.0
+    for c in range(n):
+        pivot = c
+        for r in range(c + 1, n):
+            if abs(matrix[r, c]) > abs(matrix[pivot, c]):
+                pivot = r
+        if matrix[pivot, c] == 0.0:
+            return 0.0
+        if pivot != c:
+            determinant = -determinant
+            right[c], right[pivot] = right[pivot], right[c]
+            for m in range(n):
+                matrix[c, m], matrix[pivot, m] = matrix[pivot, m], matrix[c, m]
+        determinant *= matrix[c, c]
+        for r in range(c + 1, n):
+            factor = matrix[r, c] / matrix[c, c]
+            right[r] -= factor * right[c]
+            for m in range(c, n):
+                matrix[r, m] -= factor * matrix[c, m]
+    for r in range(n - 1, -1, -1):
+        for m in range(r + 1, n):
+            right[r] -= matrix[r, m] * right[m]
+        right[r] /= matrix[r, r]
+    return determinant
+
+
+@inner_kernel
+def _relative(dpsi, drate, beta, s, matrix):
+    """Fill `matrix` (n - 1, n - 1) with how angles between the tubes at `s` depend on those at the tip.
+
+    Behind the front plate every tube goes on with constant torsion as far as its own rear end.
+    """
+    last = matrix.shape[0]
+    for i in range(last):
+        for c in range(last):
+            matrix[i, c] = dpsi[c, i] + max(s, beta[i]) * drate[c, i]
+            matrix[i, c] -= dpsi[c, last] + max(s, beta[last]) * drate[c, last]
+
+
+@numba.njit(cache=True)
+def determinant_at(dpsi, drate, beta, s, matrix, right):
+    """Return det d psi(s) / d psi_tip at or behind a node; `matrix` and `right` are scratch."""
+    if matrix.shape[0] == 0:
+        return 1.0
+    _relative(dpsi, drate, beta, s, matrix)
+    right[:] = 0.0
+    return _solve(matrix, right)
+
+
+@inner_kernel
+def _least_behind(dpsi, drate, beta, matrix, right):
+    """Return the least determinant from the front plate to the rearmost end.
+
+    Between two rear ends it is a polynomial in s of a degree less than the number of tubes: linear for two
+    of them, a parabola for three, of which the vertex is looked at.
+    """
+    n = beta.shape[0]
+    least = determinant_at(dpsi, drate, beta, 0.0, matrix, right)
+    for i in range(n):
+        near = 0.0
+        for j in range(n):
+            if beta[i] < beta[j] < near:
+                near = beta[j]
+        far = beta[i]
+        ends = determinant_at(dpsi, drate, beta, far, matrix, right)
+        least = min(least, ends)
+        if n == 3:
+            a = determinant_at(dpsi, drate, beta, near, matrix, right)
+            b = determinant_at(dpsi, drate, beta, 0.5 * (near + far), matrix, right)
+            bow = a - 2.0 * b + ends
+            if bow > 0.0:
+                vertex = 0.25 * (3.0 * a - 4.0 * b + ends) / bow
+                if 0.0 < vertex < 1.0:
+                    s = near + vertex * (far - near)
+                    least = min(least, determinant_at(dpsi, drate, beta, s, matrix, right))
+        elif n > 3:
+            for m in range(1, SHARES):
+                s = near + (far - near) * m / SHARES
+                least = min(least, determinant_at(dpsi, drate, beta, s, matrix, right))
+    return least
+
+
+@inner_kernel
+def _turns_back(dpsi, drate, beta, at, matrix, before, right):
+    """Tell whether two directions in which the tubes can turn lose stability together within one step.
+
+    Then the determinant changes sign twice; the trace of the step's own matrix shows it.
+    """
+    last = matrix.shape[0]
+    trace = 0.0
+    for c in range(last):
+        _relative(dpsi[at], drate[at], beta, 0.0, matrix)
+        _relative(dpsi[at + 1], drate[at + 1], beta, 0.0, before)
+        # Row c of the step's matrix X solves X before = matrix.
+        for m in range(last):
+            right[m] = matrix[c, m]
+            for k in range(m + 1, last):
+                before[m, k], before[k, m] = before[k, m], before[m, k]
+        _solve(before, right)
+        trace += right[c]
+    return trace <= 0.0
+
+
+@numba.njit(cache=True)
+def least_determinant(nodes, beta):
+    """Return the least determinant along the tubes; -inf where two directions turn unstable at once."""
+    _s, _psi, _rate, dpsi, drate = nodes
+    last = beta.shape[0] - 1
+    matrix, before, right = np.zeros((last, last)), np.zeros((last, last)), np.zeros(last)
+    least = 1.0
+    if last == 0:
+        return least
+    for at in range(dpsi.shape[0] - 2, -1, -1):
+        least = min(least, determinant_at(dpsi[at], drate[at], beta, _PLATE, matrix, right))
+        if last > 1 and _turns_back(dpsi, drate, beta, at, matrix, before, right):
+            return -math.inf
+    return min(least, _least_behind(dpsi[0], drate[0], beta, matrix, right))
+
+
+@inner_kernel
+def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
+    """Move the tip angles towards the wanted base angles; return the largest error before, rad."""
+    _s, psi, rate, dpsi, drate = nodes
+    last = beta.shape[0] - 1
+    worst = 0.0
+    for i in range(last + 1):
+        worst = max(worst, abs(base_angles[i] - psi[0, i] - beta[i] * rate[0, i]))
+    if worst < TOLERANCE:
+        return worst
+    error = base_angles[last] - psi[0, last] - beta[last] * rate[0, last]
+    rearmost = beta.min()
+    if last > 0:
+        for i in range(last):
+            right[i] = base_angles[i] - psi[0, i] - beta[i] * rate[0, i] - error
+        _relative(dpsi[0], drate[0], beta, rearmost, matrix)
+        _solve(matrix, right)
+        size = np.abs(right).max()
+        if not size < LARGEST_TURN:
+            factor = LARGEST_TURN / size if size < math.inf else 0.0
+            for i in range(last):
+                right[i] *= factor
+    for c in range(last):
+        error -= (dpsi[0, c, last] + beta[last] * drate[0, c, last]) * right[c]
+    tip_angles[last] += error
+    for c in range(last):
+        tip_angles[c] += right[c] + error
+    return worst
+
+
+@inner_kernel
+def _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
+    """Let Newton's method find tip angles for base angles from a guess; return the last error, rad."""
+    worst = math.inf
+    for _ in range(NEWTON_STEPS):
+        twist(design, cutting, tip_angles, owners, nodes, steps)
+        worst = _newton_step(nodes, beta, base_angles, tip_angles, matrix, right)
+        if worst < TOLERANCE:
+            break
+    return worst
+
+
+@inner_kernel
+def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
+    """Find tip angles by raising the precurvature from nothing; return the last error, rad."""
+    pieces, moments, directions, count = cutting
+    for i in range(tip_angles.shape[0]):
+        tip_angles[i] = base_angles[i]
+    kept = tip_angles.copy()
+    done, stride = 0.0, 0.125
+    worst = math.inf
+    while done < 1.0 and stride > LEAST_STRIDE:
+        share = min(done + stride, 1.0)
+        eased = (pieces, math.sqrt(share) * moments, directions, count)
+        worst = _newton(design, eased, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
+        if worst < TOLERANCE:
+            done = share
+            kept[:] = tip_angles
+        else:
+            stride *= 0.5
+            tip_angles[:] = kept
+    return worst if done == 1.0 else math.inf
+
+
+@inner_kernel
+def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
+    """Start from angles all round until a stable equilibrium is found; return the last error, rad.
+
+    If all that are found are unstable, the first of them is taken.
+    """
+    n = tip_angles.shape[0]
+    any_found = math.inf
+    kept = base_angles.copy()
+    for number in range(ROUND ** (n - 1)):
+        code = number
+        for i in range(n):
+            tip_angles[i] = base_angles[i]
+            if i < n - 1:
+                tip_angles[i] += 2.0 * math.pi * (code % ROUND) / ROUND
+                code //= ROUND
+        worst = _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
+        if worst < TOLERANCE:
+            if least_determinant(nodes, beta) > 0.0:
+                return worst
+            if any_found == math.inf:
+                any_found = worst
+                kept[:] = tip_angles
+    tip_angles[:] = kept
+    if any_found < math.inf:
+        twist(design, cutting, tip_angles, owners, nodes, steps)
+    return any_found
+
+
+@numba.njit(cache=True)
+def settle(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles):
+    """Find the equilibrium next to the guess in `tip_angles`, which gets its angles, `nodes` the rest.
+
+    If Newton's method fails from there or ends at an unstable one, the precurvature is raised from nothing,
+    and then angles all round are tried.  Returns the largest error of a base angle and the least determinant.
+    """
+    last = beta.shape[0] - 1
+    matrix, right = np.zeros((last, last)), np.zeros(last)
+    worst = _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
+    least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
+    if least > 0.0:
+        return worst, least
+    first, first_worst = tip_angles.copy(), worst
+    worst = _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
+    least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
+    if least > 0.0:
+        return worst, least
+    worst = _tried_all_round(
+        design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right
+    )
+    least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
+    if least > 0.0 or not first_worst < TOLERANCE:
+        return worst, least
+    tip_angles[:] = first
+    twist(design, cutting, tip_angles, owners, nodes, steps)
+    return first_worst, least_determinant(nodes, beta)
+
+
+@inner_kernel
+def room_for(n_steps, n, columns):
+    """Return `nodes` and `steps` as `torsion.twist` fills them."""
+    angles = np.zeros((2, n_steps + 1, n))
+    derivatives = np.zeros((2, n_steps + 1, columns, n))
+    lengths = np.zeros((n_steps, columns + 1))
+    nodes = (np.zeros(n_steps + 1), angles[0], angles[1], derivatives[0], derivatives[1])
+    return nodes, (lengths[:, 0], lengths[:, 1:], np.zeros(n_steps, np.int64))
+
+
+@numba.njit(cache=True, nogil=True)
+def settle_many(design, base_angles, beta, step, tip_angles, results):
+    """Solve many configurations; `tip_angles` (M, n) holds guesses and gets the answers.
+
+    Parameters
+    ----------
+    design : tuple
+        See `assembly`.
+    base_angles, beta : (M, n) float64
+        rad, mm.
+    step : float
+        See `assembly.cut`.
+    results : (M, RESULT_COLUMNS) float64
+        Is filled: see the columns; the tip frame is that of the first tube's material.
+    """
+    n = beta.shape[1]
+    most = 1 + n + 2 * design[2].shape[0]
+    pieces, moments, directions = np.zeros((most, PIECE_COLUMNS)), np.zeros((most, n)), np.zeros((most, n))
+    owners = -1 - np.arange(n - 1)
+    room = 0
+    nodes, steps = room_for(room, n, n - 1)
+    poses = np.zeros((room + 1, 12))
+    for m in range(beta.shape[0]):
+        count, n_steps = cut(design, beta[m], step, pieces, moments, directions)
+        if n_steps != room:
+            room = n_steps
+            nodes, steps = room_for(room, n, n - 1)
+            poses = np.zeros((room + 1, 12))
+        cutting = (pieces, moments, directions, count)
+        worst, least = settle(design, cutting, base_angles[m], beta[m], owners, nodes, steps, tip_angles[m])
+        lay(cutting, nodes, steps, poses)
+        turned(poses[room], tip_angles[m, 0], results[m, TIP:])
+        results[m, CONVERGED] = 1.0 if worst < TOLERANCE else 0.0
+        results[m, STABLE] = 1.0 if least > 0.0 else 0.0
+        results[m, LEAST_DETERMINANT] = least
+        results[m, RESIDUAL] = worst

@@ -38,7 +38,7 @@ MARKS_S = (0.01, 0.1, 1.0, 10.0)
 SLICE = 200
 UNIT = Resolution(fine_mm=1.0, fine_rolls=16)
 
-NAMES = ("rrt", "optimal", "resolution")
+NAMES = ("rrt", "optimal", "resolution", "decide")
 
 
 def asked(query: Query) -> searches.Query:

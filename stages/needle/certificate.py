@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
 from anatomy.grid import Float
+from stages.needle.kernels import bitmaps, blocked, bounds, cubes, hopes, sets
 from stages.needle.kernels import limits as index
-from stages.needle.kernels import sets
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace
 
@@ -61,7 +61,7 @@ class Plane:
     def trimmed(self) -> Plane:
         """Return the same without empty rows and columns at the edges."""
         box = np.zeros(8, dtype=np.int64)
-        sets.extent(self.bits, box)
+        bitmaps.extent(self.bits, box)
         v0, v1, u0, u1, y0, y1, w0, w1 = (int(n) for n in box)
         bits = self.bits[v0 : v1 + 1, u0 : u1 + 1, y0 : y1 + 1, w0 : w1 + 1]
         return Plane(np.ascontiguousarray(bits), self.window + np.array([v0, u0, y0, 64 * w0]))
@@ -125,7 +125,7 @@ class NoPathProof:
         self._required = float(space.limits[index.REQUIRED])
         self._exempt_mm = float(space.limits[index.EXEMPT_LENGTH]) - query.inserted_mm
         self._kappa = max(float(space.limits[index.KAPPA]) * (1.0 + ROUNDING), LEAST_KAPPA)
-        self._tolerance = space.goal_tolerance_mm + sets.SPARE
+        self._tolerance = space.goal_tolerance_mm + bounds.SPARE
         self._planes: list[Plane] = []
         self._coarse: list[Plane] = []
         self._too_steep = False
@@ -172,7 +172,7 @@ class NoPathProof:
         start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
         chord = query.target - start
         total = float(np.linalg.norm(chord))
-        length = float(space.limits[index.MAX_LENGTH]) - query.inserted_mm + sets.SPARE
+        length = float(space.limits[index.MAX_LENGTH]) - query.inserted_mm + bounds.SPARE
         turn = min(float(space.limits[index.MAX_TURN]) - query.turned_rad, self._kappa * length)
         if space.limits[index.LOOKUP_STEP] > 0.0:
             self._end("undecided", "paths of this space need not be clear")
@@ -182,12 +182,12 @@ class NoPathProof:
             self._end("undecided", "the target lies at the start")
         elif total - self._tolerance > length:
             self._end("no path", "the target is farther than the needle is long")
-        elif self._clearance_at_most(start) < self._required - sets.SPARE:
+        elif self._clearance_at_most(start) < self._required - bounds.SPARE:
             self._end("no path", "the start is too near to obstacles")
         else:
             ahead = float(chord @ forward)
             aside = math.sqrt(max(total**2 - ahead**2, 0.0))
-            if sets.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_WAY_MM:
+            if hopes.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_WAY_MM:
                 self._end("no path", "the target lies outside the workspace of the start")
         if self.outcome == "running":
             normal = chord / total
@@ -198,36 +198,36 @@ class NoPathProof:
 
     def _clearance_at_most(self, point: Float) -> float:
         exempt = self._query.branch if self._exempt_mm > 0.0 else -1
-        return float(sets.clearance_above(self._space.arrays, self._required, 0.0, exempt, *point))
+        return float(blocked.clearance_above(self._space.arrays, self._required, 0.0, exempt, *point))
 
     def _bound(self, total: float, length: float) -> None:
         """Bound the places and the angle to the line that a path of at most `length` mm can have."""
         radius = 1.0 / self._kappa
         widest = total + self._tolerance
-        self._ends = np.zeros(sets.ENDS_SIZE)
-        self._ends[: sets.LONGEST] = total, self._tolerance
-        self._ends[sets.SPINDLE_RADIUS] = math.inf
+        self._ends = np.zeros(bounds.ENDS_SIZE)
+        self._ends[: bounds.LONGEST] = total, self._tolerance
+        self._ends[bounds.SPINDLE_RADIUS] = math.inf
         self._steepest = 1.0
         longest = length
         if widest < 2.0 * radius:
             half = math.asin(0.5 * widest / radius)
             tilt = math.asin(self._tolerance / total)
             offset = radius * math.cos(half)
-            self._ends[sets.SPINDLE_MIDDLE :] = 0.5 * widest, offset, radius + widest * tilt
+            self._ends[bounds.SPINDLE_MIDDLE :] = 0.5 * widest, offset, radius + widest * tilt
             self._steepest = math.sin(min(half + tilt + ROUNDING, 0.5 * math.pi))
             longest = min(longest, 2.0 * half * radius)
         longest += self._tolerance
-        self._ends[sets.LONGEST] = longest
-        self._aside = 0.5 * math.sqrt(longest**2 - total**2) + sets.SPARE
-        self._before = 0.5 * (longest - total) + sets.SPARE
+        self._ends[bounds.LONGEST] = longest
+        self._aside = 0.5 * math.sqrt(longest**2 - total**2) + bounds.SPARE
+        self._before = 0.5 * (longest - total) + bounds.SPARE
         if widest < 2.0 * radius:
             self._aside = min(self._aside, radius + widest * tilt - offset)
         local = self._frame[1:] @ self._query.lps_from_start[:3, 2]
         self._along = float(local[0])
-        self._scale = np.zeros(sets.SCALE_SIZE)
-        self._scale[sets.KAPPA] = self._kappa
+        self._scale = np.zeros(bounds.SCALE_SIZE)
+        self._scale[bounds.KAPPA] = self._kappa
         if self._along > 0.0:
-            self._scale[sets.FIRST_V : sets.FIRST_U + 1] = local[1:] / local[0]
+            self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
 
     def _parted(self, side: float) -> bool:
         """Tell whether cubes that no path can pass part the target from the start."""
@@ -236,12 +236,13 @@ class NoPathProof:
         beside = math.ceil(self._aside / side) + 1
         before = math.ceil(self._before / side) + 1
         shape = (
-            np.array([before + math.ceil(self._ends[sets.TOTAL] / side) + before, 2 * beside, 2 * beside]) + 1
+            np.array([before + math.ceil(self._ends[bounds.TOTAL] / side) + before, 2 * beside, 2 * beside])
+            + 1
         )
         size = math.prod(int(n) for n in shape)
         if 5 * size > self._max_bytes or size >= 1 << 31:
             return False
-        return not sets.flood(
+        return not cubes.flood(
             self._space.arrays, self._required, self._query.branch, self._exempt_mm, self._scale, self._ends,
             self._frame, side, np.array([-before, -beside, -beside]), np.zeros(shape, dtype=np.bool_),
             np.zeros(size, dtype=np.int32),
@@ -249,12 +250,12 @@ class NoPathProof:
 
     def _aim_planes(self) -> None:
         """Choose the planes and the direction from which the limit of the angle counts."""
-        last = float(self._ends[sets.TOTAL]) - self._tolerance
+        last = float(self._ends[bounds.TOTAL]) - self._tolerance
         self._count = math.ceil(last / min(DEPTH_SHARE / self._kappa, LARGEST_DEPTH_MM))
         self._depth = last / self._count
         self._proved_steepest = self._steepest <= STEEPEST
         sine = self._steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
-        self._scale[sets.TOP_SINE] = sine
+        self._scale[bounds.TOP_SINE] = sine
         if self._along <= 0.0 or math.sqrt(max(1.0 - self._along**2, 0.0)) >= sine:
             self._end("undecided", "the start looks away from the target")
         reference = self._query.reference
@@ -274,9 +275,9 @@ class NoPathProof:
                 self._depth *= 0.5 if self._split else 1.0
                 self._count *= 2 if self._split else 1
             self.slope_cell = 2.0 * self.cell_mm / self._depth
-            self._scale[sets.CELL], self._scale[sets.SLOPE_CELL] = self.cell_mm, self.slope_cell
+            self._scale[bounds.CELL], self._scale[bounds.SLOPE_CELL] = self.cell_mm, self.slope_cell
             if not self._proved_steepest:
-                self._scale[sets.TOP_SINE] = 1.0 - self._kappa * self._depth
+                self._scale[bounds.TOP_SINE] = 1.0 - self._kappa * self._depth
             self._planes = []
             for number in range(self._count + 1):
                 self._forward(number)
@@ -294,7 +295,7 @@ class NoPathProof:
     def _forward(self, number: int) -> None:
         """Add a plane: the states reached from the plane before, or the start."""
         plane = self._allowed(number)
-        sets.keep_hopeful(
+        hopes.keep_hopeful(
             plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
             float(self._space.limits[index.MAX_ANGLE]),
         )  # fmt: skip
@@ -310,7 +311,7 @@ class NoPathProof:
         plane = plane.trimmed()
         self.states = max(self.states, int(np.bitwise_count(plane.bits).sum()))
         if not self._proved_steepest and not self._coarse and number < self._count:
-            sine = sets.steepest_of(plane.bits, plane.window, self._scale)
+            sine = bounds.steepest_of(plane.bits, plane.window, self._scale)
             self._too_steep = self._too_steep or sine > 1.0 - 2.0 * self._kappa * self._depth
         if self._too_steep:
             self._end("undecided", "paths may be too steep for the planes")
@@ -336,7 +337,7 @@ class NoPathProof:
             shape = np.where(halved, 2 * np.array(coarse.bits.shape) + 1, coarse.bits.shape)
             self._require(8 * math.prod(int(n) for n in shape))
             bits = np.zeros(tuple(shape), dtype=np.uint64)
-            sets.refine(coarse.bits, not self._split, bits)
+            bitmaps.refine(coarse.bits, not self._split, bits)
             return Plane(bits, np.where(halved, 2 * coarse.window - 1, coarse.window))
         low, high = self._reached(self._planes[-1].window, self._planes[-1].ends, 1, number)
         if self._coarse:
@@ -349,7 +350,7 @@ class NoPathProof:
         shape = high - low + 1
         shape[3] = -(-int(shape[3]) // 64)
         self._require(8 * math.prod(int(n) for n in shape))
-        return Plane(np.full(tuple(shape), sets.ALL, dtype=np.uint64), low)
+        return Plane(np.full(tuple(shape), bitmaps.ALL, dtype=np.uint64), low)
 
     def _reached(self, low: Window, high: Window, way: int, number: int) -> tuple[Window, Window]:
         """Return the first and last cell numbers on a plane that states between others may reach.
@@ -357,13 +358,13 @@ class NoPathProof:
         `way` is 1 from the plane before and -1 from the one after.
         """
         scale = self._scale
-        reach = sets.largest_reach(scale, self._depth, 2.0, low, *(high - low + 1)[:2])
-        top = scale[sets.TOP_SINE]
+        reach = bounds.largest_reach(scale, self._depth, 2.0, low, *(high - low + 1)[:2])
+        top = scale[bounds.TOP_SINE]
         steep = top / math.sqrt(1.0 - top * top)
-        aside = math.ceil(sets.largest_aside(top, scale, self._depth, 0.0, 1e9) / self.cell_mm + 4.0)
+        aside = math.ceil(bounds.largest_aside(top, scale, self._depth, 0.0, 1e9) / self.cell_mm + 4.0)
         least, most = low.copy(), high.copy()
         for axis in (0, 1):
-            first = scale[sets.FIRST_V + axis]
+            first = scale[bounds.FIRST_V + axis]
             least[axis] = max(low[axis] - reach, math.floor((-steep - first) / self.slope_cell) - 1)
             most[axis] = max(
                 min(high[axis] + reach, math.ceil((steep - first) / self.slope_cell) + 1), least[axis]
@@ -386,7 +387,7 @@ class NoPathProof:
     def _step(self, plane: Plane, way: int, other: Plane, blur: float) -> None:
         """Keep of another plane what a plane's states reach, as many rows of directions at once as fit."""
         nv, nu, rows, words = other.bits.shape
-        reach = sets.largest_reach(self._scale, self._depth, blur, other.window, nv, nu)
+        reach = bounds.largest_reach(self._scale, self._depth, blur, other.window, nv, nu)
         chunk = nv
         while True:
             part = plane.bits[: chunk + 2 * reach]
@@ -425,19 +426,19 @@ class NoPathProof:
             corners[:, axis] = low[axis + 2] + np.floor(ends.min(axis=0)) - 1
             shape[:, axis] = high[axis + 2] + np.ceil(ends.max(axis=0)) + 2 - corners[:, axis]
         rows, words = int(shape[:, 0].max()), -(-int(shape[:, 1].max()) // 64)
-        slacks = sets.HALF_DIAGONAL * self.cell_mm * SLACK_RATIO ** np.arange(SLACKS)
+        slacks = bounds.HALF_DIAGONAL * self.cell_mm * SLACK_RATIO ** np.arange(SLACKS)
         self._require(len(probes) * rows * words * (8 + 64 + 8 * SLACKS))
         probed = np.zeros((len(probes), rows, words), dtype=np.uint64)
-        sets.mark_probed(plane.bits, plane.window, self._scale, probes, probed, corners)
+        blocked.mark_probed(plane.bits, plane.window, self._scale, probes, probed, corners)
         grades = np.zeros((len(probes), rows, 64 * words), dtype=np.uint8)
         across = self._frame[2:] * self.cell_mm
         for n, probe in enumerate(probes):
             depth = here + float(probe)
             # A path at this depth is at least as long, so beyond the exempt length nothing is spared.
             exempt = self._query.branch if depth < self._exempt_mm else -1
-            tangent = self._scale[sets.FIRST_V : sets.FIRST_U + 1] @ self._frame[2:]
+            tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
             origin = self._frame[0] + depth * (self._frame[1] + tangent) + corners[n] @ across
-            sets.grade_clearance(
+            blocked.grade_clearance(
                 self._space.arrays, self._required, exempt, origin, across, probed[n], slacks, grades[n]
             )
-        sets.keep_clear(plane.bits, plane.window, self._scale, probes, corners, grades, slacks)
+        blocked.keep_clear(plane.bits, plane.window, self._scale, probes, corners, grades, slacks)

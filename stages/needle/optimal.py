@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.needle.kernels import optimal, tree
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import path_from_tree
+from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.searches import Query, RestartingRRT
 from stages.needle.space import NeedleSpace
 
@@ -50,6 +50,15 @@ class OptimalSearch(RestartingRRT):
         if found:
             self._read_vias(self.count - 1)
         return found
+
+    def adopt(self, path: ArcPath, cost: float) -> None:
+        """Go on from a path that another search found for the same query and objective."""
+        points = path.frames()[1:, :3, 3]
+        self.path, self.cost = path, cost
+        self._via_count = len(points)
+        if len(points) <= MAX_VIAS:
+            self._vias[: len(points), :3] = points
+            self._vias[: len(points), 3] = optimal.ARC
 
     def grow(self, iterations: int) -> tuple[int, int, bool]:
         """Grow by the RRT up to the first path, then in state and cost."""

@@ -24,6 +24,8 @@ Arrays = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int]
 
 RRT_STEP_MM = 20.0
 COST_STEP_MM = 0.5
+ROUNDING_MM = 1e-6
+"""By so much less than the goal tolerance searches miss, so that rounding leads no path out of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,6 +38,8 @@ class NeedleSpace:
     needle : Needle
     required_clearance_mm : float
         Distance that the needle's axis keeps from obstacles.
+    goal_tolerance_mm : float
+        How far from the target a path may end.
     arrays : tuple
         Clearance field, labels, geometry and obstacle bits, for the kernels.
     limits : (N_LIMITS,) float64
@@ -47,6 +51,7 @@ class NeedleSpace:
     grid: Grid
     needle: Needle
     required_clearance_mm: float
+    goal_tolerance_mm: float
     arrays: Arrays
     limits: Float
     cost_map: Volume | None
@@ -58,11 +63,6 @@ class NeedleSpace:
             costs = None if self.cost_map is None else self.cost_map.array
             self._objectives[objective] = objective.arrays(costs)
         return self._objectives[objective]
-
-    @property
-    def goal_tolerance_mm(self) -> float:
-        """How far from the target a path may end."""
-        return float(self.limits[index.GOAL_TOLERANCE])
 
 
 def needle_space(
@@ -163,11 +163,12 @@ def _space(
     limits[index.EXEMPT_LENGTH] = needle.exit_exemption_mm
     limits[index.MAX_STEP] = RRT_STEP_MM
     limits[index.COST_STEP] = COST_STEP_MM
-    limits[index.GOAL_TOLERANCE] = goal_tolerance_mm
+    limits[index.GOAL_TOLERANCE] = max(goal_tolerance_mm - ROUNDING_MM, 0.0)
     return NeedleSpace(
         grid=grid,
         needle=needle,
         required_clearance_mm=required_mm,
+        goal_tolerance_mm=goal_tolerance_mm,
         arrays=(clearance.corners, labels, clearance.geometry, bits),
         limits=read_only(limits),
         cost_map=cost_map,

@@ -12,7 +12,7 @@ from anatomy.grid import Grid
 from anatomy.structures import VESSEL
 from stages.needle.certificate import NoPathProof
 from stages.needle.device import Needle
-from stages.needle.kernels import sets
+from stages.needle.kernels import bitmaps
 from stages.needle.searches import Query, RestartingRRT
 from stages.needle.space import NeedleSpace, space_of_labels
 
@@ -158,9 +158,9 @@ def test_bitmaps_move_by_whole_cells(dy: int, dx: int) -> None:
         if 0 <= y + dy < 20 and 0 <= x + dx < 192:
             moved[y + dy, x + dx] = True
     target = np.zeros((20, 3), dtype=np.uint64)
-    sets.or_shifted(target, bits_of(cells), dy, dx)
+    bitmaps.or_shifted(target, bits_of(cells), dy, dx)
     assert np.array_equal(target, bits_of(moved))
     other = rng.random((20, 192)) < 0.5
     kept = bits_of(other)
-    sets.and_shifted(kept, bits_of(cells), dy, dx)
+    bitmaps.and_shifted(kept, bits_of(cells), dy, dx)
     assert np.array_equal(kept, bits_of(other & moved))

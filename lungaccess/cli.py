@@ -1,4 +1,4 @@
-"""The command line: demo, plan, check, info and presets.
+"""The command line: demo, plan, needle, tubes, check, info and presets.
 
 Exit codes: 0, a plan was found and the independent check accepts it; 1, there is no plan or the check
 refuses it; 2, the input is bad.
@@ -18,6 +18,7 @@ from anatomy.errors import AnatomyError, LungaccessError, SettingsError, TargetE
 from anatomy.io.files import require_writable_folder
 from anatomy.io.frames import Frame, parse_point
 from lungaccess import terminal
+from lungaccess.commands_tubes import tubes
 from lungaccess.terminal import console, error_console
 
 if TYPE_CHECKING:
@@ -67,6 +68,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
+app.command(tubes)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

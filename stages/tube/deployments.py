@@ -109,6 +109,11 @@ class Deployment:
     wall_angle_rad: float
     lateral_sweep_mm: float
 
+    @property
+    def length_in_tissue_mm(self) -> float:
+        """Length of tube beyond the lumen that it leaves."""
+        return self.inner_mm - self.exit_mm
+
 
 def scene_of(lung: Lung, *, with_fissures: bool) -> Scene:
     """Gather the arrays that the tube kernels look at."""

@@ -178,6 +178,11 @@ class ConcentricTubes:
         Largest distance along the tubes from the tip of the scope to their own tip, mm.
     max_strain : float
         Largest strain of the tube material (dimensionless).
+    min_clearance_mm : float
+        Least difference between the bore of the outer tube and the outer diameter of the inner one, mm.
+    max_channel_curvature_per_mm : float
+        Largest curvature of the working channel in which a precurved tube is held, 1/mm; in the worst case it
+        bends the tube against its precurvature.
 
     Raises
     ------
@@ -198,6 +203,12 @@ class ConcentricTubes:
         float, quantity("largest extension beyond the tip of the scope", above=0.0, at_most=300.0)
     ] = 60.0
     max_strain: Annotated[float, quantity("largest strain of the material", above=0.0, at_most=0.1)] = 0.04
+    min_clearance_mm: Annotated[
+        float, quantity("least difference of diameters of nested tubes", at_least=0.0, at_most=2.0)
+    ] = 0.0
+    max_channel_curvature_per_mm: Annotated[
+        float, quantity("largest curvature of the channel that holds the tubes", at_least=0.0, at_most=0.2)
+    ] = 0.0
 
     def __post_init__(self) -> None:
         self._check_nesting()
@@ -212,21 +223,24 @@ class ConcentricTubes:
                 "inner.bent_pieces", len(self.inner.bent_pieces), "none; plans need an inner tube of one arc"
             )
         for name, tube in (("outer", self.outer), ("inner", self.inner)):
-            if tube.rest_strain > self.max_strain:
+            strain = tube.rest_strain + self.max_channel_curvature_per_mm * tube.radius_mm
+            if strain > self.max_strain:
+                most = self.max_strain / tube.radius_mm - self.max_channel_curvature_per_mm
                 raise impossible(
                     f"{name}.precurvature_per_mm",
                     tube.max_precurvature_per_mm,
-                    f"at most 2 max_strain / outer_diameter_mm = "
-                    f"{self.max_strain / tube.radius_mm:.6g}; the strain is {tube.rest_strain:.4g}, "
-                    f"max_strain is {self.max_strain:g}",
+                    f"at most 2 max_strain / outer_diameter_mm - max_channel_curvature_per_mm = {most:.6g}; "
+                    f"the strain is {strain:.4g}, max_strain is {self.max_strain:g}",
                 )
 
     def _check_nesting(self) -> None:
-        if self.inner.outer_diameter_mm >= self.outer.inner_diameter_mm:
+        clearance = self.outer.inner_diameter_mm - self.inner.outer_diameter_mm
+        if clearance <= 0.0 or clearance < self.min_clearance_mm - 1e-9:
             raise impossible(
                 "inner.outer_diameter_mm",
                 self.inner.outer_diameter_mm,
-                f"less than outer.inner_diameter_mm = {self.outer.inner_diameter_mm:g}",
+                f"less than outer.inner_diameter_mm = {self.outer.inner_diameter_mm:g}, by at least "
+                f"min_clearance_mm = {self.min_clearance_mm:g}",
             )
         if self.inner.length_mm < self.outer.length_mm:
             raise impossible(

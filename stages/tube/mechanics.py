@@ -15,21 +15,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicHermiteSpline
 
-from anatomy.errors import LungaccessError, SettingsError
+from anatomy.errors import SettingsError
 from anatomy.grid import Float, read_only
 from stages.tube.device import Tube
+from stages.tube.errors import ConvergenceError
 from stages.tube.kernels import all_equilibria, assembly, equilibrium, jacobian, pose, torsion
 
-STEP_RAD = 0.1
+STEP_RAD = 0.075
 """Angle of the fastest torsional oscillation that one step spans; tips are then right to about 1e-6 mm."""
 LARGEST_COUNT = 64
 """Of equilibria that are looked for."""
 SAME_MM = 1e-9
-
-
-class ConvergenceError(LungaccessError):
-    """No equilibrium was found for given angles of the rear ends."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,13 +112,18 @@ class TubeMechanics:
         return Equilibrium(self, self._joints(tip_angles_rad, "tip angles"), self._shifts(beta_mm))
 
     def given_base_angles(
-        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, guess_rad: ArrayLike | None = None
+        self,
+        base_angles_rad: ArrayLike,
+        beta_mm: ArrayLike,
+        *,
+        guess_rad: ArrayLike | None = None,
+        prefer_stable: bool = True,
     ) -> Equilibrium:
         """Return an equilibrium with given rotations of the rear ends.
 
         From the guess Newton's method is tried; if it fails or ends at an unstable equilibrium, the
         precurvature is raised from nothing, and then guesses all round are tried.  So what is returned is
-        unstable only if no stable equilibrium was found.
+        unstable only if no stable equilibrium was found, or it was not preferred.
 
         Parameters
         ----------
@@ -130,6 +133,8 @@ class TubeMechanics:
             See `given_tip_angles`.
         guess_rad : (n,) float64, optional
             Tip angles to start from, such as those of a configuration nearby; by default the base angles.
+        prefer_stable : bool
+            If False, an unstable equilibrium next to the guess is as good.
 
         Raises
         ------
@@ -142,7 +147,9 @@ class TubeMechanics:
         tip = base.copy() if guess_rad is None else self._joints(guess_rad, "guess")
         results = np.zeros((1, equilibrium.RESULT_COLUMNS))
         tips = tip[None].copy()
-        equilibrium.settle_many(self._design, base[None], beta[None], self.step_rad, tips, results)
+        equilibrium.settle_many(
+            self._design, base[None], beta[None], self.step_rad, prefer_stable, tips, results
+        )
         if not results[0, equilibrium.CONVERGED]:
             raise ConvergenceError(
                 f"No equilibrium was found for base angles {np.round(base, 4).tolist()} rad and rear ends at "
@@ -210,7 +217,7 @@ class TubeMechanics:
                 )
         self._check_shifts(beta)
         results = np.zeros((len(base), equilibrium.RESULT_COLUMNS))
-        equilibrium.settle_many(self._design, base, beta, self.step_rad, tips, results)
+        equilibrium.settle_many(self._design, base, beta, self.step_rad, True, tips, results)
         return Batch(
             tip_angles_rad=read_only(tips),
             base_from_tip=read_only(matrices(results[:, equilibrium.TIP :])),
@@ -337,20 +344,28 @@ class Equilibrium:
         return np.where(self._there(s), self._along(s)[2], np.nan)
 
     def determinant(self, arc_lengths_mm: ArrayLike) -> Float:
-        """Return det d psi(s) / d psi_tip `(N,)`; ahead of the front plate that of the next node."""
+        """Return det d psi(s) / d psi_tip `(N,)`; see `least_determinant`."""
         s = self._arc_lengths(arc_lengths_mm)
-        nodes = self._relative_nodes()
-        at = np.searchsorted(nodes[0], s - 1e-9)
         n = self.mechanics.count
         matrix, right = np.zeros((n - 1, n - 1)), np.zeros(n - 1)
-        return np.array(
-            [
-                equilibrium.determinant_at(
-                    nodes[3][k], nodes[4][k], self.beta_mm, min(float(x), 0.0), matrix, right
-                )
-                for k, x in zip(np.maximum(at, 0), s, strict=True)
-            ]
-        )
+        found = np.ones(len(s))
+        for m, x in enumerate(s):
+            dpsi, drate = self._derivatives_at(float(x))
+            found[m] = equilibrium.determinant_at(
+                dpsi, drate, self.beta_mm, min(float(x), 0.0), matrix, right
+            )
+        return found
+
+    def _derivatives_at(self, s: float) -> tuple[Float, Float]:
+        """Return the derivatives of angles and torsion by all tip angles but the last, `(n - 1, n)`."""
+        arc_lengths, _psi, _rate, dpsi, drate = self._relative_nodes()
+        if s <= 0.0 or len(arc_lengths) == 1:
+            return dpsi[0], drate[0]
+        at = min(int(np.searchsorted(arc_lengths, s, "right")) - 1, len(arc_lengths) - 2)
+        h = float(arc_lengths[at + 1] - arc_lengths[at])
+        share = (s - float(arc_lengths[at])) / h
+        angles = CubicHermiteSpline([0.0, h], dpsi[at : at + 2], drate[at : at + 2])
+        return angles(share * h), angles(share * h, 1)
 
     @cached_property
     def jacobian_of_tip_angles(self) -> Float:
@@ -421,6 +436,10 @@ class Equilibrium:
     def _along(self, s: Float) -> tuple[Float, Float, Float]:
         n = self.mechanics.count
         poses, psi, rates = np.zeros((len(s), 12)), np.zeros((len(s), n)), np.zeros((len(s), n))
+        if len(self._steps[0]) == 0:
+            # Nothing is ahead of the front plate.
+            poses[:, [0, 4, 8]] = 1.0
+            return poses, psi + self.tip_angles_rad, rates
         for m, x in enumerate(s):
             pose.frame_at(
                 self._cutting, self._nodes, self._steps, self._poses, float(x), poses[m], psi[m], rates[m]

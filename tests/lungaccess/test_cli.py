@@ -93,11 +93,11 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
-    for command in ("demo", "plan", "check", "info", "presets", "--version"):
+    for command in ("demo", "plan", "needle", "tubes", "check", "info", "presets", "--version"):
         assert command in text
 
 
-@pytest.mark.parametrize("command", ["demo", "plan", "check", "info", "presets"])
+@pytest.mark.parametrize("command", ["demo", "plan", "needle", "tubes", "check", "info", "presets"])
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([command, "--help"]) == 0
     assert command in capsys.readouterr().out

@@ -259,17 +259,18 @@ def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, t
 
 
 @numba.njit(cache=True)
-def settle(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles):
+def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stable, tip_angles):
     """Find the equilibrium next to the guess in `tip_angles`, which gets its angles, `nodes` the rest.
 
-    If Newton's method fails from there or ends at an unstable one, the precurvature is raised from nothing,
-    and then angles all round are tried.  Returns the largest error of a base angle and the least determinant.
+    If Newton's method fails from there, or ends at an unstable one and stable ones are preferred, the
+    precurvature is raised from nothing, and then angles all round are tried.  Returns the largest error of a
+    base angle and the least determinant.
     """
     last = beta.shape[0] - 1
     matrix, right = np.zeros((last, last)), np.zeros(last)
     worst = _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
     least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
-    if least > 0.0:
+    if least > 0.0 or (worst < TOLERANCE and not prefer_stable):
         return worst, least
     first, first_worst = tip_angles.copy(), worst
     worst = _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
@@ -298,7 +299,7 @@ def room_for(n_steps, n, columns):
 
 
 @numba.njit(cache=True, nogil=True)
-def settle_many(design, base_angles, beta, step, tip_angles, results):
+def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, results):
     """Solve many configurations; `tip_angles` (M, n) holds guesses and gets the answers.
 
     Parameters
@@ -309,6 +310,8 @@ def settle_many(design, base_angles, beta, step, tip_angles, results):
         rad, mm.
     step : float
         See `assembly.cut`.
+    prefer_stable : bool
+        See `settle`.
     results : (M, RESULT_COLUMNS) float64
         Is filled: see the columns; the tip frame is that of the first tube's material.
     """
@@ -326,7 +329,9 @@ def settle_many(design, base_angles, beta, step, tip_angles, results):
             nodes, steps = room_for(room, n, n - 1)
             poses = np.zeros((room + 1, 12))
         cutting = (pieces, moments, directions, count)
-        worst, least = settle(design, cutting, base_angles[m], beta[m], owners, nodes, steps, tip_angles[m])
+        worst, least = settle(
+            design, cutting, base_angles[m], beta[m], owners, nodes, steps, prefer_stable, tip_angles[m]
+        )
         lay(cutting, nodes, steps, poses)
         turned(poses[room], tip_angles[m, 0], results[m, TIP:])
         results[m, CONVERGED] = 1.0 if worst < TOLERANCE else 0.0

@@ -120,7 +120,7 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
     at = lengths.shape[0]
     work = np.zeros((5, n))
     dwork = np.zeros((5, columns, n))
-    s[at] = pieces[count - 1, FAR]
+    s[at] = pieces[count - 1, FAR] if count > 0 else 0.0
     for i in range(n):
         psi[at, i] = tip_angles[i]
         rate[at, i] = 0.0

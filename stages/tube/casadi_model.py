@@ -1,0 +1,421 @@
+"""The mechanics of concentric tubes as CasADi functions, for exact derivatives and as a second opinion.
+
+This is the model of `stages.tube.mechanics` in the form of [Rucker2010]_: the state is the frame of the
+innermost tube, the angles of the others relative to it and the torsional moments, and Runge-Kutta steps
+carry it from the tip to the front plate.  It is written from the equations and shares no arithmetic with
+the kernels, so that either can judge the other.  It is slow, but can be part of a nonlinear program.
+
+Units are mm, N and rad.  Tubes are listed innermost first.  The base frame has its origin at the front
+plate, where the arc length is 0, and +z forward.  Tubes are held straight behind the plate.
+
+References
+----------
+.. [Rucker2010] docs/bibliography.md
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from stages.tube.device import Tube
+from stages.tube.errors import ConvergenceError
+
+DEFAULT_STEPS = 40
+"""Runge-Kutta steps in each piece of constant stiffness and precurvature."""
+
+SAME_MM = 1e-9
+"""Rounding of the lengths of a tube's pieces."""
+
+LARGEST_RESIDUAL_RAD = 1e-9
+_NEWTON = {"abstol": 1e-12, "abstolStep": 1e-13, "max_iter": 60, "error_on_fail": False}
+_POSITION, _ROTATION, _FIRST_ANGLE = slice(0, 3), slice(3, 7), 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """The order in which ends and bends of the tubes follow each other, seen from the tip.
+
+    Parameters
+    ----------
+    landmarks : tuple of (tube, index)
+        Landmarks ahead of the plate, the farthest first.  Those of a tube are the places where its
+        precurvature changes, counted from its base, and its end, the last.
+    """
+
+    landmarks: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CasadiEquilibrium:
+    """One equilibrium of the tubes.
+
+    Parameters
+    ----------
+    tip_angles_rad, base_angles_rad : (n,) float64
+        Angle of each tube at its own end, and at its base.
+    base_from_tip : (4, 4) float64
+        Material frame of the innermost tube at its end.
+    determinant : float
+        Determinant of the derivative of the base angles by the tip angles.
+    """
+
+    tip_angles_rad: Float
+    base_angles_rad: Float
+    base_from_tip: Float
+    determinant: float
+
+
+class OrderedTubes:
+    """The functions of tubes whose landmarks keep one order.
+
+    All are `casadi.Function`, made when first asked for, and can be called with numbers or with symbols.
+    Vectors are columns.  The order holds where `margins` is not negative; elsewhere the results mean
+    nothing.
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+        n >= 1 tubes, innermost first.
+    order : Order
+    steps_per_piece : int
+        Runge-Kutta steps between two landmarks.  The error falls with the fourth power.
+    """
+
+    def __init__(self, tubes: Sequence[Tube], order: Order, *, steps_per_piece: int) -> None:
+        self._tubes = tuple(tubes)
+        self._order = order
+        self._steps = steps_per_piece
+        self._marks = [_landmarks_mm(tube) for tube in tubes]
+        self._ahead = [sum(tube == i for tube, _ in order.landmarks) for i in range(len(tubes))]
+
+    @cached_property
+    def margins(self) -> Any:
+        """Function: beta (n,) mm -> (N,) mm, how far each landmark is from changing places.
+
+        Of a program's variables only the beta are bounded by it; `beta <= 0` is not included.
+        """
+        beta = casadi.MX.sym("beta_mm", len(self._tubes))
+        places = self._places(beta)
+        gaps = [far - near for far, near in itertools.pairwise(places)]
+        for i, marks in enumerate(self._marks):
+            if self._ahead[i] < len(marks):
+                gaps.append(-(beta[i] + marks[-1 - self._ahead[i]]))
+        return casadi.Function("margins", [beta], [casadi.vertcat(*gaps)], ["beta_mm"], ["margins_mm"])
+
+    @cached_property
+    def forward(self) -> Any:
+        """Function: tip angles (n,) rad, beta (n,) mm -> base angles, position, rotation, determinant.
+
+        The base angles are (n,) rad, the position (3,) mm and the rotation (3, 3) are those of the tip in
+        the base frame.  The determinant is that of the derivative of the base angles by the tip angles.
+        It is 0 where two equilibria merge: a motion that begins stable and keeps it above 0 stays stable.
+        """
+        tip, beta = self._symbols("tip_angles_rad")
+        base, position, rotation = self._integrate(tip, beta)
+        determinant = _determinant(len(self._tubes))(casadi.jacobian(base, tip))
+        return casadi.Function(
+            "forward",
+            [tip, beta],
+            [base, position, rotation, determinant],
+            ["tip_angles_rad", "beta_mm"],
+            ["base_angles_rad", "position_mm", "rotation", "determinant"],
+        )
+
+    @cached_property
+    def equilibrium(self) -> Any:
+        """Function: base angles (n,), beta (n,), guess (n,) -> tip angles, position, rotation, determinant.
+
+        It finds by Newton's method the equilibrium near the guess of the tip angles.  Its derivatives are
+        those of the implicit function, and the guess has none.  Call `forward` with the tip angles to see
+        whether it converged.
+        """
+        base, beta = self._symbols("base_angles_rad")
+        tip = casadi.MX.sym("tip_angles_rad", len(self._tubes))
+        residual = self._integrate(tip, beta)[0] - base
+        problem = {"x": tip, "p": casadi.vertcat(base, beta), "g": residual}
+        newton = casadi.rootfinder("tip_angles", "newton", problem, _NEWTON)
+        found = newton(x0=tip, p=casadi.vertcat(base, beta))["x"]
+        _, position, rotation, determinant = self.forward(found, beta)
+        return casadi.Function(
+            "equilibrium",
+            [base, beta, tip],
+            [found, position, rotation, determinant],
+            ["base_angles_rad", "beta_mm", "guess_rad"],
+            ["tip_angles_rad", "position_mm", "rotation", "determinant"],
+        )
+
+    @cached_property
+    def tip_jacobian(self) -> Any:
+        """Function: tip angles (n,) rad, beta (n,) mm -> (6, 2n) derivative of the tip's pose.
+
+        Columns are the base angles in rad, then beta in mm.  Rows are the position in mm, then the
+        rotation vector in rad, both in the base frame.  The tip angles follow the joints as the implicit
+        function theorem has it.  Singular where the determinant is 0.
+        """
+        tip, beta = self._symbols("tip_angles_rad")
+        base, position, rotation = self._integrate(tip, beta)
+        by_tip, by_beta = (_twist(position, rotation, by) for by in (tip, beta))
+        tip_by_base = casadi.inv(casadi.jacobian(base, tip))
+        fixed_base = by_beta - by_tip @ tip_by_base @ casadi.jacobian(base, beta)
+        return casadi.Function(
+            "tip_jacobian",
+            [tip, beta],
+            [casadi.horzcat(by_tip @ tip_by_base, fixed_base)],
+            ["tip_angles_rad", "beta_mm"],
+            ["jacobian"],
+        )
+
+    def _symbols(self, angles: str) -> tuple[Any, Any]:
+        n = len(self._tubes)
+        return casadi.MX.sym(angles, n), casadi.MX.sym("beta_mm", n)
+
+    def _places(self, beta: Any) -> list[Any]:
+        """Return the arc lengths of the landmarks, and of the plate."""
+        return [beta[tube] + self._marks[tube][index] for tube, index in self._order.landmarks] + [0.0]
+
+    def _integrate(self, tip: Any, beta: Any) -> tuple[Any, Any, Any]:
+        """Return the base angles, and position and rotation of the tip."""
+        n = len(self._tubes)
+        state = casadi.vertcat(0, 0, 0, 1, 0, 0, 0, tip[0], casadi.MX.zeros(2 * n - 1))
+        gaps = itertools.pairwise(self._places(beta))
+        passed = [0] * n
+        for (tube, _), (far, near) in zip(self._order.landmarks, gaps, strict=True):
+            passed[tube] += 1
+            if tube > 0 and passed[tube] == 1:
+                state[_FIRST_ANGLE + tube] = tip[tube] - state[_FIRST_ANGLE]
+            state = self._step(passed).fold(self._steps)(state, (near - far) / self._steps)
+        first = state[_FIRST_ANGLE]
+        others = [first + state[_FIRST_ANGLE + i] if passed[i] else tip[i] for i in range(1, n)]
+        angles = casadi.vertcat(first, *others)
+        rates = state[-n:] / casadi.DM([tube.torsional_stiffness_n_mm2 for tube in self._tubes])
+        rotation = _about_z(angles[0]) @ _rotation(state[_ROTATION]).T
+        return angles + beta * rates, -rotation @ state[_POSITION], rotation
+
+    def _step(self, passed: Sequence[int]) -> Any:
+        """Return the Runge-Kutta step in a piece: state, step in mm -> state.
+
+        `passed` counts the landmarks of each tube between the piece and the tip.
+        """
+        state, length = casadi.SX.sym("state", _FIRST_ANGLE + 2 * len(self._tubes)), casadi.SX.sym("step_mm")
+        bending, rest = [], []
+        for tube, marks, count in zip(self._tubes, self._marks, passed, strict=True):
+            bending.append(tube.bending_stiffness_n_mm2 if count else 0.0)
+            rest.append(_precurvature_per_mm(tube, marks, len(marks) - count))
+        twisting = [tube.torsional_stiffness_n_mm2 for tube in self._tubes]
+        rate = casadi.Function("rate", [state], [_rates(state, bending, twisting, rest)])
+        first = rate(state)
+        second = rate(state + 0.5 * length * first)
+        third = rate(state + 0.5 * length * second)
+        fourth = rate(state + length * third)
+        after = state + length / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+        return casadi.Function("step", [state, length], [after])
+
+
+class CasadiTubes:
+    """The mechanics of n >= 1 concentric tubes, whatever the order of their landmarks.
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+        Innermost, and so longest, first.
+    steps_per_piece : int, optional
+        Runge-Kutta steps between two landmarks.
+
+    Raises
+    ------
+    SettingsError
+        If there is no tube or no step.
+    """
+
+    def __init__(self, tubes: Sequence[Tube], *, steps_per_piece: int = DEFAULT_STEPS) -> None:
+        if not tubes or steps_per_piece < 1:
+            raise SettingsError(
+                f"{len(tubes)} tubes and {steps_per_piece} steps in a piece", expected="at least 1 of each"
+            )
+        self._tubes = tuple(tubes)
+        self._steps = steps_per_piece
+        self._ordered: dict[Order, OrderedTubes] = {}
+
+    def order_at(self, beta_mm: ArrayLike) -> Order:
+        """Return the order of the landmarks.
+
+        Parameters
+        ----------
+        beta_mm : (n,) float64
+            Arc lengths of the bases, at most 0.
+
+        Raises
+        ------
+        SettingsError
+            If a base is ahead of the plate, an end is behind it, a tube ends ahead of one inside it, or
+            numbers are missing or not finite.
+        """
+        beta = self._vector(beta_mm, "beta")
+        ends = beta + [tube.length_mm for tube in self._tubes]
+        if (beta > 0.0).any() or (ends < 0.0).any() or (np.diff(ends) > 0.0).any():
+            raise SettingsError(
+                f"The tubes' bases are at {beta.tolist()} mm and their ends at {ends.tolist()} mm",
+                expected="bases at 0 or behind, ends at 0 or ahead, and none ahead of that of a tube inside",
+            )
+        ahead = [
+            (-(beta[i] + mark), i, index)
+            for i, tube in enumerate(self._tubes)
+            for index, mark in enumerate(_landmarks_mm(tube))
+            if beta[i] + mark > 0.0
+        ]
+        return Order(landmarks=tuple((i, index) for _, i, index in sorted(ahead)))
+
+    def ordered(self, order: Order) -> OrderedTubes:
+        """Return the functions for one order; they are kept."""
+        if order not in self._ordered:
+            self._ordered[order] = OrderedTubes(self._tubes, order, steps_per_piece=self._steps)
+        return self._ordered[order]
+
+    def given_tip_angles(self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike) -> CasadiEquilibrium:
+        """Return the equilibrium with these tip angles.
+
+        Parameters
+        ----------
+        tip_angles_rad, beta_mm : (n,) float64
+
+        Raises
+        ------
+        SettingsError
+            As `order_at`.
+        """
+        tip, beta = self._vector(tip_angles_rad, "tip angles"), self._vector(beta_mm, "beta")
+        base, position, rotation, determinant = self.ordered(self.order_at(beta)).forward(tip, beta)
+        base_from_tip = np.eye(4)
+        base_from_tip[:3, :3], base_from_tip[:3, 3] = rotation.full(), position.full()[:, 0]
+        return CasadiEquilibrium(
+            tip_angles_rad=read_only(tip),
+            base_angles_rad=read_only(base.full()[:, 0]),
+            base_from_tip=read_only(base_from_tip),
+            determinant=float(determinant),
+        )
+
+    def solve(
+        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, guess_rad: ArrayLike | None = None
+    ) -> CasadiEquilibrium:
+        """Return the equilibrium with these base angles that Newton's method finds from a guess.
+
+        Parameters
+        ----------
+        base_angles_rad, beta_mm : (n,) float64
+        guess_rad : (n,) float64, optional
+            Guess of the tip angles; the base angles if none is given.
+
+        Raises
+        ------
+        SettingsError
+            As `order_at`.
+        ConvergenceError
+            If the method does not converge from this guess.
+        """
+        base, beta = self._vector(base_angles_rad, "base angles"), self._vector(beta_mm, "beta")
+        guess = base if guess_rad is None else self._vector(guess_rad, "guess")
+        functions = self.ordered(self.order_at(beta))
+        tip = functions.equilibrium(base, beta, guess)[0]
+        residual = float(np.abs(functions.forward(tip, beta)[0].full()[:, 0] - base).max())
+        if not residual <= LARGEST_RESIDUAL_RAD:
+            raise ConvergenceError(
+                f"Newton's method leaves base angles wrong by {residual:.3g} rad",
+                expected=f"at most {LARGEST_RESIDUAL_RAD:g} rad",
+                remedy="Begin nearer to an equilibrium",
+            )
+        return self.given_tip_angles(tip.full()[:, 0], beta)
+
+    def tip_jacobian(
+        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, guess_rad: ArrayLike | None = None
+    ) -> Float:
+        """Return the `(6, 2n)` derivative of the tip's pose by base angles and beta, at an equilibrium.
+
+        Rows and columns as in `OrderedTubes.tip_jacobian`; parameters and errors as in `solve`.
+        """
+        beta = self._vector(beta_mm, "beta")
+        tip = self.solve(base_angles_rad, beta, guess_rad).tip_angles_rad
+        return read_only(np.array(self.ordered(self.order_at(beta)).tip_jacobian(tip, beta).full()))
+
+    def _vector(self, values: ArrayLike, name: str) -> Float:
+        found = np.array(values, dtype=np.float64)
+        if found.shape != (len(self._tubes),) or not np.isfinite(found).all():
+            raise SettingsError(
+                f"The {name} are {found.tolist()}", expected=f"{len(self._tubes)} finite numbers, one a tube"
+            )
+        return found
+
+
+def _landmarks_mm(tube: Tube) -> list[float]:
+    """Return the ascending arc lengths from the base at which the precurvature changes, and the end."""
+    ends = {end for bend in tube.bends for end in (bend.from_mm, bend.to_mm)}
+    return [*sorted(end for end in ends if 0.0 < end < tube.length_mm - SAME_MM), tube.length_mm]
+
+
+def _precurvature_per_mm(tube: Tube, marks: Sequence[float], index: int) -> Any:
+    """Return the precurvature vector (2,) of the part of a tube that ends at a landmark."""
+    before = marks[index - 1] if index > 0 else 0.0
+    for start, end, curvature, direction in tube.bends:
+        if index < len(marks) and start <= 0.5 * (before + marks[index]) < end:
+            return curvature * np.array([np.cos(direction), np.sin(direction)])
+    return np.zeros(2)
+
+
+def _rates(state: Any, bending: Sequence[float], twisting: Sequence[float], rest: Sequence[Float]) -> Any:
+    """Return the derivative of the state by the arc length [Rucker2010]_.
+
+    The state is position, quaternion of the innermost tube's frame, its angle, the angles of the others
+    relative to it, and the torsional moments in N mm.
+    """
+    n = len(bending)
+    w, x, y, z = casadi.vertsplit(state[_ROTATION])
+    relative = [casadi.SX(0), *casadi.vertsplit(state[_FIRST_ANGLE + 1 : _FIRST_ANGLE + n])][:n]
+    rates = [state[_FIRST_ANGLE + n + i] / twisting[i] for i in range(n)]
+    turns = [_about_z(angle)[:2, :2] for angle in relative]
+    shared = sum(bending[i] * turns[i] @ rest[i] for i in range(n)) / sum(bending)
+    moments = []
+    for i in range(n):
+        own = turns[i].T @ shared
+        moments.append(bending[i] * (own[0] * rest[i][1] - own[1] * rest[i][0]))
+    forward = casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
+    a, b, c = shared[0], shared[1], rates[0]
+    spin = casadi.vertcat(
+        -x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
+    )
+    others = [rates[i] - rates[0] for i in range(1, n)]
+    return casadi.vertcat(forward, 0.5 * spin, rates[0], *others, *moments)
+
+
+def _about_z(angle: Any) -> Any:
+    """Return the rotation about z by an angle."""
+    c, s = casadi.cos(angle), casadi.sin(angle)
+    return casadi.vertcat(casadi.horzcat(c, -s, 0), casadi.horzcat(s, c, 0), casadi.horzcat(0, 0, 1))
+
+
+def _rotation(quaternion: Any) -> Any:
+    """Return the rotation of a quaternion (w, x, y, z) of any length."""
+    unit = quaternion / casadi.norm_2(quaternion)
+    cross = casadi.skew(unit[1:])
+    return casadi.MX.eye(3) + 2 * unit[0] * cross + 2 * cross @ cross
+
+
+def _twist(position: Any, rotation: Any, by: Any) -> Any:
+    """Return the (6, m) derivative of a pose: its position, then its rotation vector."""
+    columns = casadi.horzsplit(rotation)
+    turn = sum(casadi.skew(column) @ casadi.jacobian(column, by) for column in columns)
+    return casadi.vertcat(casadi.jacobian(position, by), 0.5 * turn)
+
+
+def _determinant(n: int) -> Any:
+    """Return the function: matrix (n, n) -> determinant, in plain arithmetic."""
+    matrix = casadi.SX.sym("matrix", n, n)
+    return casadi.Function("determinant", [matrix], [casadi.det(matrix)])

@@ -1,0 +1,9 @@
+"""Errors of the tube stage."""
+
+from __future__ import annotations
+
+from anatomy.errors import LungaccessError
+
+
+class ConvergenceError(LungaccessError):
+    """No equilibrium was found for given angles of the rear ends."""

@@ -1,0 +1,297 @@
+"""Sequences and designs that keep the tubes' sideways motion small, and what reach that costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from anatomy.margins import Margins
+from anatomy.settings import quantity, settings
+from stages.tube.deployments import tube_constants
+from stages.tube.device import ConcentricTubes, Tube
+from stages.tube.following import DEFAULT_STEP_MM, DEFAULT_STEP_RAD, DeployedSequence, SnapError, deploy
+from stages.tube.kernels import deployment as kernels
+from stages.tube.mechanics import TubeMechanics
+from stages.tube.sequences import Sequence, alternating, inner_first, together
+
+Int = NDArray[np.int64]
+
+INCREMENTS_MM = (2.0, 5.0, 10.0)
+"""Increments of the alternating sequences that are compared."""
+
+WALLS, LENGTHS, CURVATURES = 4, 13, 36
+"""How many values of each dimension are tried."""
+SAME_MM, SAME_RAD = 0.05, 0.02
+"""What differs less is taken to be equal."""
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SequenceComparison:
+    """Sequences to one final place, by their sweep.
+
+    Parameters
+    ----------
+    deployed : tuple of DeployedSequence
+        Those that can be carried out, least sweep first.
+    refused : dict of str to str
+        Why the others cannot: a tube is too short, or the tubes would snap.
+    """
+
+    deployed: tuple[DeployedSequence, ...]
+    refused: dict[str, str]
+
+    @property
+    def best(self) -> DeployedSequence:
+        """The sequence with the least sweep.
+
+        Raises
+        ------
+        SettingsError
+            If none can be carried out.
+        """
+        if not self.deployed:
+            raise SettingsError(
+                "No sequence reaches this deployment: "
+                + "; ".join(f"{name}: {why}" for name, why in self.refused.items()),
+                expected="at least one sequence without a snap",
+                remedy="Insert the tubes less far, turn them less against each other, or alter their lengths",
+            )
+        return self.deployed[0]
+
+
+def least_sweep_sequence(
+    tubes: SequenceOf[Tube],
+    base_angles_rad: ArrayLike,
+    insertions_mm: ArrayLike,
+    *,
+    step_mm: float = DEFAULT_STEP_MM,
+    step_rad: float = DEFAULT_STEP_RAD,
+    mechanics: TubeMechanics | None = None,
+) -> SequenceComparison:
+    """Compare the sequences that lead to one deployment, by their sweep.
+
+    Looked at are: all tubes together, the innermost first, by increments in turns, and all tubes together
+    without relative rotation, which then turn in place.
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+        Innermost first.
+    base_angles_rad : float or (n,) float64
+    insertions_mm : (n,) float64
+    step_mm, step_rad : float
+        Largest motion of any joint between two steps.
+    mechanics : TubeMechanics, optional
+        That of these tubes, if it is there already.
+
+    Raises
+    ------
+    SettingsError
+        If the insertions are out of order or beyond the tubes' lengths.
+    """
+    together(tubes, base_angles_rad, insertions_mm)
+    angles = np.broadcast_to(np.asarray(base_angles_rad, dtype=np.float64), (len(tubes),))
+    model = TubeMechanics(tubes) if mechanics is None else mechanics
+    deployed, refused = [], {}
+    for name, make in _makers(tubes, angles, insertions_mm).items():
+        try:
+            sequence = replace(make(), name=name)
+            deployed.append(deploy(model, sequence, step_mm=step_mm, step_rad=step_rad))
+        except (SettingsError, SnapError) as error:
+            refused[name] = str(error)
+    deployed.sort(key=lambda each: each.lateral_sweep_mm)
+    return SequenceComparison(deployed=tuple(deployed), refused=refused)
+
+
+def _makers(
+    tubes: SequenceOf[Tube], angles: Float, insertions_mm: ArrayLike
+) -> dict[str, Callable[[], Sequence]]:
+    """Return what makes each sequence that is compared, by its name."""
+    makers: dict[str, Callable[[], Sequence]] = {
+        "together": partial(together, tubes, angles, insertions_mm),
+        "inner first": partial(inner_first, tubes, angles, insertions_mm),
+    }
+    for increment in INCREMENTS_MM:
+        name = f"alternating by {increment:g} mm"
+        makers[name] = partial(alternating, tubes, angles, insertions_mm, increment_mm=increment)
+    if np.ptp(angles) > 0.0:
+        aligned = together(tubes, angles[0], insertions_mm)
+        makers["together, then turned in place"] = partial(aligned.then_turn, angles)
+    return makers
+
+
+@settings
+class MakerLimits:
+    """What limits the maker of a pair of tubes.
+
+    Parameters
+    ----------
+    channel_diameter_mm : float
+        Working channel of the scope.
+    longest_curve_mm : float
+        Longest curved part of the inner tube; 0 for the larger of its insertion and its present length.
+    thinnest_wall_mm : float
+        Thinnest wall of the outer tube.
+    nesting_clearance_mm, channel_clearance_mm : float
+        Differences of diameter between the tubes, and between outer tube and channel.
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite or absurd.
+    """
+
+    channel_diameter_mm: Annotated[float, quantity("working channel of the scope", above=0.0, at_most=10.0)]
+    longest_curve_mm: Annotated[
+        float, quantity("longest curved part, 0 if only the insertion limits it", at_least=0.0, at_most=500.0)
+    ] = 0.0
+    thinnest_wall_mm: Annotated[
+        float, quantity("thinnest wall of the outer tube", above=0.0, at_most=2.0)
+    ] = 0.05
+    nesting_clearance_mm: Annotated[
+        float, quantity("difference of diameters of bore and inner tube", above=0.0, at_most=2.0)
+    ] = 0.15
+    channel_clearance_mm: Annotated[
+        float, quantity("difference of diameters of channel and outer tube", above=0.0, at_most=2.0)
+    ] = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesignProposal:
+    """A pair of tubes, and what one deployment of it does, both tubes first, then the inner one alone.
+
+    Parameters
+    ----------
+    tubes : ConcentricTubes
+    lateral_sweep_mm : float
+        Largest distance of any point of the body from its final place.
+    tip_offset_mm : float
+        Distance of the tip from the scope's axis: the sideways reach.
+    tip_angle_rad : float
+        Angle between tip and scope.
+    """
+
+    tubes: ConcentricTubes
+    lateral_sweep_mm: float
+    tip_offset_mm: float
+    tip_angle_rad: float
+
+
+def propose_designs(
+    tubes: ConcentricTubes, outer_mm: float, inner_mm: float, max_sweep_mm: float, limits: MakerLimits
+) -> tuple[DesignProposal, ...]:
+    """Vary what a maker can vary, and return the designs worth a look, least sweep first.
+
+    Varied are the wall of the outer tube, and length and curvature of the inner tube's curved part, within
+    the strain limit of `tubes`; the curved part is at least half as long as now.  A design is left out if
+    another one sweeps no more, reaches no less to the side, turns the tip no more and has no longer curved
+    part.
+
+    Parameters
+    ----------
+    tubes : ConcentricTubes
+        What to start from; lengths, limits and the inner tube's diameters are kept.
+    outer_mm, inner_mm : float
+        Insertions of the deployment.
+    max_sweep_mm : float
+        Designs that sweep more are left out.
+    limits : MakerLimits
+
+    Raises
+    ------
+    SettingsError
+        If the insertions are impossible, the sweep is not finite, or no outer tube fits into the channel.
+    """
+    together((tubes.inner, tubes.outer), 0.0, (inner_mm, outer_mm))
+    if inner_mm == 0.0:
+        raise SettingsError("The inner tube stays in the scope", expected="an insertion above 0")
+    if not 0.0 <= max_sweep_mm < math.inf:
+        raise SettingsError(f"The largest sweep is {max_sweep_mm:g} mm", expected="finite, at least 0")
+    bore = tubes.inner.outer_diameter_mm + limits.nesting_clearance_mm
+    thickest = 0.5 * (limits.channel_diameter_mm - limits.channel_clearance_mm - bore)
+    if thickest < limits.thinnest_wall_mm:
+        raise SettingsError(
+            f"The outer tube's wall could be {thickest:g} mm thick at most",
+            expected=f"room for {limits.thinnest_wall_mm:g} mm between inner tube and channel",
+            remedy="Allow less clearance, or take a thinner inner tube or a larger channel",
+        )
+    longest = limits.longest_curve_mm or max(inner_mm, tubes.inner.curved_length_mm)
+    shortest = min(max(0.5 * tubes.inner.curved_length_mm, longest / LENGTHS), longest)
+    steepest = tubes.max_strain / tubes.inner.radius_mm * (1.0 - ROUNDING)
+    variants = product(
+        np.linspace(limits.thinnest_wall_mm, thickest, WALLS).tolist(),
+        np.linspace(shortest, longest, LENGTHS).tolist(),
+        np.linspace(steepest / CURVATURES, steepest, CURVATURES).tolist(),
+    )
+    found = [judge_design(_design(tubes, bore, *variant), outer_mm, inner_mm) for variant in variants]
+    kept = _worth_a_look([each for each in found if each.lateral_sweep_mm <= max_sweep_mm])
+    return tuple(sorted(kept, key=lambda each: (each.lateral_sweep_mm, -each.tip_offset_mm)))
+
+
+def _design(
+    tubes: ConcentricTubes, bore_mm: float, wall_mm: float, curve_mm: float, curvature_per_mm: float
+) -> ConcentricTubes:
+    return replace(
+        tubes,
+        outer=replace(tubes.outer, inner_diameter_mm=bore_mm, outer_diameter_mm=bore_mm + 2.0 * wall_mm),
+        inner=replace(
+            tubes.inner, curved_length_mm=curve_mm, precurvature_per_mm=curvature_per_mm, bent_pieces=()
+        ),
+    )
+
+
+def judge_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:
+    """Return sweep and reach of a design in closed form.
+
+    Parameters
+    ----------
+    tubes : ConcentricTubes
+    outer_mm, inner_mm : float
+        Insertions of the deployment.
+    """
+    numbers = tube_constants(tubes, Margins())
+    outer, inner = float(outer_mm), float(inner_mm)
+    aside, _ = kernels.planar_point(numbers, outer, inner, inner)
+    bent = min(tubes.inner.curved_length_mm, inner)
+    free = min(inner - outer, bent)
+    angle = numbers[kernels.INNER_CURVATURE] * free + numbers[kernels.OVERLAP_CURVATURE] * (bent - free)
+    return DesignProposal(
+        tubes=tubes,
+        lateral_sweep_mm=float(kernels.lateral_sweep(numbers, outer, inner)),
+        tip_offset_mm=float(aside),
+        tip_angle_rad=float(angle),
+    )
+
+
+def _worth_a_look(proposals: list[DesignProposal]) -> list[DesignProposal]:
+    """Leave out what another proposal does as well in every respect."""
+    if not proposals:
+        return []
+    # Rounded, so that designs that hardly differ count as one.
+    ranks = np.array(
+        [
+            (
+                round(each.lateral_sweep_mm / SAME_MM),
+                -round(each.tip_offset_mm / SAME_MM),
+                round(each.tip_angle_rad / SAME_RAD),
+                each.tubes.inner.curved_length_mm,
+            )
+            for each in proposals
+        ]
+    )
+    _, first = np.unique(ranks, axis=0, return_index=True)
+    ranks = ranks[first]
+    # Each is no worse than itself; the ranks of all others differ.
+    others: Int = np.sum(np.all(ranks[:, None] <= ranks[None], axis=2), axis=0) - 1
+    return [proposals[number] for number, count in zip(first, others, strict=True) if count == 0]

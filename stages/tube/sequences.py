@@ -1,0 +1,330 @@
+"""In which order joints move: turn and insert nested tubes from the scope tip to their final place."""
+
+from __future__ import annotations
+
+import collections.abc
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from stages.tube.device import Tube
+
+ROUNDING_MM = 1e-9
+"""Rounding forgiven where lengths are compared."""
+
+NUDGE_MM = 1e-12
+"""More than the last digit of a length."""
+
+TURN = "turn"
+DEFAULT_INCREMENT_MM = 5.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sequence:
+    """Waypoints of all joints; between two of them every joint moves at a steady rate.
+
+    Parameters
+    ----------
+    name : str
+    moves : tuple of str
+        What happens on the way to each waypoint after the first, W - 1 of them.
+    base_angles_rad, beta_mm : (W, n) float64
+        Rotations of the tubes' bases and arc lengths of these bases from the scope tip (never above 0),
+        innermost tube first.
+
+    Raises
+    ------
+    SettingsError
+        If the numbers of waypoints, moves and tubes do not fit, or a value is not finite.
+    """
+
+    name: str
+    moves: tuple[str, ...]
+    base_angles_rad: Float
+    beta_mm: Float
+
+    def __post_init__(self) -> None:
+        angles = np.array(self.base_angles_rad, dtype=np.float64, ndmin=2)
+        beta = np.array(self.beta_mm, dtype=np.float64, ndmin=2)
+        if angles.shape != beta.shape or len(beta) != len(self.moves) + 1 or beta.shape[1] == 0:
+            raise SettingsError(
+                f"Sequence {self.name!r} has {len(self.moves)} moves, angles of shape {angles.shape} and "
+                f"insertions of shape {beta.shape}",
+                expected="one row a waypoint, one column a tube, and one move less than waypoints",
+            )
+        if not (np.isfinite(angles).all() and np.isfinite(beta).all()):
+            raise SettingsError(
+                f"A joint of sequence {self.name!r} is not finite", expected="numbers in mm and rad"
+            )
+        object.__setattr__(self, "base_angles_rad", read_only(angles))
+        object.__setattr__(self, "beta_mm", read_only(beta))
+
+    @property
+    def n_tubes(self) -> int:
+        """Number of tubes, n."""
+        return int(self.beta_mm.shape[1])
+
+    def then_turn(self, base_angles_rad: ArrayLike, move: str = "turn in place") -> Self:
+        """Return this sequence with one more move: the bases turn to `base_angles_rad` (n,)."""
+        angles = _one_each(base_angles_rad, self.n_tubes)[None]
+        return type(self)(
+            name=f"{self.name}, {move}",
+            moves=(*self.moves, move),
+            base_angles_rad=np.concatenate([self.base_angles_rad, angles]),
+            beta_mm=np.concatenate([self.beta_mm, self.beta_mm[-1:]]),
+        )
+
+
+def together(
+    tubes: collections.abc.Sequence[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike
+) -> Sequence:
+    """Turn in the scope, insert all tubes with flush tips; each stops at its own insertion.
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+        n tubes, innermost first.
+    base_angles_rad : float or (n,) float64
+        Rotation of the bases; one number turns all of them.
+    insertions_mm : (n,) float64
+        How far each tube's tip comes out of the scope.
+
+    Raises
+    ------
+    SettingsError
+        If an outer tube would be ahead of an inner one, or a tube is too short.
+    """
+    insertions = _insertions(tubes, insertions_mm)
+    levels = np.unique(insertions[insertions > 0.0])
+    moves = [(_insert(tubes, insertions >= level), np.minimum(insertions, level)) for level in levels]
+    return _from_insertions("together", tubes, base_angles_rad, moves)
+
+
+def kuntz2015(
+    tubes: collections.abc.Sequence[Tube], rotation_rad: ArrayLike, outer_mm: float, inner_mm: float
+) -> Sequence:
+    """Turn, insert both tubes together, insert the inner one alone [Kuntz2015, sec. IV-B].
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+        Inner and outer tube, in this order.
+    rotation_rad : float or (2,) float64
+        Rotation of the bases in the scope; one number turns both.
+    outer_mm, inner_mm : float
+        How far the tubes come out of the scope.
+
+    Raises
+    ------
+    SettingsError
+        If there are not two tubes, the outer one would be ahead, or one is too short.
+    """
+    if len(tubes) != 2:
+        raise SettingsError(f"There are {len(tubes)} tubes", expected="two tubes, the inner one first")
+    made = together(tubes, rotation_rad, (inner_mm, outer_mm))
+    return Sequence(
+        name="kuntz2015", moves=made.moves, base_angles_rad=made.base_angles_rad, beta_mm=made.beta_mm
+    )
+
+
+def inner_first(
+    tubes: collections.abc.Sequence[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike
+) -> Sequence:
+    """Turn in the scope, insert the innermost tube wholly, then each next one over it.
+
+    Parameters and errors are those of `together`. The inner tubes must be long enough to be out alone.
+    """
+    insertions = _insertions(tubes, insertions_mm)
+    numbers = np.arange(len(insertions))
+    moves = [
+        (_insert(tubes, numbers == last), np.where(numbers <= last, insertions, 0.0))
+        for last in numbers[insertions > 0.0]
+    ]
+    return _from_insertions("inner first", tubes, base_angles_rad, moves)
+
+
+def alternating(
+    tubes: collections.abc.Sequence[Tube],
+    base_angles_rad: ArrayLike,
+    insertions_mm: ArrayLike,
+    *,
+    increment_mm: float = DEFAULT_INCREMENT_MM,
+) -> Sequence:
+    """Turn in the scope, then insert by increments in turns, the innermost tube ahead.
+
+    Parameters
+    ----------
+    increment_mm : float
+        How far a tube moves before it is the next one's turn.
+
+    The other parameters and the errors are those of `together`.
+    """
+    if not 0.0 < increment_mm < np.inf:
+        raise SettingsError(f"The increment is {increment_mm:g} mm", expected="a finite length above 0")
+    insertions = _insertions(tubes, insertions_mm)
+    numbers = np.arange(len(insertions))
+    now = np.zeros_like(insertions)
+    moves: list[tuple[str, Float]] = []
+    while (now < insertions).any():
+        for tube in numbers[now < insertions]:
+            now = np.where(numbers == tube, np.minimum(now + increment_mm, insertions), now)
+            moves.append((_insert(tubes, numbers == tube), now))
+    return _from_insertions("alternating", tubes, base_angles_rad, moves)
+
+
+def joint_steps(
+    sequence: Sequence, tubes: collections.abc.Sequence[Tube], *, step_mm: float, step_rad: float
+) -> tuple[Float, Float, np.ndarray]:
+    """Cut a sequence into steps, also where a curved part leaves the scope or the next tube.
+
+    Parameters
+    ----------
+    step_mm, step_rad : float
+        Largest motion of any joint in one step.
+
+    Returns
+    -------
+    base_angles_rad, beta_mm : (K, n) float64
+    move : (K,) int64
+        Index into `sequence.moves`; 0 for the first step, which is the first waypoint.
+
+    Raises
+    ------
+    SettingsError
+        If a step is not above 0, the tubes are others, or they get out of order on the way.
+    """
+    if not (0.0 < step_mm < np.inf and 0.0 < step_rad < np.inf):
+        raise SettingsError(f"The steps are {step_mm:g} mm, {step_rad:g} rad", expected="finite, above 0")
+    _require_order(sequence, tubes)
+    landmarks = _landmarks(tubes)
+    joints = np.hstack([sequence.base_angles_rad, sequence.beta_mm])
+    rows, moves = [joints[:1]], [np.zeros(1, dtype=np.int64)]
+    for number, (a, b) in enumerate(zip(joints[:-1], joints[1:], strict=True)):
+        change = np.abs(b - a)
+        n = sequence.n_tubes
+        count = max(np.ceil(change[:n].max() / step_rad), np.ceil(change[n:].max() / step_mm), 1.0)
+        share = np.unique(np.concatenate([np.arange(1, count + 1) / count, _crossings(landmarks, a, b)]))
+        rows.append(a + share[:, None] * (b - a))
+        moves.append(np.full(len(share), number))
+    steps = np.concatenate(rows)
+    beta = _in_order(steps[:, sequence.n_tubes :], np.array([tube.length_mm for tube in tubes]))
+    return steps[:, : sequence.n_tubes], beta, np.concatenate(moves)
+
+
+def _in_order(beta: Float, lengths: Float) -> Float:
+    """Undo what rounding did to the order of tips that are flush, and of bases at the scope tip."""
+    beta = np.minimum(np.maximum(beta, -lengths), 0.0)
+    for tube in range(len(lengths) - 2, -1, -1):
+        behind = beta[:, tube + 1] + lengths[tube + 1] - (beta[:, tube] + lengths[tube])
+        beta[:, tube] += np.where(behind > 0.0, behind + NUDGE_MM, 0.0)
+    return beta
+
+
+def _landmarks(tubes: collections.abc.Sequence[Tube]) -> list[tuple[int, float]]:
+    """Return (tube, distance from its base) of tube ends and of the borders of bent pieces."""
+    marks = []
+    for number, tube in enumerate(tubes):
+        borders = {tube.length_mm} | {end for bend in tube.bends for end in (bend.from_mm, bend.to_mm)}
+        marks += [(number, border) for border in sorted(borders)]
+    return marks
+
+
+def _crossings(landmarks: list[tuple[int, float]], a: Float, b: Float) -> Float:
+    """Return the shares of the way from `a` to `b` where a landmark passes the scope tip or another."""
+    n = len(a) // 2
+    start = np.array([a[n + tube] + border for tube, border in landmarks] + [0.0])
+    end = np.array([b[n + tube] + border for tube, border in landmarks] + [0.0])
+    first, second = np.triu_indices(len(start), 1)
+    gap, closing = start[first] - start[second], (start - end)[first] - (start - end)[second]
+    moving = np.abs(closing) > ROUNDING_MM
+    share = gap[moving] / closing[moving]
+    return np.asarray(share[(share > 0.0) & (share < 1.0)])
+
+
+def _insert(tubes: collections.abc.Sequence[Tube], moving: np.ndarray) -> str:
+    """Return the words for inserting some of the tubes."""
+    if moving.all():
+        return "insert the tube" if len(tubes) == 1 else "insert all tubes"
+    if len(tubes) == 2:
+        return f"insert the {'inner' if moving[0] else 'outer'} tube"
+    numbers = " and ".join(str(number + 1) for number in np.flatnonzero(moving))
+    return f"insert tube {numbers} (from the inside)"
+
+
+def _insertions(tubes: collections.abc.Sequence[Tube], insertions_mm: ArrayLike) -> Float:
+    insertions = np.array(insertions_mm, dtype=np.float64, ndmin=1)
+    if insertions.shape != (len(tubes),) or not len(tubes) or not np.isfinite(insertions).all():
+        raise SettingsError(
+            f"The insertions are {insertions.tolist()} mm",
+            expected=f"one finite length for each of the {len(tubes)} tubes",
+        )
+    if (insertions < 0.0).any() or (np.diff(insertions) > ROUNDING_MM).any():
+        raise SettingsError(
+            f"The insertions are {', '.join(f'{v:g}' for v in insertions)} mm, innermost tube first",
+            expected="0 <= outer <= inner",
+            remedy="Insert the inner tube at least as far as the outer one",
+        )
+    return insertions
+
+
+def _one_each(base_angles_rad: ArrayLike, n: int) -> Float:
+    try:
+        return np.broadcast_to(np.asarray(base_angles_rad, dtype=np.float64), (n,))
+    except ValueError:
+        raise SettingsError(
+            f"The rotations are {np.asarray(base_angles_rad).tolist()}",
+            expected=f"one angle, or one for each of the {n} tubes",
+        ) from None
+
+
+def _from_insertions(
+    name: str,
+    tubes: collections.abc.Sequence[Tube],
+    base_angles_rad: ArrayLike,
+    moves: list[tuple[str, Float]],
+) -> Sequence:
+    """Make the sequence that turns in the scope and then goes through insertions."""
+    n = len(tubes)
+    angles = _one_each(base_angles_rad, n)
+    insertions = np.array([np.zeros(n), np.zeros(n), *(stop for _, stop in moves)])
+    made = Sequence(
+        name=name,
+        moves=(TURN, *(label for label, _ in moves)),
+        base_angles_rad=np.vstack([np.zeros(n), np.tile(angles, (len(moves) + 1, 1))]),
+        beta_mm=insertions - [tube.length_mm for tube in tubes],
+    )
+    _require_order(made, tubes)
+    return made
+
+
+def _require_order(sequence: Sequence, tubes: collections.abc.Sequence[Tube]) -> None:
+    """Refuse waypoints at which tips or bases are out of order, or a base would be in front of the scope."""
+    if len(tubes) != sequence.n_tubes:
+        raise SettingsError(
+            f"Sequence {sequence.name!r} is for {sequence.n_tubes} tubes", expected=f"{len(tubes)} tubes"
+        )
+    lengths = np.array([tube.length_mm for tube in tubes])
+    beta, tips = sequence.beta_mm, sequence.beta_mm + lengths
+    if (beta > ROUNDING_MM).any():
+        raise SettingsError(
+            f"The insertions of sequence {sequence.name!r} reach {tips.max(axis=0).tolist()} mm",
+            expected=f"at most the lengths of the tubes, {lengths.tolist()} mm",
+        )
+    if (tips < -ROUNDING_MM).any() or (np.diff(tips, axis=1) > ROUNDING_MM).any():
+        raise SettingsError(
+            f"In sequence {sequence.name!r} an outer tube is ahead of an inner one, or a tip is in the scope",
+            expected="tips in order: 0 <= outer <= inner",
+        )
+    ahead = (tips[:, :-1] - tips[:, 1:]) - (lengths[:-1] - lengths[1:])
+    if (ahead > ROUNDING_MM).any():
+        worst = int(np.argmax(ahead.max(axis=0)))
+        raise SettingsError(
+            f"In sequence {sequence.name!r} tube {worst + 1} (from the inside) is "
+            f"{(tips[:, worst] - tips[:, worst + 1]).max():g} mm ahead of the next one",
+            expected=f"at most the difference of their lengths, {lengths[worst] - lengths[worst + 1]:g} mm",
+            remedy="Make the inner tube longer, or advance the outer one with it",
+        )

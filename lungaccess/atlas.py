@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from lungaccess.system import System
@@ -25,7 +26,7 @@ SITE_SPACING_MM = 1.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Atlas:
-    """All accepted deployments of a system in a lung; independent of any target.
+    """All accepted deployments of a system in a lung; independent of any target and of the needle.
 
     Parameters
     ----------
@@ -50,6 +51,22 @@ class Atlas:
     def site_pose(self, site: int) -> Float:
         """Return point and tangent `(6,)` of a site."""
         return np.asarray(self.sites.poses[site])
+
+
+def require_same(atlas: Atlas, lung: Lung, system: System) -> None:
+    """Raise SettingsError unless an atlas holds for a lung and a system: the needle does not matter."""
+    made, wanted = atlas.system, system
+    same = (
+        atlas.lung.key == lung.key
+        and (made.scope, made.tubes, made.margins) == (wanted.scope, wanted.tubes, wanted.margins)
+        and atlas.with_fissures == (lung.has_fissures and not wanted.fissures_allowed)
+    )
+    if not same:
+        raise SettingsError(
+            f"The atlas was made for {atlas.lung.name} and {made.name}",
+            expected=f"one for {lung.name} and {wanted.name}, with the same masks, scope, tubes and margins",
+            remedy="Make it with build_atlas(lung, system)",
+        )
 
 
 def build_atlas(

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Literal
 from cyclopts import App, CycloptsError
 from rich.panel import Panel
 
-from anatomy.errors import AnatomyError, LungaccessError, SettingsError, TargetError
+from anatomy.errors import AnatomyError, LungaccessError, SettingsError
 from anatomy.io.files import require_writable_folder
-from anatomy.io.frames import Frame, parse_point
+from anatomy.io.frames import Frame
 from lungaccess import terminal
+from lungaccess.commands_alternatives import alternatives
 from lungaccess.commands_tubes import tubes
+from lungaccess.inputs import load_device, load_lung, require_one_target
 from lungaccess.terminal import console, error_console
 
 if TYPE_CHECKING:
@@ -68,6 +70,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
+app.command(alternatives)
 app.command(tubes)
 
 
@@ -164,11 +167,11 @@ def plan(
     """
     from lungaccess.run import SearchRequest
 
-    _require_one_target(target, nodule)
+    require_one_target(target, nodule)
     _require_budget(budget, iterations)
     require_writable_folder(out)
-    device = _system(system, allow_fissures)
-    lung = _load(patient, cache)
+    device = load_device(system, allow_fissures)
+    lung = load_lung(patient, cache)
     if objective in ("cost-map", "voxel-sum") and lung.cost is None:
         raise SettingsError(
             f"Patient {lung.name} has no cost map",
@@ -243,10 +246,10 @@ def needle(
     from lungaccess.needle import plan_needle
     from lungaccess.target import resolve_target
 
-    _require_one_target(target, nodule)
+    require_one_target(target, nodule)
     _require_budget(budget, iterations)
-    device = _system(system, allow_fissures)
-    lung = _load(patient, cache)
+    device = load_device(system, allow_fissures)
+    lung = load_lung(patient, cache)
     answer = plan_needle(
         lung,
         device,
@@ -296,8 +299,8 @@ def check(plan: Path, patient: Path, *, system: str | None = None, cache: Path |
     from lungaccess.plans import Plan
 
     stored = Plan.load(plan)
-    device = None if system is None else _system(system, None)
-    report = judge(stored, _load(patient, cache), system=device)
+    device = None if system is None else load_device(system, None)
+    report = judge(stored, load_lung(patient, cache), system=device)
     console.print(terminal.check_table(report))
     return _verdict(report.accepted)
 
@@ -317,7 +320,7 @@ def info(patient: Path, *, out: Path | None = None, cache: Path | None = None) -
     """
     if out is not None:
         require_writable_folder(out)
-    lung = _load(patient, cache)
+    lung = load_lung(patient, cache)
     terminal.show(terminal.anatomy_tables(lung))
     _print_warnings(lung)
     if out is not None:
@@ -364,7 +367,7 @@ def demo(
     with console.status("making a synthetic patient") as status:
         lung = demo_lung(seed, cache, status.update)
     terminal.show(terminal.anatomy_tables(lung)[1:3])
-    code = _first_reachable_nodule(lung, _system(DEFAULT_SYSTEM, None), budget, seed, out)
+    code = _first_reachable_nodule(lung, load_device(DEFAULT_SYSTEM, None), budget, seed, out)
     if code == OK:
         console.print(terminal.what_to_look_at(out))
     return code
@@ -425,37 +428,6 @@ def _print_warnings(lung: Lung) -> None:
     if lung.warnings:
         text = terminal.escaped("\n".join(f"- {warning}" for warning in lung.warnings))
         console.print(Panel(text, title="warnings", title_align="left", border_style="yellow"))
-
-
-def _system(name: str, allow_fissures: bool | None) -> System:
-    """Return the system, with its rule about fissures replaced if the user states one."""
-    from dataclasses import replace
-
-    from lungaccess.system import load_system
-
-    loaded = load_system(name)
-    if allow_fissures is None or allow_fissures == loaded.fissures_allowed:
-        return loaded
-    rule = "fissures may be crossed" if allow_fissures else "fissures are obstacles"
-    return replace(loaded, name=f"{loaded.name} ({rule})", fissures_allowed=allow_fissures)
-
-
-def _load(patient: Path, cache: Path | None) -> Lung:
-    from lungaccess.patients import load_patient
-
-    with console.status(f"reading {terminal.escaped(str(patient))}") as status:
-        return load_patient(patient, cache=cache, progress=lambda step: status.update(step))
-
-
-def _require_one_target(target: str | None, nodule: int | None) -> None:
-    if (target is None) == (nodule is None):
-        raise TargetError(
-            "No target was given" if target is None else "Both a target and a nodule were given",
-            expected="either --target ras:x,y,z (or lps:x,y,z) or --nodule",
-            remedy="lungaccess plan --help shows examples",
-        )
-    if target is not None:
-        parse_point(target)
 
 
 def _require_budget(budget: float | None, iterations: int | None) -> None:

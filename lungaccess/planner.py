@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.assemble import Task, assemble
-from lungaccess.atlas import Atlas, build_atlas
+from lungaccess.atlas import Atlas, build_atlas, require_same
 from lungaccess.costs import require_objective
 from lungaccess.plans import Plan
 from lungaccess.searches import AtlasSearch, KuntzSearch, Step
@@ -94,7 +94,7 @@ def plan(
     tell = on_progress or (lambda _event: None)
     require_free(lung, target.lps_mm)
     if atlas is not None:
-        _require_same(atlas, lung, system)
+        require_same(atlas, lung, system)
     atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(_atlas_event(share)))
     task = Task(
         lung=lung,
@@ -106,15 +106,6 @@ def plan(
         seed=seed,
     )
     return _run(METHODS[method](task, atlas), task, iterations, time_s, tell)
-
-
-def _require_same(atlas: Atlas, lung: Lung, system: System) -> None:
-    if atlas.lung.key != lung.key or atlas.system != system:
-        raise SettingsError(
-            f"The atlas was made for {atlas.lung.name} and {atlas.system.name}",
-            expected=f"one for {lung.name} and {system.name}, with the same masks and settings",
-            remedy="Make it with build_atlas(lung, system)",
-        )
 
 
 def _atlas_event(share: float) -> ProgressEvent:

@@ -206,6 +206,10 @@ class AtlasSearch:
         path = None if deployment is None else direct_path(deployment.lps_from_tip, self.task.target.lps_mm)
         return tip, deployment, path
 
+    def finished(self, entry: int) -> Candidate | None:
+        """Return an atlas entry with its direct arc, proved; None if the proof fails."""
+        return self._finish(0, "direct arcs", *self._entry(entry)).candidate
+
     def _judged(self, tip: ScopeTip, rotation: float, outer: float, inner: float) -> Deployment | None:
         verdict = self._judge.judge(tip.lps_from_scope_tip, rotation, outer, inner)
         return None if isinstance(verdict, str) else verdict

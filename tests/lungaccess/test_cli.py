@@ -36,7 +36,7 @@ def never_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any) -> None:
         raise AssertionError("the patient was read")
 
-    monkeypatch.setattr(cli, "_load", fail)
+    monkeypatch.setattr(cli, "load_lung", fail)
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         )
         return SimpleNamespace(accepted=seen["accepted"], findings=(bad,))
 
-    monkeypatch.setattr(cli, "_load", lambda patient, cache: toy_lung)
+    monkeypatch.setattr(cli, "load_lung", lambda patient, cache: toy_lung)
     monkeypatch.setattr(run, "_planner", lambda: search)
     monkeypatch.setattr(
         "lungaccess.target.resolve_target",
@@ -313,7 +313,7 @@ def test_a_typed_error_is_a_panel_and_exits_2(
     def fail(*_: Any) -> None:
         raise error("The mask [airway] is empty", expected="one voxel", remedy="Look at it")
 
-    monkeypatch.setattr(cli, "_load", fail)
+    monkeypatch.setattr(cli, "load_lung", fail)
     assert cli.main(["info", "toy"]) == cli.BAD_INPUT
     text = capsys.readouterr().err
     for part in ("The mask [airway] is empty.", "one voxel", "Look at it"):
@@ -329,6 +329,6 @@ def test_lack_of_memory_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     def fail(*_: Any) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(cli, "_load", fail)
+    monkeypatch.setattr(cli, "load_lung", fail)
     assert cli.main(["info", "toy"]) == cli.BAD_INPUT
     assert "not enough memory" in capsys.readouterr().err

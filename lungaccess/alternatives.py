@@ -15,7 +15,6 @@ from anatomy.lung import Lung
 from lungaccess.assemble import Candidate, Task, assemble
 from lungaccess.atlas import Atlas, build_atlas, require_same
 from lungaccess.costs import require_objective
-from lungaccess.explain import explain
 from lungaccess.plans import Plan
 from lungaccess.searches import AtlasSearch
 from lungaccess.system import System
@@ -105,6 +104,8 @@ def alternatives(
     search = AtlasSearch(task, atlas)
     chosen = list(different_candidates(search, count, apart_mm))
     if not chosen:
+        from lungaccess.explain import explain
+
         raise explain(search, 0)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
     plans = [assemble(task, atlas.sites, each, iteration=0, timing=timing) for each in chosen]

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from lungaccess.noplan import NoPlan
+from lungaccess.remedies import Remedy, remedies
 from lungaccess.searches import AtlasSearch
 from stages.needle.device import Needle
 from stages.needle.space import direct_arcs, needle_space, workspace_lengths
 
-TIGHTER_RADII_MM = (100.0, 80.0, 60.0, 50.0, 40.0, 30.0)
-
 
 def explain(search: AtlasSearch, iterations: int) -> NoPlan:
     """Return the `NoPlan` of a search that ended without a plan."""
-    reasons = _reasons(search)
+    workable = search.atlas.deployments.count > 0 and not _reached_with(search, search.task.system.needle)
+    found = remedies(search) if workable else ()
     return NoPlan(
         f"No plan to the target after {iterations} iterations: {_main_reason(search)}",
-        reasons=reasons,
-        advice=_advice(search),
+        reasons=_reasons(search),
+        advice=_advice(search, found),
+        plans_with_changes={str(remedy): remedy.plan for remedy in found},
     )
 
 
@@ -65,8 +65,8 @@ def _reasons(search: AtlasSearch) -> dict[str, int]:
     return reasons
 
 
-def _advice(search: AtlasSearch) -> str:
-    """Name the smallest change, of those tried, that makes the target reachable by a direct arc.
+def _advice(search: AtlasSearch, found: tuple[Remedy, ...]) -> str:
+    """Say what would help, the smallest change first.
 
     Where no site or no deployment is left, say which change brings one back, if that is known.
     """
@@ -77,23 +77,15 @@ def _advice(search: AtlasSearch) -> str:
         return ""
     if _reached_with(search, system.needle):
         return "The search was too short: a single arc from a deployment of the atlas reaches the target"
-    present = system.needle.min_radius_of_curvature_mm
-    radii = [r for r in TIGHTER_RADII_MM if r < present]
-    for radius in radii:
-        if _reached_with(search, replace(system.needle, max_curvature_per_mm=1.0 / radius)):
-            return (
-                f"A needle with a radius of curvature of {radius:g} mm instead of {present:.0f} mm "
-                "would reach it"
-            )
-    thin = system.needle.diameter_mm / 2
-    if _reached_with(search, replace(system.needle, diameter_mm=thin)):
-        return f"A needle of {thin:g} mm instead of {system.needle.diameter_mm:g} mm would reach it"
+    if found:
+        first, *others = (str(remedy) for remedy in found)
+        also = f"; so would {' or '.join(others)}" if others else ""
+        return f"{first[0].upper()}{first[1:]} would reach it{also}"
     if atlas.with_fissures and _reached_with(search, system.needle, with_fissures=False):
         return (
             "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
         )
-    bent = f"a radius of curvature of {radii[-1]:g} mm or " if radii else ""
-    return f"A needle with {bent}half the diameter does not reach it with a single arc either"
+    return "No tighter or thinner needle and no thinner bronchoscope reaches it with a single arc"
 
 
 def _thinner_scope(widest_mm: float) -> str:

@@ -132,7 +132,7 @@ class TestNeedle:
             "needle: arcs stopped by a vessel", "needle: arcs stopped by the needle's limits",
         }  # fmt: skip
         assert stopped["needle: arcs stopped by a vessel"] > 0
-        assert "does not reach it" in error.advice
+        assert "reaches it" in error.advice
 
     def test_a_search_cut_short_says_so(self, small_lung: Lung, atlas_of: Any) -> None:
         target = la.resolve_target(small_lung)
@@ -156,47 +156,83 @@ class TestAdvice:
         assert report.accepted, [f.name for f in report.findings if not f.ok]
         return True
 
-    def test_a_tighter_needle(self, small_lung: Lung, atlas_of: Any) -> None:
-        radii = (100.0, 80.0, 60.0, 50.0, 40.0, 30.0)
-        seen = set()
-        targets = scattered_targets(small_lung, 25, 0)
-        for target in targets:
-            if len(seen) == 3:
-                break
+    def test_the_least_tightening_and_no_less(self, small_lung: Lung, atlas_of: Any) -> None:
+        """Three targets: a plan with the named radius, none with a radius 3 mm larger."""
+        seen = 0
+        for target in scattered_targets(small_lung, 25, 0):
             try:
                 list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
             except la.NoPlan as error:
-                named = re.search(r"radius of curvature of (\d+) mm instead of 121 mm", error.advice)
-                if named is None or float(named[1]) in seen:
+                named = [
+                    (float(re.search(r"curvature of (\d+) mm instead of 121 mm", change)[1]), made)
+                    for change, made in error.plans_with_changes.items()
+                    if "curvature" in change
+                ]
+                if not named:
                     continue
-                radius = float(named[1])
-                seen.add(radius)
-                for r in radii[: radii.index(radius) + 1][-2:]:
+                radius, made = named[0]
+                assert la.check(made, small_lung).accepted
+                assert made.system.needle.min_radius_of_curvature_mm == pytest.approx(radius)
+                for r, reaches in ((radius, True), (radius + 3.0, False)):
                     needle = replace(SYSTEM.needle, max_curvature_per_mm=1 / r)
                     system = replace(SYSTEM, needle=needle)
-                    assert self.accepted(small_lung, system, target, atlas_of(system)) == (r == radius)
-        assert len(seen) == 3
+                    assert self.accepted(small_lung, system, target, atlas_of(SYSTEM)) == reaches
+                seen += 1
+                if seen == 3:
+                    break
+        assert seen == 3
 
-    def test_a_thinner_needle_and_crossing_a_fissure(self, small_lung: Lung, atlas_of: Any) -> None:
+    def test_thinner_needles_and_scopes_and_crossing_a_fissure(self, small_lung: Lung, atlas_of: Any) -> None:
         seen = set()
-        for target in scattered_targets(small_lung, 80, 0):
-            if len(seen) == 2:
+        for target in scattered_targets(small_lung, 60, 0):
+            if len(seen) >= 2:
                 break
             try:
                 list(la.plan(small_lung, THICK, target, atlas=atlas_of(THICK), iterations=0))
             except la.NoPlan as error:
-                if "0.5 mm instead of 1 mm" in error.advice:
-                    system = replace(THICK, needle=replace(THICK.needle, diameter_mm=0.5))
-                elif "--allow-fissures" in error.advice:
+                for change, made in error.plans_with_changes.items():
+                    seen.add("needle" if "needle" in change else "scope")
+                    assert la.check(made, small_lung).accepted, change
+                    assert made.system != THICK
+                if "--allow-fissures" in error.advice:
+                    seen.add("fissure")
                     system = replace(THICK, fissures_allowed=True)
-                else:
-                    assert error.advice == (
-                        "A needle with half the diameter does not reach it with a single arc either"
-                    )
+                    assert self.accepted(small_lung, system, target, atlas_of(system))
+        assert seen >= {"needle", "fissure"}
+
+    def test_a_thinner_scope(self, small_lung: Lung) -> None:
+        """The named diameter gives a plan, and the sites of one a tenth thicker do not."""
+        thick = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=4.5))
+        atlas = la.build_atlas(small_lung, thick)
+        for target in scattered_targets(small_lung, 40, 1):
+            try:
+                list(la.plan(small_lung, thick, target, atlas=atlas, iterations=0))
+            except la.NoPlan as error:
+                changes = [change for change in error.plans_with_changes if "bronchoscope" in change]
+                if not changes:
                     continue
-                seen.add("fissure" if system.fissures_allowed else "thin")
-                assert self.accepted(small_lung, system, target, atlas_of(system))
-        assert seen == {"fissure", "thin"}
+                made = error.plans_with_changes[changes[0]]
+                assert la.check(made, small_lung).accepted
+                needed = made.system.scope.outer_diameter_mm
+                assert f"diameter of {needed:g} mm instead of 4.5 mm" in changes[0]
+                thicker = replace(thick, scope=replace(thick.scope, outer_diameter_mm=needed + 0.11))
+                again = la.build_atlas(small_lung, thicker)
+                assert not self.accepted(small_lung, thicker, target, again)
+                return
+        raise AssertionError("no target needed a thinner scope")
+
+    def test_changes_are_named_smallest_first(self, small_lung: Lung, atlas_of: Any) -> None:
+        for target in scattered_targets(small_lung, 25, 0):
+            try:
+                list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
+            except la.NoPlan as error:
+                shares = []
+                for change in error.plans_with_changes:
+                    needed, present = map(float, re.findall(r"([\d.]+) mm", change))
+                    shares.append(abs(needed - present) / present)
+                assert shares == sorted(shares)
+                first = next(iter(error.plans_with_changes), "")
+                assert not first or error.advice.lower().startswith(first)
 
 
 def test_reasons_cannot_be_changed() -> None:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from anatomy.errors import AnatomyError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import BITS
@@ -25,8 +27,8 @@ from lungaccess.plans import (
 from lungaccess.system import System, system_fingerprint
 from lungaccess.target import Target
 from stages.needle.path import ArcPath
-from stages.scope.sites import Sites
-from stages.scope.tips import ScopeTip
+from stages.scope.sites import Sites, approach_depth_mm
+from stages.scope.tips import ScopeTip, approach, leaving_point
 from stages.tube.deployments import Deployment
 from stages.tube.shape import centreline
 
@@ -112,6 +114,8 @@ def software_version() -> str:
 
 def _scope_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
     tree = task.lung.tree
+    if tip.turned:
+        return _turned_route(task, sites, tip)
     points = tree.route(tip.tree_point)
     position = tip.lps_from_scope_tip[:3, 3]
     route, radius = tree.points_lps[points].copy(), tree.radius_mm[points].copy()
@@ -131,6 +135,32 @@ def _scope_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
         length_mm=length,
         length_from_carina_mm=length - carina,
         min_lumen_margin_mm=float(sites.lumen_radius_mm[tip.tree_point]) - task.system.scope.radius_mm,
+    )
+
+
+def _turned_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
+    """Return the route of a scope whose tip is turned aside: it leaves the medial axis before the tip."""
+    lung, tree = task.lung, task.lung.tree
+    on_axis = tree.route(leaving_point(tree, tip))
+    aside = approach(tree, tip)
+    if aside is None:
+        raise AnatomyError("The scope's tip is turned farther than the scope bends")
+    route = np.concatenate([tree.points_lps[on_axis], aside[1:]])
+    nearest = cKDTree(tree.points_lps).query(aside[1:])[1]
+    branches = np.concatenate([tree.branch_of_point[on_axis], tree.branch_of_point[nearest]])
+    branches[-1] = tree.branch_of_point[tip.tree_point]
+    length = float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
+    depth = min(float(sites.lumen_radius_mm[on_axis[-1]]), approach_depth_mm(lung, tip))
+    return ScopeRoute(
+        points_lps=route,
+        lumen_radius_mm=np.concatenate([tree.radius_mm[on_axis], lung.lumen_depth.lower_bound_mm(aside[1:])]),
+        branches=branches,
+        lps_from_scope_tip=tip.lps_from_scope_tip,
+        site_point=tip.tree_point if tip.back_mm == 0.0 else -1,
+        generation=int(tree.generation[branches[-1]]),
+        length_mm=length,
+        length_from_carina_mm=length - float(tree.distance_from_root_mm[tree.carina_point]),
+        min_lumen_margin_mm=depth - task.system.scope.radius_mm,
     )
 
 

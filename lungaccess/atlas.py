@@ -18,10 +18,12 @@ from stages.tube.deployments import (
     DEFAULT_STOP_MM,
     Deployments,
     deployments,
+    joined,
     tracking_length_mm,
 )
 
 SITE_SPACING_MM = 1.0
+TURNED_COARSER = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,16 +97,27 @@ def build_atlas(
     with_fissures = lung.has_fissures and not system.fissures_allowed
     reach = tracking_length_mm(system.tubes)
     places = sites(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
-    found = deployments(
-        lung,
-        system.tubes,
-        system.margins,
-        places.poses,
-        with_fissures=with_fissures,
-        rotations=rotations,
-        stop_spacing_mm=stop_spacing_mm,
-        progress=progress,
-    )
+    straight = int((~places.turned).sum())
+    share = straight / max(places.count, 1)
+    tell = progress or (lambda _share: None)
+
+    def enumerated(poses: Float, rotations: int, spacing_mm: float, begin: float, end: float) -> Deployments:
+        return deployments(
+            lung,
+            system.tubes,
+            system.margins,
+            poses,
+            with_fissures=with_fissures,
+            rotations=rotations,
+            stop_spacing_mm=spacing_mm,
+            progress=lambda done: tell(begin + done * (end - begin)),
+        )
+
+    found = enumerated(places.poses[:straight], rotations, stop_spacing_mm, 0.0, share)
+    if straight < places.count:
+        # Tips turned aside look in so many directions that each of them needs fewer rotations and stops.
+        coarse = max(1, rotations // TURNED_COARSER), stop_spacing_mm * TURNED_COARSER
+        found = joined(found, enumerated(places.poses[straight:], *coarse, share, 1.0), straight)
     return Atlas(
         lung=lung,
         system=system,

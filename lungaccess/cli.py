@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from anatomy.grid import Float
     from anatomy.lung import Lung
     from lungaccess.run import SearchRequest
-    from lungaccess.system import System
 
 OK, NO_PLAN, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 DEFAULT_SYSTEM = "lung-default"
@@ -36,7 +35,7 @@ DEFAULT_BUDGET_S = 10.0
 DEMO_SEED = 2
 
 Objective = Literal["inverse-clearance", "cost-map", "voxel-sum", "length"]
-Method = Literal["atlas", "kuntz2015"]
+Method = Literal["atlas", "kuntz2015", "kuntz2015-without-rejection"]
 NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 
 _TOO_LARGE = AnatomyError(
@@ -189,6 +188,7 @@ def plan(
         seed=seed,
         time_s=budget,
         iterations=iterations,
+        cache=cache,
     )
     return _plan_and_report(lung, request, out)
 
@@ -360,29 +360,30 @@ def demo(
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
-    from lungaccess.run import demo_lung
+    from lungaccess.run import SearchRequest, demo_lung
 
     _require_budget(budget, None)
     require_writable_folder(out)
     with console.status("making a synthetic patient") as status:
         lung = demo_lung(seed, cache, status.update)
     terminal.show(terminal.anatomy_tables(lung)[1:3])
-    code = _first_reachable_nodule(lung, load_device(DEFAULT_SYSTEM, None), budget, seed, out)
+    request = SearchRequest(system=load_device(DEFAULT_SYSTEM, None), seed=seed, time_s=budget, cache=cache)
+    code = _first_reachable_nodule(lung, request, out)
     if code == OK:
         console.print(terminal.what_to_look_at(out))
     return code
 
 
-def _first_reachable_nodule(lung: Lung, device: System, budget: float, seed: int, out: Path) -> int:
+def _first_reachable_nodule(lung: Lung, request: SearchRequest, out: Path) -> int:
     """Plan to the nodules in their order until one can be reached."""
+    from dataclasses import replace
+
     from lungaccess.noplan import NoPlan
-    from lungaccess.run import SearchRequest
 
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
-        request = SearchRequest(system=device, nodule=number, seed=seed, time_s=budget)
         try:
-            return _plan_and_report(lung, request, out)
+            return _plan_and_report(lung, replace(request, nodule=number), out)
         except NoPlan as error:
             console.print(f"Nodule {number} cannot be reached; trying the next one.")
             failure = error

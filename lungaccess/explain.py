@@ -77,15 +77,18 @@ def _advice(search: AtlasSearch, found: tuple[Remedy, ...]) -> str:
         return ""
     if _reached_with(search, system.needle):
         return "The search was too short: a single arc from a deployment of the atlas reaches the target"
+    said = []
     if found:
         first, *others = (str(remedy) for remedy in found)
         also = f"; so would {' or '.join(others)}" if others else ""
-        return f"{first[0].upper()}{first[1:]} would reach it{also}"
+        said.append(f"{first[0].upper()}{first[1:]} would reach it{also}")
     if atlas.with_fissures and _reached_with(search, system.needle, with_fissures=False):
-        return (
+        said.append(
             "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
         )
-    return "No tighter or thinner needle and no thinner bronchoscope reaches it with a single arc"
+    if not said:
+        return "No tighter or thinner needle and no thinner bronchoscope reaches it with a single arc"
+    return ". ".join(said)
 
 
 def _thinner_scope(widest_mm: float) -> str:

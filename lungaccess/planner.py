@@ -13,11 +13,15 @@ from lungaccess.assemble import Task, assemble
 from lungaccess.atlas import Atlas, build_atlas, require_same
 from lungaccess.costs import require_objective
 from lungaccess.plans import Plan
-from lungaccess.searches import AtlasSearch, KuntzSearch, Step
+from lungaccess.searches import AtlasSearch, KuntzSearch, KuntzSearchWithoutRejection, Step
 from lungaccess.system import System
 from lungaccess.target import Target, require_free
 
-METHODS = {"atlas": AtlasSearch, "kuntz2015": KuntzSearch}
+METHODS = {
+    "atlas": AtlasSearch,
+    "kuntz2015": KuntzSearch,
+    "kuntz2015-without-rejection": KuntzSearchWithoutRejection,
+}
 PROGRESS_EVERY_S = 0.1
 HOPELESS_ITERATIONS = 2000
 
@@ -67,7 +71,8 @@ def plan(
         "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1] or "length_mm".
     method : str
         "atlas": direct arcs from every deployment of the atlas, then random refinement of the best and
-        RRTs from the others.  "kuntz2015": Algorithm 1 of that paper.
+        RRTs from the others.  "kuntz2015": Algorithm 1 of that paper; "kuntz2015-without-rejection": the
+        same without its workspace test.
     seed : int
         The same seed and `iterations` give the same plans.
     iterations : int, optional
@@ -95,7 +100,7 @@ def plan(
     require_free(lung, target.lps_mm)
     if atlas is not None:
         require_same(atlas, lung, system)
-    atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(_atlas_event(share)))
+    atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(atlas_event(share)))
     task = Task(
         lung=lung,
         system=system,
@@ -108,7 +113,8 @@ def plan(
     return _run(METHODS[method](task, atlas), task, iterations, time_s, tell)
 
 
-def _atlas_event(share: float) -> ProgressEvent:
+def atlas_event(share: float) -> ProgressEvent:
+    """Return what is told while the atlas is made."""
     return ProgressEvent(
         iteration=0,
         elapsed_s=0.0,

@@ -63,8 +63,8 @@ def remedies(search: AtlasSearch) -> tuple[Remedy, ...]:
     """Return what would help, the smallest relative change first.
 
     Tighter curvature and a thinner needle, with the deployments of the atlas, and a thinner scope, with what
-    it could reach beyond them; each changed no more than a single arc of the needle demands.  They are changes
-    of one parameter alone: whether such a device exists, and what else it would need, is not asked.
+    it could reach beyond them: each changed alone, no more than a single arc of the needle demands.  Whether
+    such a device exists, and what else it would need, is not asked.
     """
     found = [*_curvature(search), *_needle_diameter(search), *_scope_diameter(search)]
     return tuple(sorted(found, key=lambda remedy: remedy.relative_change))
@@ -126,7 +126,7 @@ def _scope_diameter(search: AtlasSearch) -> Iterator[Remedy]:
         task.target.lps_mm,
     )  # fmt: skip
     clear = near[blockers == 0]
-    room = atlas.sites.lumen_radius_mm[atlas.sites.tree_point[entries.site[clear]]] - scope.lumen_margin_mm
+    room = atlas.sites.room_mm[entries.site[clear]] - scope.lumen_margin_mm
     for entry in clear[np.argsort(-room, kind="stable")]:
         candidate = thin.finished(int(entry))
         if candidate is None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from lungaccess.atlas import Atlas
     from lungaccess.planner import ProgressEvent
     from lungaccess.plans import Plan
     from lungaccess.report import CostPoint
@@ -48,6 +49,8 @@ class SearchRequest:
     time_s : float or None
         Planning time; None for as long as the iterations take.
     iterations : int or None
+    cache : Path or None
+        Folder where the deployment atlas is kept; None for the usual one.
     """
 
     system: System
@@ -58,6 +61,7 @@ class SearchRequest:
     seed: int = 0
     time_s: float | None = None
     iterations: int | None = None
+    cache: Path | None = None
 
 
 class CostHistory:
@@ -105,6 +109,7 @@ def run_search(
     history = CostHistory(display)
     best: Plan | None = None
     with display:
+        atlas = _atlas(lung, request, history)
         plans = _planner()(
             lung,
             request.system,
@@ -114,6 +119,7 @@ def run_search(
             seed=request.seed,
             iterations=request.iterations,
             time_s=request.time_s,
+            atlas=atlas,
             on_progress=history.on_progress,
         )
         try:
@@ -125,6 +131,18 @@ def run_search(
     if best is None:
         raise _ended_silently()
     return best, history.points
+
+
+def _atlas(lung: Lung, request: SearchRequest, history: CostHistory) -> Atlas:
+    from lungaccess.atlas_store import open_atlas
+    from lungaccess.planner import atlas_event
+
+    return open_atlas(
+        lung,
+        request.system,
+        cache=request.cache,
+        progress=lambda share: history.on_progress(atlas_event(share)),
+    )
 
 
 def _planner() -> Callable[..., Iterator[Plan]]:

@@ -20,7 +20,8 @@ from lungaccess.costs import path_cost
 from stages.needle.path import ArcPath, blocker_on_path, direct_path, estimated_inverse_clearance
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace, direct_arcs, needle_space, workspace_lengths
-from stages.scope.tips import MedialAxis, ScopeTip, looks_ahead, tip_at, walk
+from stages.scope.sites import can_stand
+from stages.scope.tips import MedialAxis, ScopeTip, looks_ahead, walk
 from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
 
 if TYPE_CHECKING:
@@ -196,7 +197,7 @@ class AtlasSearch:
     def _entry(self, entry: int) -> tuple[ScopeTip, Deployment | None, ArcPath | None]:
         """Return an atlas entry in full, with its direct arc."""
         entries = self.atlas.deployments
-        tip = tip_at(self.task.lung.tree, int(self.atlas.sites.tree_point[entries.site[entry]]))
+        tip = self.atlas.sites.tip(self.task.lung.tree, int(entries.site[entry]))
         deployment = self._judged(
             tip,
             float(entries.rotation_rad[entry]),
@@ -250,7 +251,7 @@ class AtlasSearch:
         shift, turn, outer, inner = rng.standard_normal(4) * spread
         tip = walk(self.task.lung.tree, around.tip, shift * SITE_SPREAD_MM, rng)
         nothing = Step(iteration=iteration, phase="refinement")
-        if not (self.atlas.sites.passable[tip.tree_point] and looks_ahead(self.task.lung.tree, tip)):
+        if not can_stand(self.task.lung, system.scope, self.atlas.sites, tip):
             return nothing
         outer_mm = max(0.0, around.deployment.outer_mm + outer * INSERTION_SPREAD_MM)
         inner_mm = around.deployment.inner_mm + inner * INSERTION_SPREAD_MM
@@ -284,6 +285,9 @@ class KuntzSearch(AtlasSearch):
     hold the target; line 9 runs the RRT, here for a fixed number of iterations so that runs repeat.
     """
 
+    rejects = True
+    """Whether line 8 is carried out."""
+
     def steps(self) -> Iterator[Step]:
         """Search forever; the caller stops."""
         best = math.inf
@@ -307,7 +311,13 @@ class KuntzSearch(AtlasSearch):
         if not looks_ahead(self.task.lung.tree, tip):
             return Step(iteration=iteration, phase="Algorithm 1")
         deployment = self._judged(tip, rotation, float(outer), float(inner))
-        if deployment is None or not self.desk.reaches(deployment.lps_from_tip):
+        if deployment is None or (self.rejects and not self.desk.reaches(deployment.lps_from_tip)):
             return Step(iteration=iteration, phase="Algorithm 1")
         path = self.desk.search(deployment, seed, RRT_ITERATIONS)
         return self._finish(iteration, "Algorithm 1", tip, deployment, path)
+
+
+class KuntzSearchWithoutRejection(KuntzSearch):
+    """The same without line 8: the paper's measure of what rejection saves."""
+
+    rejects = False

@@ -31,6 +31,12 @@ MAX_CHORD_ANGLE_RAD = np.deg2rad(45.0) + 1e-6
 
 CHORD_MM = 2.0
 
+MAX_OFF_AXIS_MM = 20.0
+"""Only so near to its tip may a scope with a turned tip be beside the medial axis."""
+
+BENDING_RADIUS_MM = 10.0
+"""Smallest radius with which a scope bends there."""
+
 
 def check_route(plan: Plan, lung: Lung, found: Findings) -> None:
     """Record everything about the bronchoscope."""
@@ -62,12 +68,46 @@ def _check_on_tree(route: ScopeRoute, tree: AirwayTree, found: Findings) -> floa
     found.at_most("scope.start", start, AXIS_TOLERANCE_MM, "mm", "first point to the root of the airway tree")
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     found.at_most("scope.connected", float(steps.max()), MAX_STEP_MM, "mm", "largest step of the route")
-    gaps = _distance_to_tree(_resample(points, 10.0 * SAMPLE_MM), tree)
+    samples = _resample(points, 10.0 * SAMPLE_MM)
+    gaps = _distance_to_tree(samples, tree)
+    before_tip = np.linalg.norm(np.diff(samples, axis=0), axis=1)
+    before_tip = np.append(np.cumsum(before_tip[::-1])[::-1], 0.0)
+    if _is_turned(route, tree):
+        _check_bend(points, gaps, before_tip, found)
+        gaps = gaps[before_tip > MAX_OFF_AXIS_MM] if before_tip[0] > MAX_OFF_AXIS_MM else gaps[:1]
     found.at_most("scope.on_axis", float(gaps.max()), AXIS_TOLERANCE_MM, "mm", "route to airway axis")
     nearest = cKDTree(tree.points_lps).query(points, k=min(3, tree.n_points))[1].reshape(len(points), -1)
     same = (tree.branch_of_point[nearest] == route.branches[:, None]).any(axis=1)
     found.true("scope.branches", bool(same.all()), f"{int((~same).sum())} points name another branch")
     return float(gaps.max())
+
+
+def _axis_at_tip(route: ScopeRoute, tree: AirwayTree) -> Float:
+    """Return the direction of the airway where the route ends."""
+    if 0 <= route.site_point < tree.n_points:
+        return np.asarray(tree.tangents[route.site_point])
+    return _tangent_between(tree, route.lps_from_scope_tip[:3, 3])
+
+
+def _is_turned(route: ScopeRoute, tree: AirwayTree) -> bool:
+    """Tell whether the tip looks elsewhere than along the airway."""
+    tilt = angle_between(route.lps_from_scope_tip[:3, 2], _axis_at_tip(route, tree))
+    return float(tilt) > ANGLE_TOLERANCE_RAD
+
+
+def _check_bend(points: Float, gaps: Float, before_tip: Float, found: Findings) -> None:
+    """Where the route leaves the axis it bends no tighter than a scope can."""
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    off = before_tip[gaps > AXIS_TOLERANCE_MM].max(initial=0.0)
+    within = np.flatnonzero(np.cumsum(lengths[::-1])[::-1] < off)
+    turns = [
+        float(angle_between(steps[n], steps[n + 1])) / max(0.5 * (lengths[n] + lengths[n + 1]), 1e-9)
+        for n in within[:-1]
+    ]
+    found.at_most(
+        "scope.bend", max(turns, default=0.0), 1.05 / BENDING_RADIUS_MM, "1/mm", "curvature beside the axis"
+    )
 
 
 def _distance_to_tree(points: Float, tree: AirwayTree) -> Float:
@@ -114,12 +154,16 @@ def _check_tip(route: ScopeRoute, tree: AirwayTree, found: Findings) -> None:
     if 0 <= route.site_point < tree.n_points:
         site = route.site_point
         found.agrees("scope.site", route.points_lps[-1], tree.points_lps[site], POSITION_TOLERANCE_MM, "mm")
-        tangent = tree.tangents[site]
     else:
         found.true("scope.site", route.site_point == -1, f"site {route.site_point}")
-        tangent = _tangent_between(tree, pose[:3, 3])
-    tilt = float(angle_between(pose[:3, 2], tangent))
-    found.at_most("scope.tip.tangent", tilt, ANGLE_TOLERANCE_RAD, "rad", "tip to airway axis")
+        gap = float(_distance_to_tree(pose[None, :3, 3], tree)[0])
+        found.at_most("scope.site.on_axis", gap, AXIS_TOLERANCE_MM, "mm", "tip to airway axis")
+    # A tip looks along the airway's axis, or along the end of a route that leaves the axis.
+    end = route.points_lps[-1] - route.points_lps[-2] if len(route.points_lps) > 1 else pose[:3, 2]
+    turned = _is_turned(route, tree)
+    tilt = float(angle_between(pose[:3, 2], end if turned else _axis_at_tip(route, tree)))
+    of_what = "tip to the end of its route" if turned else "tip to airway axis"
+    found.at_most("scope.tip.tangent", tilt, ANGLE_TOLERANCE_RAD, "rad", of_what)
     back = np.linalg.norm(route.points_lps - route.points_lps[-1], axis=1) >= CHORD_MM
     before = route.points_lps[np.flatnonzero(back)[-1]] if back.any() else route.points_lps[0]
     tilt = float(angle_between(pose[:3, 2], route.points_lps[-1] - before))

@@ -8,12 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE
 from stages.scope.device import Bronchoscope
-from stages.scope.tips import looks_ahead, tip_at
+from stages.scope.tips import (
+    ScopeTip,
+    approach,
+    looks_ahead,
+    tip_at,
+    turned_aside,
+)
 
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
@@ -21,6 +28,11 @@ Bool = NDArray[np.bool_]
 WALL_PROBE_MM = 2.5
 PROBE_DIRECTIONS = 8
 PROOF_STEP_MM = 0.05
+APPROACH_STEP_MM = 0.25
+ARC_SAGITTA_MM = 0.01
+TURNED_SPACING_MM = 2.0
+TURNS_RAD = tuple(math.radians(angle) for angle in (0.0, 20.0, 40.0))
+TURN_DIRECTIONS = 6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,7 +44,11 @@ class Sites:
     tree_point : (S,) int64
         Index into the airway tree.
     poses : (S, 6) float64
-        Point and unit tangent, LPS mm: the scope tip looks along the medial axis.
+        Point and direction of the scope tip, LPS mm.
+    turned : (S,) bool
+        Whether the tip is turned aside, or looks along the medial axis.
+    room_mm : (S,) float64
+        Proved radius of the narrowest place of the lumen on the way there, also beside the axis.
     lumen_radius_mm : (N,) float64
         For each tree point, the smallest radius of the lumen on the way to it from the root, proved for
         every point of the way and not only for the tree points.
@@ -49,6 +65,8 @@ class Sites:
 
     tree_point: Int
     poses: Float
+    turned: Bool
+    room_mm: Float
     lumen_radius_mm: Float
     passable: Bool
     exits_ahead: Bool
@@ -60,8 +78,18 @@ class Sites:
         """Number of sites, S."""
         return len(self.tree_point)
 
+    def tip(self, tree: AirwayTree, site: int) -> ScopeTip:
+        """Return the scope tip at a site."""
+        point, pose = int(self.tree_point[site]), self.poses[site]
+        if not self.turned[site]:
+            return tip_at(tree, point)
+        frame = frames.pose(pose[:3], pose[3:])
+        return ScopeTip(tree_point=point, back_mm=0.0, lps_from_scope_tip=frame, turned=True)
 
-def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float = 1.0) -> Sites:
+
+def sites(
+    lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float = 1.0, turning: bool = True
+) -> Sites:
     """Find where the scope tip can stand so that tubes can leave the airway from there.
 
     A site is a point of the medial axis that the scope reaches through a lumen wider than itself all
@@ -76,6 +104,9 @@ def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float
         How far ahead of the scope tip the airway may be left.
     spacing_mm : float
         Distance between sites along a branch.
+    turning : bool
+        Whether tips are also turned aside, every 2 mm, by up to 40 degrees from where the scope comes from,
+        as far as the lumen leaves room for its body.
 
     References
     ----------
@@ -86,18 +117,78 @@ def sites(lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float
     narrowest_so_far = _narrowest_on_the_way(lung)
     passable = narrowest_so_far >= needed
     ahead = _distance_to_exit(tree, _in_lung_tissue(lung)) <= reach_mm
-    looking = _looking_ahead(tree, np.flatnonzero(ahead & _every(tree, spacing_mm)))
-    chosen = looking[passable[looking]]
+    spaced = np.flatnonzero(ahead & _every(tree, spacing_mm))
+    looking = _looking_ahead(tree, spaced)
+    straight = looking[passable[looking]]
+    sparse = np.flatnonzero(ahead & passable & _every(tree, max(spacing_mm, TURNED_SPACING_MM)))
+    turned, depths = _turned_tips(lung, scope, sparse) if turning else ([], np.zeros(0))
+    chosen = np.concatenate([straight, np.array([tip.tree_point for tip in turned], dtype=np.int64)])
+    aside = [np.concatenate([tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]]) for tip in turned]
+    along = np.hstack([tree.points_lps[straight], tree.tangents[straight]])
     widest = float(narrowest_so_far[looking].max(initial=0.0))
     return Sites(
         tree_point=chosen,
-        poses=np.hstack([tree.points_lps[chosen], tree.tangents[chosen]]),
+        poses=np.concatenate([along, np.array(aside).reshape(-1, 6)]),
+        turned=np.arange(len(chosen)) >= len(straight),
+        room_mm=np.minimum(
+            narrowest_so_far[chosen], np.concatenate([np.full(len(straight), np.inf), depths])
+        ),
         lumen_radius_mm=narrowest_so_far,
         passable=passable,
         exits_ahead=ahead,
         narrowest=_where_too_narrow(tree, passable, narrowest_so_far, needed),
         widest_scope_mm=max(2.0 * (widest - scope.lumen_margin_mm), 0.0),
     )
+
+
+def approach_depth_mm(lung: Lung, tip: ScopeTip) -> float:
+    """Return a radius that the lumen has all along where a scope with a turned tip leaves the axis.
+
+    0 if it cannot bend there.  The depth in the lumen is 1-Lipschitz: between two samples it is at most half
+    their distance less.
+    """
+    return float(_approach_depths(lung, [tip])[0])
+
+
+def can_stand(lung: Lung, scope: Bronchoscope, places: Sites, tip: ScopeTip) -> bool:
+    """Tell whether a scope can stand with its tip so: it fits all the way, and bends no more than it can."""
+    if not places.passable[tip.tree_point]:
+        return False
+    if not tip.turned:
+        return looks_ahead(lung.tree, tip)
+    return approach_depth_mm(lung, tip) >= scope.radius_mm + scope.lumen_margin_mm
+
+
+def _approach_depths(lung: Lung, tips: list[ScopeTip]) -> Float:
+    samples, owner = [], []
+    depths = np.zeros(len(tips))
+    for number, tip in enumerate(tips):
+        line = approach(lung.tree, tip)
+        if line is None:
+            continue
+        depths[number] = math.inf
+        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        share = np.concatenate([[0.0], np.cumsum(steps)])
+        at = np.linspace(0.0, share[-1], math.ceil(share[-1] / APPROACH_STEP_MM) + 1)
+        samples.append(np.stack([np.interp(at, share, line[:, axis]) for axis in range(3)], axis=1))
+        owner.append(np.full(len(at), number))
+    if samples:
+        found = lung.lumen_depth.lower_bound_mm(np.concatenate(samples))
+        np.minimum.at(depths, np.concatenate(owner), found - 0.5 * APPROACH_STEP_MM - ARC_SAGITTA_MM)
+    return np.maximum(depths, 0.0)
+
+
+def _turned_tips(lung: Lung, scope: Bronchoscope, points: Int) -> tuple[list[ScopeTip], Float]:
+    """Return the turned tips at tree points that the scope's body fits behind, and the room that it has."""
+    tips = []
+    for point in points:
+        along = tip_at(lung.tree, int(point))
+        for polar in TURNS_RAD:
+            for azimuth in np.arange(TURN_DIRECTIONS if polar else 1) * (2.0 * math.pi / TURN_DIRECTIONS):
+                tips.append(turned_aside(lung.tree, along, polar, float(azimuth)))
+    depths = _approach_depths(lung, tips)
+    fits = depths >= scope.radius_mm + scope.lumen_margin_mm
+    return [tip for tip, does in zip(tips, fits, strict=True) if does], depths[fits]
 
 
 def _looking_ahead(tree: AirwayTree, points: Int) -> Int:

@@ -1,9 +1,9 @@
-"""Scope tips anywhere on the medial axis, also between tree points."""
+"""Scope tips anywhere on the medial axis, also between tree points, along it or turned aside."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,21 @@ from anatomy.grid import Float
 TURN_CHORD_MM = 2.0
 MAX_TURN_AT_TIP_RAD = math.radians(45.0)
 """A tip must look where the scope comes from going, within this angle of its last TURN_CHORD_MM."""
+STRAIGHT_END_MM = 1.0
+"""So much of a scope whose tip is turned aside lies straight behind the tip."""
+BENDING_RADIUS_MM = 10.0
+"""Radius with which such a scope bends; thin bronchoscopes bend at least so tightly."""
+LEAVING_MM = 15.0
+"""Way along the medial axis, behind the tip, on which it leaves the axis."""
+MAX_BEND_RAD = math.radians(75.0)
+ARC_PIECE_RAD = math.radians(4.0)
+MAX_PIECE_MM = 2.5
+CORNER_STEPS = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScopeTip:
-    """The tip of the scope on the medial axis, looking along it.
+    """The tip of the scope on the medial axis, looking along it or turned aside.
 
     Parameters
     ----------
@@ -28,11 +38,14 @@ class ScopeTip:
     back_mm : float
         How far before that point the tip stands, towards the root.
     lps_from_scope_tip : (4, 4) float64
+    turned : bool
+        Whether it looks elsewhere than along the medial axis.
     """
 
     tree_point: int
     back_mm: float
     lps_from_scope_tip: Float
+    turned: bool = False
 
 
 def step_length_mm(tree: AirwayTree, point: int) -> float:
@@ -54,6 +67,72 @@ def tip_at(tree: AirwayTree, point: int, back_mm: float = 0.0) -> ScopeTip:
     )
 
 
+def leaving_point(tree: AirwayTree, tip: ScopeTip) -> int:
+    """Return the last tree point of the route that a scope with a turned tip still passes."""
+    way = tree.distance_from_root_mm
+    most = float(way[tip.tree_point]) - tip.back_mm - LEAVING_MM
+    point = tip.tree_point
+    while way[point] > most and tree.parent_point[point] >= 0:
+        point = int(tree.parent_point[point])
+    return point
+
+
+def approach(tree: AirwayTree, tip: ScopeTip) -> Float | None:
+    """Return the polyline `(K, 3)` by which a turned tip leaves the medial axis, the tip last, LPS mm.
+
+    It is straight, an arc of BENDING_RADIUS_MM, and straight again; None if the bend is more than
+    MAX_BEND_RAD or finds no room.  The polyline is nearer than 0.01 mm to the arc.
+    """
+    position, forward = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
+    begin = tree.points_lps[leaving_point(tree, tip)]
+    tangent_mm, bend = 0.0, 0.0
+    # The corner of the two straight pieces and the angle between them depend on each other.
+    for _ in range(CORNER_STEPS):
+        corner = position - (STRAIGHT_END_MM + tangent_mm) * forward
+        way = corner - begin
+        length = float(np.linalg.norm(way))
+        if length <= tangent_mm:
+            return None
+        first = way / length
+        cosine = float(first @ forward)
+        bend = math.atan2(float(np.linalg.norm(forward - cosine * first)), cosine)
+        if bend > MAX_BEND_RAD:
+            return None
+        tangent_mm = BENDING_RADIUS_MM * math.tan(0.5 * bend)
+    arc = _fillet(corner, first, forward, bend)
+    return np.concatenate([_straight(begin, arc[0]), arc[1:], _straight(arc[-1], position)[1:]])
+
+
+def _fillet(corner: Float, first: Float, second: Float, bend: float) -> Float:
+    """Return points of the arc that rounds off a corner between two directions."""
+    tangent_mm = BENDING_RADIUS_MM * math.tan(0.5 * bend)
+    start = corner - tangent_mm * first
+    if bend < 1e-9:
+        return start[None]
+    aside = second - (second @ first) * first
+    aside /= np.linalg.norm(aside)
+    angles = np.linspace(0.0, bend, math.ceil(bend / ARC_PIECE_RAD) + 1)[:, None]
+    return np.asarray(start + BENDING_RADIUS_MM * (np.sin(angles) * first + (1.0 - np.cos(angles)) * aside))
+
+
+def _straight(begin: Float, end: Float) -> Float:
+    """Return points from one to the other, at most MAX_PIECE_MM apart."""
+    count = max(1, math.ceil(float(np.linalg.norm(end - begin)) / MAX_PIECE_MM - 1e-9))
+    return np.asarray(begin + (np.arange(count + 1) / count)[:, None] * (end - begin))
+
+
+def turned_aside(tree: AirwayTree, tip: ScopeTip, polar_rad: float, azimuth_rad: float) -> ScopeTip:
+    """Return a tip turned by `polar_rad` from the chord between where it leaves the axis and its place."""
+    position = tip.lps_from_scope_tip[:3, 3]
+    chord = position - tree.points_lps[leaving_point(tree, tip)]
+    if not np.any(chord):
+        chord = tree.tangents[tip.tree_point]
+    frame = frames.pose(position, chord)
+    aside = frames.bending_directions(frame, azimuth_rad)[0]
+    forward = math.cos(polar_rad) * frame[:3, 2] + math.sin(polar_rad) * aside
+    return replace(tip, lps_from_scope_tip=frames.pose(position, forward), turned=True)
+
+
 def looks_ahead(tree: AirwayTree, tip: ScopeTip) -> bool:
     """Tell whether a tip points on along its route, and not sideways just behind a fork."""
     position, forward = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
@@ -66,7 +145,10 @@ def looks_ahead(tree: AirwayTree, tip: ScopeTip) -> bool:
 
 
 def walk(tree: AirwayTree, tip: ScopeTip, distance_mm: float, rng: np.random.Generator) -> ScopeTip:
-    """Return the tip moved along the airway, back for negative distances; forks are taken at random."""
+    """Return the tip moved along the airway, back for negative distances; forks are taken at random.
+
+    A turned tip stays turned by the same angles from its chord.
+    """
     point, back = tip.tree_point, tip.back_mm - distance_mm
     while back > step_length_mm(tree, point) and tree.parent_point[point] >= 0:
         back -= step_length_mm(tree, point)
@@ -78,7 +160,13 @@ def walk(tree: AirwayTree, tip: ScopeTip, distance_mm: float, rng: np.random.Gen
             break
         point = int(children[rng.integers(len(children))])
         back += step_length_mm(tree, point)
-    return tip_at(tree, point, back)
+    moved = tip_at(tree, point, back)
+    if not tip.turned:
+        return moved
+    straight = turned_aside(tree, tip, 0.0, 0.0).lps_from_scope_tip
+    seen = straight[:3, :3].T @ tip.lps_from_scope_tip[:3, 2]
+    polar = math.atan2(math.hypot(seen[0], seen[1]), seen[2])
+    return turned_aside(tree, moved, polar, math.atan2(seen[1], seen[0]))
 
 
 class MedialAxis:

@@ -221,6 +221,20 @@ def deployments(
     return _without_trachea(found) if _has_trachea(lung) else found
 
 
+def joined(one: Deployments, other: Deployments, first_site: int) -> Deployments:
+    """Return the deployments of two enumerations; the other's sites are counted from `first_site`."""
+    arrays: dict[str, Any] = {
+        f.name: read_only(np.concatenate([getattr(one, f.name), getattr(other, f.name)]))
+        for f in fields(one)
+        if isinstance(getattr(one, f.name), np.ndarray)
+    }
+    arrays["site"] = read_only(np.concatenate([one.site, other.site + first_site]))
+    refused = {
+        why: one.refused.get(why, 0) + other.refused.get(why, 0) for why in [*one.refused, *other.refused]
+    }
+    return Deployments(**arrays, candidates=one.candidates + other.candidates, refused=refused)
+
+
 def _has_trachea(lung: Lung) -> bool:
     """Tell whether branch 0 is a trachea: in a tree of one branch nothing says so."""
     return lung.tree.n_branches > 1

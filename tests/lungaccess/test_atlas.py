@@ -25,7 +25,12 @@ def atlas(small_lung: Lung) -> la.Atlas:
 def test_counts_add_up(atlas: la.Atlas) -> None:
     stops = len(insertion_stops(SYSTEM.tubes))
     found = atlas.deployments
-    assert found.candidates == atlas.sites.count * 36 * (stops * (stops + 1) // 2 - 1)
+    turned = int(atlas.sites.turned.sum())
+    fewer = len(insertion_stops(SYSTEM.tubes, 4.0))
+    assert found.candidates == (
+        (atlas.sites.count - turned) * 36 * (stops * (stops + 1) // 2 - 1)
+        + turned * 18 * (fewer * (fewer + 1) // 2 - 1)
+    )
     assert found.count + sum(found.refused.values()) == found.candidates
     assert found.count > 5000 and atlas.sites.count > 50
     assert atlas.build_s > 0.0

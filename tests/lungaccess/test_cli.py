@@ -71,6 +71,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         return SimpleNamespace(accepted=seen["accepted"], findings=(bad,))
 
     monkeypatch.setattr(cli, "load_lung", lambda patient, cache: toy_lung)
+    monkeypatch.setattr(run, "_atlas", lambda *_: None)
     monkeypatch.setattr(run, "_planner", lambda: search)
     monkeypatch.setattr(
         "lungaccess.target.resolve_target",

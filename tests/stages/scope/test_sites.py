@@ -10,6 +10,7 @@ from anatomy.lung import Lung
 from anatomy.structures import BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 from stages.scope.device import Bronchoscope
 from stages.scope.sites import sites
+from stages.scope.tips import approach
 from tests.stages.scenes import Canvas, brute_clearance, forked_tree, lung_of
 
 CARINA, FORK = np.array([0.0, 0.0, 20.0]), np.array([26.0, 0.0, -4.0])
@@ -121,7 +122,7 @@ def test_reach_lets_the_tip_stand_before_the_lung(lung: Lung) -> None:
 
 
 def test_tips_look_along_the_airway(lung: Lung) -> None:
-    found = sites(lung, scope(2.0), reach_mm=30.0)
+    found = sites(lung, scope(2.0), reach_mm=30.0, turning=False)
     assert np.array_equal(found.poses[:, :3], lung.tree.points_lps[found.tree_point])
     assert np.array_equal(found.poses[:, 3:], lung.tree.tangents[found.tree_point])
     assert found.count == len(found.poses) == len(found.tree_point)
@@ -129,7 +130,7 @@ def test_tips_look_along_the_airway(lung: Lung) -> None:
 
 @pytest.mark.parametrize("spacing", [0.5, 1.0, 3.0])
 def test_spacing(lung: Lung, spacing: float) -> None:
-    found = sites(lung, scope(2.0), reach_mm=100.0, spacing_mm=spacing)
+    found = sites(lung, scope(2.0), reach_mm=100.0, spacing_mm=spacing, turning=False)
     way = lung.tree.distance_from_root_mm[found.tree_point]
     for branch in range(5):
         on_branch = np.sort(way[lung.tree.branch_of_point[found.tree_point] == branch])
@@ -157,3 +158,25 @@ def test_no_airway_in_lung_tissue() -> None:
     assert found.count == 0 and found.widest_scope_mm == 0.0
     assert found.passable.all() and not found.exits_ahead.any()
     assert found.poses.shape == (0, 6)
+
+
+def test_bodies_of_turned_scopes_are_inside_the_lumen(lung: Lung) -> None:
+    """Every point of the polyline by which they leave the axis, measured to every voxel that is no lumen."""
+    device = scope(3.0)
+    found = sites(lung, device, reach_mm=30.0)
+    turned = np.flatnonzero(found.turned)
+    assert len(turned) > 20
+    assert (np.diff(found.turned.astype(int)) >= 0).all(), "those along the axis come first"
+    for site in turned[:: max(len(turned) // 25, 1)]:
+        line = approach(lung.tree, found.tip(lung.tree, int(site)))
+        assert line is not None
+        share = np.linspace(0.0, 1.0, 8)[:, None]
+        points = np.concatenate([a + share * (b - a) for a, b in zip(line[:-1], line[1:], strict=True)])
+        outside = np.where(lung.labels & LUMEN, 0, VESSEL).astype(np.uint16)
+        assert brute_clearance(outside, lung.grid, points, VESSEL, 6.0).min() >= device.radius_mm - 1e-6
+
+
+def test_without_turning_tips_look_along_the_axis(lung: Lung) -> None:
+    found = sites(lung, scope(3.0), reach_mm=30.0, turning=False)
+    assert found.count and not found.turned.any()
+    assert np.allclose(found.poses[:, 3:], lung.tree.tangents[found.tree_point])

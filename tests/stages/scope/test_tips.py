@@ -11,7 +11,18 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from anatomy.airway_tree import AirwayTree
-from stages.scope.tips import MAX_TURN_AT_TIP_RAD, MedialAxis, looks_ahead, step_length_mm, tip_at, walk
+from stages.scope.tips import (
+    ARC_PIECE_RAD,
+    MAX_TURN_AT_TIP_RAD,
+    MedialAxis,
+    approach,
+    leaving_point,
+    looks_ahead,
+    step_length_mm,
+    tip_at,
+    turned_aside,
+    walk,
+)
 from tests.stages.scenes import forked_tree
 
 CARINA = np.array([0.0, 0.0, 20.0])
@@ -132,3 +143,43 @@ def test_the_medial_axis_is_drawn_uniformly_by_length() -> None:
 
 def test_an_empty_axis() -> None:
     assert MedialAxis(TREE, np.zeros(TREE.n_points, dtype=bool)).length_mm == 0.0
+
+
+@pytest.mark.parametrize("polar_deg", [0.0, 10.0, 20.0, 30.0])
+@pytest.mark.parametrize("azimuth", [0.0, 2.0, 4.5])
+def test_a_turned_tip_leaves_the_axis_gently(polar_deg: float, azimuth: float) -> None:
+    along = tip_at(TREE, int(TREE.branch_points(1)[-1]))
+    tip = turned_aside(TREE, along, math.radians(polar_deg), azimuth)
+    line = approach(TREE, tip)
+    assert line is not None
+    pose = tip.lps_from_scope_tip
+    assert np.allclose(line[-1], pose[:3, 3]) and np.allclose(
+        line[0], TREE.points_lps[leaving_point(TREE, tip)]
+    )
+    steps = np.diff(line, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    assert lengths.max() <= 2.5 + 1e-9
+    assert np.allclose(steps[-1] / lengths[-1], pose[:3, 2], atol=1e-9)
+    cosines = (steps[:-1] * steps[1:]).sum(axis=1) / (lengths[:-1] * lengths[1:])
+    turns = np.arccos(np.clip(cosines, -1.0, 1.0))
+    assert turns.max() <= ARC_PIECE_RAD + 1e-9
+    assert turns.sum() == pytest.approx(math.radians(polar_deg), abs=0.35)
+    chord = line[-1] - line[0]
+    cosine = chord @ pose[:3, 2] / np.linalg.norm(chord)
+    assert math.acos(min(cosine, 1.0)) == pytest.approx(math.radians(polar_deg), abs=1e-6)
+
+
+def test_no_scope_bends_without_room() -> None:
+    along = tip_at(TREE, int(TREE.branch_points(1)[-1]))
+    assert approach(TREE, turned_aside(TREE, along, math.radians(150.0), 0.0)) is None
+
+
+@given(distance=st.floats(-6.0, 3.0), polar=st.floats(0.05, 0.7), azimuth=st.floats(-3.0, 3.0))
+def test_a_turned_tip_stays_turned_on_its_walk(distance: float, polar: float, azimuth: float) -> None:
+    tip = turned_aside(TREE, tip_at(TREE, int(TREE.branch_points(1)[-3])), polar, azimuth)
+    moved = walk(TREE, tip, distance, np.random.default_rng(0))
+    assert moved.turned
+    for each in (tip, moved):
+        chord = each.lps_from_scope_tip[:3, 3] - TREE.points_lps[leaving_point(TREE, each)]
+        cosine = chord @ each.lps_from_scope_tip[:3, 2] / np.linalg.norm(chord)
+        assert math.acos(min(float(cosine), 1.0)) == pytest.approx(polar, abs=1e-6)

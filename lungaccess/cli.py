@@ -131,6 +131,7 @@ def plan(
     objective: Objective = "inverse-clearance",
     method: Method = "atlas",
     allow_fissures: bool | None = None,
+    processes: int = 1,
     out: Path = Path("lungaccess-plan"),
     cache: Path | None = None,
 ) -> int:
@@ -159,6 +160,8 @@ def plan(
         Search over the deployment atlas, or Algorithm 1 of Kuntz et al. 2015.
     allow_fissures : bool
         Whether fissures may be crossed; as the system says if not given.
+    processes : int
+        How many processes refine the plan at the same time.
     out : Path
         Folder for plan.json, overview.png, cost_over_time.png and cost_over_time.csv.
     cache : Path
@@ -189,6 +192,7 @@ def plan(
         time_s=budget,
         iterations=iterations,
         cache=cache,
+        processes=processes,
     )
     return _plan_and_report(lung, request, out)
 

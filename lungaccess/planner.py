@@ -58,6 +58,7 @@ def plan(
     iterations: int | None = None,
     time_s: float | None = None,
     atlas: Atlas | None = None,
+    processes: int = 1,
     on_progress: Callable[[ProgressEvent], None] | None = None,
 ) -> Iterator[Plan]:
     """Plan all three stages; yield each plan that is better than the one before.
@@ -81,6 +82,9 @@ def plan(
         Stop after so many seconds of planning.  With neither limit the caller stops the iterator.
     atlas : Atlas, optional
         Made with `build_atlas` beforehand; made here if None.
+    processes : int
+        How many processes vary the best candidate at the same time.  The same seed, number of processes and
+        `iterations` give the same plans.
     on_progress : callable, optional
         Told about ten times a second.
 
@@ -89,7 +93,8 @@ def plan(
     NoPlan
         If the search ends without a plan; counts the reasons.
     SettingsError
-        If objective or method is unknown, or the atlas belongs to another lung or system.
+        If objective or method is unknown, the atlas belongs to another lung or system, or there cannot be so
+        many processes.
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
@@ -110,7 +115,16 @@ def plan(
         method=method,
         seed=seed,
     )
-    return _run(METHODS[method](task, atlas), task, iterations, time_s, tell)
+    search = METHODS[method](task, atlas)
+    if processes == 1:
+        return _run(search, search.steps(), iterations, time_s, tell)
+    if method != "atlas":
+        raise SettingsError(
+            f"{processes} processes are asked for with {method}", expected="one process, or method atlas"
+        )
+    from lungaccess.parallel import parallel_steps
+
+    return _run(search, parallel_steps(search, processes), iterations, time_s, tell)
 
 
 def atlas_event(share: float) -> ProgressEvent:
@@ -126,7 +140,7 @@ def atlas_event(share: float) -> ProgressEvent:
 
 def _run(
     search: AtlasSearch,
-    task: Task,
+    steps: Iterator[Step],
     iterations: int | None,
     time_s: float | None,
     tell: Callable[[ProgressEvent], None],
@@ -134,10 +148,10 @@ def _run(
     """Drive a search within its budget."""
     from lungaccess.explain import explain
 
-    clock = Clock()
+    clock, task = Clock(), search.task
     best: float | None = None
     iteration = 0
-    for step in search.steps():
+    for step in steps:
         if _spent(step, clock, iterations, time_s):
             break
         iteration = step.iteration

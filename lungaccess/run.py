@@ -51,6 +51,8 @@ class SearchRequest:
     iterations : int or None
     cache : Path or None
         Folder where the deployment atlas is kept; None for the usual one.
+    processes : int
+        How many of them refine the plan at the same time.
     """
 
     system: System
@@ -62,6 +64,7 @@ class SearchRequest:
     time_s: float | None = None
     iterations: int | None = None
     cache: Path | None = None
+    processes: int = 1
 
 
 class CostHistory:
@@ -120,6 +123,7 @@ def run_search(
             iterations=request.iterations,
             time_s=request.time_s,
             atlas=atlas,
+            processes=request.processes,
             on_progress=history.on_progress,
         )
         try:

@@ -156,21 +156,30 @@ class AtlasSearch:
     def steps(self) -> Iterator[Step]:
         """Search forever; the caller stops."""
         best: Step | None = None
-        for step in self._direct_arcs():
-            if step.candidate is not None and (best is None or step.cost < best.cost):
-                best = step
-                yield step
-            else:
-                yield replace(step, candidate=None)
+        for step in self.direct_steps():
+            best = step if step.candidate is not None else best
+            yield step
         iteration = 0
         while True:
             iteration += 1
-            step = self._vary(iteration, best)
+            step = self.vary(iteration, best)
             if step.candidate is not None and (best is None or step.cost < best.cost):
                 best = step
             else:
                 step = replace(step, candidate=None)
             yield step
+
+    def direct_steps(self) -> Iterator[Step]:
+        """Try the direct arcs; a step has a candidate if it is better than all before."""
+        best = math.inf
+        for step in self._direct_arcs():
+            better = step.candidate is not None and step.cost < best
+            best = step.cost if better else best
+            yield step if better else replace(step, candidate=None)
+
+    def seed_with(self, rng: np.random.Generator) -> None:
+        """Take the random numbers from another generator from now on."""
+        self._rng = rng
 
     def _direct_arcs(self) -> Iterator[Step]:
         """Try the single arc from every deployment with the target in its workspace, nearest first."""
@@ -224,7 +233,7 @@ class AtlasSearch:
         candidate = Candidate(tip=tip, deployment=deployment, path=path)
         return Step(iteration=iteration, phase=phase, candidate=candidate, cost=self.desk.cost(path))
 
-    def _vary(self, iteration: int, best: Step | None) -> Step:
+    def vary(self, iteration: int, best: Step | None) -> Step:
         """Refine the best candidate, or explore from another deployment."""
         explore = best is None or iteration % EXPLORE_EVERY == 0
         if explore and iteration % 2 == 0 and len(self.in_workspace):

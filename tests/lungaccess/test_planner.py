@@ -253,3 +253,23 @@ class TestBadInput:
         far = Target(lps_mm=np.array([900.0, 0.0, 0.0]), origin="point")
         with pytest.raises(TargetError, match="outside the lung"):
             la.plan(small_lung, SYSTEM, far, atlas=atlas)
+
+
+class TestProcesses:
+    """Several processes at once."""
+
+    def test_same_plans_every_time_and_all_valid(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        one, two = (plans_of(small_lung, target, atlas, processes=2, iterations=200) for _ in range(2))
+        assert same_run(one) == same_run(two)
+        costs = [plan.costs["inverse_clearance"] for plan in one]
+        assert costs == sorted(costs, reverse=True)
+        assert la.check(one[-1], small_lung).accepted
+        alone = plans_of(small_lung, target, atlas, iterations=0)
+        assert costs[-1] <= alone[-1].costs["inverse_clearance"]
+
+    def test_bad_numbers(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+        for options in ({"processes": 0}, {"processes": -2}, {"processes": 2, "method": "kuntz2015"}):
+            with pytest.raises(SettingsError, match="processes"):
+                plans_of(small_lung, target, atlas, **options)

@@ -18,6 +18,7 @@ from anatomy.errors import AnatomyError, LungaccessError, SettingsError
 from anatomy.io.files import require_writable_folder
 from anatomy.io.frames import Frame
 from lungaccess import terminal
+from lungaccess.commands_advise import advise
 from lungaccess.commands_alternatives import alternatives
 from lungaccess.commands_tubes import tubes
 from lungaccess.inputs import load_device, load_lung, require_one_target
@@ -69,6 +70,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
+app.command(advise)
 app.command(alternatives)
 app.command(tubes)
 

@@ -20,6 +20,8 @@ from anatomy.io.frames import Frame
 from lungaccess import terminal
 from lungaccess.commands_advise import advise
 from lungaccess.commands_alternatives import alternatives
+from lungaccess.commands_reach import reach
+from lungaccess.commands_risk import risk
 from lungaccess.commands_tubes import tubes
 from lungaccess.inputs import load_device, load_lung, require_one_target
 from lungaccess.terminal import console, error_console
@@ -73,6 +75,8 @@ app = App(
 app.command(advise)
 app.command(alternatives)
 app.command(tubes)
+app.command(risk)
+app.command(reach)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

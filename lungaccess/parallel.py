@@ -14,6 +14,8 @@ from lungaccess.searches import AtlasSearch, Step
 
 ROUND_ITERATIONS = 50
 """Iterations of one process before the best of all is shared."""
+JOINT_ROUND = 8
+"""Every so many rounds the first process refines the best candidate by a nonlinear program instead."""
 
 _forked: dict[str, AtlasSearch] = {}
 """The search that forked processes find: so lung and atlas are shared and not copied."""
@@ -65,6 +67,9 @@ def _varied(number: int, process: int, best: Step | None) -> Step | None:
     """Vary the best candidate in one process; return a better step, if one is found."""
     search = _forked["search"]
     search.seed_with(np.random.Generator(np.random.PCG64([search.task.seed, number, process])))
+    if best is not None and process == 0 and number % JOINT_ROUND == JOINT_ROUND - 1:
+        refined = search.refined(number, best)
+        return refined if refined.candidate is not None else None
     found: Step | None = None
     for iteration in range(1, ROUND_ITERATIONS + 1):
         step = search.vary(iteration, found or best)

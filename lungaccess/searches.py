@@ -31,6 +31,8 @@ CHUNK = 1000
 FINALISTS = 20
 RRT_ITERATIONS = 300
 EXPLORE_EVERY = 4
+JOINT_EVERY = 400
+"""Iterations after which what was found is refined by a nonlinear program, once."""
 SITE_SPREAD_MM = 2.0
 ROTATION_SPREAD_RAD = math.radians(8.0)
 INSERTION_SPREAD_MM = 1.5
@@ -152,6 +154,7 @@ class AtlasSearch:
         order = np.argsort(lengths, kind="stable")
         self.in_workspace = order[: int(np.isfinite(lengths).sum())]
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
+        self._refined: Candidate | None = None
 
     def steps(self) -> Iterator[Step]:
         """Search forever; the caller stops."""
@@ -235,6 +238,8 @@ class AtlasSearch:
 
     def vary(self, iteration: int, best: Step | None) -> Step:
         """Refine the best candidate, or explore from another deployment."""
+        if best is not None and iteration % JOINT_EVERY == 0 and best.candidate is not self._refined:
+            return self.refined(iteration, best)
         explore = best is None or iteration % EXPLORE_EVERY == 0
         if explore and iteration % 2 == 0 and len(self.in_workspace):
             return self._rrt(iteration, best)
@@ -243,6 +248,23 @@ class AtlasSearch:
             return Step(iteration=iteration, phase="refinement")
         spread = COUNTED_SPREADS[int(self._rng.integers(len(COUNTED_SPREADS)))]
         return self._perturbed(iteration, around, spread, math.inf if best is None else best.cost)
+
+    def refined(self, iteration: int, best: Step) -> Step:
+        """Improve site, tubes and needle of the best candidate together, by a nonlinear program."""
+        from lungaccess.refinement import refine
+
+        self._refined = best.candidate
+        nothing = Step(iteration=iteration, phase="joint refinement")
+        # A turned tip has no smooth way along the axis.
+        if best.candidate is None or best.candidate.tip.turned:
+            return nothing
+        found = refine(self.task, self.atlas.sites, best.candidate)
+        if found is None:
+            return nothing
+        step = self._finish(iteration, "joint refinement", found.tip, found.deployment, found.path)
+        if step.candidate is not None and step.cost < best.cost:
+            self._refined = step.candidate
+        return step
 
     def _random_candidate(self) -> Candidate | None:
         """Return a deployment to vary, from those with the target in their workspace or near it."""

@@ -1,0 +1,168 @@
+"""Compiled kernel of the risk: where plans with deviations end, and what they touch on the way.
+
+The tubes beyond the scope tip and the needle are one chain of arcs.  `pieces` is `(N, P, 4)`: for each of N
+deviated plans the length in mm, the roll in rad before it, the curvature in 1/mm and the radius in mm of
+each of P arcs; the first `n_tube` of them are the tubes.  `starts` is `(N, 9)`: scope tip, its unit tangent
+and the +x axis of its frame, LPS mm.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
+from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, LUMEN
+
+LENGTH = 0
+ROLL = 1
+CURVATURE = 2
+RADIUS = 3
+N_PIECE = 4
+
+STAYS_INSIDE = 1 << 14
+"""Flag beside the structures touched: the scope tip is not in a lumen, or the tubes end in one."""
+
+IN_LUMEN = -2
+NOT_IN_LUMEN = -3
+
+STEP_MM = 0.05
+"""Shortest step in a lumen or along what is touched."""
+WALL_ZONE_MM = 1.0
+"""From so far behind the exit on, the axis is out of every lumen."""
+TOUCHES_MM = 1e-9
+
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+_LUMEN = np.int64(LUMEN)
+
+
+@inner_kernel
+def _touch(scene, touched, x, y, z, radius, spared, lumen_mm):
+    """Add what a ball touches, and return how far no structure that is not yet touched can be met.
+
+    The airway of the branch `spared` counts for nothing (-1: none is spared), but the lumen of any airway
+    nearer than `lumen_mm` does (negative: it does not).
+    """
+    _field, labels, geometry, bits = scene
+    reach = radius + EXACT_REACH_MM
+    gap = EXACT_REACH_MM
+    left = bits & ~touched
+    while left != 0:
+        distance, label = exact_distance(labels, geometry, x, y, z, left, spared, reach)
+        if distance >= radius - TOUCHES_MM:
+            gap = distance - radius
+            break
+        hit = label & left
+        if hit != AIRWAY and (label >> BRANCH_SHIFT) - 1 == spared:
+            hit &= ~AIRWAY
+        touched |= hit
+        left &= ~hit
+    if lumen_mm >= 0.0 and not touched & AIRWAY:
+        distance, _label = exact_distance(
+            labels, geometry, x, y, z, _LUMEN, _NOBODY, lumen_mm + EXACT_REACH_MM
+        )
+        if distance < lumen_mm - TOUCHES_MM or distance == 0.0:
+            touched |= AIRWAY
+        gap = min(gap, distance - lumen_mm)
+    return touched, max(gap, STEP_MM)
+
+
+@inner_kernel
+def _in_lumen(scene, depth, x, y, z):
+    """Return the step to the next point in a lumen, and the branch; NOT_IN_LUMEN outside of all."""
+    _field, labels, geometry, _bits = scene
+    label = label_at(labels, geometry, x, y, z)
+    if not label & LUMEN:
+        return 0.0, NOT_IN_LUMEN
+    corners, depth_geometry = depth
+    return max(distance_bound(corners, depth_geometry, x, y, z), STEP_MM), (label >> BRANCH_SHIFT) - 1
+
+
+@inner_kernel
+def _follow(scene, depth, start, pieces, n_tube, exempt_mm):
+    """Follow one chain; return what it touches and the point where it ends."""
+    field, _labels, geometry, bits = scene
+    pose = (start[0], start[1], start[2], start[3], start[4], start[5])
+    nx, ny, nz = start[6], start[7], start[8]
+    touched = 0
+    pierced = IN_LUMEN
+    branch = IN_LUMEN
+    done = 0.0
+    left_at = 0.0
+    tube_mm = pieces[:n_tube, LENGTH].sum()
+    for p in range(pieces.shape[0]):
+        length, roll, kappa, radius = pieces[p]
+        c, s = math.cos(roll), math.sin(roll)
+        bx = pose[4] * nz - pose[5] * ny
+        by = pose[5] * nx - pose[3] * nz
+        bz = pose[3] * ny - pose[4] * nx
+        bend = (kappa, c * nx + s * bx, c * ny + s * by, c * nz + s * bz)
+        if p == n_tube and pierced == IN_LUMEN:
+            touched |= STAYS_INSIDE
+        at = 0.0
+        while not touched & STAYS_INSIDE and touched & bits != bits:
+            x, y, z = point_on_arc(pose, bend, at)
+            if pierced == IN_LUMEN:
+                step, here = _in_lumen(scene, depth, x, y, z)
+                if here == NOT_IN_LUMEN:
+                    if branch == IN_LUMEN:
+                        touched |= STAYS_INSIDE
+                    pierced = branch
+                    left_at = done + at
+                    continue
+                branch = here
+            else:
+                step = distance_bound(field, geometry, x, y, z) - radius
+                if step < MIN_GAP_MM:
+                    spared = pierced if p < n_tube or done + at < tube_mm + exempt_mm else -1
+                    lumen_mm = -1.0
+                    if p >= n_tube:
+                        lumen_mm = radius
+                    elif done + at > left_at + WALL_ZONE_MM:
+                        lumen_mm = 0.0
+                    touched, step = _touch(scene, touched, x, y, z, radius, spared, lumen_mm)
+            if at >= length:
+                break
+            at = min(at + step, length)
+        nx, ny, nz = normal_on_arc(pose, bend, length)
+        pose = pose_on_arc(pose, bend, length)
+        done += length
+    return touched, pose[0], pose[1], pose[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def follow(scene, depth, starts, pieces, n_tube, exempt_mm, touched, ends):
+    """Follow N deviated plans, and note what each touches and where it ends.
+
+    A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
+    radius.  Judging begins where the tubes leave the lumen: the airway of the branch that they leave is
+    spared for the tubes and the first `exempt_mm` of the needle, except that behind the wall the tubes' axis
+    and the needle's surface may not enter a lumen again.  Clearance changes by no more than one moves, so
+    from one look to the next nothing is missed, but for what is touched over less than STEP_MM.
+
+    Parameters
+    ----------
+    scene : tuple
+        Clearance field of all structures in `bits`, labels, geometry, bits.
+    depth : tuple
+        Lumen depth and its geometry.
+    starts : (N, 9) float64
+    pieces : (N, P, 4) float64
+    n_tube : int
+    exempt_mm : float
+    touched : (N,) int64
+        Receives the bits of the structures touched, with STAYS_INSIDE where the chain was not judged.
+    ends : (N, 3) float64, LPS mm
+        Receives the last points.
+    """
+    for n in range(starts.shape[0]):
+        found, x, y, z = _follow(scene, depth, starts[n], pieces[n], n_tube, exempt_mm)
+        touched[n] = found
+        ends[n, 0] = x
+        ends[n, 1] = y
+        ends[n, 2] = z

@@ -1,0 +1,147 @@
+"""The work behind a reachability map: its points layer by layer, kept on disk as they are finished."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float, Grid
+from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.lung import Lung
+from anatomy.structures import FISSURE, OBSTACLES
+from stages.needle.reach import Reached, ReachScan
+
+THREADS = 2
+
+
+def counted_voxels(lung: Lung, grid: Grid, with_fissures: bool) -> NDArray[np.bool_]:
+    """Tell which voxels of a map have their centre in lung tissue that is no obstacle."""
+    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    counted = np.zeros(grid.shape, dtype=bool, order="F")
+    for k in range(grid.shape[2]):
+        ijk = np.floor(lung.grid.ijk(_layer_points(grid, k)) + 0.5).astype(np.int64)
+        inside = ((ijk >= 0) & (ijk < lung.grid.shape)).all(axis=-1)
+        layer = np.zeros(inside.shape, dtype=bool)
+        layer[inside] = (lung.labels[tuple(ijk[inside].T)] & bits) == 0
+        counted[:, :, k] = layer
+    return counted
+
+
+def _layer_points(grid: Grid, k: int) -> Float:
+    """Return the centres `(ni, nj, 3)` of a layer of voxels, LPS mm."""
+    ni, nj, _nk = grid.shape
+    i, j = np.meshgrid(np.arange(ni), np.arange(nj), indexing="ij")
+    return grid.lps(np.stack([i, j, np.full_like(i, k)], axis=-1))
+
+
+def scan_layers(
+    scan: ReachScan,
+    grid: Grid,
+    counted: NDArray[np.bool_],
+    store: LayerStore | None,
+    progress: Callable[[float], None] | None,
+) -> tuple[NDArray[np.float32], int]:
+    """Try the points of all layers.
+
+    Parameters
+    ----------
+    scan : ReachScan
+    grid : Grid
+    counted : (ni, nj, nk) bool
+        Voxels whose centres are tried.
+    store : LayerStore or None
+        Where finished layers are kept; emptied at the end.
+    progress : callable or None
+        Told the share of the layers done.
+
+    Returns
+    -------
+    found : (3, ni, nj, nk) float32
+        Kind, cost and clearance, see `stages.needle.reach.Reached`.
+    resumed : int
+        Layers taken from the store.
+    """
+    found = np.zeros((3, *grid.shape), dtype=np.float32)
+    done, resumed = 0, 0
+
+    def one_layer(k: int) -> None:
+        nonlocal done, resumed
+        places = np.argwhere(counted[:, :, k])
+        kept = None if store is None else store.load(k, len(places))
+        if kept is None and len(places):
+            ijk = np.concatenate([places, np.full((len(places), 1), k)], axis=1)
+            kept = _as_rows(
+                scan.reach(grid.lps(ijk), _seeds(grid, ijk), _earlier_neighbours(counted[:, :, k]))
+            )
+            if store is not None:
+                store.save(k, kept)
+        elif kept is not None:
+            resumed += 1
+        if kept is not None:
+            found[:, places[:, 0], places[:, 1], k] = kept
+        done += 1
+        if progress:
+            progress(done / grid.shape[2])
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(one_layer, range(grid.shape[2])))
+    if store is not None:
+        store.clear()
+    return found, resumed
+
+
+def _seeds(grid: Grid, ijk: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Return a seed for each voxel: its number in the grid."""
+    return np.asarray(np.ravel_multi_index(tuple(ijk.T), grid.shape), dtype=np.uint64)
+
+
+def _earlier_neighbours(counted: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the indices `(N, 3)` of the neighbours before each True place of a layer, -1 for none."""
+    index = np.full((counted.shape[0] + 1, counted.shape[1] + 2), -1, dtype=np.int64)
+    index[1:, 1:-1][counted] = np.arange(np.count_nonzero(counted))
+    i, j = np.nonzero(counted)
+    return np.stack([index[i + 1, j], index[i, j + 1], index[i, j + 2]], axis=1)
+
+
+def _as_rows(reached: Reached) -> NDArray[np.float32]:
+    return np.stack([reached.kinds, reached.cost, reached.clearance_mm]).astype(np.float32)
+
+
+class LayerStore:
+    """Finished layers on disk, in a folder named after what they depend on.
+
+    Parameters
+    ----------
+    work : Path
+    key : str
+    """
+
+    def __init__(self, work: Path, key: str) -> None:
+        self._folder = require_writable_folder(work / f".reach-{key}")
+
+    def _path(self, layer: int) -> Path:
+        return self._folder / f"layer-{layer:04d}.npz"
+
+    def load(self, layer: int, count: int) -> NDArray[np.float32] | None:
+        """Return the rows `(3, count)` of a layer, None if it is not there or not whole."""
+        try:
+            with np.load(self._path(layer)) as stored:
+                rows = np.asarray(stored["rows"], dtype=np.float32)
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            return None
+        return rows if rows.shape == (3, count) else None
+
+    def save(self, layer: int, rows: NDArray[np.float32]) -> None:
+        """Write a layer, whole or not at all."""
+        with atomic_write(self._path(layer)) as temporary:
+            np.savez_compressed(temporary, rows=rows)
+
+    def clear(self) -> None:
+        """Remove all layers."""
+        shutil.rmtree(self._folder, ignore_errors=True)

@@ -1,0 +1,67 @@
+"""Joint refinement of a proved candidate: site, tubes and needle together."""
+
+from __future__ import annotations
+
+from lungaccess.assemble import Candidate, Task
+from lungaccess.refinement.problem import ARC_COUNTS, WEIGHTS, Court, Problem
+from stages.scope.sites import Sites
+
+ITERATIONS = 40
+NEEDLE_SHARES = (1.0, 0.5)
+BETTER = 1e-3
+"""Share of the cost that an improvement must save."""
+
+
+def refine(
+    task: Task, atlas_sites: Sites, candidate: Candidate, *, iterations: int = ITERATIONS
+) -> Candidate | None:
+    """Improve everything about a candidate together.
+
+    A nonlinear program moves the scope's site, the tubes and all arcs of the needle at once.  What it finds
+    is put back into the numbers of a plan and judged by the discrete tests, so nothing is returned that they
+    do not accept.  Called again with what it returned, it may find more.  Not for several threads at a time.
+
+    Parameters
+    ----------
+    task : Task
+    atlas_sites : Sites
+        Where the scope passes.
+    candidate : Candidate
+        Accepted by the same tests.
+    iterations : int
+        Most steps of the program's solver, each time it runs (two or three times a call).  For each number a
+        program is built at the first call, which takes a second or two.
+
+    Returns
+    -------
+    Candidate or None
+        Cheaper than the one given by BETTER or more, or None.
+    """
+    if len(candidate.path.arcs) > ARC_COUNTS[-1] or _costs_nothing(task):
+        return None
+    return _refined(Court(task), atlas_sites, candidate, iterations)
+
+
+def _costs_nothing(task: Task) -> bool:
+    """Tell whether every path is free, because the objective weighs a map and there is none."""
+    return WEIGHTS[task.objective][2] > 0.0 and task.lung.cost is None
+
+
+def _refined(court: Court, sites: Sites, candidate: Candidate, iterations: int) -> Candidate | None:
+    """Solve for everything, then for the needle alone from tubes that the discrete test accepts."""
+    from lungaccess.refinement.program import program
+
+    problem, limit = Problem(court, sites, candidate), court.cost(candidate) * (1.0 - BETTER)
+    solver = program(problem.layout, iterations)
+    _objective, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
+    found = solver.solve(problem.start, problem.eased(values), problem.boxes)
+    for stand in problem.stands(found):
+        aimed = solver.solve(stand.x, problem.for_needle(stand), problem.boxes)
+        for share in NEEDLE_SHARES:
+            new = problem.finished(stand, stand.x + share * (aimed - stand.x))
+            if new is None:
+                continue
+            if court.cost(new) < limit:
+                return new
+            break
+    return None

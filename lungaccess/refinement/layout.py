@@ -1,0 +1,160 @@
+"""Which number stands where in the refinement's program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from anatomy.grid import Float
+
+AXIS_DEGREE = 5
+"""The airway's axis near the site is a polynomial of this degree ..."""
+AXIS_SCALE_MM = 2.5
+"""... in the way along it, as a share of the greatest, so many mm to either side."""
+ZONE_POINTS = 8
+NEEDLE_POINTS = 60
+TUBE_POINTS = 24
+WALL_POINTS = 8
+WALL_WAY_MM = 6.0
+"""Way of the tubes before the exit where they may touch the wall."""
+SLOPE_MM = 0.5
+"""Step over which the share of lumen is compared at the exit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """The shape of a program.
+
+    Parameters
+    ----------
+    arcs : int
+        Arcs of the needle.
+    with_map : bool
+        Whether the objective looks at a cost map.
+    zone_points, tube_points, wall_points : int
+        Samples of the needle's exempt length, and of the tubes behind and before the exit.
+    """
+
+    arcs: int
+    with_map: bool
+    zone_points: int = ZONE_POINTS
+    tube_points: int = TUBE_POINTS
+    wall_points: int = WALL_POINTS
+
+    @cached_property
+    def variables(self) -> dict[str, Any]:
+        """Places of the variables: mm, rad, curvatures as shares of the greatest."""
+        a = self.arcs
+        return {
+            "site": 0,
+            "rotation": 1,
+            "outer": 2,
+            "inner": 3,
+            "exit": 4,
+            "lengths": slice(5, 5 + a),
+            "bend_x": slice(5 + a, 5 + 2 * a),
+            "bend_y": slice(5 + 2 * a, 5 + 3 * a),
+        }
+
+    @property
+    def n_variables(self) -> int:
+        """Number of variables."""
+        return 5 + 3 * self.arcs
+
+    @property
+    def arc_points(self) -> int:
+        """Number of samples of each arc: fewer of shorter arcs."""
+        return max(NEEDLE_POINTS // self.arcs, 1)
+
+    @cached_property
+    def parameters(self) -> dict[str, slice]:
+        """Places of the parameters, without the values of the fields."""
+        sizes = {
+            "axis_points": 3 * (AXIS_DEGREE + 1),
+            "axis_tangents": 3 * (AXIS_DEGREE + 1),
+            "sideways": 3,
+            "target": 3,
+            "max_curvature_per_mm": 1,
+            "shared_curvature_per_mm": 1,
+            "inner_curvature_per_mm": 1,
+            "curved_length_mm": 1,
+            "straight_out": 1,
+            "outer_radius_step_mm": 1,
+            "exempt_mm": 1,
+            "weigh_clear": 1,
+            "weigh_length": 1,
+            "weigh_map": 1,
+        }
+        for n in range(self.boxes):
+            sizes[f"affine{n}"] = 12
+            sizes[f"shape{n}"] = 3
+        return _in_a_row(sizes)
+
+    @property
+    def boxes(self) -> int:
+        """Number of fields, see `lungaccess.refinement.boxes`."""
+        return 5 if self.with_map else 4
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of parameters."""
+        return _end(self.parameters)
+
+    @cached_property
+    def constraints(self) -> dict[str, slice]:
+        """Places of the constraints."""
+        sizes = {
+            "end": 3,
+            "curvature": self.arcs,
+            "length": 1,
+            "turn": 1,
+            "cosine": 2 * self.arcs,
+            "order": 1,
+            "overlap": 1,
+            "in_tissue": 1,
+            "exit": 1,
+            "slope": 1,
+            "zone": self.zone_points,
+            "needle": self.arcs * self.arc_points,
+            "tube": self.tube_points + 1,
+            "wall": self.wall_points,
+        }
+        return _in_a_row(sizes)
+
+    @property
+    def n_constraints(self) -> int:
+        """Number of constraints."""
+        return _end(self.constraints)
+
+
+def _in_a_row(sizes: dict[str, int]) -> dict[str, slice]:
+    places, begin = {}, 0
+    for name, size in sizes.items():
+        places[name] = slice(begin, begin + size)
+        begin += size
+    return places
+
+
+def _end(places: dict[str, slice]) -> int:
+    return int(max(place.stop for place in places.values()))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Numbers:
+    """What one call of a program is about.
+
+    Parameters
+    ----------
+    parameters : (P,) float64
+    lower, upper : (n,) float64
+        Bounds of the variables.
+    least, most : (m,) float64
+        Bounds of the constraints.
+    """
+
+    parameters: Float
+    lower: Float
+    upper: Float
+    least: Float
+    most: Float

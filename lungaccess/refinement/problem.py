@@ -1,0 +1,344 @@
+"""The numbers of the refinement's program for one candidate, and candidates from its variables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from anatomy import poses
+from anatomy.grid import Float
+from anatomy.structures import FISSURE, OBSTACLES
+from lungaccess.assemble import Candidate, Task
+from lungaccess.costs import path_cost
+from lungaccess.refinement import boxes as fields
+from lungaccess.refinement.axis import LocalAxis, standing_still
+from lungaccess.refinement.curve import aimed, path_of, rows_of, split
+from lungaccess.refinement.layout import SLOPE_MM, WALL_WAY_MM, Layout, Numbers
+from stages.needle.objections import objection
+from stages.needle.path import CURVATURE
+from stages.needle.searches import Query
+from stages.needle.space import needle_space
+from stages.scope.sites import Sites
+from stages.scope.tips import ScopeTip
+from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm, tube_constants
+from stages.tube.kernels import deployment as index
+from stages.tube.shape import centreline
+
+ARC_COUNTS = (3, 5, 8)
+"""A program is built for each; shorter paths are split."""
+NEEDLE_MARGIN_MM = 10.0
+TUBE_MARGIN_MM = 8.0
+MAX_TURN_RAD = 1.2
+SHORTEST_ARC_MM = 1.0
+NEEDLE_SLACK_MM = 0.02
+TUBE_SLACK_MM = 0.1
+"""More than is required, for what lies between samples and for the field between its lattice points."""
+CURVATURE_SLACK = 1e-3
+ANGLE_SLACK_RAD = math.radians(2.0)
+EASED = ("zone", "needle", "tube", "wall", "slope")
+EASE = 1e-4
+SHARES = (1.0, 0.85, 0.7, 0.5, 0.35, 0.2, 0.1)
+MOVED_STANDS = 2
+WEIGHTS = {
+    "inverse_clearance": (1.0, 0.0, 0.0),
+    "length_mm": (0.0, 1.0, 0.0),
+    "cost_map": (0.0, 0.0, 1.0),
+    "voxel_sum": (0.0, 0.0, 1.0),
+}
+"""Weights of 1 / clearance, length and cost map; the sum over voxels follows the map's line integral."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Stand:
+    """Accepted tubes, and the program's variables there.
+
+    Parameters
+    ----------
+    share : float
+        How far on the way from the candidate (0) to what the program found (1).
+    x : (n,) float64
+        The site counts from `tip`.
+    tip : ScopeTip
+    deployment : Deployment
+    """
+
+    share: float
+    x: Float
+    tip: ScopeTip
+    deployment: Deployment
+
+
+class Court:
+    """Judges candidates of one task by the discrete tests."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        system, fissures = task.system, task.with_fissures
+        self._space = needle_space(task.lung, system.needle, system.margins, with_fissures=fissures)
+        self.tubes = TubeJudge(task.lung, system.tubes, system.margins, with_fissures=fissures)
+
+    def cost(self, candidate: Candidate) -> float:
+        """Return the cost under the task's objective."""
+        return self._cost(candidate, self.task.objective)
+
+    def accepts(self, candidate: Candidate) -> bool:
+        """Tell whether the needle keeps all limits, is proved clear and enters no voxel of infinite cost."""
+        deployment = candidate.deployment
+        query = Query(
+            lps_from_start=deployment.lps_from_tip, target=self.task.target.lps_mm, branch=deployment.branch
+        )
+        tightest = candidate.path.arcs[:, CURVATURE].max()
+        if tightest > self.task.system.needle.max_curvature_per_mm:
+            return False
+        if objection(self._space, query, candidate.path):
+            return False
+        return math.isfinite(self._cost(candidate, "cost_map"))
+
+    def _cost(self, candidate: Candidate, objective: str) -> float:
+        task = self.task
+        return path_cost(task.lung, candidate.path, objective, with_fissures=task.with_fissures)
+
+
+class Problem:
+    """The program's numbers for one candidate.
+
+    Parameters
+    ----------
+    court : Court
+    sites : Sites
+    candidate : Candidate
+        With at most as many arcs as the last of ARC_COUNTS.
+
+    Attributes
+    ----------
+    layout : Layout
+    start : (n,) float64
+        The candidate as variables.
+    numbers : Numbers
+    boxes : tuple of FieldBox
+    axis : LocalAxis
+    """
+
+    def __init__(self, court: Court, sites: Sites, candidate: Candidate) -> None:
+        self.task = court.task
+        self._court, self._candidate = court, candidate
+        needle, deployment = self.task.system.needle, candidate.deployment
+        rows = rows_of(candidate.path)
+        arcs = next(count for count in ARC_COUNTS if count >= len(rows))
+        self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
+        rows = split(rows, arcs, self._exempt_mm)
+        self.layout = Layout(arcs=arcs, with_map=WEIGHTS[self.task.objective][2] > 0.0)
+        self.axis = LocalAxis(self.task.lung.tree, sites, candidate.tip, deployment.branch)
+        tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
+        bends = rows[:, 1:].T / needle.max_curvature_per_mm
+        self.start = np.concatenate([[0.0], tubes, rows[:, 0], *bends])
+        self.boxes = self._cut_boxes()
+        lower, upper = self._variable_bounds()
+        least, most = self._constraint_bounds()
+        self.numbers = Numbers(
+            parameters=self._parameters(self.axis.points, self.axis.tangents),
+            lower=lower,
+            upper=upper,
+            least=least,
+            most=most,
+        )
+
+    def eased(self, values: Float) -> Numbers:
+        """Return the numbers with the clearances of the start, `values` (m,), allowed where they are less.
+
+        So the program starts from where it may be, though its fields are not exact.
+        """
+        least = self.numbers.least.copy()
+        for name in EASED:
+            place = self.layout.constraints[name]
+            least[place] = np.minimum(least[place], values[place] - EASE)
+        return replace(self.numbers, least=least)
+
+    def stands(self, found: Float) -> Iterator[Stand]:
+        """Yield accepted tubes: the nearest to `found`, some at most half as far, those of the candidate."""
+        farthest, left = 1.0, MOVED_STANDS
+        for share in SHARES:
+            moved = self.stand(found, share) if left and share <= farthest else None
+            if moved is not None:
+                farthest, left = 0.5 * share, left - 1
+                yield moved
+        own = self.stand(found, 0.0)
+        if own is not None:
+            yield own
+
+    def stand(self, found: Float, share: float) -> Stand | None:
+        """Return the tubes at a share of the way from the candidate to `found`, if they are accepted."""
+        at = self.layout.variables
+        x = self.start + share * (found - self.start)
+        tip = self.axis.tip(float(x[at["site"]]))
+        deployment = self._judged(tip, x)
+        if isinstance(deployment, str):
+            return None
+        x[at["site"]] = 0.0
+        x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm
+        x[at["exit"]] = deployment.exit_mm
+        return Stand(share=share, x=x, tip=tip, deployment=deployment)
+
+    def for_needle(self, stand: Stand) -> Numbers:
+        """Return the numbers for the needle alone, from tubes that stay as they are."""
+        rows, numbers = self.layout.constraints, self.numbers
+        lower, upper = numbers.lower.copy(), numbers.upper.copy()
+        least, most = numbers.least.copy(), numbers.most.copy()
+        tubes = slice(0, self.layout.variables["lengths"].start)
+        lower[tubes] = upper[tubes] = stand.x[tubes]
+        for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall"):
+            least[rows[name]], most[rows[name]] = -np.inf, np.inf
+        parameters = self._parameters(*standing_still(stand.tip))
+        return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
+
+    def finished(self, stand: Stand, x: Float) -> Candidate | None:
+        """Return the candidate with the needle of `x`, aimed anew, if the discrete tests accept it."""
+        at, kappa = self.layout.variables, self.task.system.needle.max_curvature_per_mm
+        start = stand.deployment.lps_from_tip
+        rows = np.stack([x[at["lengths"]], kappa * x[at["bend_x"]], kappa * x[at["bend_y"]]], axis=1)
+        aim = aimed(start, rows, self.task.target.lps_mm, kappa)
+        if aim is None:
+            return None
+        found = Candidate(tip=stand.tip, deployment=stand.deployment, path=path_of(start, aim))
+        return found if self._court.accepts(found) else None
+
+    def _judged(self, tip: ScopeTip, x: Float) -> Deployment | str:
+        """Judge the tubes of `x`; the angle of rotation counts from the tip's own +x."""
+        at, frame = self.layout.variables, tip.lps_from_scope_tip
+        smooth = poses.pose(frame[:3, 3], frame[:3, 2], self._sideways)
+        bend = poses.bending_directions(smooth, x[at["rotation"]])[0]
+        inner = min(max(float(x[at["inner"]]), 0.0), self._longest_mm)
+        outer = min(max(float(x[at["outer"]]), 0.0), inner)
+        return self._court.tubes.judge(frame, poses.roll_towards(frame, bend), outer, inner)
+
+    @property
+    def _sideways(self) -> Float:
+        return np.asarray(self._candidate.tip.lps_from_scope_tip[:3, 0])
+
+    @property
+    def _straight_out(self) -> bool:
+        """Whether the straight part of the inner tube reaches out of the scope."""
+        return 0.0 < self.task.system.tubes.inner.curved_length_mm < self._candidate.deployment.inner_mm
+
+    @property
+    def _longest_mm(self) -> float:
+        """The greatest insertion: where the tubes follow their own track, or that of the candidate."""
+        return max(tracking_length_mm(self.task.system.tubes), self._candidate.deployment.inner_mm)
+
+    def _cut_boxes(self) -> tuple[fields.FieldBox, ...]:
+        lung, fissures = self.task.lung, self.task.with_fissures
+        deployment, margin = self._candidate.deployment, self.task.system.margins.total_mm
+        bits = OBSTACLES | (FISSURE if fissures else 0)
+        leaves = deployment.exit_mm
+        outside = self._tube_points(np.linspace(leaves, deployment.inner_mm, 12))
+        inside = self._tube_points(np.linspace(max(leaves - WALL_WAY_MM, 0.0), leaves, 6))
+        needle, lengths = self._candidate.path.sample(1.0)
+        near = np.concatenate([outside, needle[lengths <= self._exempt_mm]])
+        boxes = [
+            fields.clearance_box(lung, needle, NEEDLE_MARGIN_MM, with_fissures=fissures),
+            fields.spared_box(lung, near, TUBE_MARGIN_MM, bits=bits, branch=deployment.branch),
+            fields.wall_box(lung, inside, TUBE_MARGIN_MM, with_fissures=fissures, kept_mm=margin),
+            fields.lumen_box(lung, inside[-1:], TUBE_MARGIN_MM),
+        ]
+        if self.layout.with_map and lung.cost is not None:
+            boxes.append(fields.map_box(lung.cost, needle, NEEDLE_MARGIN_MM))
+        return tuple(boxes)
+
+    def _tube_points(self, arc_lengths: Float) -> Float:
+        deployment = self._candidate.deployment
+        return centreline(
+            self.task.system.tubes,
+            self._candidate.tip.lps_from_scope_tip,
+            deployment.rotation_rad,
+            deployment.outer_mm,
+            deployment.inner_mm,
+            arc_lengths,
+        )
+
+    def _lumen_at_exit(self) -> tuple[float, float]:
+        """Return the share of lumen at the exit, and its greatest slope there, per mm."""
+        box = self.boxes[fields.LUMEN_SHARE]
+        exit_point = self._tube_points(np.array([self._candidate.deployment.exit_mm]))
+        places = exit_point + SLOPE_MM * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+        lattice = places @ box.lattice_from_lps[:, :3].T + box.lattice_from_lps[:, 3]
+        values = box.values.reshape(box.shape, order="F")
+        share = ndimage.map_coordinates(values, lattice.T, order=3, prefilter=False, mode="nearest")
+        return float(share[0]), float(np.linalg.norm(share[1:4] - share[4:]) / (2.0 * SLOPE_MM))
+
+    def _parameters(self, points: Float, tangents: Float) -> Float:
+        """Return the parameters for an axis of the scope's tip given by coefficients."""
+        tubes = self.task.system.tubes
+        constants = tube_constants(tubes, self.task.system.margins)
+        clear, length, mapped = WEIGHTS[self.task.objective]
+        values: dict[str, object] = {
+            "axis_points": points,
+            "axis_tangents": tangents,
+            "sideways": self._sideways,
+            "target": self.task.target.lps_mm,
+            "max_curvature_per_mm": self.task.system.needle.max_curvature_per_mm,
+            "shared_curvature_per_mm": constants[index.OVERLAP_CURVATURE],
+            "inner_curvature_per_mm": constants[index.INNER_CURVATURE],
+            "curved_length_mm": constants[index.CURVED_LENGTH],
+            "straight_out": float(self._straight_out),
+            "outer_radius_step_mm": tubes.outer.radius_mm - tubes.inner.radius_mm,
+            "exempt_mm": self._exempt_mm,
+            "weigh_clear": clear,
+            "weigh_length": length,
+            "weigh_map": mapped,
+        }
+        for n, box in enumerate(self.boxes):
+            values[f"affine{n}"] = box.lattice_from_lps.T
+            values[f"shape{n}"] = box.shape
+        out = np.zeros(self.layout.n_parameters)
+        for name, place in self.layout.parameters.items():
+            out[place] = np.asarray(values[name], dtype=np.float64).ravel()
+        return out
+
+    def _variable_bounds(self) -> tuple[Float, Float]:
+        at, system = self.layout.variables, self.task.system
+        lower, upper = np.full(self.layout.n_variables, -1.0), np.full(self.layout.n_variables, 1.0)
+        rotation = self._candidate.deployment.rotation_rad
+        bounds = {
+            "site": (self.axis.low_mm, self.axis.high_mm),
+            "rotation": (rotation - MAX_TURN_RAD, rotation + MAX_TURN_RAD),
+            "outer": (0.0, self._longest_mm),
+            "inner": (system.tubes.inner.curved_length_mm if self._straight_out else 0.0, self._longest_mm),
+            "exit": (0.0, self._longest_mm),
+            "lengths": (SHORTEST_ARC_MM, system.needle.max_length_mm),
+        }
+        for name, (low, high) in bounds.items():
+            lower[at[name]], upper[at[name]] = low, high
+        lower[at["lengths"].start] += self._exempt_mm
+        return lower, upper
+
+    def _constraint_bounds(self) -> tuple[Float, Float]:
+        system, deployment = self.task.system, self._candidate.deployment
+        needle, tubes, margin = system.needle, system.tubes, system.margins.total_mm
+        level, slope = self._lumen_at_exit()
+        thick = tubes.inner.radius_mm + deployment.lateral_sweep_mm + TUBE_SLACK_MM
+        clear = needle.radius_mm + margin + NEEDLE_SLACK_MM
+        steep = math.sin(math.radians(tubes.min_wall_angle_deg) + ANGLE_SLACK_RAD)
+        bounds = {
+            "end": (0.0, 0.0),
+            "curvature": (-np.inf, (1.0 - CURVATURE_SLACK) ** 2),
+            "length": (-np.inf, needle.max_length_mm),
+            "turn": (-np.inf, math.radians(needle.max_accumulated_turn_deg)),
+            "cosine": (math.cos(math.radians(needle.max_angle_from_start_deg)), np.inf),
+            "order": (0.0, tubes.max_inner_protrusion_mm),
+            "overlap": (0.0, np.inf),
+            "in_tissue": (index.WALL_ZONE_MM + NEEDLE_SLACK_MM, np.inf),
+            "exit": (level, level),
+            "slope": (slope * steep, np.inf),
+            "zone": (clear, np.inf),
+            "needle": (clear, np.inf),
+            "tube": (thick + margin, np.inf),
+            "wall": (thick, np.inf),
+        }
+        least, most = np.zeros(self.layout.n_constraints), np.zeros(self.layout.n_constraints)
+        for name, place in self.layout.constraints.items():
+            least[place], most[place] = bounds[name]
+        return least, most

@@ -1,0 +1,354 @@
+"""Many points and many start poses: which points the needle reaches, and how well.
+
+`starts` is `(E, 6)`: point and unit tangent of each start pose, LPS mm, neighbours in the list being alike;
+`branches` (E,) the branch that each has pierced.  `order` (E,) is a permutation of them, and `mixed` `(6, E)`
+holds the same poses in that order: reachable points then need few looks.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.arcs import arc_to_point, point_on_arc
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.field import UNITS_PER_MM, distance_bound, exact_distance, interpolate_squared
+from anatomy.kernels.labels import AIRWAY
+from stages.needle.kernels.connections import seen_from, workspace_length
+from stages.needle.kernels.cost import inverse_clearance_on_arc
+from stages.needle.kernels.limits import (
+    COST_STEP,
+    EXEMPT_LENGTH,
+    KAPPA,
+    MAX_ANGLE,
+    MAX_LENGTH,
+    MAX_TURN,
+    REQUIRED,
+)
+from stages.needle.kernels.proof import PROBE_SPACING_MM, blocker_on_arc
+from stages.needle.kernels.rrt import grow_rrt
+from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
+
+DIRECT = 1
+SEARCHED = 2
+UNREACHED = 3
+NO_ROOM = 4
+
+# Columns of `found`: estimated integral of 1 / clearance, least clearance beyond the exempt length (mm).
+COST = 0
+CLEARANCE = 1
+
+CLEARANCE_STEP_MM = 0.5
+LONGEST_JUMP = 256
+JUMP_GROWTH = 4
+"""Neighbours of the best start pose are tried 1, 4, 16, ... places away in the list, up to the longest."""
+ROUNDS = 20
+BLOCK = 512
+
+# A typed number: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+
+
+@inner_kernel
+def _least_clearance(space, limits, pose, bend, length, s0, least):
+    """Return a clearance that an arc is never below beyond the exempt length, at most `least`."""
+    field, _labels, geometry, _bits = space
+    begin = min(max(limits[EXEMPT_LENGTH] - s0, 0.0), length)
+    count = max(int(math.ceil((length - begin) / CLEARANCE_STEP_MM)), 1)
+    half = 0.5 * (length - begin) / count
+    for m in range(count + 1):
+        x, y, z = point_on_arc(pose, bend, begin + (length - begin) * m / count)
+        least = min(least, distance_bound(field, geometry, x, y, z) - half)
+    return max(least, 0.0)
+
+
+@inner_kernel
+def _is_blocked(space, required, x, y, z):
+    """Tell whether a point is nearer than `required` to an obstacle; exact distances only where in doubt."""
+    field, labels, geometry, bits = space
+    total, spread = interpolate_squared(field, geometry, x, y, z)
+    if total - spread >= required * required:
+        return False
+    # See `anatomy.kernels.field`: the true distance is at most this.
+    if math.sqrt(total) + math.sqrt(spread) + 1.0 / UNITS_PER_MM < required:
+        return True
+    distance, _label = exact_distance(labels, geometry, x, y, z, bits, _NOBODY, required)
+    return distance < required
+
+
+@inner_kernel
+def _blocked_share(space, limits, pose, bend, length, share):
+    """Look for an obstacle at a few points of an arc, first where it was met the last time; -1 if none is.
+
+    `share` is that place, as a share of the length beyond the exempt one.
+    """
+    required = limits[REQUIRED]
+    begin = limits[EXEMPT_LENGTH]
+    if length <= begin:
+        return -1.0
+    x, y, z = point_on_arc(pose, bend, begin + (length - begin) * share)
+    if _is_blocked(space, required, x, y, z):
+        return share
+    count = 1
+    while (length - begin) / count > PROBE_SPACING_MM:
+        for m in range(count):
+            share = (m + 0.5) / count
+            x, y, z = point_on_arc(pose, bend, begin + (length - begin) * share)
+            if _is_blocked(space, required, x, y, z):
+                return share
+        count *= 2
+    return -1.0
+
+
+@inner_kernel
+def _arc_cost(space, limits, start, branch, q, below, hints, entry):
+    """Return the estimated cost of the direct arc.
+
+    It is inf if the arc breaks a limit, is not proved clear, or costs no less than `below`.
+    """
+    pose = (start[0], start[1], start[2], start[3], start[4], start[5])
+    length, bend, turn = arc_to_point(pose, q)
+    if (
+        bend[0] > limits[KAPPA]
+        or length > limits[MAX_LENGTH]
+        or turn > min(limits[MAX_ANGLE], limits[MAX_TURN])
+    ):
+        return math.inf
+    share = _blocked_share(space, limits, pose, bend, length, hints[entry])
+    if share >= 0.0:
+        hints[entry] = share
+        return math.inf
+    cost = -1.0
+    if below < math.inf:
+        cost = inverse_clearance_on_arc(space, limits[COST_STEP], pose, bend, length)
+    if cost >= below or blocker_on_arc(space, limits, pose, bend, length, 0.0, branch) != 0:
+        return math.inf
+    return cost if cost >= 0.0 else inverse_clearance_on_arc(space, limits[COST_STEP], pose, bend, length)
+
+
+@inner_kernel
+def _mark_candidates(limits, mixed, q, begin, end, marks):
+    """Mark the poses `begin` to `end` of the mixed order whose arc to a point may be within the limits.
+
+    It needs no angles: with a turn of at most `a`, the chord leans at most a / 2 from the start, and the
+    curvature is twice the offset over the squared chord.
+    """
+    # Slightly too wide: rounding may not exclude what the arc itself would pass.
+    lean = 0.999999 * math.cos(0.5 * min(limits[MAX_ANGLE], limits[MAX_TURN]))
+    lean2 = lean * lean
+    kappa2 = 1.000001 * 0.25 * limits[KAPPA] * limits[KAPPA]
+    longest2 = limits[MAX_LENGTH] * limits[MAX_LENGTH]
+    for m in range(begin, end):
+        dx = q[0] - mixed[0, m]
+        dy = q[1] - mixed[1, m]
+        dz = q[2] - mixed[2, m]
+        h = dx * mixed[3, m] + dy * mixed[4, m] + dz * mixed[5, m]
+        chord2 = dx * dx + dy * dy + dz * dz
+        marks[m - begin] = (
+            (h > 0.0)
+            & (chord2 - h * h <= kappa2 * chord2 * chord2)
+            & (chord2 <= longest2)
+            & (h * h >= lean2 * chord2)
+        )
+
+
+@inner_kernel
+def _best_of_mixed(space, limits, starts, branches, order, mixed, q, wanted, hints, marks):
+    """Return the cheapest of the first `wanted` clear arcs and its start pose, (inf, -1) if there is none."""
+    best = math.inf
+    chosen = -1
+    clear = 0
+    total = mixed.shape[1]
+    for begin in range(0, total, BLOCK):
+        end = min(begin + BLOCK, total)
+        _mark_candidates(limits, mixed, q, begin, end, marks)
+        for m in range(begin, end):
+            if not marks[m - begin]:
+                continue
+            entry = order[m]
+            cost = _arc_cost(space, limits, starts[entry], branches[entry], q, math.inf, hints, entry)
+            if cost < math.inf:
+                clear += 1
+                if cost < best:
+                    best = cost
+                    chosen = entry
+                if clear >= wanted:
+                    return best, chosen
+    return best, chosen
+
+
+@inner_kernel
+def _improved(space, limits, starts, branches, q, best, chosen, hints):
+    """Move from the best start pose to its neighbours in the list as long as that is cheaper."""
+    for _ in range(ROUNDS):
+        centre = chosen
+        jump = 1
+        while jump <= LONGEST_JUMP:
+            for side in range(2):
+                other = centre + jump if side == 0 else centre - jump
+                if 0 <= other < starts.shape[0]:
+                    cost = _arc_cost(space, limits, starts[other], branches[other], q, best, hints, other)
+                    if cost < best:
+                        best = cost
+                        chosen = other
+            jump *= JUMP_GROWTH
+        if chosen == centre:
+            break
+    return best, chosen
+
+
+@inner_kernel
+def _has_room(space, limits, q, bits):
+    """Tell whether the needle's tip keeps the required clearance at a point."""
+    _field, labels, geometry, _bits = space
+    required = limits[REQUIRED]
+    distance, _label = exact_distance(labels, geometry, q[0], q[1], q[2], bits, -1, required + 0.1)
+    return distance >= required
+
+
+@numba.njit(cache=True, nogil=True)
+def reach_by_arcs(
+    space, limits, starts, branches, order, mixed, points, near, wanted, hints, marks, kinds, found, entries
+):  # fmt: skip
+    """Try the single arcs to each point.
+
+    A point counts as reached if one arc is proved clear.  The cheapest is taken of the first `wanted` clear
+    ones in the mixed order and of those from the start poses of neighbouring points; then its neighbours in
+    the list are tried as long as they are cheaper: a good arc, not the proved best.  Where none is clear,
+    all have been tried.
+
+    Parameters
+    ----------
+    space, limits : tuple, (N_LIMITS,) float64
+        See `proof` and `limits`.
+    starts, branches, order, mixed
+        See the module.
+    points : (N, 3) float64, LPS mm
+    near : (N, K) int64
+        Points near each that come before it; -1 for none.
+    wanted : int
+        At least 1.
+    hints : (E,) float64, marks : (BLOCK,) uint8
+        Scratch; `hints` starts at 0.5, and says where each arc was blocked the last time.
+    kinds : (N,) int64
+        Receives DIRECT, UNREACHED or NO_ROOM.
+    found : (N, 2) float64
+        Receives cost and least clearance of what is reached.
+    entries : (N,) int64
+        Receives the start pose of what is reached, else -1.
+    """
+    bits = space[3]
+    for n in range(points.shape[0]):
+        q = (points[n, 0], points[n, 1], points[n, 2])
+        kinds[n] = NO_ROOM
+        entries[n] = -1
+        # At the exit the airway may be nearer.
+        if not _has_room(space, limits, q, bits & ~AIRWAY):
+            continue
+        best, chosen = _best_of_mixed(space, limits, starts, branches, order, mixed, q, wanted, hints, marks)
+        if chosen < 0:
+            if _has_room(space, limits, q, bits):
+                kinds[n] = UNREACHED
+            continue
+        for other in near[n]:
+            entry = entries[other] if other >= 0 else -1
+            if entry >= 0:
+                cost = _arc_cost(space, limits, starts[entry], branches[entry], q, best, hints, entry)
+                if cost < best:
+                    best, chosen = cost, entry
+        best, chosen = _improved(space, limits, starts, branches, q, best, chosen, hints)
+        entries[n] = chosen
+        start = starts[chosen]
+        pose = (start[0], start[1], start[2], start[3], start[4], start[5])
+        length, bend, _turn = arc_to_point(pose, q)
+        kinds[n] = DIRECT
+        found[n, COST] = best
+        found[n, CLEARANCE] = _least_clearance(space, limits, pose, bend, length, 0.0, math.inf)
+
+
+@inner_kernel
+def _grow(space, limits, objective, start, branch, q, nodes, parents, iterations, share, state):
+    """Grow a tree from one start pose; return the row at the point, 0 if it was not reached."""
+    for c in range(nodes.shape[1]):
+        nodes[0, c] = start[c] if c < 6 else 0.0
+    count, _used, solved = grow_rrt(
+        space, limits, objective, branch, q, nodes, parents, 1, iterations, share, state, math.inf
+    )
+    return count - 1 if solved else 0
+
+
+@inner_kernel
+def _record_path(space, limits, nodes, parents, last, row):
+    """Fill `row` with cost and least clearance of the path to the node `last`."""
+    least = math.inf
+    node = last
+    while node != 0:
+        parent = parents[node]
+        arc = nodes[node]
+        bend = (arc[BEND], arc[BEND + 1], arc[BEND + 2], arc[BEND + 3])
+        pose = pose_of(nodes[parent])
+        if nodes[node, PATH_LENGTH] > limits[EXEMPT_LENGTH] or node == last:
+            begun = nodes[parent, PATH_LENGTH]
+            least = _least_clearance(space, limits, pose, bend, arc[ARC_LENGTH], begun, least)
+        node = parent
+    row[COST] = nodes[last, PATH_COST]
+    row[CLEARANCE] = least
+
+
+@numba.njit(cache=True, nogil=True)
+def reach_by_search(
+    space, limits, objective, starts, branches, order, points, trees, iterations, share, seeds,
+    nodes, parents, picked, kinds, found, entries,
+):  # fmt: skip
+    """Search paths of several arcs to the points that no single arc reaches.
+
+    From every start pose with the point in its workspace, the shortest path is tried; if none is clear, an
+    RRT from the first `trees` of them in the mixed order.
+
+    Parameters
+    ----------
+    space, limits, objective, starts, branches, order, points
+        See `reach_by_arcs` and `cost`.
+    trees, iterations, share : int, int, float
+        Trees for each point, and iterations and share of random arcs of each.
+    seeds : (N,) uint64
+        Seed of each point, so that points may be searched in any order.
+    nodes, parents, picked : arrays
+        Scratch: a tree, and `trees` int64.
+    kinds, found, entries : arrays
+        As `reach_by_arcs` left them; points found become SEARCHED.
+    """
+    state = seeds[:1].copy()
+    for n in range(points.shape[0]):
+        if kinds[n] != UNREACHED:
+            continue
+        q = (points[n, 0], points[n, 1], points[n, 2])
+        state[0] = seeds[n]
+        last = 0
+        count = 0
+        entry = -1
+        for entry in order:
+            start = starts[entry]
+            rho, h = seen_from((start[0], start[1], start[2], start[3], start[4], start[5]), q)
+            if workspace_length(rho, h, limits) == math.inf:
+                continue
+            last = _grow(space, limits, objective, start, branches[entry], q, nodes, parents, 0, share, state)
+            if last > 0:
+                break
+            if count < trees:
+                picked[count] = entry
+                count += 1
+        turn = 0
+        while last == 0 and turn < count:
+            entry = picked[turn]
+            last = _grow(
+                space, limits, objective, starts[entry], branches[entry], q, nodes, parents, iterations,
+                share, state,
+            )  # fmt: skip
+            turn += 1
+        if last > 0:
+            kinds[n] = SEARCHED
+            entries[n] = entry
+            _record_path(space, limits, nodes, parents, last, found[n])

@@ -1,0 +1,133 @@
+"""Which of many points the needle reaches from many start poses, and how well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from stages.needle.kernels import reach as kernel
+from stages.needle.kernels import tree
+from stages.needle.objective import Objective
+from stages.needle.searches import RANDOM_SHARE
+from stages.needle.space import NeedleSpace
+
+DIRECT, SEARCHED, UNREACHED, NO_ROOM = kernel.DIRECT, kernel.SEARCHED, kernel.UNREACHED, kernel.NO_ROOM
+
+DEFAULT_ARCS = 4
+RRT_ITERATIONS = 200
+ORDER_SEED = 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reached:
+    """What became of N points.
+
+    Parameters
+    ----------
+    kinds : (N,) uint8
+        `DIRECT`: a single arc is proved clear.  `SEARCHED`: a path of several arcs is.  `UNREACHED`: no
+        single arc is, and the search, if there was one, found nothing.  `NO_ROOM`: the same, and the point
+        is nearer to an obstacle than the needle's axis may be.
+    cost : (N,) float64
+        Estimated integral of 1 / clearance of the path found; 0 where there is none.
+    clearance_mm : (N,) float64
+        Lower bound of its clearance beyond the exempt length; 0 where there is none.
+    entries : (N,) int64
+        Its start pose; -1 where there is none.
+    """
+
+    kinds: NDArray[np.uint8]
+    cost: Float
+    clearance_mm: Float
+    entries: NDArray[np.int64]
+
+
+class ReachScan:
+    """Many start poses in one needle space, to be asked about any number of points.
+
+    It may be used by several threads at once.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    positions, tangents : (E, 3) float64, LPS mm
+        Start poses; neighbours in the list should be alike.
+    branches : (E,) int64
+        Branch whose wall each has pierced; -1 for none.
+    arcs : int
+        Clear arcs of which the cheapest is improved.
+    trees : int
+        RRTs for each point that no single arc reaches; 0 for no search at all.
+
+    Raises
+    ------
+    SettingsError
+        If `arcs` is below 1 or `trees` below 0.
+    """
+
+    def __init__(
+        self,
+        space: NeedleSpace,
+        positions: ArrayLike,
+        tangents: ArrayLike,
+        branches: ArrayLike,
+        *,
+        arcs: int = DEFAULT_ARCS,
+        trees: int = 0,
+    ) -> None:
+        if arcs < 1 or trees < 0:
+            raise SettingsError(
+                f"Arcs and trees of a reachability scan are {arcs} and {trees}",
+                expected="at least 1 arc and 0 trees",
+            )
+        self.space = space
+        self.trees = trees
+        self._arcs = arcs
+        self._starts = np.ascontiguousarray(np.hstack([np.asarray(positions), np.asarray(tangents)]), float)
+        self._starts = self._starts.reshape(-1, 6)
+        self._branches = np.array(branches, dtype=np.int64)
+        # One order for all points: what is reached does not depend on how the points are shared out.
+        self._order = np.random.Generator(np.random.PCG64(ORDER_SEED)).permutation(len(self._branches))
+        self._mixed = np.ascontiguousarray(self._starts[self._order].T)
+        self._objective = space.objective_arrays(Objective(length=0.0, inverse_clearance=1.0))
+
+    def reach(
+        self, points: ArrayLike, seeds: NDArray[np.uint64], near: NDArray[np.int64] | None = None
+    ) -> Reached:
+        """Try all points, one after the other.
+
+        Parameters
+        ----------
+        points : (N, 3) float64, LPS mm
+        seeds : (N,) uint64
+            Seed of the search to each point.
+        near : (N, K) int64, optional
+            Indices of points near each that come before it, -1 for none; by default the one before.
+        """
+        places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
+        kinds, found = np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 2))
+        space, entries = self.space, np.full(len(places), -1, dtype=np.int64)
+        before = np.arange(len(places))[:, None] - 1 if near is None else near
+        kernel.reach_by_arcs(
+            space.arrays, space.limits, self._starts, self._branches, self._order, self._mixed, places,
+            np.array(before, dtype=np.int64, order="C"), self._arcs, np.full(len(self._starts), 0.5),
+            np.zeros(kernel.BLOCK, dtype=np.uint8), kinds, found, entries,
+        )  # fmt: skip
+        if self.trees:
+            rows = RRT_ITERATIONS * tree.ROWS_PER_STEP
+            kernel.reach_by_search(
+                space.arrays, space.limits, self._objective, self._starts, self._branches, self._order,
+                places, self.trees, RRT_ITERATIONS, RANDOM_SHARE, np.array(seeds, dtype=np.uint64),
+                np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64),
+                np.zeros(self.trees, dtype=np.int64), kinds, found, entries,
+            )  # fmt: skip
+        return Reached(
+            kinds=kinds.astype(np.uint8),
+            cost=found[:, kernel.COST],
+            clearance_mm=found[:, kernel.CLEARANCE],
+            entries=entries,
+        )

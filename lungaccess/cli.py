@@ -1,4 +1,4 @@
-"""The command line: demo, plan, needle, tubes, check, info and presets.
+"""The command line: plans, what is known about them, and each stage alone.
 
 Exit codes: 0, a plan was found and the independent check accepts it; 1, there is no plan or the check
 refuses it; 2, the input is bad.
@@ -22,6 +22,8 @@ from lungaccess.commands_advise import advise
 from lungaccess.commands_alternatives import alternatives
 from lungaccess.commands_reach import reach
 from lungaccess.commands_risk import risk
+from lungaccess.commands_route import route
+from lungaccess.commands_tour import tour
 from lungaccess.commands_tubes import tubes
 from lungaccess.inputs import load_device, load_lung, require_one_target
 from lungaccess.terminal import console, error_console
@@ -74,6 +76,8 @@ app = App(
 )
 app.command(advise)
 app.command(alternatives)
+app.command(route)
+app.command(tour)
 app.command(tubes)
 app.command(risk)
 app.command(reach)

@@ -57,6 +57,7 @@ def alternatives(
         Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.alternatives import alternatives as find
+    from lungaccess.atlas_store import open_atlas
     from lungaccess.checking import check
     from lungaccess.target import resolve_target
 
@@ -64,9 +65,9 @@ def alternatives(
     require_writable_folder(out)
     device = load_device(system, allow_fissures)
     lung = load_lung(patient, cache)
-    menu = find(
-        lung, device, resolve_target(lung, target, nodule), objective=objective, count=count, apart_mm=apart
-    )
+    aim = resolve_target(lung, target, nodule)
+    atlas = open_atlas(lung, device, cache=cache)
+    menu = find(lung, device, aim, objective=objective, count=count, apart_mm=apart, atlas=atlas)
     refused = 0
     for number, each in enumerate(menu, start=1):
         each.plan.save(out / f"plan-{number:02d}.json")

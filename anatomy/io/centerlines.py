@@ -40,6 +40,24 @@ def read_centerlines(path: str | Path, *, frame: Frame | None = None) -> AirwayT
     AnatomyError
         If the lines hold no trachea.
     """
+    return tree_from_graph(*read_centerline_graph(path, frame=frame))
+
+
+def read_centerline_graph(
+    path: str | Path, *, frame: Frame | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Read the lines of a centreline file of any tubes, airways or vessels; see `read_centerlines`.
+
+    Returns
+    -------
+    (N, 3) float64, (N,) float64, (E, 2) int64
+        Points in LPS mm, radii in mm, and pairs of points that follow each other on a line.
+
+    Raises
+    ------
+    FileError, FrameError
+        As `read_centerlines`.
+    """
     file = read_vtk_xml(path)
     lps_from_file = LPS_FROM[_frame(file, path, frame)]
     points, radii, edges, count = [], [], [], 0
@@ -54,9 +72,8 @@ def read_centerlines(path: str | Path, *, frame: Frame | None = None) -> AirwayT
             expected="centrelines as lines or polylines",
             remedy="Save the centreline model, not a surface",
         )
-    return tree_from_graph(
-        transform_points(lps_from_file, np.concatenate(points)), np.concatenate(radii), np.concatenate(edges)
-    )
+    lps = transform_points(lps_from_file, np.concatenate(points))
+    return lps, np.concatenate(radii), np.concatenate(edges)
 
 
 def _frame(file: VtkFile, path: str | Path, given: Frame | None) -> Frame:

@@ -1,0 +1,365 @@
+"""Centrelines with radii: what a route runs along, and the lumen that they stand for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.errors import AnatomyError, TargetError
+from anatomy.fields import CENTRES, ROUNDING_MM, SOLID, DistanceField, corner_geometry, distance_field
+from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.kernels.field import exact_at
+from anatomy.lung import Lung
+from stages.scope.route.kernels import lumen as kernel
+
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+DEFAULT_SPACING_MM = 0.75
+MIN_CELL_MM = 1.0
+SAME_POINT_MM = 1e-3
+MAX_CELLS = 2_000_000
+THIN_VOXELS = 6.0
+"""Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to half."""
+FINE_MM = 0.05
+"""Spacing of the places at which a cone is compared with the mask."""
+SMOOTHING_ROUNDS = 30
+KEPT_DEPTH = 0.9
+"""Smoothing never takes a point of a skeleton to less than this share of the depth it had."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Centreline:
+    """A graph of centred points with radii; N nodes, E edges.
+
+    The lumen is the union of round cones along the edges: all balls with a centre on an edge and the radius
+    interpolated between its ends.  With `from_lung` and `from_mask` that union is proved to lie in the mask.
+
+    Parameters
+    ----------
+    nodes_mm : (N, 3) float64
+        LPS mm; for a drawing, z = 0.
+    radius_mm : (N,) float64
+    edges : (E, 2) int64
+        Pairs of nodes that follow each other along a tube.
+
+    Raises
+    ------
+    AnatomyError
+        If there are no edges, or the arrays do not fit together or hold no finite numbers.
+    """
+
+    nodes_mm: Float
+    radius_mm: Float
+    edges: Int
+
+    def __post_init__(self) -> None:
+        nodes = np.array(self.nodes_mm, dtype=np.float64)
+        radius = np.array(self.radius_mm, dtype=np.float64)
+        edges = np.array(self.edges, dtype=np.int64)
+        fits = nodes.ndim == 2 and nodes.shape[1] == 3 and radius.shape == (len(nodes),)
+        fits = fits and edges.ndim == 2 and edges.shape[1] == 2 and len(edges) > 0
+        if not fits or not np.isfinite(nodes).all() or not np.isfinite(radius).all() or (radius < 0).any():
+            raise AnatomyError(
+                f"A centreline has nodes {nodes.shape}, radii {radius.shape} and edges {edges.shape}",
+                expected="finite (N, 3) points, (N,) radii of at least 0 and (E, 2) edges, E > 0",
+            )
+        if edges.min() < 0 or edges.max() >= len(nodes):
+            raise AnatomyError("An edge of a centreline names a node that is not there")
+        for name, array in (("nodes_mm", nodes), ("radius_mm", radius), ("edges", edges)):
+            object.__setattr__(self, name, read_only(array))
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes, N."""
+        return len(self.nodes_mm)
+
+    @cached_property
+    def cones(self) -> Float:
+        """The round cones of the lumen, `(E, 8)`: point, radius, point, radius."""
+        a, b = self.edges.T
+        parts = (self.nodes_mm[a], self.radius_mm[a, None], self.nodes_mm[b], self.radius_mm[b, None])
+        return read_only(np.ascontiguousarray(np.hstack(parts)))
+
+    @cached_property
+    def cells(self) -> tuple[Float, Int, Int]:
+        """A grid of cells with the cones that touch each: origin, size and shape (7,); starts; cones."""
+        margin = self.radius_mm[:, None]
+        low, high = (self.nodes_mm - margin).min(axis=0), (self.nodes_mm + margin).max(axis=0)
+        size = max(2.0 * float(np.median(self.radius_mm)), MIN_CELL_MM)
+        while True:
+            shape = np.floor((high - low) / size) + 1.0
+            if shape.prod() <= MAX_CELLS:
+                break
+            size *= 1.5
+        index = np.concatenate((low, (size,), shape))
+        start, listed = kernel.list_cells(self.cones, index)
+        return read_only(index), read_only(start), read_only(listed)
+
+    def depth_mm(self, points_mm: ArrayLike) -> Float:
+        """Return how deep points `(N, 3)` lie in the lumen, `(N,)` mm; negative outside."""
+        points = np.ascontiguousarray(np.asarray(points_mm, dtype=np.float64).reshape(-1, 3))
+        out = np.zeros(len(points))
+        kernel.depths_at(self.cones, *self.cells, points, out)
+        return out
+
+    def nearest_node(self, point_mm: ArrayLike) -> int:
+        """Return the node nearest to a point `(3,)` in mm."""
+        offset = self.nodes_mm - np.asarray(point_mm, dtype=np.float64)
+        return int(np.argmin(np.einsum("ij,ij->i", offset, offset)))
+
+    def moved(self, nodes_mm: ArrayLike, radius_mm: ArrayLike | None = None) -> Centreline:
+        """Return the same graph with its nodes at other places, as after breathing or registration."""
+        return Centreline(
+            nodes_mm=np.asarray(nodes_mm, dtype=np.float64),
+            radius_mm=self.radius_mm if radius_mm is None else np.asarray(radius_mm, dtype=np.float64),
+            edges=self.edges,
+        )
+
+    def require_inside(self, point_mm: Float, needed_mm: float, name: str) -> None:
+        """Raise `TargetError` unless a point lies at least `needed_mm` deep in the lumen."""
+        depth = float(self.depth_mm(point_mm)[0])
+        if not depth >= needed_mm:
+            nearest = self.nodes_mm[self.nearest_node(point_mm)]
+            near = ", ".join(f"{x:.1f}" for x in nearest)
+            where = (
+                f"outside the lumen; the nearest point of the centreline, ({near}), is "
+                f"{np.linalg.norm(nearest - point_mm):.1f} mm away"
+                if depth < 0
+                else f"{depth:.2f} mm inside the lumen"
+            )
+            raise TargetError(
+                f"The {name} of the route lies {where}",
+                expected=f"at least {needed_mm:g} mm inside it, the radius of the device with its margin",
+                remedy="Choose another point, or a thinner device",
+            )
+
+
+def from_tree(tree: AirwayTree) -> Centreline:
+    """Return the centreline of a tree as it is; where a gap was bridged the radius is 0."""
+    child = np.arange(1, tree.n_points)
+    edges = np.stack((tree.parent_point[1:], child), axis=1)
+    return Centreline(nodes_mm=tree.points_lps, radius_mm=tree.radius_mm, edges=edges)
+
+
+def from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> Centreline:
+    """Return the centreline of lines that need not be an airway, as a file holds them.
+
+    Points that coincide to 0.001 mm become one, with the larger radius: files often begin each branch with a
+    copy of the point that it hangs on.
+
+    Parameters
+    ----------
+    points_lps : (N, 3) float64, LPS mm
+    radius_mm : (N,) float64
+    edges : (E, 2) int64
+    """
+    points, radius = np.asarray(points_lps, dtype=np.float64), np.asarray(radius_mm, dtype=np.float64)
+    _same, first, merged = np.unique(
+        np.round(points / SAME_POINT_MM), axis=0, return_index=True, return_inverse=True
+    )
+    widest = np.zeros(len(first))
+    np.maximum.at(widest, merged.ravel(), radius)
+    pairs = np.unique(np.sort(merged.ravel()[np.asarray(edges, dtype=np.int64)], axis=1), axis=0)
+    return Centreline(nodes_mm=points[first], radius_mm=widest, edges=pairs[pairs[:, 0] != pairs[:, 1]])
+
+
+def from_lung(lung: Lung, *, spacing_mm: float = DEFAULT_SPACING_MM) -> Centreline:
+    """Return the centreline of the airway with radii proved against the lumen mask.
+
+    Parameters
+    ----------
+    lung : Lung
+    spacing_mm : float
+        Longest edge.
+    """
+    base = from_tree(lung.tree)
+    return _proved(
+        *_refined(base.nodes_mm, base.edges, spacing_mm),
+        _Walls(lung.mask("lumen").array, lung.grid, SOLID, lung.lumen_depth),
+    )
+
+
+def from_mask(
+    mask: Volume, *, spacing_mm: float = DEFAULT_SPACING_MM, max_gap_mm: float = 0.0, rounded: bool = False
+) -> Centreline:
+    """Return the centreline of any branching tube: vein, artery or airway, without a root.
+
+    The skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels as
+    solid boxes).
+
+    Parameters
+    ----------
+    mask : Volume
+        Non-zero inside the tube.
+    spacing_mm : float
+        Longest edge.
+    max_gap_mm : float
+        Longest break of the tube that is bridged; the radius is 0 there.
+
+    Raises
+    ------
+    AnatomyError
+        If the mask is empty, or too small for a line.
+    """
+    from anatomy.tree.lumen import prepare_lumen
+    from anatomy.tree.skeleton import prune, spanning_tree, thin
+
+    prepared = prepare_lumen(mask, max_gap_mm)
+    grid = prepared.grid
+    ijk = thin(prepared.solid)
+    depth = prepared.solid_depth_mm[tuple(ijk.T)].astype(np.float64)
+    skeleton, _rings = spanning_tree(ijk, prepared.lumen, depth, grid.spacing_mm)
+    prune(skeleton, grid.spacing_mm)
+    pairs = [(a, b) for a, near in enumerate(skeleton.neighbours) for b in near if a < b]
+    if not pairs:
+        raise AnatomyError("The skeleton of the mask is a single point", expected="a tube longer than wide")
+    walls = _Walls(prepared.lumen, grid, CENTRES if rounded else SOLID)
+    used, edges = np.unique(np.array(pairs), return_inverse=True)
+    nodes = _smoothed(grid.lps(skeleton.ijk[used]), edges.reshape(-1, 2), walls)
+    return _proved(*_refined(nodes, edges.reshape(-1, 2), spacing_mm), walls)
+
+
+def from_image(drawing: Bool, *, pixel_mm: float, spacing_mm: float = DEFAULT_SPACING_MM) -> Centreline:
+    """Return the centreline of a drawing of vessels, in the plane z = 0.
+
+    Parameters
+    ----------
+    drawing : (rows, columns) bool
+        True inside a vessel.
+    pixel_mm : float
+        Size of a pixel; the pixel in row i and column j is centred at x = j, y = i times that.
+    spacing_mm : float
+        Longest edge.
+
+    Raises
+    ------
+    AnatomyError
+        If the drawing is empty or not two-dimensional.
+    """
+    picture = np.asarray(drawing, dtype=bool)
+    if picture.ndim != 2 or not picture.any():
+        raise AnatomyError(
+            f"A drawing of the shape {picture.shape} shows no vessel",
+            expected="a picture of rows and columns, true inside the vessels",
+        )
+    from scipy.spatial import KDTree
+    from skimage.morphology import skeletonize
+
+    framed = np.pad(picture.T, 1)
+    # Three equal layers: in the middle one only the walls of the drawing are near.
+    slab = np.repeat(framed[:, :, None], 3, axis=2)
+    corner = np.full(3, -pixel_mm)
+    grid = Grid.from_spacing(slab.shape, (pixel_mm, pixel_mm, pixel_mm), corner)
+    walls = _Walls(slab, grid, SOLID)
+    ij = np.argwhere(skeletonize(_largest(framed)))
+    edges = KDTree(ij).query_pairs(1.5, output_type="ndarray").astype(np.int64)
+    if not len(edges):
+        raise AnatomyError(
+            "The skeleton of the drawing is a single point", expected="vessels longer than wide"
+        )
+    middle = np.column_stack((ij, np.ones(len(ij))))
+    nodes = _smoothed(grid.lps(middle), edges, walls)
+    return _proved(*_refined(nodes, edges, spacing_mm), walls)
+
+
+def _largest(picture: Bool) -> Bool:
+    """Keep the largest connected piece of a drawing."""
+    from scipy import ndimage
+
+    labels, _count = ndimage.label(picture, np.ones((3, 3), dtype=bool))
+    return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
+
+
+def _refined(nodes: Float, edges: Int, spacing_mm: float) -> tuple[Float, Int]:
+    """Divide edges evenly until none is longer than `spacing_mm`."""
+    begin, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
+    parts = np.maximum(np.ceil(np.linalg.norm(end - begin, axis=1) / spacing_mm - 1e-9), 1).astype(np.int64)
+    which = np.repeat(np.arange(len(edges)), parts - 1)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(parts - 1) - (parts - 1), parts - 1) + 1
+    share = (number / parts[which])[:, None]
+    added = begin[which] * (1.0 - share) + end[which] * share
+    base = len(nodes) + np.cumsum(parts - 1) - (parts - 1)
+    chains = []
+    for e, (a, b) in enumerate(edges):
+        middle = base[e] + np.arange(parts[e] - 1)
+        chain = np.concatenate(((a,), middle, (b,)))
+        chains.append(np.stack((chain[:-1], chain[1:]), axis=1))
+    return np.vstack((nodes, added)), np.concatenate(chains)
+
+
+def _smoothed(nodes: Float, edges: Int, walls: _Walls) -> Float:
+    """Draw each node towards the middle of its neighbours as long as it stays about as deep."""
+    floor = KEPT_DEPTH * walls.depth_mm(nodes)
+    degree = np.bincount(edges.ravel(), minlength=len(nodes))
+    free = degree == 2
+    current = nodes.copy()
+    for _ in range(SMOOTHING_ROUNDS):
+        total = np.zeros_like(current)
+        np.add.at(total, edges[:, 0], current[edges[:, 1]])
+        np.add.at(total, edges[:, 1], current[edges[:, 0]])
+        wanted = np.where(free[:, None], 0.5 * (current + total / degree[:, None]), current)
+        good = walls.depth_mm(wanted) >= floor
+        current = np.where(good[:, None], wanted, current)
+    return current
+
+
+def _proved(nodes: Float, edges: Int, walls: _Walls) -> Centreline:
+    """Give every node the largest radius with which the cones are proved to lie in the lumen.
+
+    The depth is 1-Lipschitz, so it is at least its value at the nearest of the places tried, less half of
+    their spacing.  Where the interpolated radius is larger, both ends of the edge give way.
+    """
+    radius = walls.depth_mm(nodes)
+    begin, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
+    length = np.linalg.norm(end - begin, axis=1)
+    count = max(1, int(np.ceil(float(length.max()) / FINE_MM)))
+    excess = np.zeros(len(edges))
+    for share in np.linspace(0.0, 1.0, count + 1)[1:-1]:
+        depth = walls.depth_mm(begin * (1.0 - share) + end * share)
+        wanted = radius[edges[:, 0]] * (1.0 - share) + radius[edges[:, 1]] * share
+        excess = np.maximum(excess, wanted - depth)
+    excess += length / count
+    lowered = np.zeros(len(nodes))
+    np.maximum.at(lowered, edges[:, 0], excess)
+    np.maximum.at(lowered, edges[:, 1], excess)
+    return Centreline(nodes_mm=nodes, radius_mm=np.maximum(radius - lowered, 0.0), edges=edges)
+
+
+class _Walls:
+    """The distance to the voxels that are not lumen: exact in thin tubes, a lower bound in thick ones.
+
+    Parameters
+    ----------
+    lumen : bool array
+        With at least one layer that is not lumen all around.
+    grid : Grid
+    half_voxels : float
+        Whether walls are solid boxes, or the centres of their voxels; then half of the smallest voxel edge
+        is taken off, so that a flat wall stays where it is and only steps are rounded.
+    """
+
+    def __init__(
+        self, lumen: Bool, grid: Grid, half_voxels: float, field: DistanceField | None = None
+    ) -> None:
+        wall = ~np.asarray(lumen)
+        self._field = field or distance_field("wall", wall, grid, half_voxels)
+        self._labels = np.asfortranarray(wall.astype(np.uint16))
+        self._geometry = corner_geometry(grid, half_voxels)
+        self._lost = float(np.linalg.norm(grid.spacing_mm)) + ROUNDING_MM + 1.0 / 256.0
+        self._thin_mm = THIN_VOXELS * float(grid.spacing_mm.min())
+        self._taken_off = 0.0 if half_voxels == SOLID else 0.5 * float(grid.spacing_mm.min())
+
+    def depth_mm(self, points: Float) -> Float:
+        """Return depths `(N,)` in mm."""
+        bound = self._field.lower_bound_mm(points)
+        thin = np.flatnonzero(bound < self._thin_mm)
+        exact = np.zeros(len(thin))
+        cap = self._thin_mm + self._lost
+        exact_at(self._labels, self._geometry, np.ascontiguousarray(points[thin]), 1, -1, cap, exact)
+        bound[thin] = exact
+        return np.asarray(bound - self._taken_off)

@@ -1,0 +1,252 @@
+"""Repair a route by a nonlinear program on its spline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from anatomy.grid import Float
+from stages.scope.route.centreline import Centreline
+from stages.scope.route.curve import DEGREE, Curve
+from stages.scope.route.kernels.repair import repair
+from stages.scope.route.kernels.spline import take_samples
+from stages.scope.route.proof import Proof, prove
+from stages.scope.route.settings import RouteLimits
+from stages.scope.route.way import Way
+
+CENTRING = 0.02
+"""Weight of the squared distance from the way, in radii; small against the limits."""
+BENDING = 0.02
+"""Weight of the squared curvature, in limits."""
+ROUNDS, STEPS = 12, 30
+SOLVED = 2e-3
+"""Violation that counts as none; the spares are larger, so that the limits themselves hold."""
+HOPELESS = 0.02
+"""With a larger violation, finer samples do not help; more room may."""
+LEAST_SPANS = 8
+"""A segment is widened by at least so many spans on both sides: a bend needs room."""
+MARGIN_SHARE = 0.05
+"""Share of all spans by which a segment is widened on both sides, as in [Li2021]."""
+ANY_CURVATURE = 1e9
+
+Stage = tuple[float, float, int, int]
+"""Price of bending, times the limit of curvature, rounds and steps."""
+FINAL_STAGE: Stage = (BENDING, 1.0, ROUNDS, STEPS)
+
+SMOOTH: tuple[Stage, ...] = ((2.0, ANY_CURVATURE, 2, 10),)
+SMOOTH_WITHIN: tuple[Stage, ...] = ((2.0, ANY_CURVATURE, 1, 8), (2.0, 1.0, 2, 10))
+FALLING: tuple[Stage, ...] = (
+    (30.0, ANY_CURVATURE, 1, 8),
+    *((price, 1.0, 1, 10) for price in (30.0, 3.0, 0.3)),
+)
+STIFF: tuple[Stage, ...] = ((30.0, ANY_CURVATURE, 4, STEPS), (30.0, 1.0, 4, STEPS))
+AS_IT_IS: tuple[Stage, ...] = ()
+TIGHTENED: tuple[Stage, ...] = tuple((BENDING, times, 4, STEPS) for times in (8.0, 4.0, 2.0, 1.4, 1.15))
+"""The program is not convex: what is solved before its last stage decides where it ends."""
+
+OTHER_WAYS: tuple[tuple[float, tuple[Stage, ...]], ...] = (
+    (6.0, SMOOTH),
+    (4.5, AS_IT_IS),
+    (2.0, SMOOTH_WITHIN),
+    (3.0, SMOOTH_WITHIN),
+    (1.5, TIGHTENED),
+    (2.0, FALLING),
+    (1.5, AS_IT_IS),
+    (2.0, AS_IT_IS),
+    (2.0, SMOOTH),
+    (4.5, FALLING),
+    (2.0, STIFF),
+    (1.5, FALLING),
+    (1.5, STIFF),
+)
+"""Spacings of the waypoints in mm, and starts, that are tried with the whole curve where the first did not
+work: the quick ones first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """At how many samples the program holds, and how much stricter it is than the limits.
+
+    Parameters
+    ----------
+    per_span : int
+        Samples a span; the first is the knot, where the curvature can peak.
+    spare_curvature : float
+        Share of the limit.
+    spare_mm : float
+        Depth.
+    """
+
+    per_span: int
+    spare_curvature: float
+    spare_mm: float
+
+
+LEVELS = (
+    Level(per_span=4, spare_curvature=0.01, spare_mm=0.02),
+    Level(per_span=8, spare_curvature=0.01, spare_mm=0.02),
+    Level(per_span=16, spare_curvature=0.02, spare_mm=0.03),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Problem:
+    """What a route has to keep to.
+
+    Parameters
+    ----------
+    way : Way
+        What it follows; its ends are the wanted ones.
+    centreline : Centreline
+    limits : RouteLimits
+    """
+
+    way: Way
+    centreline: Centreline
+    limits: RouteLimits
+
+    def prove(self, curve: Curve) -> Proof:
+        """Prove or disprove a curve."""
+        return prove(
+            curve,
+            self.centreline,
+            max_curvature_per_mm=self.limits.max_curvature_per_mm,
+            needed_mm=self.limits.needed_mm,
+        )
+
+
+def repaired(
+    curve: Curve,
+    problem: Problem,
+    free: tuple[int, int],
+    level: Level,
+    start: Sequence[Stage],
+) -> tuple[Curve, float]:
+    """Move the control points `free[0]` to `free[1] - 1` of a curve until it keeps to its limits.
+
+    Parameters
+    ----------
+    curve : Curve
+    problem : Problem
+    free : (int, int)
+        The other control points stay, and with them the curve three spans away and its smoothness.
+    level : Level
+    start : sequence of Stage
+        What to solve before, as `SMOOTH`.
+
+    Returns
+    -------
+    (Curve, float)
+        The new curve, and the largest violation of the stricter limits: a share of the limit of curvature,
+        or of the local radius.
+    """
+    low, high = free
+    way, lumen, limits = problem.way, problem.centreline, problem.limits
+    begin, end = max(low - DEGREE, 0), min(high, curve.n_spans)
+    count = level.per_span * (end - begin) + 1
+    first, rows, samples = np.zeros(count, dtype=np.int64), np.zeros((count, 3, 4)), np.zeros((count, 7))
+    along, with_radius = way.along_mm, np.column_stack((way.points_mm, way.radius_mm))
+    control = np.array(curve.control_mm)
+    take_samples(control, curve.knots, begin, end, level.per_span, along, with_radius, first, rows, samples)
+    limit, worst = limits.max_curvature_per_mm, np.inf
+    for bending, times, rounds, steps in (*start, FINAL_STAGE):
+        weights = np.array((
+            CENTRING, bending / limit**2, times * limit, limits.needed_mm, level.spare_curvature,
+            level.spare_mm, limits.end_tolerance_mm,
+        ))  # fmt: skip
+        worst, _taken = repair(
+            control, low, high, first, rows, samples, lumen.cones, *lumen.cells, way.cones, weights,
+            way.points_mm[[0, -1]], rounds, steps, SOLVED,
+        )  # fmt: skip
+    return Curve(control_mm=control, knots=curve.knots), float(worst)
+
+
+def segments(proof: Proof, n_control: int, margin: int, *, ends_free: bool) -> list[tuple[int, int]]:
+    """Return the ranges of control points to free for the spans that are not proved, widened and merged.
+
+    Parameters
+    ----------
+    proof : Proof
+    n_control : int
+    margin : int
+        Spans added on both sides.
+    ends_free : bool
+        Whether the first and last control points may move.
+    """
+    lowest, highest = (0, n_control) if ends_free else (1, n_control - 1)
+    found: list[tuple[int, int]] = []
+    for span in proof.failed_spans.tolist():
+        low, high = max(span - margin, lowest), min(span + DEGREE + 1 + margin, highest)
+        if found and low <= found[-1][1] + DEGREE:
+            found[-1] = (found[-1][0], high)
+        else:
+            found.append((low, high))
+    return found
+
+
+def repair_exact(tentative: Curve, problem: Problem, executor: Executor | None = None) -> tuple[Curve, Proof]:
+    """Return a curve that is proved to keep its limits, if the program finds one.
+
+    Parameters
+    ----------
+    tentative : Curve
+        Spline through points of the way.
+    problem : Problem
+    executor : concurrent.futures.Executor, optional
+        Repairs the segments of a round side by side; threads are enough, the program runs without the lock.
+
+    Returns
+    -------
+    (Curve, Proof)
+        If nothing worked, the curve with the fewest spans that fail.
+    """
+    curve, proof = _by_segments(tentative, problem, MARGIN_SHARE, SMOOTH, executor)
+    for spacing, start in OTHER_WAYS:
+        if proof.holds:
+            break
+        whole = _by_segments(problem.way.curve(spacing), problem, 1.0, start, None)
+        if _failed_share(whole[1]) < _failed_share(proof):
+            curve, proof = whole
+    return curve, proof
+
+
+def _failed_share(proof: Proof) -> float:
+    return len(proof.failed_spans) / len(proof.verdicts)
+
+
+def _by_segments(
+    curve: Curve, problem: Problem, share: float, start: Sequence[Stage], executor: Executor | None
+) -> tuple[Curve, Proof]:
+    """Repair what is not proved, with `share` of all spans on both sides."""
+    proof = problem.prove(curve)
+    if proof.holds:
+        return curve, proof
+    margin = max(LEAST_SPANS, round(share * curve.n_spans))
+    ends_free = problem.limits.end_tolerance_mm > 0
+    parts = segments(proof, len(curve.control_mm), margin, ends_free=ends_free)
+    work = partial(_repaired_segment, curve, problem, start)
+    done = map(work, parts) if executor is None or len(parts) < 2 else executor.map(work, parts)
+    control = np.array(curve.control_mm)
+    for (low, high), moved in zip(parts, done, strict=True):
+        control[low:high] = moved
+    curve = Curve(control_mm=control, knots=curve.knots)
+    return curve, problem.prove(curve)
+
+
+def _repaired_segment(curve: Curve, problem: Problem, start: Sequence[Stage], free: tuple[int, int]) -> Float:
+    """Return the control points `free` of the curve: those with the fewest failed spans that were found."""
+    low, high = free
+    spans = slice(max(low - DEGREE, 0), high)
+    best, fewest = curve, np.count_nonzero(problem.prove(curve).verdicts[spans])
+    for level in LEVELS:
+        new, worst = repaired(curve, problem, free, level, start)
+        failed = np.count_nonzero(problem.prove(new).verdicts[spans])
+        if failed < fewest:
+            best, fewest = new, failed
+        if worst > HOPELESS or failed == 0:
+            break
+    return best.control_mm[low:high]

@@ -1,0 +1,53 @@
+"""What [Li2021] measures of a route."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.scope.route.centreline import Centreline
+from stages.scope.route.curve import Curve
+
+PER_SPAN = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class RouteMetrics:
+    """Numbers of a curve, from dense samples.
+
+    Parameters
+    ----------
+    normalised_length : float
+        Length over the distance between the ends.
+    mean_curvature_per_mm, largest_curvature_per_mm : float
+    mean_wall_mm, least_wall_mm : float
+        Distance of the curve to the wall; negative outside.
+    """
+
+    normalised_length: float
+    mean_curvature_per_mm: float
+    largest_curvature_per_mm: float
+    mean_wall_mm: float
+    least_wall_mm: float
+
+
+def measure(curve: Curve, centreline: Centreline) -> RouteMetrics:
+    """Measure a curve at `PER_SPAN` samples a span.
+
+    References
+    ----------
+    .. [Li2021] docs/bibliography.md
+    """
+    parameters = curve.parameters(PER_SPAN)
+    points = curve.at(parameters)[0]
+    curvature = curve.curvature_per_mm(parameters)
+    wall = centreline.depth_mm(points)
+    chord = float(np.linalg.norm(points[-1] - points[0]))
+    return RouteMetrics(
+        normalised_length=curve.length_mm(PER_SPAN) / chord,
+        mean_curvature_per_mm=float(curvature.mean()),
+        largest_curvature_per_mm=float(curvature.max()),
+        mean_wall_mm=float(wall.mean()),
+        least_wall_mm=float(wall.min()),
+    )

@@ -1,0 +1,306 @@
+"""Plan a route: search, spline, repair, proof; and plan it again when the anatomy has moved."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from stages.scope.route.centreline import Centreline
+from stages.scope.route.curve import Curve
+from stages.scope.route.exact import Problem, repair_exact
+from stages.scope.route.genetic import GeneticSettings, repair_genetic
+from stages.scope.route.proof import Proof
+from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
+from stages.scope.route.settings import RouteLimits
+from stages.scope.route.way import WAYPOINT_SPACING_MM, Way, way_along
+
+Int = NDArray[np.int64]
+Repair = Literal["exact", "ga", "none"]
+REPAIRS: tuple[Repair, ...] = get_args(Repair)
+
+CORRIDOR_MM = 3.0
+"""A tube counts for replanning if it comes so near to one that the route runs through."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Route:
+    """A route from start to goal.
+
+    Parameters
+    ----------
+    nodes : (K,) int64
+        Nodes of the centreline that the search found.
+    way : Way
+        They, with start and goal.
+    tentative : Curve
+        The spline through points of the way.
+    curve : Curve
+        The route.
+    proof : Proof
+        Of `curve`.
+    limits : RouteLimits
+    repair : str
+        "exact", "ga" or "none".
+    claimed : bool
+        Whether the repair itself believes that the limits are kept: `ga` looks at path points alone.
+    """
+
+    nodes: Int
+    way: Way
+    tentative: Curve
+    curve: Curve
+    proof: Proof
+    limits: RouteLimits
+    repair: Repair
+    claimed: bool
+
+    @property
+    def proved(self) -> bool:
+        """Whether the whole curve is proved to keep its limits, and ends where it should."""
+        return self.proof.holds and self.end_error_mm <= self.limits.end_tolerance_mm + 1e-9
+
+    @property
+    def end_error_mm(self) -> float:
+        """How far the ends lie from the wanted start and goal, the larger of both."""
+        off = self.curve.control_mm[[0, -1]] - self.way.points_mm[[0, -1]]
+        return float(np.linalg.norm(off, axis=1).max())
+
+
+def try_route(
+    centreline: Centreline,
+    start_mm: ArrayLike,
+    goal_mm: ArrayLike,
+    limits: RouteLimits,
+    *,
+    repair: Repair = "exact",
+    links: Links | None = None,
+    waypoint_spacing_mm: float = WAYPOINT_SPACING_MM,
+    seed: int = 0,
+    genetic: GeneticSettings | None = None,
+    executor: Executor | None = None,
+) -> Route:
+    """Plan a route and say whether it is proved; see `plan_route`, which refuses one that is not."""
+    start, goal = (np.array(point, dtype=np.float64).reshape(3) for point in (start_mm, goal_mm))
+    if repair not in REPAIRS:
+        raise SettingsError(f"There is no repair {repair!r}", expected=f"one of {', '.join(REPAIRS)}")
+    centreline.require_inside(start, limits.needed_mm, "start")
+    centreline.require_inside(goal, limits.needed_mm, "goal")
+    links = nearest_links(centreline) if links is None else links
+    nodes = fewest_hops(links, centreline.nearest_node(start), centreline.nearest_node(goal))
+    way = way_along(centreline, nodes, start, goal)
+    tentative = way.curve(waypoint_spacing_mm)
+    return _route(centreline, nodes, way, tentative, limits, repair, seed, genetic, executor)
+
+
+def plan_route(
+    centreline: Centreline,
+    start_mm: ArrayLike,
+    goal_mm: ArrayLike,
+    limits: RouteLimits,
+    *,
+    repair: Repair = "exact",
+    links: Links | None = None,
+    waypoint_spacing_mm: float = WAYPOINT_SPACING_MM,
+    seed: int = 0,
+    genetic: GeneticSettings | None = None,
+    executor: Executor | None = None,
+) -> Route:
+    """Plan a route that is proved to keep its limits on the whole curve.
+
+    Breadth-first search over centreline nodes, a cubic B-spline through points of the way, and a repair of
+    the segments that bend too much or come too near to the wall [Li2021].
+
+    Parameters
+    ----------
+    centreline : Centreline
+    start_mm, goal_mm : (3,) float64
+        In the frame of the centreline (LPS mm), inside the lumen.
+    limits : RouteLimits
+    repair : str
+        "exact": a nonlinear program; "ga": the genetic search of the paper; "none".
+    links : Links, optional
+        Made with `nearest_links` beforehand, where many routes are planned on one centreline.
+    waypoint_spacing_mm : float
+        Distance of the points that the spline runs through; 0 for every node.
+    seed : int
+        Of the genetic search.
+    genetic : GeneticSettings, optional
+    executor : concurrent.futures.Executor, optional
+        Repairs segments side by side.
+
+    Raises
+    ------
+    NoRouteError
+        If start and goal are not joined, or no curve was found that can be proved.
+    TargetError
+        If start or goal lies too near to the wall, or outside.
+    SettingsError
+        If there is no such repair, or start and goal coincide.
+
+    References
+    ----------
+    .. [Li2021] docs/bibliography.md
+    """
+    route = try_route(
+        centreline,
+        start_mm,
+        goal_mm,
+        limits,
+        repair=repair,
+        links=links,
+        waypoint_spacing_mm=waypoint_spacing_mm,
+        seed=seed,
+        genetic=genetic,
+        executor=executor,
+    )
+    require_proved(route)
+    return route
+
+
+def require_proved(route: Route) -> None:
+    """Raise `NoRouteError`, which says where and why, unless a route is proved."""
+    if route.proved:
+        return
+    limits = route.limits
+    if route.proof.holds:
+        raise NoRouteError(
+            f"The route ends {route.end_error_mm:.2f} mm from where it should",
+            expected=f"at most {limits.end_tolerance_mm:g} mm",
+            remedy="Allow a larger end tolerance, or use the exact repair",
+        )
+    failed = route.proof.failed_spans
+    where = ", ".join(f"{x:.1f}" for x in route.proof.points_mm[failed[len(failed) // 2]])
+    counts = "; ".join(f"{count} spans {why}" for why, count in route.proof.reasons().items())
+    raise NoRouteError(
+        f"No proved route was found with the repair {route.repair!r}: of {route.curve.n_spans} spans, "
+        f"{counts}, as near LPS {where} mm",
+        expected=f"at most {limits.max_curvature_per_mm:g} per mm, {limits.needed_mm:g} mm inside the lumen",
+        remedy="Take a device that bends more or is thinner, or move start or goal",
+    )
+
+
+def _route(
+    centreline: Centreline,
+    nodes: Int,
+    way: Way,
+    tentative: Curve,
+    limits: RouteLimits,
+    repair: Repair,
+    seed: int,
+    genetic: GeneticSettings | None,
+    executor: Executor | None,
+) -> Route:
+    problem = Problem(way=way, centreline=centreline, limits=limits)
+    curve, claimed = tentative, True
+    if repair == "exact":
+        curve, proof = repair_exact(tentative, problem, executor)
+        claimed = proof.holds
+    else:
+        if repair == "ga":
+            curve, claimed = repair_genetic(
+                tentative, centreline, limits, seed=seed, settings=genetic, executor=executor
+            )
+        proof = problem.prove(curve)
+    return Route(
+        nodes=read_only(nodes),
+        way=way,
+        tentative=tentative,
+        curve=curve,
+        proof=proof,
+        limits=limits,
+        repair=repair,
+        claimed=claimed,
+    )
+
+
+class Replanner:
+    """Plans a route anew for each new state of the anatomy, at the rate of a tracker.
+
+    What does not change while tubes move is kept: which nodes the route passes, and which tubes are near.
+
+    Parameters
+    ----------
+    centreline : Centreline
+    route : Route
+        The route for the centreline as it was.
+
+    Examples
+    --------
+    >>> replanner = Replanner(centreline, route)            # doctest: +SKIP
+    >>> moved = replanner.replan(breathing(centreline.nodes_mm))   # doctest: +SKIP
+    """
+
+    def __init__(self, centreline: Centreline, route: Route) -> None:
+        self._centreline, self._route = centreline, route
+        self._kept, self._edges = _corridor(centreline, route.nodes)
+        position = np.full(centreline.n_nodes, -1, dtype=np.int64)
+        position[self._kept] = np.arange(len(self._kept))
+        self._nodes = position[route.nodes]
+        self._edges = position[self._edges]
+
+    def replan(
+        self,
+        nodes_mm: ArrayLike,
+        *,
+        radius_mm: ArrayLike | None = None,
+        start_mm: ArrayLike | None = None,
+        goal_mm: ArrayLike | None = None,
+    ) -> Route:
+        """Return the route for the centreline with its nodes at new places.
+
+        Parameters
+        ----------
+        nodes_mm : (N, 3) float64
+            All nodes of the centreline, in its order, LPS mm.
+        radius_mm : (N,) float64, optional
+            New radii; the old ones if None.
+        start_mm, goal_mm : (3,) float64, optional
+            Where the tip is now, and the goal; the old ones, moved along with the nearest node, if None.
+
+        Raises
+        ------
+        NoRouteError, TargetError
+            As `plan_route`.
+        """
+        old = self._centreline
+        moved = np.asarray(nodes_mm, dtype=np.float64)
+        if moved.shape != old.nodes_mm.shape:
+            raise SettingsError(
+                f"{moved.shape[0]} nodes were given for a centreline of {old.n_nodes}", expected="all nodes"
+            )
+        radius = old.radius_mm if radius_mm is None else np.asarray(radius_mm, dtype=np.float64)
+        here = Centreline(nodes_mm=moved[self._kept], radius_mm=radius[self._kept], edges=self._edges)
+        ends = [
+            self._carried(end, moved) if given is None else np.asarray(given, dtype=np.float64)
+            for end, given in ((0, start_mm), (-1, goal_mm))
+        ]
+        limits = self._route.limits
+        for point, name in zip(ends, ("start", "goal"), strict=True):
+            here.require_inside(point, limits.needed_mm, name)
+        way = way_along(here, self._nodes, *ends)
+        route = _route(here, self._nodes, way, way.curve(), limits, "exact", 0, None, None)
+        require_proved(route)
+        return route
+
+    def _carried(self, end: int, moved: Float) -> Float:
+        node = self._route.nodes[end]
+        point: Float = self._route.way.points_mm[end] + moved[node] - self._centreline.nodes_mm[node]
+        return point
+
+
+def _corridor(centreline: Centreline, nodes: Int) -> tuple[Int, Int]:
+    """Return the nodes near those of a route, and the edges among them."""
+    from scipy.spatial import KDTree
+
+    here, radius = centreline.nodes_mm, centreline.radius_mm
+    distance, nearest = KDTree(here[nodes]).query(here)
+    near = distance <= radius + radius[nodes[nearest]] + CORRIDOR_MM
+    near[nodes] = True
+    edges = centreline.edges[near[centreline.edges].all(axis=1)]
+    return np.flatnonzero(near), edges

@@ -1,0 +1,94 @@
+"""The proof that a whole curve keeps to its limits, by bounds on pieces and not by samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float, read_only
+from stages.scope.route.centreline import Centreline
+from stages.scope.route.curve import Curve
+from stages.scope.route.kernels import spline as kernel
+
+REASONS = {
+    kernel.BENDS: "too curved",
+    kernel.LEAVES: "too near the wall",
+    kernel.UNDECIDED: "at its limit, undecided",
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Proof:
+    """What was proved of a curve with M spans.
+
+    Parameters
+    ----------
+    verdicts : (M,) int64
+        0 where all of a span keeps both limits; 1, too curved; 2, too near the wall; 3, undecided.
+    points_mm : (M, 3) float64
+        A point that breaks a limit, for the spans where there is one.
+    curvature_bound_per_mm, depth_bound_mm : float
+        No point of the proved spans is more curved, or less deep in the lumen.  Not sharp.
+    """
+
+    verdicts: NDArray[np.int64]
+    points_mm: Float
+    curvature_bound_per_mm: float
+    depth_bound_mm: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether every span is proved."""
+        return not self.verdicts.any()
+
+    @property
+    def failed_spans(self) -> NDArray[np.int64]:
+        """Spans that are not proved."""
+        return np.flatnonzero(self.verdicts)
+
+    def reasons(self) -> dict[str, int]:
+        """Count the spans that are not proved by their reason."""
+        return {
+            text: int((self.verdicts == verdict).sum())
+            for verdict, text in REASONS.items()
+            if (self.verdicts == verdict).any()
+        }
+
+
+def prove(curve: Curve, centreline: Centreline, *, max_curvature_per_mm: float, needed_mm: float) -> Proof:
+    """Prove, or disprove, that a curve keeps its curvature limit and stays inside the lumen.
+
+    Each span is a Bezier cubic, halved until bounds decide: the convex hull of the derivative's points
+    bounds its norm from below, that of the cross product from above, and the depth in the lumen cannot
+    change by more than the distance.  A span that is not decided after ten halvings counts as failed.
+
+    Parameters
+    ----------
+    curve : Curve
+    centreline : Centreline
+    max_curvature_per_mm : float
+    needed_mm : float
+        Depth in the lumen that every point of the curve must have.
+    """
+    verdicts = np.zeros(curve.n_spans, dtype=np.int64)
+    points = np.zeros((curve.n_spans, 3))
+    bounds = np.array((0.0, np.inf))
+    kernel.prove_spans(
+        curve.control_mm,
+        curve.knots,
+        centreline.cones,
+        *centreline.cells,
+        float(max_curvature_per_mm),
+        float(needed_mm),
+        verdicts,
+        points,
+        bounds,
+    )
+    return Proof(
+        verdicts=read_only(verdicts),
+        points_mm=read_only(points),
+        curvature_bound_per_mm=float(bounds[0]),
+        depth_bound_mm=float(bounds[1]),
+    )

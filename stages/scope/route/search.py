@@ -1,0 +1,94 @@
+"""The global planner: a way along the nodes of a centreline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import LungaccessError, SettingsError
+from anatomy.grid import read_only
+from stages.scope.route.centreline import Centreline
+from stages.scope.route.kernels.search import breadth_first
+
+Int = NDArray[np.int64]
+
+DEFAULT_NEIGHBOURS = 8
+
+
+class NoRouteError(LungaccessError):
+    """There is no route, or none was found; the message says where and why."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Links:
+    """Which nodes the search may go to from a node, as a compressed list.
+
+    Parameters
+    ----------
+    start : (N + 1,) int64
+        The links of node n are `nodes[start[n]:start[n + 1]]`.
+    nodes : (L,) int64
+        Nearest first.
+    """
+
+    start: Int
+    nodes: Int
+
+
+def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) -> Links:
+    """Link each node with its nearest ones, and with those it shares an edge with.
+
+    A nearest node counts only if the balls around both overlap: otherwise it may lie behind a wall, in a
+    tube that runs past.
+
+    Parameters
+    ----------
+    centreline : Centreline
+    neighbours : int
+        Number of nearest nodes, k of [Li2021].
+
+    Raises
+    ------
+    SettingsError
+        If `neighbours` is less than 1.
+
+    References
+    ----------
+    .. [Li2021] docs/bibliography.md
+    """
+    from scipy.spatial import KDTree
+
+    if neighbours < 1:
+        raise SettingsError(f"The search looks at {neighbours} neighbours", expected="at least 1")
+    nodes, n = centreline.nodes_mm, centreline.n_nodes
+    distance, near = KDTree(nodes).query(nodes, k=min(neighbours + 1, n))
+    a = np.repeat(np.arange(n), near.shape[1])
+    b = near.ravel()
+    radius = centreline.radius_mm
+    open_between = (a != b) & (distance.ravel() < radius[a] + radius[b])
+    pairs = np.vstack((np.stack((a, b), axis=1)[open_between], centreline.edges, centreline.edges[:, ::-1]))
+    pairs = np.unique(np.vstack((pairs, pairs[:, ::-1])), axis=0)
+    gap = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
+    order = np.lexsort((gap, pairs[:, 0]))
+    start = np.searchsorted(pairs[order, 0], np.arange(n + 1))
+    return Links(start=read_only(start), nodes=read_only(np.ascontiguousarray(pairs[order, 1])))
+
+
+def fewest_hops(links: Links, source: int, goal: int) -> Int:
+    """Return the nodes from `source` to `goal` with the fewest hops; not always the shortest way.
+
+    Raises
+    ------
+    NoRouteError
+        If no chain of links joins them.
+    """
+    path: Int = breadth_first(links.start, links.nodes, source, goal)
+    if not len(path):
+        raise NoRouteError(
+            "The centreline does not join start and goal",
+            expected="one connected tree of tubes",
+            remedy="Look at the gaps in the segmentation, or choose points in the same tree",
+        )
+    return path

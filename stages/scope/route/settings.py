@@ -1,0 +1,45 @@
+"""Settings of a route."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from anatomy.settings import quantity, settings
+
+
+@settings
+class RouteLimits:
+    """What the device can follow.
+
+    Parameters
+    ----------
+    max_curvature_per_mm : float
+        Largest curvature, S of [Li2021].
+    device_radius_mm : float
+        Outer radius of the device.
+    wall_margin_mm : float
+        Gap that must remain between device and wall.
+    end_tolerance_mm : float
+        How far the ends of the route may lie from the wanted points; 0 for exactly there.
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite or absurd.
+    """
+
+    max_curvature_per_mm: Annotated[float, quantity("largest curvature", above=0.0, at_most=10.0)]
+    device_radius_mm: Annotated[float, quantity("outer radius of the device", at_least=0.0, at_most=10.0)] = (
+        0.0
+    )
+    wall_margin_mm: Annotated[float, quantity("gap between device and wall", at_least=0.0, at_most=10.0)] = (
+        0.0
+    )
+    end_tolerance_mm: Annotated[
+        float, quantity("distance of the ends from the wanted points", at_least=0.0, at_most=10.0)
+    ] = 0.0
+
+    @property
+    def needed_mm(self) -> float:
+        """Depth in the lumen that every point of the route must have."""
+        return self.device_radius_mm + self.wall_margin_mm

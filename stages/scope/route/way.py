@@ -1,0 +1,83 @@
+"""The way that a route follows: centreline nodes with start and goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from stages.scope.route.centreline import Centreline
+from stages.scope.route.curve import DEGREE, Curve, interpolate
+
+SAME_PLACE_MM = 1e-6
+WAYPOINT_SPACING_MM = 3.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Way:
+    """Points from start to goal with the radius of the lumen; P points.
+
+    Parameters
+    ----------
+    points_mm : (P, 3) float64
+        The first is the start, the last the goal; no two that follow each other coincide.
+    radius_mm : (P,) float64
+    """
+
+    points_mm: Float
+    radius_mm: Float
+
+    @property
+    def along_mm(self) -> Float:
+        """Length of the polyline up to each point, `(P,)`."""
+        step = np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1)
+        return np.concatenate(((0.0,), np.cumsum(step)))
+
+    @property
+    def cones(self) -> Float:
+        """Round cones along the way, `(P - 1, 8)`; they lead, but are no part of the lumen."""
+        with_radius = np.column_stack((self.points_mm, self.radius_mm))
+        return np.hstack((with_radius[:-1], with_radius[1:]))
+
+    def curve(self, spacing_mm: float = WAYPOINT_SPACING_MM) -> Curve:
+        """Return the tentative curve: the cubic B-spline through points of the way.
+
+        Parameters
+        ----------
+        spacing_mm : float
+            Distance of the points along the way, about; 0 for every point, as in [Li2021].
+        """
+        along = self.along_mm
+        if spacing_mm <= 0.0:
+            return interpolate(self.points_mm)
+        count = max(round(along[-1] / spacing_mm), DEGREE)
+        at = np.linspace(0.0, along[-1], count + 1)
+        return interpolate(np.stack([np.interp(at, along, axis) for axis in self.points_mm.T], axis=1))
+
+
+def way_along(centreline: Centreline, nodes: NDArray[np.int64], start_mm: Float, goal_mm: Float) -> Way:
+    """Return the way over centreline nodes.
+
+    Start and goal take the place of the nodes nearest to them.
+
+    Raises
+    ------
+    SettingsError
+        If start and goal are the same point.
+    """
+    inner = nodes[1:-1]
+    points = np.vstack((start_mm, centreline.nodes_mm[inner], goal_mm))
+    radius = np.concatenate(
+        (centreline.radius_mm[nodes[:1]], centreline.radius_mm[inner], centreline.radius_mm[nodes[-1:]])
+    )
+    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > SAME_PLACE_MM
+    kept = np.concatenate(((True,), apart))
+    if kept.sum() < 2:
+        raise SettingsError("Start and goal of the route are the same point", expected="two points apart")
+    if not apart[-1]:
+        kept[np.flatnonzero(kept)[-1]] = False
+        kept[-1] = True
+    return Way(points_mm=read_only(points[kept]), radius_mm=read_only(radius[kept]))

@@ -1,0 +1,112 @@
+"""The choice of exits by minimum resistance [Pan2025, algorithms 1 and 2]."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from stages.scope.tour.kernels.circuit import all_resistances
+from stages.scope.tour.ways import Ways
+
+Int = NDArray[np.int64]
+Reading = Literal["printed", "reduced"]
+
+MOST_COMBINATIONS = 5_000_000
+SAME_RESISTANCE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Circuits:
+    """The circuits of all combinations of exits; C combinations, M lesions.
+
+    Parameters
+    ----------
+    first : (M + 1,) int64
+        The exits of lesion m are `first[m]` to `first[m + 1] - 1`.
+    printed : (C,) float64
+        Resistance by the steps of section II-C and algorithm 1: resistors in as many loops are summed, even
+        if they lie in different branches.
+    reduced : (C,) float64
+        Resistance by merging layer by layer from the ends, as the last lines of section II-D have it: the
+        true resistance of the tree.
+    """
+
+    first: Int
+    printed: Float
+    reduced: Float
+
+    @property
+    def count(self) -> int:
+        """Number of combinations, C."""
+        return len(self.printed)
+
+    def distinct(self, reading: Reading = "printed") -> int:
+        """Return the number of circuits with different resistances."""
+        values = np.sort(self.values(reading))
+        return 1 + int((np.diff(values) > SAME_RESISTANCE * values[:-1]).sum())
+
+    def values(self, reading: Reading) -> Float:
+        """Return the resistances by one of the two readings."""
+        if reading not in ("printed", "reduced"):
+            raise SettingsError(f"There is no reading {reading!r}", expected="printed or reduced")
+        return self.printed if reading == "printed" else self.reduced
+
+    def choice(self, reading: Reading = "printed") -> tuple[int, ...]:
+        """Return the exits, one a lesion, of the circuit with the least resistance; the first of equals."""
+        number = int(np.argmin(self.values(reading)))
+        chosen = []
+        for m in range(len(self.first) - 2, -1, -1):
+            size = int(self.first[m + 1] - self.first[m])
+            chosen.append(int(self.first[m]) + number % size)
+            number //= size
+        return tuple(chosen[::-1])
+
+
+def combinations(ways: Ways) -> int:
+    """Return the number of choices of one exit a lesion."""
+    return math.prod(np.bincount(ways.exit_lesion).tolist())
+
+
+def circuits(ways: Ways) -> Circuits:
+    """Compute the resistances of all combinations of exits.
+
+    Parameters
+    ----------
+    ways : Ways
+
+    Raises
+    ------
+    SettingsError
+        If there are more than 5 million combinations.
+
+    References
+    ----------
+    .. [Pan2025] docs/bibliography.md
+    """
+    sizes = np.bincount(ways.exit_lesion, minlength=ways.n_lesions)
+    count = combinations(ways)
+    if count > MOST_COMBINATIONS:
+        raise SettingsError(
+            f"{ways.n_lesions} lesions have {count} combinations of exits",
+            expected=f"at most {MOST_COMBINATIONS} for the method of least resistance",
+            remedy="Use the exact tour alone",
+        )
+    first = np.concatenate(((0,), np.cumsum(sizes)))
+    printed, reduced = np.zeros(count), np.zeros(count)
+    all_resistances(
+        ways.parent,
+        ways.resistance,
+        ways.side,
+        ways.exit_vertex,
+        ways.exit_resistance,
+        first,
+        printed,
+        reduced,
+    )
+    return Circuits(first=read_only(first), printed=read_only(printed), reduced=read_only(reduced))

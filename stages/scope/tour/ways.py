@@ -1,0 +1,186 @@
+"""The part of the airway tree that leads to the exits: a small rooted tree of stretches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from stages.scope.tour.exits import Exit
+from stages.scope.tour.resistance import Resistances, branch_resistances
+
+Int = NDArray[np.int64]
+
+MAIN, LEFT, RIGHT = 0, 1, 2
+MOST_LESIONS = 62
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ways:
+    """The stretches from the root to all exits; K vertices, parents first, and X exits of M lesions.
+
+    A vertex is the root, a fork of ways to different exits, an exit, or the carina.  Where more than two
+    ways part, the vertex has more than two children; that is the same as a chain of binary forks with
+    stretches of no length and no resistance between them.
+
+    Parameters
+    ----------
+    tree_point : (K,) int64
+        Index into the airway tree.
+    parent : (K,) int64
+        -1 for the root.
+    length_mm, resistance : (K,) float64
+        Of the stretch from the parent; 0 for the root.
+    side : (K,) int64
+        Of the stretch: 0 above the carina, 1 left, 2 right.
+    exits : tuple of X Exit
+        Ordered by lesion.
+    exit_vertex : (X,) int64
+    exit_resistance : (X,) float64
+        Of lesion and needle: eta inside the airway, eta and the weighted sum outside.
+    exit_cost_mm : (X,) float64
+        What taking this exit costs besides the way, as a length.
+    """
+
+    tree_point: Int
+    parent: Int
+    length_mm: Float
+    resistance: Float
+    side: Int
+    exits: tuple[Exit, ...]
+    exit_vertex: Int
+    exit_resistance: Float
+    exit_cost_mm: Float
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, K."""
+        return len(self.parent)
+
+    @property
+    def n_lesions(self) -> int:
+        """Number of lesions, M."""
+        return self.exits[-1].lesion + 1
+
+    @property
+    def exit_lesion(self) -> Int:
+        """The lesion of each exit, `(X,)`."""
+        return np.array([e.lesion for e in self.exits], dtype=np.int64)
+
+    @property
+    def depth_mm(self) -> Float:
+        """Way from the root to each vertex, `(K,)`."""
+        depth = np.zeros(self.n_vertices)
+        for v in range(1, self.n_vertices):
+            depth[v] = depth[self.parent[v]] + self.length_mm[v]
+        return depth
+
+
+def ways_to(
+    tree: AirwayTree,
+    exits: Sequence[Sequence[Exit]],
+    *,
+    weights: Resistances | None = None,
+    exit_cost_mm: Sequence[Sequence[float]] | None = None,
+) -> Ways:
+    """Take the ways to all exits out of a tree.
+
+    Parameters
+    ----------
+    tree : AirwayTree
+    exits : sequence of sequences of Exit
+        For each lesion, as `find_exits` returns them.
+    weights : Resistances, optional
+    exit_cost_mm : sequence of sequences of float, optional
+        For each exit, not negative; 0 if None.
+
+    Raises
+    ------
+    SettingsError
+        If there are no lesions, one without exits, or more than 62.
+    """
+    if not exits or not all(len(of_one) for of_one in exits) or len(exits) > MOST_LESIONS:
+        raise SettingsError(
+            f"A tour was asked for {len(exits)} lesions with {[len(e) for e in exits]} exits",
+            expected=f"1 to {MOST_LESIONS} lesions with at least one exit each",
+        )
+    chosen = weights or Resistances()
+    flat = tuple(e for of_one in exits for e in of_one)
+    vertices = _vertices(tree, np.array([e.tree_point for e in flat], dtype=np.int64))
+    at = np.full(tree.n_points, -1, dtype=np.int64)
+    at[vertices] = np.arange(len(vertices))
+    parent, length, resistance = _stretches(tree, vertices, at, branch_resistances(tree, chosen))
+    inside = np.array([e.roles == ("inside",) for e in flat])
+    cost = (
+        np.zeros(len(flat))
+        if exit_cost_mm is None
+        else np.array([c for of_one in exit_cost_mm for c in of_one])
+    )
+    if cost.shape != (len(flat),) or not (cost >= 0).all():
+        raise SettingsError("The costs of the exits do not fit", expected="one number of at least 0 for each")
+    return Ways(
+        tree_point=read_only(vertices),
+        parent=read_only(parent),
+        length_mm=read_only(length),
+        resistance=read_only(resistance),
+        side=read_only(_sides(tree)[tree.branch_of_point[vertices]]),
+        exits=flat,
+        exit_vertex=read_only(at[[e.tree_point for e in flat]]),
+        exit_resistance=read_only(
+            np.where(inside, chosen.eta, chosen.eta + np.array([e.weighted for e in flat]))
+        ),
+        exit_cost_mm=read_only(np.asarray(cost, dtype=np.float64)),
+    )
+
+
+def _vertices(tree: AirwayTree, points: Int) -> Int:
+    """Return root, carina, exits and forks between them, parents first."""
+    used = np.zeros(tree.n_points, dtype=bool)
+    for point in np.unique(points).tolist():
+        while point >= 0 and not used[point]:
+            used[point] = True
+            point = int(tree.parent_point[point])
+    below = np.zeros(tree.n_points, dtype=np.int64)
+    child = np.flatnonzero(used[1:]) + 1
+    np.add.at(below, tree.parent_point[child], 1)
+    kept = used & (below > 1)
+    kept[points] = True
+    kept[0] = True
+    kept[tree.carina_point] |= bool(used[tree.carina_point])
+    return np.flatnonzero(kept)
+
+
+def _stretches(tree: AirwayTree, vertices: Int, at: Int, z: Float) -> tuple[Int, Float, Float]:
+    """Return parent, length and resistance of each vertex; a part of a branch has its share of it."""
+    per_mm = z / np.maximum(tree.branch_length_mm, 1e-9)
+    parent = np.full(len(vertices), -1, dtype=np.int64)
+    length, resistance = np.zeros(len(vertices)), np.zeros(len(vertices))
+    for v, point in enumerate(vertices.tolist()):
+        here = point
+        while (above := int(tree.parent_point[here])) >= 0:
+            step = float(tree.distance_from_root_mm[here] - tree.distance_from_root_mm[above])
+            length[v] += step
+            resistance[v] += step * float(per_mm[tree.branch_of_point[here]])
+            here = above
+            if at[here] >= 0:
+                parent[v] = at[here]
+                break
+    return parent, length, resistance
+
+
+def _sides(tree: AirwayTree) -> Int:
+    """Return the side of each branch, from where its main bronchus ends relative to the carina (+x left)."""
+    side = np.zeros(tree.n_branches, dtype=np.int64)
+    for branch in range(1, tree.n_branches):
+        above = int(tree.branch_parent[branch])
+        if above == 0:
+            end = tree.points_lps[tree.branch_start[branch + 1] - 1]
+            side[branch] = LEFT if end[0] > tree.carina_lps[0] else RIGHT
+        else:
+            side[branch] = side[above]
+    return side

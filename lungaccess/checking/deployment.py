@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 EXIT_TOLERANCE_MM = 0.02
 BISECTIONS = 20
+THIN_SAMPLES = 201
 CORNER_MM = 0.1
 """An axis that leaves the lumen for less than this cuts the corner of a voxel: not yet an exit."""
 
@@ -143,8 +144,8 @@ def _check_exit(
         return None
     if not found.true("tube.leaves", len(left) > 0, "the tube leaves the airway lumen"):
         return None
-    last = _exit_frame(curve, in_lumen, stated.arc_length_mm)
-    arc_mm, point = _border(lung, curve, last)
+    last, inside, outside = _exit_step(lung, curve, in_lumen, stated.arc_length_mm)
+    arc_mm, point = _border(lung, curve, last, inside, outside)
     before = curve.arc_mm[last] - curve.arc_mm
     near = (before >= 0.0) & (before <= BRANCH_ZONE_MM)
     branches = {int(b) for b in branch_of(labels[near])}
@@ -164,10 +165,13 @@ def _check_exit(
     return Exit(frame=last, arc_mm=arc_mm, branch=exemption.branch)
 
 
-def _exit_frame(curve: Curve, in_lumen: NDArray[np.bool_], stated_mm: float) -> int:
-    """Return the last frame in the lumen.
+def _exit_step(
+    lung: Lung, curve: Curve, in_lumen: NDArray[np.bool_], stated_mm: float
+) -> tuple[int, float, float]:
+    """Return the last frame in the lumen, and shares of the step behind it that are in the lumen and not.
 
-    Of the exit and the voxel corners that are cut on the way to it, the one nearest to what is stated.
+    Of the exit and the voxel corners that are cut on the way to it, the one nearest to what is stated; a
+    corner may be thinner than the step.
     """
     leaves = np.flatnonzero(in_lumen[:-1] & ~in_lumen[1:])
     enters = np.append(np.flatnonzero(~in_lumen[:-1] & in_lumen[1:]), len(in_lumen) - 1)
@@ -175,12 +179,19 @@ def _exit_frame(curve: Curve, in_lumen: NDArray[np.bool_], stated_mm: float) -> 
     away = curve.arc_mm[back] - curve.arc_mm[leaves]
     away[back == len(in_lumen) - 1] = np.inf
     candidates = leaves[: int(np.argmax(away > CORNER_MM)) + 1]
-    return int(candidates[np.argmin(np.abs(curve.arc_mm[candidates] - stated_mm))])
+    stated = int(np.searchsorted(curve.arc_mm, stated_mm, side="right")) - 1
+    if 0 <= stated < candidates[-1] and in_lumen[stated] and in_lumen[stated + 1]:
+        share = np.linspace(0.0, 1.0, THIN_SAMPLES)
+        a, b = curve.points[stated], curve.points[stated + 1]
+        wet = (labels_at(lung, a + share[:, None] * (b - a)) & structures.LUMEN) != 0
+        if not wet.all():
+            out = int(np.argmin(wet))
+            return stated, float(share[out - 1]), float(share[out])
+    return int(candidates[np.argmin(np.abs(curve.arc_mm[candidates] - stated_mm))]), 0.0, 1.0
 
 
-def _border(lung: Lung, curve: Curve, frame: int) -> tuple[float, Float]:
-    """Return arc length and position of the border of the lumen behind a frame, by bisection."""
-    inside, outside = 0.0, 1.0
+def _border(lung: Lung, curve: Curve, frame: int, inside: float, outside: float) -> tuple[float, Float]:
+    """Return arc length and position of the border of the lumen in the step behind a frame, by bisection."""
     a, b = curve.points[frame], curve.points[frame + 1]
     for _ in range(BISECTIONS):
         middle = 0.5 * (inside + outside)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
-
 import numpy as np
 
 from anatomy.fields import distance_field
 from anatomy.grid import Grid
 from anatomy.kernels.field import exact_at
+from benchmarks.fresh import FreshProcess
 
 POINTS = 100_000
 COLD_RUN = """
@@ -52,22 +48,11 @@ class Field:
         exact_at(self.labels, self.field.geometry, self.points, 1, -1, 1.5, self.out)
 
 
-class Compile:
+class Compile(FreshProcess):
     """A first plan in a new process, without and with cached kernels."""
 
-    params = (True, False)
-    param_names = ("cold",)
-    timeout = 300
-    number = 1
-    repeat = 1
-    warmup_time = 0.0
-
-    def setup(self, cold: bool) -> None:
-        """Choose an empty or a filled kernel cache."""
-        self.environment = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
-        if not cold:
-            self.time_first_plan(cold)
+    code = COLD_RUN
 
     def time_first_plan(self, cold: bool) -> None:
         """Phantom, lung, atlas, first plan."""
-        subprocess.run([sys.executable, "-c", COLD_RUN], check=True, env=self.environment)
+        self.run()

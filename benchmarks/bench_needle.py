@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
-
 import numpy as np
 
 from anatomy.grid import Grid
 from anatomy.structures import VESSEL
+from benchmarks.fresh import FreshProcess
 from stages.needle.certificate import NoPathProof
 from stages.needle.device import Needle
 from stages.needle.optimal import OptimalSearch
@@ -98,22 +94,11 @@ class Searches:
             proof.advance()
 
 
-class Compile:
+class Compile(FreshProcess):
     """All kernels of the stage in a new process, without and with cached ones."""
 
-    params = (True, False)
-    param_names = ("cold",)
-    timeout = 300
-    number = 1
-    repeat = 1
-    warmup_time = 0.0
-
-    def setup(self, cold: bool) -> None:
-        """Choose an empty or a filled kernel cache."""
-        self.environment = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
-        if not cold:
-            self.time_all_searches(cold)
+    code = COLD_RUN
 
     def time_all_searches(self, cold: bool) -> None:
         """A few steps of every search."""
-        subprocess.run([sys.executable, "-c", COLD_RUN], check=True, env=self.environment)
+        self.run()

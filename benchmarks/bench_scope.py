@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
-
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume
+from benchmarks.fresh import FreshProcess
 from stages.scope.advisor import Advisor, start_state
 from stages.scope.best_motion import Weights, best_motion
 from stages.scope.collision import Scene
@@ -104,22 +100,11 @@ class Stage:
         orientability(scene, self.tree, 60)
 
 
-class Compile:
+class Compile(FreshProcess):
     """All kernels of the stage in a new process, without and with cached ones."""
 
-    params = (True, False)
-    param_names = ("cold",)
-    timeout = 300
-    number = 1
-    repeat = 1
-    warmup_time = 0.0
-
-    def setup(self, cold: bool) -> None:
-        """Choose an empty or a filled kernel cache."""
-        self.environment = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
-        if not cold:
-            self.time_stage(cold)
+    code = COLD_RUN
 
     def time_stage(self, cold: bool) -> None:
         """Each piece of work once."""
-        subprocess.run([sys.executable, "-c", COLD_RUN], check=True, env=self.environment)
+        self.run()

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
-import tempfile
 
 import numpy as np
 
+from benchmarks.fresh import FreshProcess
 from stages.tube.device import Tube
 from stages.tube.mechanics import TubeMechanics
 
@@ -79,22 +76,11 @@ class Solves:
         return float(1e3 * np.abs(one[:, :3, 3] - two[:, :3, 3]).max())
 
 
-class Compile:
+class Compile(FreshProcess):
     """All kernels of the mechanics in a new process, without and with cached ones."""
 
-    params = (True, False)
-    param_names = ("cold",)
-    timeout = 300
-    number = 1
-    repeat = 1
-    warmup_time = 0.0
-
-    def setup(self, cold: bool) -> None:
-        """Choose an empty or a filled kernel cache."""
-        self.environment = {**os.environ, "NUMBA_CACHE_DIR": tempfile.mkdtemp()}
-        if not cold:
-            self.time_all_kernels(cold)
+    code = COLD_RUN
 
     def time_all_kernels(self, cold: bool) -> None:
         """A few solves."""
-        subprocess.run([sys.executable, "-c", COLD_RUN], check=True, env=self.environment)
+        self.run()

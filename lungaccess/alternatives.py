@@ -62,7 +62,7 @@ def alternatives(
     apart_mm: float = APART_MM,
     atlas: Atlas | None = None,
 ) -> tuple[Alternative, ...]:
-    """Return up to `count` plans of which every two lie at least `apart_mm` apart somewhere.
+    """Return up to `count` plans of which the needles of every two lie at least `apart_mm` apart somewhere.
 
     Direct arcs from the atlas are taken, the cheapest first, the cheapest through each airway branch before
     others; each is proved and complete as any plan.
@@ -76,7 +76,7 @@ def alternatives(
         What "cheap" means; see `lungaccess.planner.plan`.
     count : int
     apart_mm : float
-        Somewhere a point of the axis of tube and needle of one plan is so far from all of the other's.
+        Somewhere a point of the needle of one plan is so far from all of the other's.
     atlas : Atlas, optional
         Made with `build_atlas` beforehand.
 

@@ -225,20 +225,13 @@ def motion_by_step(steps: SequenceOf[Equilibrium]) -> tuple[Float, Float]:
     """
     final = steps[-1]
     arcs = [_samples(step.length_mm) for step in steps]
-    bodies = np.concatenate([_points(step, arc) for step, arc in zip(steps, arcs, strict=True)])
-    places = _points(final, np.minimum(np.concatenate(arcs), final.length_mm))
-    track = _points(final, _samples(final.length_mm, TRACK_SPACING_MM))
+    bodies = np.concatenate([step.backbone(arc) for step, arc in zip(steps, arcs, strict=True)])
+    places = final.backbone(np.minimum(np.concatenate(arcs), final.length_mm))
+    track = final.backbone(_samples(final.length_mm, TRACK_SPACING_MM))
     first = np.cumsum([0, *(len(arc) for arc in arcs[:-1])])
     sweep = np.maximum.reduceat(np.linalg.norm(bodies - places, axis=1), first)
     error = np.maximum.reduceat(_distance_to_track(bodies, track), first)
     return sweep, np.minimum(error, sweep)
-
-
-def _points(step: Equilibrium, arc_lengths_mm: Float) -> Float:
-    """Return points (N, 3) of the centreline; all are the scope tip while nothing is out."""
-    if step.length_mm == 0.0:
-        return np.zeros((len(arc_lengths_mm), 3))
-    return step.backbone(arc_lengths_mm)
 
 
 def _samples(length_mm: float, spacing_mm: float = SAMPLE_MM) -> Float:

@@ -6,6 +6,7 @@ refuses it; 2, the input is bad.
 
 from __future__ import annotations
 
+import json as json_format
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,7 +41,9 @@ DEFAULT_BUDGET_S = 10.0
 DEMO_SEED = 2
 
 Objective = Literal["inverse-clearance", "cost-map", "voxel-sum", "length"]
-Method = Literal["atlas", "kuntz2015", "kuntz2015-without-rejection"]
+Method = Literal[
+    "atlas", "kuntz2015", "kuntz2015-without-rejection", "reference", "reference-without-rejection"
+]
 NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 
 _TOO_LARGE = AnatomyError(
@@ -167,7 +170,8 @@ def plan(
         What to make small: integral of 1/clearance, integral of the patient's cost map, its sum over the
         voxels crossed, or length.
     method : str
-        Search over the deployment atlas, or Algorithm 1 of Kuntz et al. 2015.
+        Search over the deployment atlas; Algorithm 1 of Kuntz et al. 2015; or reference: the same as
+        printed, with collisions of surface meshes, slow.
     allow_fissures : bool
         Whether fissures may be crossed; as the system says if not given.
     processes : int
@@ -295,7 +299,14 @@ def _start_pose(lung: Lung, start: str, frame: Frame) -> Float:
 
 
 @app.command
-def check(plan: Path, patient: Path, *, system: str | None = None, cache: Path | None = None) -> int:
+def check(
+    plan: Path,
+    patient: Path,
+    *,
+    system: str | None = None,
+    json: bool = False,
+    cache: Path | None = None,
+) -> int:
     """Judge a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
 
     Parameters
@@ -306,6 +317,8 @@ def check(plan: Path, patient: Path, *, system: str | None = None, cache: Path |
         Folder of the patient it was made for.
     system : str
         Judge against this preset or TOML file instead of the devices stated in the plan.
+    json : bool
+        Print JSON instead of tables.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
@@ -315,7 +328,11 @@ def check(plan: Path, patient: Path, *, system: str | None = None, cache: Path |
     stored = Plan.load(plan)
     device = None if system is None else load_device(system, None)
     report = judge(stored, load_lung(patient, cache), system=device)
-    console.print(terminal.check_table(report))
+    if json:
+        text = json_format.dumps(report.to_mapping(), indent=2)
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        return OK if report.accepted else NO_PLAN
+    terminal.show(terminal.check_tables(report))
     return _verdict(report.accepted)
 
 
@@ -425,7 +442,7 @@ def _plan_and_report(lung: Lung, request: SearchRequest, out: Path) -> int:
     terminal.show(terminal.plan_tables(found))
     _print_warnings(lung)
     if not report.accepted:
-        console.print(terminal.check_table(report, refusals_only=True))
+        terminal.show(terminal.check_tables(report, refusals_only=True))
     written = ", ".join(("plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv"))
     console.print(terminal.escaped(f"Written to {out}: {written}"))
     return _verdict(report.accepted)

@@ -16,7 +16,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from anatomy.errors import LungaccessError
     from anatomy.lung import Lung
-    from lungaccess.checking import CheckReport
+    from lungaccess.checking import CheckReport, Finding
     from lungaccess.needle import NeedleAnswer
     from lungaccess.noplan import NoPlan
     from lungaccess.plans import Plan
@@ -173,32 +173,34 @@ def _least(plan: Plan, device: str, structure: str) -> str:
     return f"{plan.required_clearance_mm[{'tube': 'inner_tube'}.get(device, device)]:.2f}"
 
 
-def check_table(report: CheckReport, *, refusals_only: bool = False) -> Table:
-    """Return the findings of an independent check, all of them or those that are not ok."""
-    made = _bare_table("Independent check")
-    for heading in ("", "what"):
-        made.add_column(heading)
-    for heading in ("found", "limit"):
+def check_tables(report: CheckReport, *, refusals_only: bool = False) -> list[Table]:
+    """Return the findings of an independent check by stage, all of them or those that are not ok."""
+    shown = [finding for finding in report.findings if not (refusals_only and finding.ok)]
+    stages = dict.fromkeys(finding.stage for finding in shown)
+    return [_findings_table(stage, [each for each in shown if each.stage == stage]) for stage in stages]
+
+
+def _findings_table(stage: str, findings: list[Finding]) -> Table:
+    """Return what was found of one stage: values, limits and the distances between the two."""
+    made = _bare_table(f"Independent check: {stage}")
+    made.add_column("")
+    made.add_column("what", no_wrap=True)
+    for heading in ("found", "limit", "margin"):
         made.add_column(heading, justify="right")
     made.add_column("")
-    shown = (finding for finding in report.findings if not (refusals_only and finding.ok))
-    for finding in shown:
+    for finding in findings:
         mark = "[green]ok[/]" if finding.ok else "[bold red]refused[/]"
+        limit = "" if finding.side is None else f"{finding.side} {finding.limit:.4g}"
         unit = f" {finding.unit}" if finding.unit else ""
         made.add_row(
             mark,
             escaped(finding.name),
-            _number(finding.value, unit),
-            _number(finding.limit, unit),
-            "" if finding.ok else escaped(finding.detail),
+            "" if finding.value is None else f"{finding.value:.4g}{unit}",
+            limit,
+            "" if finding.margin is None else f"{finding.margin:.3g}",
+            escaped(finding.detail),
         )
     return made
-
-
-def _number(value: object, unit: str) -> str:
-    if value is None:
-        return ""
-    return f"{value:.4g}{unit}" if isinstance(value, (int, float)) else escaped(f"{value}{unit}")
 
 
 def anatomy_tables(lung: Lung) -> list[Table]:

@@ -11,19 +11,12 @@ from numpy.typing import NDArray
 from anatomy import structures
 from anatomy.grid import Float
 from lungaccess.checking import shapes
+from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import POSITION_TOLERANCE_MM, check_rigid, check_same_pose
+from lungaccess.checking.scene import Scene
 from lungaccess.checking.shapes import Curve
-from lungaccess.checking.space import (
-    Boxes,
-    Select,
-    airway_except,
-    branch_of,
-    has,
-    labels_at,
-    region_around,
-    segment_clearance_mm,
-)
+from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at, region_around
 from lungaccess.plans import Plan
 
 if TYPE_CHECKING:
@@ -47,19 +40,6 @@ RIM_POINTS = 24
 SWEEP_STEP_MM = 1.0
 SWEEP_POINT_MM = 0.5
 SWEEP_TOLERANCE_MM = 0.02
-CLEARANCE_TOLERANCE_MM = 1e-3
-SPARE = "clearance beyond what is required"
-UNDERSTATED_MM = 0.25
-"""A planner may state its proved lower bound: less than the truth by a voxel's diagonal and this."""
-
-STATED_TOLERANCE_MM = 0.05
-"""A stated clearance is a lower bound; where it was sampled, it may be this much above the recomputed one."""
-
-STATED_MM = 5.0
-"""A clearance beyond this may be stated as no more than this."""
-
-REACH_MM = 20.0
-"""Clearances are recomputed up to this distance; what lies farther counts as this far."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,9 +51,9 @@ class Exit:
     branch: int
 
 
-def check_deployment(plan: Plan, lung: Lung, found: Findings) -> Curve | None:
+def check_deployment(plan: Plan, scene: Scene, found: Findings) -> Curve | None:
     """Record everything about the tubes; return their re-integrated centreline if it can be followed."""
-    tube, tubes = plan.tube, plan.system.tubes
+    tube, tubes, lung = plan.tube, plan.system.tubes, scene.lung
     if not (check_rigid("tube.tip", tube.lps_from_tip, found) and _is_pose(plan.scope.lps_from_scope_tip)):
         return None
     bend = shapes.bend_of(tubes, tube.outer_insertion_mm, tube.inner_insertion_mm)
@@ -88,7 +68,7 @@ def check_deployment(plan: Plan, lung: Lung, found: Findings) -> Curve | None:
         way_out = replace(way_out, frame=int(np.abs(curve.arc_mm - way_out.arc_mm).argmin()))
         labels = labels_at(lung, curve.points)
         _check_containment(plan, curve, labels, way_out, found)
-        _check_clearance(plan, lung, curve, way_out, sweep_mm, found)
+        _check_clearance(plan, scene, curve, way_out, sweep_mm, found)
     return curve
 
 
@@ -118,18 +98,19 @@ def _check_sweep(plan: Plan, found: Findings) -> float:
     outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
     final = shapes.planar_shape(shapes.bend_of(tubes, outer, inner), SWEEP_POINT_MM)
     sweep = leader = 0.0
-    for bend in shapes.deployment_bends(tubes, outer, inner, SWEEP_STEP_MM):
+    bends = shapes.deployment_bends(tubes, outer, inner, SWEEP_STEP_MM)
+    for bend in bends:
         apart = shapes.distance_to_polyline(shapes.planar_shape(bend, SWEEP_POINT_MM), final)
         sweep, leader = max(sweep, float(apart.max())), max(leader, float(apart[-1]))
     limit = tubes.max_lateral_sweep_mm
-    detail = "sideways motion while the tubes are deployed"
-    found.at_most("tube.sweep.limit", sweep, limit + SWEEP_TOLERANCE_MM, "mm", detail)
-    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm")
+    detail = f"sideways motion while the tubes are deployed, {len(bends)} steps replayed"
+    found.at_most("tube.sweep.limit", sweep, limit, "mm", detail, SWEEP_TOLERANCE_MM)
+    detail = "sideways motion as stated"
+    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm", detail)
     stated = ((tube.lateral_sweep_mm, sweep, "sweep"), (tube.follow_the_leader_error_mm, leader, "leader"))
     for value, recomputed, name in stated:
-        found.at_least(
-            f"tube.{name}.stated", value, max(recomputed - SWEEP_TOLERANCE_MM, 0.0), "mm", "not understated"
-        )
+        detail = "not less than recomputed"
+        found.at_least(f"tube.{name}.stated", value, recomputed, "mm", detail, SWEEP_TOLERANCE_MM)
     return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)
 
 
@@ -148,7 +129,7 @@ def _check_exit(
     arc_mm, point = _border(lung, curve, last, inside, outside)
     before = curve.arc_mm[last] - curve.arc_mm
     near = (before >= 0.0) & (before <= BRANCH_ZONE_MM)
-    branches = {int(b) for b in branch_of(labels[near])}
+    branches = {int(b) for b in branch_of(labels[near & in_lumen])}
     found.true("tube.exit.branch", stated.branch in branches, f"{stated.branch} against {sorted(branches)}")
     trachea = lung.tree.n_branches > 1 and stated.branch == 0
     found.true("tube.exit.not_trachea", not trachea, "the trachea lies in the mediastinum")
@@ -161,7 +142,8 @@ def _check_exit(
     found.agrees("tube.exit.angle", stated.wall_angle_rad, angle, WALL_ANGLE_TOLERANCE_RAD, "rad")
     limit = float(np.deg2rad(plan.system.tubes.min_wall_angle_deg))
     found.at_least("tube.exit.angle.stated_limit", stated.wall_angle_rad, limit, "rad")
-    found.at_least("tube.exit.angle.limit", angle, limit - WALL_ANGLE_TOLERANCE_RAD, "rad")
+    detail = "recomputed angle to the wall"
+    found.at_least("tube.exit.angle.limit", angle, limit, "rad", detail, WALL_ANGLE_TOLERANCE_RAD)
     return Exit(frame=last, arc_mm=arc_mm, branch=exemption.branch)
 
 
@@ -240,21 +222,23 @@ def _check_containment(
 def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:
     """Return the frame from which on, up to the exit, the tube's rim is never wholly in the lumen."""
     phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
-    for frame in range(way_out.frame, -1, -1):
-        device = plan.system.tubes
-        tube = device.outer if curve.arc_mm[frame] <= plan.tube.outer_insertion_mm else device.inner
-        x, y, centre = curve.frames[frame, :3, 0], curve.frames[frame, :3, 1], curve.points[frame]
-        rim = centre + 0.5 * tube.outer_diameter_mm * (np.cos(phi)[:, None] * x + np.sin(phi)[:, None] * y)
-        if ((labels_at(lung, rim) & structures.LUMEN) != 0).all():
-            return frame
-    return 0
+    device, frames = plan.system.tubes, curve.frames[: way_out.frame + 1, None, :3]
+    radius = 0.5 * np.where(
+        curve.arc_mm[: way_out.frame + 1] <= plan.tube.outer_insertion_mm,
+        device.outer.outer_diameter_mm,
+        device.inner.outer_diameter_mm,
+    )
+    across = np.cos(phi)[:, None] * frames[..., 0] + np.sin(phi)[:, None] * frames[..., 1]
+    rim = frames[..., 3] + radius[:, None, None] * across
+    wet = ((labels_at(lung, rim) & structures.LUMEN) != 0).reshape(len(radius), RIM_POINTS).all(axis=1)
+    return int(np.flatnonzero(wet)[-1]) if wet.any() else 0
 
 
 def _check_clearance(
-    plan: Plan, lung: Lung, curve: Curve, way_out: Exit, sweep_mm: float, found: Findings
+    plan: Plan, scene: Scene, curve: Curve, way_out: Exit, sweep_mm: float, found: Findings
 ) -> None:
     """From its first contact with the wall on, each tube keeps radius, margins and sweep from obstacles."""
-    contact = _first_contact(lung, curve, way_out, plan)
+    contact = _first_contact(scene.lung, curve, way_out, plan)
     margin = plan.system.margins.total_mm + sweep_mm
     tubes = plan.system.tubes
     radius = np.where(
@@ -263,17 +247,15 @@ def _check_clearance(
         0.5 * tubes.inner.outer_diameter_mm,
     )
     needed = radius + margin + curve.sagitta_mm
-    region = region_around(lung, curve.points[contact:], REACH_MM)
     for name, select, first in obstacles_of(way_out.branch, contact, way_out.frame):
-        boxes = Boxes(region, select)
+        boxes = scene.boxes(select, REACH_MM)
         points = curve.points[first:]
-        if name != "fissure" or plan.fissures_are_obstacles:
-            gap = segment_clearance_mm(boxes, points, float(needed.max()) + 1.0)
-            spare = float((gap - needed[first:]).min())
-            found.at_least(f"tube.clearance.{name}", spare, -CLEARANCE_TOLERANCE_MM, "mm", SPARE)
-        least = float(boxes.distance_mm(points).min())
-        most = float(boxes.distance_mm(curve.points[way_out.frame :]).min())
-        diagonal = float(np.linalg.norm(region.grid.spacing_mm))
+        least = check_clear(
+            f"tube.clearance.{name}", boxes, points, needed[first:], found,
+            limited=name != "fissure" or plan.fissures_are_obstacles,
+        )  # fmt: skip
+        most = boxes.least_mm(curve.points[way_out.frame :])
+        diagonal = float(np.linalg.norm(scene.lung.grid.spacing_mm))
         check_stated_clearance(plan, "tube", name, (least, most), diagonal, found)
 
 
@@ -288,20 +270,3 @@ def obstacles_of(branch: int, contact: int, way_out: int) -> list[tuple[str, Sel
         ("fissure", has(structures.FISSURE), contact),
         ("airway", airway_except(branch), way_out),
     ]
-
-
-def check_stated_clearance(
-    plan: Plan, stage: str, name: str, range_mm: tuple[float, float], diagonal_mm: float, found: Findings
-) -> None:
-    """Record whether a stated clearance is true: not more than there is, nor much less.
-
-    `range_mm` is what was recomputed; the tube's differs with and without its contact in the lumen.
-    """
-    stated = plan.clearance_mm.get(stage, {}).get(name)
-    if stated is None:
-        return
-    least, most = range_mm
-    label = f"{stage}.clearance.{name}.stated"
-    found.at_most(label, min(stated, REACH_MM), most + STATED_TOLERANCE_MM, "mm", "not more than recomputed")
-    limit = min(least, STATED_MM) - diagonal_mm - UNDERSTATED_MM
-    found.at_least(f"{label}.least", stated, limit, "mm", "not much less than recomputed")

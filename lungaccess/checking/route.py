@@ -5,22 +5,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from anatomy import structures
 from anatomy.grid import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
-from lungaccess.checking.shapes import distance_to_polyline
-from lungaccess.checking.space import Boxes, labels_at, not_lumen, region_around
+from lungaccess.checking.scene import AirwayAxis, Scene
+from lungaccess.checking.space import labels_at, not_lumen
 from lungaccess.plans import Plan, ScopeRoute
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
-    from anatomy.lung import Lung
 
 SAMPLE_MM = 0.1
 AXIS_TOLERANCE_MM = 0.01
+SAME_MM = 1e-6
+"""Points of a route that are nearer than this are the same."""
+
 MAX_STEP_MM = 5.0
 REACH_MM = 15.0
 RADIUS_TOLERANCE_MM = 0.05
@@ -38,18 +39,18 @@ BENDING_RADIUS_MM = 10.0
 """Smallest radius with which a scope bends there."""
 
 
-def check_route(plan: Plan, lung: Lung, found: Findings) -> None:
+def check_route(plan: Plan, scene: Scene, found: Findings) -> None:
     """Record everything about the bronchoscope."""
-    route, tree = plan.scope, lung.tree
-    astray_mm = _check_on_tree(route, tree, found)
+    route, lung = plan.scope, scene.lung
+    astray_mm = _check_on_tree(route, scene.axis, found)
     samples = _resample(route.points_lps, SAMPLE_MM)
     in_lumen = (labels_at(lung, samples) & structures.LUMEN) != 0
     detail = f"{int((~in_lumen).sum())} of {len(samples)} samples outside"
     found.true("scope.in_lumen", in_lumen.all(), detail)
     if astray_mm <= REACH_MM:
-        _check_fit(plan, lung, samples, found)
-    _check_tip(route, tree, found)
-    _check_statements(route, tree, found)
+        _check_fit(plan, scene, samples, found)
+    _check_tip(route, scene.axis, found)
+    _check_statements(route, lung.tree, found)
 
 
 def _resample(points: Float, step_mm: float) -> Float:
@@ -61,43 +62,52 @@ def _resample(points: Float, step_mm: float) -> Float:
     return np.concatenate(pieces)
 
 
-def _check_on_tree(route: ScopeRoute, tree: AirwayTree, found: Findings) -> float:
+def _check_on_tree(route: ScopeRoute, axis: AirwayAxis, found: Findings) -> float:
     """The route begins at the root and keeps to the edges of the airway tree; return how far it strays."""
-    points = route.points_lps
+    points, tree = route.points_lps, axis.tree
     start = float(np.linalg.norm(points[0] - tree.points_lps[0]))
     found.at_most("scope.start", start, AXIS_TOLERANCE_MM, "mm", "first point to the root of the airway tree")
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     found.at_most("scope.connected", float(steps.max()), MAX_STEP_MM, "mm", "largest step of the route")
     samples = _resample(points, 10.0 * SAMPLE_MM)
-    gaps = _distance_to_tree(samples, tree)
+    gaps = axis.distance_mm(samples)
     before_tip = np.linalg.norm(np.diff(samples, axis=0), axis=1)
     before_tip = np.append(np.cumsum(before_tip[::-1])[::-1], 0.0)
-    if _is_turned(route, tree):
+    if _is_turned(route, axis):
         _check_bend(points, gaps, before_tip, found)
         gaps = gaps[before_tip > MAX_OFF_AXIS_MM] if before_tip[0] > MAX_OFF_AXIS_MM else gaps[:1]
     found.at_most("scope.on_axis", float(gaps.max()), AXIS_TOLERANCE_MM, "mm", "route to airway axis")
-    nearest = cKDTree(tree.points_lps).query(points, k=min(3, tree.n_points))[1].reshape(len(points), -1)
+    nearest = axis.nearest_points(points, 3)
     same = (tree.branch_of_point[nearest] == route.branches[:, None]).any(axis=1)
     found.true("scope.branches", bool(same.all()), f"{int((~same).sum())} points name another branch")
     return float(gaps.max())
 
 
-def _axis_at_tip(route: ScopeRoute, tree: AirwayTree) -> Float:
+def _axis_at_tip(route: ScopeRoute, axis: AirwayAxis) -> Float:
     """Return the direction of the airway where the route ends."""
-    if 0 <= route.site_point < tree.n_points:
-        return np.asarray(tree.tangents[route.site_point])
-    return _tangent_between(tree, route.lps_from_scope_tip[:3, 3])
+    if 0 <= route.site_point < axis.tree.n_points:
+        return np.asarray(axis.tree.tangents[route.site_point])
+    return axis.tangent_at(route.lps_from_scope_tip[:3, 3])
 
 
-def _is_turned(route: ScopeRoute, tree: AirwayTree) -> bool:
+def _is_turned(route: ScopeRoute, axis: AirwayAxis) -> bool:
     """Tell whether the tip looks elsewhere than along the airway."""
-    tilt = angle_between(route.lps_from_scope_tip[:3, 2], _axis_at_tip(route, tree))
+    tilt = angle_between(route.lps_from_scope_tip[:3, 2], _axis_at_tip(route, axis))
     return float(tilt) > ANGLE_TOLERANCE_RAD
+
+
+def _apart(points: Float) -> Float:
+    """Return a polyline without the points that are where the one before them is: they have no direction."""
+    kept = [points[0]]
+    for point in points[1:]:
+        if np.linalg.norm(point - kept[-1]) > SAME_MM:
+            kept.append(point)
+    return np.array(kept)
 
 
 def _check_bend(points: Float, gaps: Float, before_tip: Float, found: Findings) -> None:
     """Where the route leaves the axis it bends no tighter than a scope can."""
-    steps = np.diff(points, axis=0)
+    steps = np.diff(_apart(points), axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     off = before_tip[gaps > AXIS_TOLERANCE_MM].max(initial=0.0)
     within = np.flatnonzero(np.cumsum(lengths[::-1])[::-1] < off)
@@ -110,44 +120,31 @@ def _check_bend(points: Float, gaps: Float, before_tip: Float, found: Findings) 
     )
 
 
-def _distance_to_tree(points: Float, tree: AirwayTree) -> Float:
-    """Return the distances from points to the nearest edge of the tree."""
-    child = np.flatnonzero(tree.parent_point >= 0)
-    a, b = tree.points_lps[tree.parent_point[child]], tree.points_lps[child]
-    longest = float(np.linalg.norm(b - a, axis=1).max())
-    middles = cKDTree(0.5 * (a + b))
-    gaps = np.array(middles.query(points)[0], dtype=np.float64)
-    for n, point in enumerate(points):
-        near = middles.query_ball_point(point, 0.5 * longest + 1.0)
-        lines = [distance_to_polyline(point[None], np.stack([a[e], b[e]]))[0] for e in near]
-        gaps[n] = min([gaps[n], *lines])
-    return gaps
-
-
-def _check_fit(plan: Plan, lung: Lung, samples: Float, found: Findings) -> None:
+def _check_fit(plan: Plan, scene: Scene, samples: Float, found: Findings) -> None:
     """The lumen is wide enough all along, and the stated radii and margin are not more than there is."""
     route, scope = plan.scope, plan.system.scope
-    boxes = Boxes(region_around(lung, samples, REACH_MM), not_lumen)
+    boxes = scene.boxes(not_lumen, REACH_MM)
     radius = 0.5 * scope.outer_diameter_mm
-    narrowest = float(boxes.distance_mm(samples).min())
+    narrowest = boxes.least_mm(samples)
     found.at_least(
         "scope.fits",
         narrowest,
-        radius + scope.lumen_margin_mm - POSITION_TOLERANCE_MM,
+        radius + scope.lumen_margin_mm,
         "mm",
         "smallest lumen radius, at points and between them; needed: radius of the scope plus its margin",
+        POSITION_TOLERANCE_MM,
     )
     stated = np.minimum(route.lumen_radius_mm, REACH_MM) - boxes.distance_mm(route.points_lps)
     found.at_most("scope.lumen_radius", float(stated.max()), RADIUS_TOLERANCE_MM, "mm", "stated beyond found")
-    slack = float(np.linalg.norm(lung.grid.spacing_mm))
+    slack = float(np.linalg.norm(scene.lung.grid.spacing_mm))
     found.at_least("scope.lumen_radius.least", float(stated.min()), -slack, "mm", "stated below found")
     over = route.min_lumen_margin_mm - (narrowest - radius)
     found.at_most("scope.margin", over, RADIUS_TOLERANCE_MM, "mm", "stated beyond recomputed margin")
 
 
-def _check_tip(route: ScopeRoute, tree: AirwayTree, found: Findings) -> None:
+def _check_tip(route: ScopeRoute, axis: AirwayAxis, found: Findings) -> None:
     """The tip stands at the end of the route and looks along the airway."""
-    pose = route.lps_from_scope_tip
+    pose, tree = route.lps_from_scope_tip, axis.tree
     if not check_rigid("scope.tip", pose, found):
         return
     found.agrees("scope.tip.position", pose[:3, 3], route.points_lps[-1], POSITION_TOLERANCE_MM, "mm")
@@ -156,29 +153,18 @@ def _check_tip(route: ScopeRoute, tree: AirwayTree, found: Findings) -> None:
         found.agrees("scope.site", route.points_lps[-1], tree.points_lps[site], POSITION_TOLERANCE_MM, "mm")
     else:
         found.true("scope.site", route.site_point == -1, f"site {route.site_point}")
-        gap = float(_distance_to_tree(pose[None, :3, 3], tree)[0])
+        gap = float(axis.distance_mm(pose[None, :3, 3])[0])
         found.at_most("scope.site.on_axis", gap, AXIS_TOLERANCE_MM, "mm", "tip to airway axis")
     # A tip looks along the airway's axis, or along the end of a route that leaves the axis.
     end = route.points_lps[-1] - route.points_lps[-2] if len(route.points_lps) > 1 else pose[:3, 2]
-    turned = _is_turned(route, tree)
-    tilt = float(angle_between(pose[:3, 2], end if turned else _axis_at_tip(route, tree)))
+    turned = _is_turned(route, axis)
+    tilt = float(angle_between(pose[:3, 2], end if turned else _axis_at_tip(route, axis)))
     of_what = "tip to the end of its route" if turned else "tip to airway axis"
     found.at_most("scope.tip.tangent", tilt, ANGLE_TOLERANCE_RAD, "rad", of_what)
     back = np.linalg.norm(route.points_lps - route.points_lps[-1], axis=1) >= CHORD_MM
     before = route.points_lps[np.flatnonzero(back)[-1]] if back.any() else route.points_lps[0]
     tilt = float(angle_between(pose[:3, 2], route.points_lps[-1] - before))
     found.at_most("scope.tip.forward", tilt, float(MAX_CHORD_ANGLE_RAD), "rad", "tip to the end of the route")
-
-
-def _tangent_between(tree: AirwayTree, point: Float) -> Float:
-    """Return the direction of the airway at a point on an edge of the tree, linear along the edge."""
-    child = np.flatnonzero(tree.parent_point >= 0)
-    parent = tree.parent_point[child]
-    begin, step = tree.points_lps[parent], tree.points_lps[child] - tree.points_lps[parent]
-    share = np.clip(((point - begin) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)[:, None]
-    edge = int(np.linalg.norm(begin + share * step - point, axis=1).argmin())
-    ends = tree.tangents[parent[edge]], tree.tangents[child[edge]]
-    return np.asarray((1.0 - share[edge]) * ends[0] + share[edge] * ends[1])
 
 
 def _check_statements(route: ScopeRoute, tree: AirwayTree, found: Findings) -> None:

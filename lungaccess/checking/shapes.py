@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from anatomy.grid import Float
 from stages.tube.device import ConcentricTubes
 
 TINY_MM = 1e-9
+TERMS = 14
+"""Of the exponential series for a matrix of norm 1/4: the next term is less than 1e-20."""
+
 STEP_MM = 0.05
 """Largest integration step; the sagitta of one step at a curvature of 0.025 / mm is 8e-6 mm."""
 
@@ -65,6 +66,20 @@ class Curve:
         return np.asarray(self.frames[-1])
 
 
+def expm(matrix: Float) -> Float:
+    """Return the exponential of a small matrix: the power series of a fraction of it, squared up again."""
+    size = float(np.abs(matrix).sum(axis=0).max())
+    halvings = max(int(np.ceil(np.log2(max(size, 1e-300)))) + 2, 0)
+    fraction = matrix / 2.0**halvings
+    term = total = np.eye(len(matrix))
+    for n in range(1, TERMS + 1):
+        term = term @ fraction / n
+        total = total + term
+    for _ in range(halvings):
+        total = total @ total
+    return total
+
+
 def twist(curvature_per_mm: float) -> Float:
     """Return the `(4, 4)` unicycle twist: forward along +z at unit speed, bending towards +x."""
     matrix = np.zeros((4, 4))
@@ -77,7 +92,7 @@ def turn(angle_rad: float) -> Float:
     """Return the `(4, 4)` rotation about +z, as the exponential of its generator."""
     generator = np.zeros((4, 4))
     generator[1, 0], generator[0, 1] = angle_rad, -angle_rad
-    return np.asarray(expm(generator))
+    return expm(generator)
 
 
 def integrate(lps_from_start: Float, pieces: Sequence[Piece]) -> Curve:
@@ -184,9 +199,7 @@ def distance_to_polyline(points: Float, line: Float) -> Float:
     """Return the `(n,)` distances from points `(n, d)` to a polyline `(m, d)`, m >= 2."""
     start, step = line[:-1], np.diff(line, axis=0)
     length = np.maximum((step**2).sum(axis=1), 1e-300)
-    best: NDArray[np.float64] = np.full(len(points), np.inf)
-    for n, point in enumerate(points):
-        along = np.clip(((point - start) * step).sum(axis=1) / length, 0.0, 1.0)
-        gap = point - start - along[:, None] * step
-        best[n] = np.sqrt((gap**2).sum(axis=1).min())
-    return best
+    away = points[:, None, :] - start
+    along = np.clip((away * step).sum(axis=2) / length, 0.0, 1.0)
+    gap = away - along[:, :, None] * step
+    return np.asarray(np.sqrt((gap**2).sum(axis=2).min(axis=1)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.grid import Float
-from lungaccess.checking.deployment import CLEARANCE_TOLERANCE_MM, REACH_MM, SPARE, check_stated_clearance
+from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import (
     ANGLE_TOLERANCE_RAD,
@@ -18,18 +18,9 @@ from lungaccess.checking.poses import (
     check_rigid,
     check_same_pose,
 )
+from lungaccess.checking.scene import Scene
 from lungaccess.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
-from lungaccess.checking.space import (
-    Boxes,
-    Region,
-    Select,
-    airway_except,
-    branch_of,
-    has,
-    labels_at,
-    region_around,
-    segment_clearance_mm,
-)
+from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
 from lungaccess.plans import Plan
 
 if TYPE_CHECKING:
@@ -46,9 +37,9 @@ GREATEST_VOXEL_COST = 1.0
 GRAZED_MM = 1e-9
 
 
-def check_needle(plan: Plan, lung: Lung, tube_end: Float | None, found: Findings) -> None:
+def check_needle(plan: Plan, scene: Scene, tube_end: Float | None, found: Findings) -> None:
     """Record everything about the needle, the target and the costs."""
-    needle = plan.needle
+    needle, lung = plan.needle, scene.lung
     if not check_rigid("needle.start", needle.lps_from_start, found):
         return
     check_same_pose("needle.start", needle.lps_from_start, plan.tube.lps_from_tip, found)
@@ -64,9 +55,8 @@ def check_needle(plan: Plan, lung: Lung, tube_end: Float | None, found: Findings
     _check_target(plan, lung, curve, found)
     _check_exemption(plan, found)
     _check_containment(plan, lung, curve, found)
-    region = region_around(lung, curve.points, REACH_MM)
-    _check_clearance(plan, region, curve, found)
-    _check_costs(plan, lung, region, curve, found)
+    _check_clearance(plan, scene, curve, found)
+    _check_costs(plan, scene, curve, found)
 
 
 def _check_motion(plan: Plan, curve: Curve, found: Findings) -> bool:
@@ -74,20 +64,25 @@ def _check_motion(plan: Plan, curve: Curve, found: Findings) -> bool:
     needle, device = plan.needle, plan.system.needle
     curvature = [arc.curvature_per_mm for arc in needle.arcs]
     bound = device.max_curvature_per_mm
-    found.at_most("needle.curvature", max(curvature), bound * (1.0 + LIMIT_TOLERANCE), "1/mm")
+    detail = "tightest arc"
+    found.at_most("needle.curvature", max(curvature), bound, "1/mm", detail, LIMIT_TOLERANCE * bound)
     found.at_least("needle.curvature.sign", min(curvature), 0.0, "1/mm", "a bend is turned by its roll")
     found.at_least("needle.arc_length", min(arc.length_mm for arc in needle.arcs), 1e-9, "mm", "shortest arc")
     length = float(sum(arc.length_mm for arc in needle.arcs))
     found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
-    fits = found.at_most("needle.length.limit", length, device.max_length_mm + LENGTH_TOLERANCE_MM, "mm")
+    detail = "sum of the arcs"
+    fits = found.at_most(
+        "needle.length.limit", length, device.max_length_mm, "mm", detail, LENGTH_TOLERANCE_MM
+    )
     turned = float(angle_between(curve.tangents[:-1], curve.tangents[1:]).sum())
     found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
-    limit = float(np.deg2rad(device.max_accumulated_turn_deg)) + ANGLE_TOLERANCE_RAD
-    found.at_most("needle.turn.limit", turned, limit, "rad", "sum of all turning")
+    limit = float(np.deg2rad(device.max_accumulated_turn_deg))
+    found.at_most("needle.turn.limit", turned, limit, "rad", "sum of all turning", ANGLE_TOLERANCE_RAD)
     angle = float(angle_between(curve.tangents, curve.tangents[0]).max())
     found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
-    limit = float(np.deg2rad(device.max_angle_from_start_deg)) + ANGLE_TOLERANCE_RAD
-    found.at_most("needle.angle.limit", angle, limit, "rad", "largest angle from the start direction")
+    limit = float(np.deg2rad(device.max_angle_from_start_deg))
+    detail = "largest angle from the start direction"
+    found.at_most("needle.angle.limit", angle, limit, "rad", detail, ANGLE_TOLERANCE_RAD)
     return fits
 
 
@@ -124,8 +119,8 @@ def forbidden_bits(plan: Plan) -> int:
 def _check_exemption(plan: Plan, found: Findings) -> None:
     """The exemption is not longer than the device's; its branch and point are judged with the tube's exit."""
     exempt = plan.exemption.needle_length_mm
-    limit = plan.system.needle.exit_exemption_mm + LENGTH_TOLERANCE_MM
-    found.at_most("exemption.length", exempt, limit, "mm", "needle that may be near the pierced wall")
+    limit, detail = plan.system.needle.exit_exemption_mm, "needle that may be near the pierced wall"
+    found.at_most("exemption.length", exempt, limit, "mm", detail, LENGTH_TOLERANCE_MM)
     found.at_least("exemption.length.sign", exempt, 0.0, "mm")
 
 
@@ -143,7 +138,7 @@ def _check_containment(plan: Plan, lung: Lung, curve: Curve, found: Findings) ->
     found.true("needle.containment", not hit.any(), f"{int(hit.sum())} samples in an obstacle")
 
 
-def _check_clearance(plan: Plan, region: Region, curve: Curve, found: Findings) -> None:
+def _check_clearance(plan: Plan, scene: Scene, curve: Curve, found: Findings) -> None:
     """The needle, as capsules padded by the sagitta, keeps radius and margins from every structure."""
     radius = 0.5 * plan.system.needle.diameter_mm
     required = radius + plan.system.margins.total_mm
@@ -162,17 +157,18 @@ def _check_clearance(plan: Plan, region: Region, curve: Curve, found: Findings) 
         first, last = _stretch(where)
         if last - first < 1:
             continue
-        boxes = Boxes(region, select)
-        points = curve.points[first : last + 1]
-        if name != "fissure" or plan.fissures_are_obstacles:
-            gap = segment_clearance_mm(boxes, points, needed + 1.0) - curve.sagitta_mm[first:last]
-            spare = float(gap.min()) - needed
-            found.at_least(f"needle.clearance.{name}", spare, -CLEARANCE_TOLERANCE_MM, "mm", SPARE)
-        nearest[name] = float(boxes.distance_mm(points).min())
+        nearest[name] = check_clear(
+            f"needle.clearance.{name}",
+            scene.boxes(select, REACH_MM),
+            curve.points[first : last + 1],
+            needed + curve.sagitta_mm[first:last],
+            found,
+            limited=name != "fissure" or plan.fissures_are_obstacles,
+        )
     # Towards the airway counts all of it behind the exempt length, and other branches before.
     airway = min(nearest.pop("airway", REACH_MM), nearest.pop("other_airway", REACH_MM))
     nearest.pop("lumen", None)
-    diagonal = float(np.linalg.norm(region.grid.spacing_mm))
+    diagonal = float(np.linalg.norm(scene.lung.grid.spacing_mm))
     for name, exact in {**nearest, "airway": airway}.items():
         check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
 
@@ -185,7 +181,7 @@ def _stretch(where: np.ndarray) -> tuple[int, int]:
     return int(frames[0]), min(int(frames[-1]) + 1, len(where) - 1)
 
 
-def _check_costs(plan: Plan, lung: Lung, region: Region, curve: Curve, found: Findings) -> None:
+def _check_costs(plan: Plan, scene: Scene, curve: Curve, found: Findings) -> None:
     """The stated costs are those of the re-integrated needle."""
     stated: Mapping[str, float] = plan.costs
     names = {"inverse_clearance", "cost_map", "length_mm"}
@@ -193,17 +189,17 @@ def _check_costs(plan: Plan, lung: Lung, region: Region, curve: Curve, found: Fi
         return
     found.true("costs.objective", plan.objective in stated, plan.objective)
     found.agrees("costs.length_mm", stated["length_mm"], curve.arc_mm[-1], LENGTH_TOLERANCE_MM, "mm")
-    recomputed = inverse_clearance(plan, region, curve)
+    recomputed = inverse_clearance(plan, scene, curve)
     tolerance = COST_TOLERANCE * recomputed
     found.agrees("costs.inverse_clearance", stated["inverse_clearance"], recomputed, tolerance, "")
-    mapped, summed = cost_map_integral_and_sum(lung, curve)
+    mapped, summed = cost_map_integral_and_sum(scene.lung, curve)
     found.agrees("costs.cost_map", stated["cost_map"], mapped, COST_TOLERANCE * mapped + 1e-6, "mm")
     if "voxel_sum" in stated:
         tolerance = COST_TOLERANCE * summed + GREATEST_VOXEL_COST
         found.agrees("costs.voxel_sum", stated["voxel_sum"], summed, tolerance, "")
 
 
-def inverse_clearance(plan: Plan, region: Region, curve: Curve) -> float:
+def inverse_clearance(plan: Plan, scene: Scene, curve: Curve) -> float:
     """Return the integral of 1 / clearance over the needle's length [Kuntz2015], by the trapezoid rule.
 
     The clearance to the nearest obstacle, voxels as solid boxes, is not taken below 0.1 mm nor above
@@ -212,7 +208,7 @@ def inverse_clearance(plan: Plan, region: Region, curve: Curve) -> float:
     length = float(curve.arc_mm[-1])
     arc = np.linspace(0.0, length, max(int(np.ceil(length / COST_STEP_MM)), 1) + 1)
     points = np.stack([np.interp(arc, curve.arc_mm, curve.points[:, axis]) for axis in range(3)], axis=1)
-    clearance = Boxes(region, has(forbidden_bits(plan))).distance_mm(points)
+    clearance = scene.boxes(has(forbidden_bits(plan)), REACH_MM).distance_mm(points)
     return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
 
 

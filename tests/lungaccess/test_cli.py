@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ import pytest
 
 from anatomy.errors import AnatomyError, FrameError
 from lungaccess import cli, run, terminal
+from lungaccess.checking import CheckReport, Finding
 from lungaccess.noplan import NoPlan
 from lungaccess.plans import Plan
 
@@ -65,10 +67,16 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
 
     def judge(plan: Plan, lung: Any, system: Any = None, target_lps: Any = None) -> Any:
         seen["judged_with"] = system
-        bad = SimpleNamespace(
-            name="needle.clearance.vessel", ok=seen["accepted"], value=0.4, limit=1.0, unit="mm", detail="why"
+        bad = Finding(
+            name="needle.clearance.vessel",
+            ok=seen["accepted"],
+            value=0.4,
+            limit=1.0,
+            side="at least",
+            unit="mm",
+            detail="why",
         )
-        return SimpleNamespace(accepted=seen["accepted"], findings=(bad,))
+        return CheckReport(accepted=seen["accepted"], findings=(bad,))
 
     monkeypatch.setattr(cli, "load_lung", lambda patient, cache: toy_lung)
     monkeypatch.setattr(run, "_atlas", lambda *_: None)
@@ -245,6 +253,21 @@ def test_check_exits_with_its_verdict(
     assert toy_commands["judged_with"] is None
     cli.main(["check", str(tmp_path / "plan.json"), "toy", "--system", "ultrathin"])
     assert toy_commands["judged_with"].name == "ultrathin"
+
+
+def test_check_shows_value_limit_and_margin(
+    toy_commands: dict[str, Any], toy_plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toy_plan.save(tmp_path / "plan.json")
+    words = ["check", str(tmp_path / "plan.json"), "toy"]
+    toy_commands["accepted"] = False
+    assert cli.main(words) == cli.NO_PLAN
+    row = next(line for line in capsys.readouterr().out.splitlines() if "needle.clearance.vessel" in line)
+    assert " ".join(row.split()) == "refused needle.clearance.vessel 0.4 mm at least 1 -0.6 why"
+    assert cli.main([*words, "--json"]) == cli.NO_PLAN
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert finding["margin"] == pytest.approx(-0.6)
+    assert (finding["stage"], finding["side"], finding["ok"]) == ("needle", "at least", False)
 
 
 @pytest.mark.slow

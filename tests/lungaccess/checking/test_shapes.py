@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from anatomy import structures
 from lungaccess.checking import shapes
+from lungaccess.checking.boxes import Boxes
 from lungaccess.checking.poses import angle_between
-from lungaccess.checking.space import Boxes, has, labels_at, not_lumen, region_around, segment_clearance_mm
+from lungaccess.checking.scene import AirwayAxis
+from lungaccess.checking.space import Select, airway_except, has, labels_at, not_lumen
+from lungaccess.checking.tiles import Tiles
 
 ARC = st.tuples(st.floats(0.01, 20.0), st.floats(-6.3, 6.3), st.floats(0.0, 0.05))
 
@@ -67,31 +73,97 @@ def test_follow_the_leader_within_the_curved_length(system: Any) -> None:
         assert shapes.distance_to_polyline(shapes.planar_shape(bend, 0.5), final).max() < 1e-3
 
 
-@settings(max_examples=15)
-@given(data=st.data())
-def test_box_distances_against_brute_force(lung: Any, tools: Any, data: st.DataObject) -> None:
-    low, high = np.array([20.0, -20.0, 5.0]), np.array([75.0, 20.0, 70.0])
-    share = np.array(data.draw(st.lists(st.floats(0, 1), min_size=12, max_size=12))).reshape(4, 3)
-    points = low + share * (high - low)
-    for select in (has(structures.VESSEL), not_lumen, has(structures.AIRWAY | structures.OUTSIDE)):
-        boxes = Boxes(region_around(lung, points, 20.0), select)
-        wanted = tools.brute_distance(lung, select(lung.labels), points)
-        np.testing.assert_allclose(boxes.distance_mm(points), wanted, atol=1e-9)
+@given(curvature=st.floats(0.0, 1.0), length=st.floats(1e-6, 50.0), turn=st.floats(-7.0, 7.0))
+def test_exponential_against_that_of_scipy(curvature: float, length: float, turn: float) -> None:
+    for matrix in (shapes.twist(curvature) * length, shapes.twist(0.0) * turn):
+        np.testing.assert_allclose(shapes.expm(matrix), expm(matrix), rtol=1e-12, atol=1e-12)
 
 
-def test_segments_and_points_give_the_same_clearance(lung: Any, plan: Any) -> None:
+SELECTS = (
+    has(structures.VESSEL),
+    has(structures.AIRWAY),
+    has(structures.LUMEN),
+    has(structures.OBSTACLES | structures.FISSURE),
+    not_lumen,
+    airway_except(0),
+    airway_except(1),
+    airway_except(7),
+)
+LOW, HIGH = np.array([20.0, -26.0, 5.0]), np.array([88.0, 26.0, 92.0])
+
+
+def drawn_points(data: st.DataObject, count: int) -> np.ndarray:
+    share = data.draw(st.lists(st.floats(0, 1), min_size=3 * count, max_size=3 * count))
+    return LOW + np.array(share).reshape(count, 3) * (HIGH - LOW)
+
+
+@pytest.fixture(scope="module")
+def tiles(lung: Any) -> Tiles:
+    """One for all examples: what was kept from the one before must serve the next."""
+    return Tiles(lung)
+
+
+def wanted_mm(lung: Any, tools: Any, select: Select, points: np.ndarray) -> np.ndarray:
+    """Brute force over every voxel of the lung and of a rim of two voxels around it, which is outside."""
+    labels = np.pad(lung.labels, 2, constant_values=structures.OUTSIDE)
+    grid = lung.grid.crop((-2, -2, -2), np.asarray(lung.labels.shape) + 2)
+    return np.asarray(tools.brute_distance(SimpleNamespace(grid=grid), select(labels), points))
+
+
+@settings(max_examples=25)
+@given(data=st.data(), select=st.sampled_from(SELECTS))
+def test_box_distances_against_brute_force(
+    lung: Any, tiles: Tiles, tools: Any, data: st.DataObject, select: Select
+) -> None:
+    points = drawn_points(data, 4)
+    wanted = wanted_mm(lung, tools, select, points)
+    np.testing.assert_allclose(Boxes(tiles, select, 20.0).distance_mm(points), wanted, atol=1e-9)
+    np.testing.assert_allclose(Boxes(Tiles(lung), select, 20.0).distance_mm(points), wanted, atol=1e-9)
+
+
+@settings(max_examples=25)
+@given(data=st.data(), select=st.sampled_from(SELECTS))
+def test_least_distance_of_a_path_is_that_of_its_points(
+    tiles: Tiles, data: st.DataObject, select: Select
+) -> None:
+    corners = drawn_points(data, 3)
+    t = np.linspace(0.0, 1.0, 150)[:, None]
+    path = np.concatenate([a + t * (b - a) for a, b in zip(corners[:-1], corners[1:], strict=True)])
+    boxes = Boxes(tiles, select, 20.0)
+    assert boxes.least_mm(path) == boxes.distance_mm(path).min()
+
+
+@settings(max_examples=25)
+@given(data=st.data(), select=st.sampled_from(SELECTS), within=st.floats(0.3, 20.0))
+def test_segments_and_points_give_the_same_clearance(
+    tiles: Tiles, data: st.DataObject, select: Select, within: float
+) -> None:
     """FCL on the exact surface against the search among boxes."""
-    points = plan.needle.lps_from_start[:3, 3] + np.linspace(0, 1, 300)[:, None] * [25.0, 4.0, -6.0]
-    boxes = Boxes(region_around(lung, points, 20.0), has(structures.VESSEL))
-    segments = segment_clearance_mm(boxes, points, 20.0)
-    exact = boxes.distance_mm(points)
-    step = float(np.linalg.norm(points[1] - points[0]))
-    assert (segments <= np.minimum(exact[:-1], exact[1:]) + 1e-9).all()
-    assert (segments >= np.minimum(exact[:-1], exact[1:]) - step / 2 - 1e-9).all()
+    a, b = drawn_points(data, 2)
+    path = a + np.linspace(0.0, 1.0, 200)[:, None] * (b - a)
+    boxes = Boxes(tiles, select, 20.0)
+    segments, exact = boxes.segments_mm(path, within), boxes.distance_mm(path)
+    step = float(np.linalg.norm(path[1] - path[0]))
+    ends = np.minimum(exact[:-1], exact[1:])
+    assert (segments <= np.minimum(ends, within) + 1e-9).all()
+    assert (segments >= np.minimum(ends - step / 2, within) - 1e-9).all()
 
 
 def test_beyond_the_grid_is_outside(lung: Any) -> None:
     far = lung.grid.lps([[-3.0, 5.0, 5.0], [5.0, 5.0, 500.0]])
     assert (labels_at(lung, far) == structures.OUTSIDE).all()
-    boxes = Boxes(region_around(lung, far, 20.0), has(structures.OUTSIDE))
-    assert (boxes.distance_mm(far) == 0.0).all()
+    assert (Boxes(Tiles(lung), has(structures.OUTSIDE), 20.0).distance_mm(far) == 0.0).all()
+    assert (Boxes(Tiles(lung), has(structures.VESSEL), 20.0).distance_mm(far)[1] == 20.0).all()
+
+
+@settings(max_examples=20)
+@given(data=st.data())
+def test_distance_to_the_airway_axis_against_all_edges(lung: Any, data: st.DataObject) -> None:
+    points, tree = drawn_points(data, 5), lung.tree
+    child = np.flatnonzero(tree.parent_point >= 0)
+    begin = tree.points_lps[tree.parent_point[child]]
+    step = tree.points_lps[child] - begin
+    away = points[:, None] - begin
+    share = np.clip((away * step).sum(axis=2) / (step**2).sum(axis=1), 0.0, 1.0)[..., None]
+    wanted = np.linalg.norm(away - share * step, axis=2).min(axis=1)
+    np.testing.assert_allclose(AirwayAxis(tree).distance_mm(points), wanted, atol=1e-9)

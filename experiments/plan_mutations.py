@@ -1,0 +1,24 @@
+"""All mutations by name, and a random one that applies to a plan."""
+
+from __future__ import annotations
+
+import mutants_of_motion
+import mutants_of_place
+import mutants_of_record
+import mutants_of_tissue
+from mutants import Case, Mutant, Mutation, Rng
+
+MUTATIONS: dict[str, Mutation] = {
+    mutation.__name__: mutation
+    for family in (mutants_of_record, mutants_of_motion, mutants_of_place, mutants_of_tissue)
+    for mutation in family.MUTATIONS
+}
+
+
+def mutate(case: Case, rng: Rng) -> tuple[str, Mutant]:
+    """Return the name of a random mutation that applies, and its mutant."""
+    while True:
+        name = str(rng.choice(list(MUTATIONS)))
+        mutant = MUTATIONS[name](case, rng)
+        if mutant is not None:
+            return name, mutant

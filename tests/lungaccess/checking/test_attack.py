@@ -1,0 +1,143 @@
+"""Random plans of a synthetic patient are accepted, and every kind of mutant of them is refused."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lungaccess as la
+from anatomy.lung import Lung
+from anatomy.settings import override
+from lungaccess.checking import Checker, check
+from lungaccess.plans import Plan
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "experiments"))
+
+import check_attack
+import random_plans
+from mutants import Case
+from plan_mutations import MUTATIONS
+
+PLANS_A_SYSTEM = 8
+MUTANTS_OF_A_KIND = 4
+
+
+def systems() -> list[la.System]:
+    """A preset, and a device of its own that may cross fissures and bends tightly."""
+    preset = la.load_system("ultrathin")
+    own = {
+        "name": "own",
+        "fissures_allowed": True,
+        "needle.max_curvature_per_mm": 0.02,
+        "needle.exit_exemption_mm": 3.0,
+        "tubes.max_lateral_sweep_mm": 2.0,
+        "tubes.inner.curved_length_mm": 20.0,
+        "margins.registration_margin_mm": 0.2,
+    }
+    return [preset, override(preset, own)]
+
+
+@pytest.fixture(scope="module")
+def judge(small_lung: Lung) -> Any:
+    return check_attack.Judge(small_lung)
+
+
+@pytest.fixture(scope="module")
+def made(small_lung: Lung) -> list[tuple[Any, Any, Plan]]:
+    """Systems, targets and plans, made in all the ways there are."""
+    found = []
+    for number, system in enumerate(systems()):
+        rng = np.random.default_rng(number)
+        atlas = la.build_atlas(small_lung, system, rotations=12, stop_spacing_mm=4.0, site_spacing_mm=3.0)
+        mine: list[tuple[Any, Any, Plan]] = []
+        while len(mine) < PLANS_A_SYSTEM or not any(len(plan.needle.arcs) > 1 for _, _, plan in mine):
+            target = random_plans.random_target(small_lung, atlas, rng)
+            if target is not None:
+                plans = random_plans.plans_to(small_lung, system, target, atlas, rng)
+                mine += [(system, plan.target_lps, plan) for plan in plans]
+        found += mine
+    return found
+
+
+@pytest.fixture(scope="module")
+def cases(made: list[tuple[Any, Any, Plan]], judge: Any, small_lung: Lung) -> list[tuple[Any, Any, Case]]:
+    return [
+        (
+            system,
+            target,
+            Case(
+                lung=small_lung,
+                plan=plan,
+                report=judge.of_plan(plan, system, target),
+                other=made[n - 1][2],
+            ),
+        )
+        for n, (system, target, plan) in enumerate(made)
+    ]
+
+
+def test_every_plan_is_accepted(cases: list[tuple[Any, Any, Case]]) -> None:
+    assert [case.report.refusals for _, _, case in cases] == [()] * len(cases)
+    assert len({case.plan.method for _, _, case in cases}) > 1
+    assert any(case.plan.fissures_are_obstacles for _, _, case in cases)
+
+
+@pytest.mark.parametrize("kind", MUTATIONS)
+def test_every_kind_of_mutant_is_refused(kind: str, cases: list[tuple[Any, Any, Case]], judge: Any) -> None:
+    rng = np.random.default_rng(0)
+    refused = 0
+    for n in range(200):
+        system, target, case = cases[n % len(cases)]
+        mutant = MUTATIONS[kind](case, rng)
+        if mutant is not None:
+            assert not judge.of_mutant(mutant, system, target).accepted, f"mutant {n} of {kind}"
+            refused += 1
+        if refused == MUTANTS_OF_A_KIND:
+            return
+    raise AssertionError(f"{kind} made {refused} mutants")
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 2**32), number=st.integers(0, 2 * PLANS_A_SYSTEM - 1))
+def test_random_mutants_are_refused(
+    seed: int, number: int, cases: list[tuple[Any, Any, Case]], judge: Any
+) -> None:
+    system, target, case = cases[number]
+    kind, mutant = check_attack.mutate(case, np.random.default_rng(seed))
+    assert not judge.of_mutant(mutant, system, target).accepted, kind
+
+
+def test_a_checker_that_has_seen_other_plans_says_the_same(
+    cases: list[tuple[Any, Any, Case]], small_lung: Lung
+) -> None:
+    """What is kept from one plan to the next changes nothing."""
+    checker = Checker(small_lung)
+    for _ in range(2):
+        for _system, _target, case in cases[::4]:
+            assert checker.check(case.plan).findings == check(case.plan, small_lung).findings
+
+
+def test_a_run_that_was_interrupted_goes_on(
+    small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(random_plans, "PLANS_A_BATCH", 2)
+    monkeypatch.setattr("lungaccess.explain.explain", lambda *_: la.NoPlan("No plan", reasons={}))
+    monkeypatch.setattr(random_plans, "random_system", lambda _rng: la.load_system("ultrathin"))
+    files = [tmp_path / name for name in ("at-once.jsonl", "in-parts.jsonl")]
+    for file, parts in zip(files, [(4,), (2, 4)], strict=True):
+        for plans in parts:
+            check_attack.run("small", small_lung, plans, 0, file, tmp_path)
+    records = [[_lasting(each) for each in check_attack.read(file)] for file in files]
+    assert records[0] == records[1]
+    assert sum("accepted" in each for each in records[0]) == 4
+    assert "all" in check_attack.table(check_attack.read(files[0]))
+
+
+def _lasting(record: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in record.items() if not key.endswith("_s")}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,12 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from lungaccess.system import System
+from stages.needle.bundles import StartIndex
+from stages.scope.collision import Scene
+from stages.scope.kinematics import model_of
+from stages.scope.lumen import lumen_of_lung
+from stages.scope.navigation import navigation_field
+from stages.scope.orientability import orientability
 from stages.scope.sites import Sites, sites
 from stages.tube.deployments import (
     DEFAULT_ROTATIONS,
@@ -21,6 +28,7 @@ from stages.tube.deployments import (
     joined,
     tracking_length_mm,
 )
+from stages.tube.mechanics import TubeMechanics
 
 SITE_SPACING_MM = 1.0
 TURNED_COARSER = 2
@@ -53,6 +61,53 @@ class Atlas:
     def site_pose(self, site: int) -> Float:
         """Return point and tangent `(6,)` of a site."""
         return np.asarray(self.sites.poses[site])
+
+    @cached_property
+    def index(self) -> StartIndex:
+        """Finds the deployments with a target in the needle's workspace, for any needle."""
+        return StartIndex(self.deployments.positions, self.deployments.tangents)
+
+    @cached_property
+    def exit_clearance_mm(self) -> Float:
+        """For each deployment `(E,)`, by how much its tip is clearer of vessels and pleura than it must be.
+
+        A lower bound, mm, of the distance from the tip of the inner tube to vessels, pleura and, where they
+        are obstacles, fissures, less the tube's radius and the margins.  Airways do not count: the tube has
+        just pierced one.
+        """
+        names = ("vessel", "pleura", "fissure") if self.with_fissures else ("vessel", "pleura")
+        tips = self.deployments.positions
+        nearest = np.min([self.lung.fields[name].lower_bound_mm(tips) for name in names], axis=0)
+        required = self.system.tubes.inner.radius_mm + self.system.margins.total_mm
+        return np.asarray(nearest - required)
+
+    @cached_property
+    def stability(self) -> Float:
+        """For each deployment `(E,)`, the least determinant of its tubes in torsion: stable above 0.
+
+        1 is that of tubes which do not wind each other up; see `stages.tube.mechanics.Equilibrium`.
+        """
+        entries, tubes = self.deployments, self.system.tubes
+        insertions, which = np.unique(
+            np.stack([entries.inner_mm, entries.outer_mm], axis=1), axis=0, return_inverse=True
+        )
+        rear_ends = insertions - np.array([tubes.inner.length_mm, tubes.outer.length_mm])
+        solved = TubeMechanics((tubes.inner, tubes.outer)).batch(np.zeros_like(rear_ends), rear_ends)
+        return np.asarray(np.where(solved.converged, solved.least_determinant, -np.inf)[which.ravel()])
+
+    def tip_miss_rad(self, site: int) -> float:
+        """Return by how much a bending scope tip at least misses the direction of a site, pi if it cannot stand.
+
+        See `stages.scope.orientability`: the tip may stand aside from the medial axis, as far as there is
+        room.  About 0.05 s a site; sites themselves are chosen by a stricter rule.
+        """
+        point = int(self.sites.tree_point[site])
+        return orientability(self._scope_scene, self.lung.tree, point).angle_rad(self.sites.poses[site, 3:])
+
+    @cached_property
+    def _scope_scene(self) -> Scene:
+        lumen = lumen_of_lung(self.lung)
+        return Scene(model=model_of(self.system.scope), field=navigation_field(lumen, 0))
 
 
 def require_same(atlas: Atlas, lung: Lung, system: System) -> None:
@@ -87,7 +142,7 @@ def build_atlas(
     lung : Lung
     system : System
     rotations : int
-        Evenly spaced rotations of the tubes.
+        Evenly spaced rotations of the tubes, and further ones where tube or exit is near a limit.
     stop_spacing_mm, site_spacing_mm : float
         Spacing of insertions and of sites along the airway.
     progress : callable, optional

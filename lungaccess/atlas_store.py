@@ -23,7 +23,7 @@ from lungaccess.system import System
 from stages.scope.sites import Sites
 from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
-FORMAT = 1
+FORMAT = 2
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 

@@ -31,8 +31,8 @@ PROOF_STEP_MM = 0.05
 APPROACH_STEP_MM = 0.25
 ARC_SAGITTA_MM = 0.01
 TURNED_SPACING_MM = 2.0
-TURNS_RAD = tuple(math.radians(angle) for angle in (0.0, 20.0, 40.0))
-TURN_DIRECTIONS = 6
+TURNS_RAD = tuple(math.radians(angle) for angle in (0.0, 15.0, 30.0, 45.0))
+TURN_DIRECTIONS = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,7 +105,7 @@ def sites(
     spacing_mm : float
         Distance between sites along a branch.
     turning : bool
-        Whether tips are also turned aside, every 2 mm, by up to 40 degrees from where the scope comes from,
+        Whether tips are also turned aside, every 2 mm, by up to 45 degrees from where the scope comes from,
         as far as the lumen leaves room for its body.
 
     References

@@ -24,7 +24,8 @@ LEAVING_MM = 15.0
 MAX_BEND_RAD = math.radians(75.0)
 ARC_PIECE_RAD = math.radians(4.0)
 MAX_PIECE_MM = 2.5
-CORNER_STEPS = 8
+TINY_MM = 1e-9
+TINY_RAD = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,34 +86,24 @@ def approach(tree: AirwayTree, tip: ScopeTip) -> Float | None:
     """
     position, forward = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
     begin = tree.points_lps[leaving_point(tree, tip)]
-    tangent_mm, bend = 0.0, 0.0
-    # The corner of the two straight pieces and the angle between them depend on each other.
-    for _ in range(CORNER_STEPS):
-        corner = position - (STRAIGHT_END_MM + tangent_mm) * forward
-        way = corner - begin
-        length = float(np.linalg.norm(way))
-        if length <= tangent_mm:
-            return None
-        first = way / length
-        cosine = float(first @ forward)
-        bend = math.atan2(float(np.linalg.norm(forward - cosine * first)), cosine)
-        if bend > MAX_BEND_RAD:
-            return None
-        tangent_mm = BENDING_RADIUS_MM * math.tan(0.5 * bend)
-    arc = _fillet(corner, first, forward, bend)
+    end = position - STRAIGHT_END_MM * forward
+    behind = float((end - begin) @ forward)
+    aside = begin - end + behind * forward
+    beside = float(np.linalg.norm(aside))
+    # Backwards from the end: an arc towards the place where the axis is left, and its tangent to there.
+    straight2 = (beside - BENDING_RADIUS_MM) ** 2 + behind**2 - BENDING_RADIUS_MM**2
+    if straight2 <= 0.0 or behind <= 0.0:
+        return None
+    bend = math.atan2(behind, BENDING_RADIUS_MM - beside) - math.atan2(
+        math.sqrt(straight2), BENDING_RADIUS_MM
+    )
+    if bend > MAX_BEND_RAD:
+        return None
+    aside /= max(beside, TINY_MM)
+    pieces = math.ceil(bend / ARC_PIECE_RAD) if bend > TINY_RAD else 0
+    angles = np.linspace(bend, 0.0, pieces + 1)[:, None]
+    arc = end + BENDING_RADIUS_MM * ((1.0 - np.cos(angles)) * aside - np.sin(angles) * forward)
     return np.concatenate([_straight(begin, arc[0]), arc[1:], _straight(arc[-1], position)[1:]])
-
-
-def _fillet(corner: Float, first: Float, second: Float, bend: float) -> Float:
-    """Return points of the arc that rounds off a corner between two directions."""
-    tangent_mm = BENDING_RADIUS_MM * math.tan(0.5 * bend)
-    start = corner - tangent_mm * first
-    if bend < 1e-9:
-        return start[None]
-    aside = second - (second @ first) * first
-    aside /= np.linalg.norm(aside)
-    angles = np.linspace(0.0, bend, math.ceil(bend / ARC_PIECE_RAD) + 1)[:, None]
-    return np.asarray(start + BENDING_RADIUS_MM * (np.sin(angles) * first + (1.0 - np.cos(angles)) * aside))
 
 
 def _straight(begin: Float, end: Float) -> Float:

@@ -41,7 +41,7 @@ LEAVES_TRACHEA = "the tube would leave the trachea, which lies in the mediastinu
 TRACHEA = 0
 """The branch at the root of every airway tree."""
 
-DEFAULT_ROTATIONS = 36
+DEFAULT_ROTATIONS = 24
 DEFAULT_STOP_MM = 2.0
 THREADS = 2
 
@@ -183,42 +183,64 @@ def deployments(
     with_fissures : bool
         Whether fissures are obstacles.
     rotations : int
-        Evenly spaced rotations of the tubes.
+        Evenly spaced rotations of the tubes.  Between two of them a further one is looked at where not the
+        same insertions are accepted at both: there the tube or its exit is near a limit.
     stop_spacing_mm : float
         Spacing of the insertions of both tubes.
     progress : callable, optional
         Told the share of sites done.
     """
     tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 6)
-    angles: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
+    coarse: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
+    angles = np.concatenate([coarse, coarse + math.pi / rotations])
     stops = insertion_stops(tubes, stop_spacing_mm)
     scene = scene_of(lung, with_fissures=with_fissures)
     constants = tube_constants(tubes, margins)
-    most = rotations * len(stops) * (len(stops) + 1) // 2
+    most = len(stops) * (len(stops) + 1) // 2
     done = 0
 
-    def one_site(site: int) -> tuple[Float, Int]:
+    def one_site(site: int) -> tuple[Float, Int, int]:
         nonlocal done
-        normals = frames.bending_directions(frames.pose(tips[site, :3], tips[site, 3:]), angles)
-        rows = np.zeros((most, kernels.ENTRY_COLUMNS))
+        frame = frames.pose(tips[site, :3], tips[site, 3:])
         refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
         work = np.zeros((2, kernels.N_TRACE))
-        count = kernels.enumerate_site(
-            scene, constants, tips[site], normals, site, stops, rows, refused, work
-        )
+
+        def rows_of(turns: Int) -> Float:
+            normals = frames.bending_directions(frame, angles[turns])
+            rows = np.zeros((most * len(turns), kernels.ENTRY_COLUMNS))
+            count = kernels.enumerate_site(
+                scene, constants, tips[site], normals, site, stops, rows, refused, work
+            )
+            found = rows[:count].copy()
+            found[:, 1] = turns[found[:, 1].astype(np.int64)]
+            return found
+
+        found = rows_of(np.arange(rotations))
+        between = _between_unlike(found, rotations, stops)
+        if len(between):
+            found = np.concatenate([found, rows_of(rotations + between)])
         done += 1
         if progress and done % 50 == 0:
             progress(done / len(tips))
-        return rows[:count].copy(), refused
+        return found, refused, (rotations + len(between)) * (most - 1)
 
     with ThreadPoolExecutor(THREADS) as pool:
         parts = list(pool.map(one_site, range(len(tips))))
-    rows = np.concatenate([np.zeros((0, kernels.ENTRY_COLUMNS)), *(part for part, _ in parts)])
+    rows = np.concatenate([np.zeros((0, kernels.ENTRY_COLUMNS)), *(rows for rows, _, _ in parts)])
     refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
-    for _, counts in parts:
+    for _, counts, _ in parts:
         refused += counts
-    found = _as_deployments(rows, angles, refused, (most - rotations) * len(tips))
+    found = _as_deployments(rows, angles, refused, sum(candidates for _, _, candidates in parts))
     return _without_trachea(found) if _has_trachea(lung) else found
+
+
+def _between_unlike(rows: Float, rotations: int, stops: Float) -> Int:
+    """Return the rotations between which and the next ones other insertions are accepted: a limit is near."""
+    accepted = np.zeros((rotations, len(stops), len(stops)), dtype=bool)
+    outer, inner = (np.rint(rows[:, column] / stops[1]).astype(np.int64) for column in (2, 3))
+    accepted[rows[:, 1].astype(np.int64), outer, inner] = True
+    unlike = (accepted != np.roll(accepted, -1, axis=0)).any(axis=(1, 2))
+    return np.flatnonzero(unlike)
 
 
 def joined(one: Deployments, other: Deployments, first_site: int) -> Deployments:

@@ -96,7 +96,7 @@ class Atlas:
         return np.asarray(np.where(solved.converged, solved.least_determinant, -np.inf)[which.ravel()])
 
     def tip_miss_rad(self, site: int) -> float:
-        """Return by how much a bending scope tip at least misses the direction of a site, pi if it cannot stand.
+        """Return by how much a bending scope tip misses the direction of a site, pi if it cannot stand there.
 
         See `stages.scope.orientability`: the tip may stand aside from the medial axis, as far as there is
         room.  About 0.05 s a site; sites themselves are chosen by a stricter rule.

@@ -17,7 +17,8 @@ A surface is hollow: what lies wholly inside touches nothing.  Test containment 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,16 +62,21 @@ class SurfaceMesh:
         return trimesh.Trimesh(vertices=self.vertices_lps, faces=self.faces, process=False)
 
 
-def box_surface(mask: NDArray[np.bool_], grid: Grid) -> SurfaceMesh:
+def box_surface(mask: NDArray[np.bool_], grid: Grid, *, beyond: bool = False) -> SurfaceMesh:
     """Return the exact boundary of the voxels of `mask` as solid boxes.
 
     Parameters
     ----------
     mask : (ni, nj, nk) bool
-        A mask on `grid`; beyond it there is nothing.  An empty mask has an empty surface.
+        A mask on `grid`.  An empty mask has an empty surface.
     grid : Grid
         Use `Grid.crop` for a region of interest.
+    beyond : bool
+        Whether all that lies beyond the grid belongs to the mask, too.
     """
+    if beyond:
+        rest = box_surface(~np.asarray(mask, dtype=bool), grid)
+        return replace(rest, faces=rest.faces[:, ::-1])
     padded = np.pad(np.asarray(mask, dtype=bool), 1)
     quads = [_faces_of(padded, axis, side) for axis in range(3) for side in (0, 1)]
     corners = np.concatenate(quads)
@@ -132,7 +138,7 @@ class MeshDistance:
     """Distances from segments, the axes of capsules, to a mesh (an FCL bounding volume hierarchy).
 
     A capsule (a ball of radius r swept along a segment) touches the mesh if and only if the segment is not
-    farther than r from it.  The segment enters as a flat triangle: FCL compares triangles in closed form
+    farther than r from it.  Segments enter as flat triangles: FCL compares triangles in closed form
     (error about 1e-14 mm), but capsules by iteration (error about 1e-5 mm).
 
     Parameters
@@ -156,13 +162,31 @@ class MeshDistance:
         ends = np.asarray(ends_lps, dtype=np.float64).reshape(-1, 3)
         if self._mesh is None:
             return np.full(len(starts), np.inf)
-        return np.array([self._distance(a, b) for a, b in zip(starts, ends, strict=True)])
+        return np.array([self._distance(a[None], b[None]) for a, b in zip(starts, ends, strict=True)])
 
-    def _distance(self, start: Float, end: Float) -> float:
+    def polyline_distance_mm(self, points_lps: ArrayLike) -> float:
+        """Return the distance in mm from a polyline to the surface, 0 where it crosses it.
+
+        All segments enter as one mesh, several times faster than one by one.
+
+        Parameters
+        ----------
+        points_lps : (N, 3) float64, LPS mm
+            N >= 1; one point is a polyline of no length.
+        """
+        points = np.asarray(points_lps, dtype=np.float64).reshape(-1, 3)
+        if self._mesh is None:
+            return math.inf
+        last = max(len(points) - 1, 1)
+        return self._distance(points[:last], points[-last:])
+
+    def _distance(self, starts: Float, ends: Float) -> float:
         import fcl
 
-        segment = _fcl_object(np.stack([start, end, 0.5 * (start + end)]), np.array([[0, 1, 2]]))
-        found = fcl.distance(self._mesh, segment, fcl.DistanceRequest(), fcl.DistanceResult())
+        count = np.arange(len(starts))
+        triangles = np.stack([count, count + len(starts), count + 2 * len(starts)], axis=1)
+        segments = _fcl_object(np.concatenate([starts, ends, 0.5 * (starts + ends)]), triangles)
+        found = fcl.distance(self._mesh, segments, fcl.DistanceRequest(), fcl.DistanceResult())
         return max(float(found), 0.0)
 
 

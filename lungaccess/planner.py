@@ -13,6 +13,7 @@ from lungaccess.assemble import Task, assemble
 from lungaccess.atlas import Atlas, build_atlas, require_same
 from lungaccess.costs import require_objective
 from lungaccess.plans import Plan
+from lungaccess.reference import ReferenceSearch, ReferenceSearchWithoutRejection
 from lungaccess.searches import AtlasSearch, KuntzSearch, KuntzSearchWithoutRejection, Step
 from lungaccess.system import System
 from lungaccess.target import Target, require_free
@@ -21,6 +22,8 @@ METHODS = {
     "atlas": AtlasSearch,
     "kuntz2015": KuntzSearch,
     "kuntz2015-without-rejection": KuntzSearchWithoutRejection,
+    "reference": ReferenceSearch,
+    "reference-without-rejection": ReferenceSearchWithoutRejection,
 }
 PROGRESS_EVERY_S = 0.1
 HOPELESS_ITERATIONS = 2000
@@ -73,7 +76,8 @@ def plan(
     method : str
         "atlas": direct arcs from every deployment of the atlas, then random refinement of the best and
         RRTs from the others.  "kuntz2015": Algorithm 1 of that paper; "kuntz2015-without-rejection": the
-        same without its workspace test.
+        same without its workspace test.  "reference" and "reference-without-rejection": the same as printed,
+        with FCL on meshes, slow; see `lungaccess.reference`.
     seed : int
         The same seed and `iterations` give the same plans.
     iterations : int, optional

@@ -44,7 +44,7 @@ class SearchRequest:
     objective : str
         "inverse_clearance", "cost_map", "voxel_sum" or "length_mm".
     method : str
-        "atlas" or "kuntz2015".
+        One of `lungaccess.planner.METHODS`.
     seed : int
     time_s : float or None
         Planning time; None for as long as the iterations take.

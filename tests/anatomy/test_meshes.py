@@ -119,3 +119,29 @@ def test_meshes_cannot_be_changed() -> None:
     mesh = SurfaceMesh(vertices_lps=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]), bound_mm=0.0)
     with pytest.raises(ValueError, match="read-only"):
         mesh.vertices_lps[0, 0] = 1.0
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 1000), count=st.integers(1, 6))
+def test_a_polyline_is_its_segments(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    mask = rng.random((8, 8, 8)) < 0.05
+    grid = oblique_grid(mask.shape)
+    mesh = MeshDistance(box_surface(mask, grid))
+    line = grid.lps(rng.uniform(-2, 10, (count, 3)))
+    ends = line[1:] if count > 1 else line
+    wanted = mesh.segment_distance_mm(line[: max(count - 1, 1)], ends).min()
+    assert mesh.polyline_distance_mm(line) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_a_mask_may_go_on_beyond_the_grid() -> None:
+    mask = np.zeros((6, 6, 6), dtype=bool)
+    mask[:2] = True
+    grid = oblique_grid(mask.shape)
+    closed, room = box_surface(mask, grid), box_surface(mask, grid, beyond=True)
+    assert len(closed.faces) == 2 * (2 * 36 + 4 * 12)
+    assert len(room.faces) == 2 * (2 * 36 + 4 * 24)
+    assert room.to_trimesh().volume == pytest.approx(-(~mask).sum() * grid.voxel_volume_mm3)
+    point = grid.lps([[4.5, 3.0, 3.0]])
+    assert MeshDistance(room).polyline_distance_mm(point) == pytest.approx(1.0 * SPACING_MM[0])
+    assert MeshDistance(closed).polyline_distance_mm(point) == pytest.approx(3.0 * SPACING_MM[0])

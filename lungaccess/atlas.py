@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -49,6 +49,8 @@ class Atlas:
         `deployments.site` indexes `sites`.
     build_s : float
         Seconds it took.
+    index : StartIndex
+        Made from the deployments: finds those with a target in the needle's workspace, for any needle.
     """
 
     lung: Lung
@@ -57,15 +59,15 @@ class Atlas:
     sites: Sites
     deployments: Deployments
     build_s: float
+    index: StartIndex = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        index = StartIndex(self.deployments.positions, self.deployments.tangents)
+        object.__setattr__(self, "index", index)
 
     def site_pose(self, site: int) -> Float:
         """Return point and tangent `(6,)` of a site."""
         return np.asarray(self.sites.poses[site])
-
-    @cached_property
-    def index(self) -> StartIndex:
-        """Finds the deployments with a target in the needle's workspace, for any needle."""
-        return StartIndex(self.deployments.positions, self.deployments.tangents)
 
     @cached_property
     def exit_clearance_mm(self) -> Float:

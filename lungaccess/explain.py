@@ -10,7 +10,7 @@ from lungaccess.noplan import NoPlan
 from lungaccess.remedies import Remedy, remedies
 from lungaccess.searches import AtlasSearch
 from stages.needle.device import Needle
-from stages.needle.space import direct_arcs, needle_space, workspace_lengths
+from stages.needle.space import direct_arcs, needle_space
 
 
 def explain(search: AtlasSearch, iterations: int) -> NoPlan:
@@ -107,7 +107,7 @@ def _reached_with(search: AtlasSearch, needle: Needle, *, with_fissures: bool | 
         with_fissures=task.with_fissures if with_fissures is None else with_fissures,
     )
     entries, target = atlas.deployments, task.target.lps_mm
-    near = np.flatnonzero(np.isfinite(workspace_lengths(space, entries.positions, entries.tangents, target)))
+    near, _lengths = atlas.index.holding(space, target)
     blockers, _lengths, _costs = direct_arcs(
         space,
         entries.positions[near],

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import count
+from multiprocessing.connection import Connection
 
-import numpy as np
-
-from anatomy.errors import SettingsError
+from anatomy.errors import AnatomyError, SettingsError
 from lungaccess.searches import AtlasSearch, Step
 
-ROUND_ITERATIONS = 50
+ROUND_ITERATIONS = 100
 """Iterations of one process before the best of all is shared."""
-JOINT_ROUND = 8
-"""Every so many rounds the first process refines the best candidate by a nonlinear program instead."""
-
-_forked: dict[str, AtlasSearch] = {}
-"""The search that forked processes find: so lung and atlas are shared and not copied."""
 
 
 def parallel_steps(search: AtlasSearch, processes: int) -> Iterator[Step]:
     """Search forever in several processes; the caller stops.
 
-    Direct arcs come first.  Then rounds: each process varies the best candidate, with random numbers of its
-    own that depend on the seed, the round and its number, and the best of all goes into the next round.  So
-    the same seed, number of processes and iterations give the same plans, whatever the machine's load.
+    Direct arcs come first.  Then rounds: each process goes on with a search of its own, which begins from
+    every so many of the direct arcs and has random numbers that depend on the seed and its number, and the
+    best of all goes into the next round.  So the same seed, number of processes and iterations give the same
+    plans, whatever the machine's load.
 
     Raises
     ------
@@ -39,41 +34,61 @@ def parallel_steps(search: AtlasSearch, processes: int) -> Iterator[Step]:
             expected="at least 2, on a system that can fork processes",
             remedy="Search in one process",
         )
-    best: Step | None = None
-    for step in search.direct_steps():
-        if step.candidate is not None:
-            best = step
-        yield step
-    _forked["search"] = search
+    yield from search.direct_steps()
+    context = multiprocessing.get_context("fork")
+    ends, workers = [], []
     try:
-        with multiprocessing.get_context("fork").Pool(processes) as pool:
-            number = 0
-            while True:
-                tasks = [(number, process, best) for process in range(processes)]
-                found = [step for step in pool.starmap(_varied, tasks) if step is not None]
-                number += 1
-                iteration = number * processes * ROUND_ITERATIONS
-                better = min(found, key=lambda step: step.cost, default=None)
-                if better is not None and (best is None or better.cost < best.cost):
-                    best = replace(better, iteration=iteration)
-                    yield best
-                else:
-                    yield Step(iteration=iteration, phase="refinement")
+        for number in range(processes):
+            here, there = context.Pipe()
+            worker = context.Process(target=_work, args=(search, number, processes, there), daemon=True)
+            worker.start()
+            there.close()
+            ends.append(here)
+            workers.append(worker)
+        for turn in count(1):
+            for end in ends:
+                end.send(search.best)
+            found = [_received(end) for end in ends]
+            yield _best_of(search, found, turn * processes * ROUND_ITERATIONS)
     finally:
-        _forked.clear()
+        for worker in workers:
+            worker.terminate()
+            worker.join()
 
 
-def _varied(number: int, process: int, best: Step | None) -> Step | None:
-    """Vary the best candidate in one process; return a better step, if one is found."""
-    search = _forked["search"]
-    search.seed_with(np.random.Generator(np.random.PCG64([search.task.seed, number, process])))
-    if best is not None and process == 0 and number % JOINT_ROUND == JOINT_ROUND - 1:
-        refined = search.refined(number, best)
-        return refined if refined.candidate is not None else None
-    found: Step | None = None
-    for iteration in range(1, ROUND_ITERATIONS + 1):
-        step = search.vary(iteration, found or best)
-        limit = math.inf if best is None else best.cost
-        if step.candidate is not None and step.cost < (limit if found is None else found.cost):
-            found = step
-    return found
+def _best_of(search: AtlasSearch, found: list[Step | None], iteration: int) -> Step:
+    """Return the best of a round, if it is better than all before, and keep it."""
+    better = min((step for step in found if step is not None), key=lambda step: step.cost, default=None)
+    if better is None or (search.best is not None and better.cost >= search.best.cost):
+        return Step(iteration=iteration, phase="climb")
+    better = replace(better, iteration=iteration)
+    search.adopt(better)
+    return better
+
+
+def _received(end: Connection) -> Step | None:
+    """Return what a process has found in its round."""
+    try:
+        step: Step | None = end.recv()
+    except EOFError as reason:
+        raise AnatomyError("A process of the search has ended before its time") from reason
+    return step
+
+
+def _work(search: AtlasSearch, number: int, processes: int, end: Connection) -> None:
+    """Go on with the search in this process: a round for each message, which is the best of all."""
+    search.take_part(number, processes)
+    steps = search.further_steps()
+    while True:
+        try:
+            best: Step | None = end.recv()
+        except EOFError:
+            return
+        if best is not None:
+            search.adopt(best)
+        found = None
+        for _ in range(ROUND_ITERATIONS):
+            step = next(steps, None)
+            if step is not None and step.candidate is not None:
+                found = step
+        end.send(found)

@@ -79,6 +79,34 @@ class LocalAxis:
         return fitted[0], fitted[1]
 
 
+class StillAxis:
+    """A tip that is turned aside and stays where it is: it has no smooth way along the airway.
+
+    Parameters
+    ----------
+    tip : ScopeTip
+
+    Attributes
+    ----------
+    low_mm, high_mm, points, tangents
+        See `LocalAxis`.
+    """
+
+    def __init__(self, tip: ScopeTip) -> None:
+        self._tip = tip
+        self.low_mm = self.high_mm = 0.0
+        self.points, self.tangents = standing_still(tip)
+
+    def tip(self, _shift_mm: float) -> ScopeTip:
+        """Return the tip."""
+        return self._tip
+
+
+def axis_of(tree: AirwayTree, sites: Sites, tip: ScopeTip, branch: int) -> LocalAxis | StillAxis:
+    """Return where a tip can be moved; see `LocalAxis`."""
+    return StillAxis(tip) if tip.turned else LocalAxis(tree, sites, tip, branch)
+
+
 def standing_still(tip: ScopeTip) -> tuple[Float, Float]:
     """Return the coefficients of an axis that is one tip."""
     points, tangents = np.zeros((3, AXIS_DEGREE + 1)), np.zeros((3, AXIS_DEGREE + 1))

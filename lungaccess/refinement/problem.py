@@ -15,7 +15,7 @@ from anatomy.structures import FISSURE, OBSTACLES
 from lungaccess.assemble import Candidate, Task
 from lungaccess.costs import path_cost
 from lungaccess.refinement import boxes as fields
-from lungaccess.refinement.axis import LocalAxis, standing_still
+from lungaccess.refinement.axis import axis_of, standing_still
 from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_WAY_MM, Layout, Numbers
 from stages.needle.objections import objection
@@ -120,7 +120,7 @@ class Problem:
         The candidate as variables.
     numbers : Numbers
     boxes : tuple of FieldBox
-    axis : LocalAxis
+    axis : LocalAxis or StillAxis
     """
 
     def __init__(self, court: Court, sites: Sites, candidate: Candidate) -> None:
@@ -132,7 +132,7 @@ class Problem:
         self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
         rows = split(rows, arcs, self._exempt_mm)
         self.layout = Layout(arcs=arcs, with_map=WEIGHTS[self.task.objective][2] > 0.0)
-        self.axis = LocalAxis(self.task.lung.tree, sites, candidate.tip, deployment.branch)
+        self.axis = axis_of(self.task.lung.tree, sites, candidate.tip, deployment.branch)
         tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
         bends = rows[:, 1:].T / needle.max_curvature_per_mm
         self.start = np.concatenate([[0.0], tubes, rows[:, 0], *bends])

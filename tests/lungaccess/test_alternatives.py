@@ -15,7 +15,8 @@ import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess import cli
-from lungaccess.alternatives import Alternative, _branches_first, _lines, alternatives, judged
+from lungaccess.alternatives import Alternative, _branches_first, _lines, _samples, alternatives, judged
+from lungaccess.kernels.apart import choose_apart
 from stages.needle.path import direct_path
 from tests.lungaccess.resample import needle_walk
 
@@ -48,6 +49,27 @@ def test_each_branch_comes_first_once(menu: tuple[Alternative, ...]) -> None:
     first = list(dict.fromkeys(branches))
     assert branches[: len(first)] == first
     assert _branches_first(np.array([4, 4, 2, 4, 7, 2])).tolist() == [0, 2, 4, 1, 3, 5]
+
+
+def test_samples_are_all_and_hold_every_branch_first() -> None:
+    rng = np.random.default_rng(0)
+    for total in (0, 5, 40_000):
+        branch = np.sort(rng.integers(0, 5, total)) * 3
+        branch[-1:] = 99
+        parts = list(_samples(branch))
+        assert sorted(np.concatenate(parts).tolist()) == list(range(total))
+        assert set(branch[parts[0]]) == set(branch)
+        assert len(parts[0]) <= 10_000
+
+
+def test_lines_are_apart_if_a_point_strays() -> None:
+    straight = np.column_stack([np.zeros((9, 2)), np.linspace(0.0, 40.0, 9)])
+    bowed, near, longer = straight.copy(), straight.copy(), straight.copy()
+    bowed[4, 0], near[4, 0], longer[-1, 2] = 6.0, 3.0, 45.5
+    lines, chosen = np.stack([straight, near, bowed, straight, longer]), np.zeros(5, dtype=np.int64)
+    count = choose_apart(lines, np.arange(5), 5.0, chosen)
+    assert chosen[:count].tolist() == [0, 2, 4]
+    assert choose_apart(lines, np.arange(5), 5.0, chosen[:2]) == 2
 
 
 def test_criteria_are_those_of_the_plan(menu: tuple[Alternative, ...]) -> None:

@@ -9,15 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import lungaccess as la
 from anatomy.errors import SettingsError, TargetError
-from anatomy.grid import Volume
+from anatomy.grid import Float, Volume
 from anatomy.lung import Lung
+from lungaccess.assemble import Task
 from lungaccess.costs import OBJECTIVES
+from lungaccess.kernels import pricing
 from lungaccess.planner import ProgressEvent
 from lungaccess.plans import Plan
+from lungaccess.searches import AtlasSearch
+from lungaccess.searches.climbs import Climber, needle_of, path_through
+from lungaccess.searches.entries import different, least_costs
+from lungaccess.searches.stands import Stands
 from lungaccess.target import Target
+from stages.needle.space import direct_arcs, workspace_lengths
+from tests.lungaccess.ahead import turned_candidates
 from tests.lungaccess.resample import needle_walk, problems
 
 SYSTEM = la.load_system("ultrathin")
@@ -273,3 +282,124 @@ class TestProcesses:
         for options in ({"processes": 0}, {"processes": -2}, {"processes": 2, "method": "kuntz2015"}):
             with pytest.raises(SettingsError, match="processes"):
                 plans_of(small_lung, target, atlas, **options)
+
+
+@pytest.fixture(scope="module")
+def search(small_lung: Lung, target: Target, atlas: la.Atlas) -> AtlasSearch:
+    task = Task(
+        lung=small_lung, system=SYSTEM, target=target, objective="inverse_clearance",
+        with_fissures=atlas.with_fissures, method="atlas", seed=0,
+    )  # fmt: skip
+    return AtlasSearch(task, atlas)
+
+
+def prices(search: AtlasSearch, slack: float) -> tuple[NDArray[np.int64], Float]:
+    """Return blockers and estimated costs of the direct arcs from all deployments in the workspace."""
+    entries, near = search.atlas.deployments, search.in_workspace
+    blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
+    x, y, z = search.task.target.lps_mm.tolist()
+    pricing.priced_arcs(
+        needle_of(search.desk.space, search.task), entries.positions[near], entries.tangents[near],
+        entries.branch[near], (x, y, z), slack, math.inf, blockers, costs,
+    )  # fmt: skip
+    return blockers, costs
+
+
+class TestPrices:
+    """Direct arcs with a running best, and lower bounds."""
+
+    def test_what_is_not_passed_over_is_judged_as_by_the_needle_stage(self, search: AtlasSearch) -> None:
+        entries, near = search.atlas.deployments, search.in_workspace
+        labels, _lengths, inverse = direct_arcs(
+            search.desk.space, entries.positions[near], entries.tangents[near], entries.branch[near],
+            search.task.target.lps_mm,
+        )  # fmt: skip
+        blockers, costs = prices(search, math.inf)
+        assert (blockers == labels).all() and (costs[labels == 0] == inverse[labels == 0]).all()
+        blockers, costs = prices(search, 1.0)
+        dear = blockers == pricing.TOO_DEAR
+        assert 0 < dear.sum() < len(near) and (blockers[~dear] == labels[~dear]).all()
+        best = inverse[labels == 0].min()
+        assert costs[blockers == 0].min() == best
+        assert (inverse[dear & (labels == 0)] >= best).all()
+
+    def test_lower_bounds_are_below_exact_costs(self, search: AtlasSearch) -> None:
+        entries, near = search.atlas.deployments, search.in_workspace
+        needle, target = needle_of(search.desk.space, search.task), search.task.target.lps_mm
+        lengths = workspace_lengths(
+            search.desk.space, entries.positions[near], entries.tangents[near], target
+        )
+        bounds = least_costs(needle, entries, near, lengths, target)
+        clear = np.flatnonzero(prices(search, math.inf)[0] == 0)
+        for n in clear[:: max(len(clear) // 60, 1)].tolist():
+            candidate = search.finished(int(near[n]))
+            assert candidate is not None and 0.0 < bounds[n] <= search.desk.cost(candidate.path)
+
+    def test_different_deployments_are_the_first_of_their_kind(self, search: AtlasSearch) -> None:
+        entries, near = search.atlas.deployments, search.in_workspace
+        kept = different(entries, near)
+        assert kept[0] == near[0] and 0 < len(kept) < len(near)
+        assert (np.diff([near.tolist().index(n) for n in kept.tolist()]) > 0).all()
+        assert set(entries.branch[kept]) == set(entries.branch[near])
+        assert (different(entries, kept) == kept).all()
+
+
+class TestClimbs:
+    """Random improvement in compiled batches."""
+
+    @pytest.mark.parametrize("turned", [False, True])
+    def test_they_only_fall_and_end_at_what_is_proved(
+        self, search: AtlasSearch, small_lung: Lung, atlas: la.Atlas, turned: bool
+    ) -> None:
+        if turned:
+            search, begun = next(turned_candidates(small_lung, atlas))
+        else:
+            last = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][-1]))
+            assert last is not None
+            begun = last
+        climber = Climber(search.desk, search.judge, search.atlas.sites, np.random.default_rng(0))
+        climb = climber.begin(begun)
+        assert climb is not None
+        again = climber.candidate(climb)
+        assert again is not None and np.allclose(again.path.arcs, begun.path.arcs, atol=1e-9)
+        costs = []
+        for _ in range(12):
+            climber.advance(climb, 50)
+            costs.append(climb.cost)
+            found = search.desk.finished(0, "climb", climber.candidate(climb))
+            assert found.candidate is not None
+            assert found.cost == pytest.approx(climb.cost, rel=0.05)
+            assert found.candidate.tip.turned == turned
+        assert costs == sorted(costs, reverse=True) and costs[-1] < 0.99 * search.desk.cost(begun.path)
+
+    def test_kicked_ones_find_back_to_what_is_proved(self, search: AtlasSearch) -> None:
+        climber = Climber(search.desk, search.judge, search.atlas.sites, np.random.default_rng(0))
+        begun = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][0]))
+        assert begun is not None
+        finite = 0
+        for _ in range(8):
+            climb = climber.begin(begun)
+            assert climb is not None
+            climber.kick(climb)
+            climber.advance(climb, 300)
+            if math.isfinite(climb.cost):
+                finite += 1
+                assert search.desk.finished(0, "climb", climber.candidate(climb)).candidate is not None
+        assert finite >= 1
+
+    def test_rows_hold_the_tips(self, search: AtlasSearch, small_lung: Lung) -> None:
+        tip = search.atlas.sites.tip(small_lung.tree, 0)
+        stands = Stands(small_lung, SYSTEM.scope, search.atlas.sites, tip, np.random.default_rng(0))
+        assert stands.allowed[stands.home] and stands.rotation_rad(stands.home, 0.7) == pytest.approx(0.7)
+        for row, each in zip(stands.rows, stands.tips, strict=True):
+            frame = each.lps_from_scope_tip
+            assert np.allclose(row[:6], [*frame[:3, 3], *frame[:3, 2]])
+            assert abs(row[3:6] @ row[6:]) < 1e-9 and np.linalg.norm(row[6:]) == pytest.approx(1.0)
+
+    def test_paths_lead_through_their_points(self, search: AtlasSearch) -> None:
+        begun = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][0]))
+        assert begun is not None
+        target = search.task.target.lps_mm
+        vias = begun.path.sample(2.0)[0][[3, 6]] + 0.3
+        path = path_through(begun.deployment, vias, target)
+        assert np.allclose(path.frames()[1:, :3, 3], [*vias, target], atol=1e-9)

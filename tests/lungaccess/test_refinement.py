@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import casadi
 import numpy as np
@@ -25,6 +26,7 @@ from stages.needle.space import direct_arcs, needle_space
 from stages.scope.sites import Sites, sites
 from stages.scope.tips import looks_ahead, tip_at
 from stages.tube.deployments import Deployment, TubeJudge, deployments, tracking_length_mm
+from tests.lungaccess.ahead import turned_candidates
 from tests.lungaccess.resample import problems
 
 SYSTEM = la.load_system("ultrathin")
@@ -343,3 +345,21 @@ def places_of(box: boxes.FieldBox) -> Float:
     index = np.stack(np.unravel_index(np.arange(len(box.values)), box.shape, order="F"), axis=1)
     matrix, offset = box.lattice_from_lps[:, :3], box.lattice_from_lps[:, 3]
     return np.asarray((index - offset) @ np.linalg.inv(matrix).T)
+
+
+def test_turned_tips_stay_where_they_are(small_lung: Lung) -> None:
+    """Tubes and needle move; the tip, which has no smooth way along the airway, does not."""
+    atlas = la.build_atlas(small_lung, SYSTEM)
+    better = 0
+    for search, candidate in islice(turned_candidates(small_lung, atlas), 4):
+        assert candidate.tip.turned
+        refined = refine(search.task, atlas.sites, candidate, iterations=ITERATIONS)
+        if refined is None:
+            continue
+        better += 1
+        court = Court(search.task)
+        assert refined.tip is candidate.tip and court.accepts(refined)
+        assert court.cost(refined) < court.cost(candidate)
+        plan = assemble(search.task, atlas.sites, refined, iteration=0, timing={})
+        assert la.check(plan, small_lung).accepted
+    assert better >= 2

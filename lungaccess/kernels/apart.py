@@ -1,0 +1,61 @@
+"""Compiled kernel of the menus of plans: lines of which every two differ."""
+
+from __future__ import annotations
+
+import numba
+
+from anatomy.kernels.compiling import inner_kernel
+
+
+@inner_kernel
+def _strays(one, other, square):
+    """Tell whether some point of a line is so far from all points of another; `square` in mm^2."""
+    for m in range(one.shape[0]):
+        near = False
+        for n in range(other.shape[0]):
+            dx = one[m, 0] - other[n, 0]
+            dy = one[m, 1] - other[n, 1]
+            dz = one[m, 2] - other[n, 2]
+            if dx * dx + dy * dy + dz * dz < square:
+                near = True
+                break
+        if not near:
+            return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True)
+def choose_apart(lines, order, apart_mm, chosen):
+    """Choose lines one after the other, each that differs from all chosen before.
+
+    Two differ where some point of either is `apart_mm` or more from all points of the other.
+
+    Parameters
+    ----------
+    lines : (N, M, 3) float64, mm
+    order : (K,) int64
+        Which lines to look at, the best first.
+    apart_mm : float
+    chosen : (C,) int64
+        Receives at most C of them.
+
+    Returns
+    -------
+    int
+        How many were chosen.
+    """
+    square = apart_mm * apart_mm
+    count = 0
+    for n in order:
+        if count == chosen.shape[0]:
+            break
+        differs = True
+        for m in range(count):
+            one, other = lines[n], lines[chosen[m]]
+            if not (_strays(one, other, square) or _strays(other, one, square)):
+                differs = False
+                break
+        if differs:
+            chosen[count] = n
+            count += 1
+    return count

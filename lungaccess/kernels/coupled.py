@@ -1,0 +1,153 @@
+"""Compiled kernels of the coupled search: tubes and needle together, varied and judged as one.
+
+`tube` is the tuple (scene, constants, forbidden branch) of `stages.tube.kernels.deployment`; -1 forbids no
+branch.  `needle` is the tuple (space, limits, objective, whether voxels of infinite cost exist that the
+objective does not see, a cost map) of `stages.needle.kernels`.  A choice is `x`, the place of the scope's
+tip as a row of `stands`, the rotation in rad, and the insertions of outer and inner tube in mm; and `vias`,
+points (LPS mm) through which single arcs lead from the tube to the target.  A row of `stands` is a scope tip:
+point, unit tangent, and a unit vector across from which the rotation counts.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.kernels.arcs import arc_to_point, normal_on_arc, pose_on_arc
+from anatomy.kernels.compiling import inner_kernel
+from stages.needle.kernels.connections import least_cosine
+from stages.needle.kernels.cost import cost_of_arc, map_costs_on_arc
+from stages.needle.kernels.limits import COST_STEP, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN
+from stages.needle.kernels.proof import blocker_on_arc
+from stages.tube.kernels.deployment import (
+    ACCEPTED,
+    BRANCH,
+    CURVED_LENGTH,
+    INNER_CURVATURE,
+    MAX_EXTENSION,
+    MAX_PROTRUSION,
+    OVERLAP_CURVATURE,
+    deploy,
+)
+
+STAND = 0
+ROTATION = 1
+OUTER = 2
+INNER = 3
+N_CHOICE = 4
+
+ROUNDING = 1e-9
+"""Share of each limit that is left, so that the numbers of a plan keep it whatever is rounded."""
+SHORTEST_ARC_MM = 0.5
+
+
+@inner_kernel
+def _tube_tip(constants, base, normal, outer, inner):
+    """Return the pose at the tip of the inner tube, as `deploy` does but without looking at anything."""
+    straight = max(inner - constants[CURVED_LENGTH], 0.0)
+    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
+    towards = (normal[0], normal[1], normal[2])
+    at = 0.0
+    for piece in range(4):
+        stop, kappa = min(straight, outer), 0.0
+        if piece == 1:
+            stop, kappa = outer, constants[OVERLAP_CURVATURE]
+        elif piece == 2:
+            stop, kappa = max(straight, outer), 0.0
+        elif piece == 3:
+            stop, kappa = inner, constants[INNER_CURVATURE]
+        if stop > at:
+            bend = (kappa, towards[0], towards[1], towards[2])
+            towards = normal_on_arc(pose, bend, stop - at)
+            pose = pose_on_arc(pose, bend, stop - at)
+            at = stop
+    return pose
+
+
+@inner_kernel
+def _needle_cost(needle, pose, vias, count, target, dearest):
+    """Return the cost of the arcs through `count` vias; infinite beyond a limit or above `dearest`."""
+    space, limits, objective, sees_walls, walls = needle
+    length = 0.0
+    turn = 0.0
+    cost = 0.0
+    start = pose
+    cosine = math.cos(limits[MAX_ANGLE] * (1.0 - ROUNDING))
+    for m in range(count + 1):
+        goal = target
+        if m < count:
+            goal = (vias[m, 0], vias[m, 1], vias[m, 2])
+        arc, bend, angle = arc_to_point(pose, goal)
+        length += arc
+        turn += angle
+        if (
+            bend[0] > limits[KAPPA] * (1.0 - ROUNDING)
+            or length > limits[MAX_LENGTH] * (1.0 - ROUNDING)
+            or turn > limits[MAX_TURN] * (1.0 - ROUNDING)
+            or arc < SHORTEST_ARC_MM
+        ):
+            return math.inf
+        forward = pose[3] * start[3] + pose[4] * start[4] + pose[5] * start[5]
+        aside = bend[1] * start[3] + bend[2] * start[4] + bend[3] * start[5]
+        if least_cosine(forward, aside, angle) < cosine:
+            return math.inf
+        cost += cost_of_arc(space, objective, limits[COST_STEP], pose, bend, arc, m == 0)
+        if not cost < dearest:
+            return math.inf
+        if sees_walls and map_costs_on_arc(walls, space[2], pose, bend, arc, m == 0)[0] == math.inf:
+            return math.inf
+        if m < count:
+            pose = pose_on_arc(pose, bend, arc)
+    return cost
+
+
+@inner_kernel
+def _needle_clear(needle, pose, vias, count, target, branch):
+    """Tell whether all arcs through the vias are proved clear."""
+    space, limits, _objective, _sees_walls, _walls = needle
+    length = 0.0
+    for m in range(count + 1):
+        goal = target
+        if m < count:
+            goal = (vias[m, 0], vias[m, 1], vias[m, 2])
+        arc, bend, _angle = arc_to_point(pose, goal)
+        if blocker_on_arc(space, limits, pose, bend, arc, length, branch) != 0:
+            return False
+        length += arc
+        pose = pose_on_arc(pose, bend, arc)
+    return True
+
+
+@inner_kernel
+def judged_cost(tube, needle, stands, allowed, x, vias, count, target, dearest, trace, tip):
+    """Return the cost of a choice if it is below `dearest` and all of it is proved; else infinity.
+
+    What is fast comes first.
+    """
+    scene, constants, forbidden = tube
+    row = int(x[STAND])
+    outer, inner = x[OUTER], x[INNER]
+    if row < 0 or row >= stands.shape[0] or not allowed[row]:
+        return math.inf
+    if outer < 0.0 or outer > inner or inner > constants[MAX_EXTENSION]:
+        return math.inf
+    if inner - outer > constants[MAX_PROTRUSION]:
+        return math.inf
+    base = stands[row]
+    c, s = math.cos(x[ROTATION]), math.sin(x[ROTATION])
+    normal = (
+        c * base[6] + s * (base[4] * base[8] - base[5] * base[7]),
+        c * base[7] + s * (base[5] * base[6] - base[3] * base[8]),
+        c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
+    )
+    pose = _tube_tip(constants, base, normal, outer, inner)
+    cost = _needle_cost(needle, pose, vias, count, target, dearest)
+    if cost == math.inf:
+        return math.inf
+    if deploy(scene, constants, base[:6], np.array(normal), outer, inner, trace, tip) != ACCEPTED:
+        return math.inf
+    branch = int(trace[BRANCH])
+    if branch == forbidden or not _needle_clear(needle, pose, vias, count, target, branch):
+        return math.inf
+    return cost

@@ -1,0 +1,69 @@
+"""Scope tips in a row along the airway, as the kernels of the coupled search take them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy import poses
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from stages.scope.device import Bronchoscope
+from stages.scope.sites import Sites, can_stand
+from stages.scope.tips import ScopeTip, walk
+
+STEP_MM = 0.25
+REACH_MM = 4.0
+TURNED_STEP_MM = 0.5
+"""Whether a turned tip has room takes longer to find out."""
+
+
+class Stands:
+    """The scope tips up to REACH_MM behind and ahead of one; at forks a random way is taken.
+
+    Parameters
+    ----------
+    lung : Lung
+    scope : Bronchoscope
+    places : Sites
+        Where the scope passes.
+    tip : ScopeTip
+    rng : numpy.random.Generator
+
+    Attributes
+    ----------
+    tips : list of ScopeTip
+    home : int
+        Which of them is the one given.
+    rows : (K, 9) float64
+        Point, tangent, and the vector across from which rotations count: that of the tip given, carried over.
+    allowed : (K,) bool
+        Where the scope can stand.
+    """
+
+    def __init__(
+        self, lung: Lung, scope: Bronchoscope, places: Sites, tip: ScopeTip, rng: np.random.Generator
+    ) -> None:
+        step = TURNED_STEP_MM if tip.turned else STEP_MM
+        self.home = round(REACH_MM / step)
+        behind = [walk(lung.tree, tip, -step * n, rng) for n in range(self.home, 0, -1)]
+        ahead = [tip]
+        for _ in range(self.home):
+            ahead.append(walk(lung.tree, ahead[-1], step, rng))
+        self.tips = [*behind, *ahead]
+        sideways = tip.lps_from_scope_tip[:3, 0]
+        self.rows: Float = np.zeros((len(self.tips), 9))
+        self.allowed: NDArray[np.bool_] = np.zeros(len(self.tips), dtype=np.bool_)
+        for n, each in enumerate(self.tips):
+            frame = each.lps_from_scope_tip
+            self.rows[n, :3], self.rows[n, 3:6] = frame[:3, 3], frame[:3, 2]
+            across = sideways - (sideways @ frame[:3, 2]) * frame[:3, 2]
+            size = float(np.linalg.norm(across))
+            self.rows[n, 6:] = across / size if size > 0.1 else frame[:3, 0]
+            self.allowed[n] = can_stand(lung, scope, places, each)
+
+    def rotation_rad(self, stand: int, rotation_rad: float) -> float:
+        """Return the rotation counted from the tip's own +x, from one counted from the row's vector."""
+        point, forward, sideways = np.split(self.rows[stand], 3)
+        bend = poses.bending_directions(poses.pose(point, forward, sideways), rotation_rad)[0]
+        return poses.roll_towards(self.tips[stand].lps_from_scope_tip, bend)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -47,10 +47,10 @@ class Atlas:
     sites : Sites
     deployments : Deployments
         `deployments.site` indexes `sites`.
-    build_s : float
-        Seconds it took.
     index : StartIndex
         Made from the deployments: finds those with a target in the needle's workspace, for any needle.
+    build_s : float
+        Seconds it took.
     """
 
     lung: Lung
@@ -58,12 +58,8 @@ class Atlas:
     with_fissures: bool
     sites: Sites
     deployments: Deployments
+    index: StartIndex
     build_s: float
-    index: StartIndex = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        index = StartIndex(self.deployments.positions, self.deployments.tangents)
-        object.__setattr__(self, "index", index)
 
     def site_pose(self, site: int) -> Float:
         """Return point and tangent `(6,)` of a site."""
@@ -181,5 +177,6 @@ def build_atlas(
         with_fissures=with_fissures,
         sites=places,
         deployments=found,
+        index=StartIndex(found.positions, found.tangents),
         build_s=time.perf_counter() - began,
     )

@@ -20,6 +20,7 @@ from anatomy.settings import to_mapping
 from anatomy.store import default_cache
 from lungaccess.atlas import SITE_SPACING_MM, Atlas, build_atlas
 from lungaccess.system import System
+from stages.needle.bundles import StartIndex
 from stages.scope.sites import Sites
 from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
@@ -116,12 +117,14 @@ def _load(path: Path, lung: Lung, system: System) -> Atlas | None:
         sites: Any = {field.name: values[f"sites.{field.name}"] for field in fields(Sites)}
         sites["narrowest"] = tuple(sites["narrowest"])
         found: Any = {field.name: values[f"deployments.{field.name}"] for field in fields(Deployments)}
+        deployments = Deployments(**found)
         return Atlas(
             lung=lung,
             system=system,
             with_fissures=rest["with_fissures"],
             sites=Sites(**sites),
-            deployments=Deployments(**found),
+            deployments=deployments,
+            index=StartIndex(deployments.positions, deployments.tangents),
             build_s=rest["build_s"],
         )
     except DAMAGE:

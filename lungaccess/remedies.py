@@ -18,6 +18,7 @@ from lungaccess.searches import AtlasSearch
 from lungaccess.system import System
 from stages.needle.space import direct_arcs
 from stages.scope.device import Bronchoscope
+from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 TIGHTEST_RADIUS_MM = 20.0
 THINNEST_NEEDLE_MM = 0.3
@@ -27,6 +28,9 @@ LEAST_WALL_MM = 0.2
 RADIUS_STEP_MM = 1.0
 DIAMETER_STEP_MM = 0.05
 SCOPE_STEP_MM = 0.1
+ROTATIONS = DEFAULT_ROTATIONS // 2
+STOP_MM = 2.0 * DEFAULT_STOP_MM
+"""A thinner scope has many more places to stand; what it could do there is enumerated more coarsely."""
 
 _THIN: WeakKeyDictionary[Atlas, Atlas] = WeakKeyDictionary()
 
@@ -154,7 +158,8 @@ def _with_the_thinnest_scope(atlas: Atlas) -> Atlas | None:
     if thinnest >= atlas.system.scope.outer_diameter_mm:
         return None
     if atlas not in _THIN:
-        _THIN[atlas] = build_atlas(atlas.lung, _with_scope(atlas.system, thinnest))
+        thin = _with_scope(atlas.system, thinnest)
+        _THIN[atlas] = build_atlas(atlas.lung, thin, rotations=ROTATIONS, stop_spacing_mm=STOP_MM)
     return _THIN[atlas]
 
 

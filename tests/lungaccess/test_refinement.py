@@ -63,7 +63,8 @@ def case(small_lung: Lung) -> Case:
     blockers, _lengths, costs = direct_arcs(
         space, found.positions, found.tangents, found.branch, target.lps_mm
     )
-    clear = np.flatnonzero(blockers == 0)
+    inside = ~places.turned[found.site] & (found.outer_mm > 0.0)
+    clear = np.flatnonzero((blockers == 0) & inside)
     ranked = clear[np.argsort(-costs[clear], kind="stable")]
     judge = TubeJudge(lung, system.tubes, system.margins, **fissures)
     candidates = []

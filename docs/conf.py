@@ -1,0 +1,30 @@
+"""How Sphinx builds these pages: `make docs`; every warning is an error."""
+
+from __future__ import annotations
+
+import importlib.metadata
+
+project = "lungaccess"
+author = "The lungaccess contributors"
+copyright = f"2026, {author}"  # noqa: A001
+release = importlib.metadata.version("lungaccess")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+html_theme = "furo"
+html_title = "lungaccess"
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+autosummary_generate = True
+autosummary_imported_members = False
+nitpicky = False
+# Docstrings name their sources as [Kuntz2015]; the bibliography is one page for all of them.
+suppress_warnings = ["ref.citation", "ref.python"]

@@ -45,11 +45,11 @@ test: lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 docs: $(VENV)/.installed-docs
-	$(BIN)/mkdocs build --strict
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs site
 
 bench: $(VENV)/.installed-dev
 	cd benchmarks && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr
 
 clean:
-	rm -rf site build dist demo-output *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .asv
+	rm -rf site docs/reference build dist demo-output *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .asv
 	find anatomy stages lungaccess tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

@@ -189,6 +189,12 @@ class AirwayTree:
             return "generation disagrees with branch_parent"
         return ""
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        from anatomy.display import tree_html
+
+        return tree_html(self)
+
     @property
     def n_points(self) -> int:
         """Number of points, N."""

@@ -87,6 +87,12 @@ class Lung:
         object.__setattr__(self, "fields", MappingProxyType(dict(self.fields)))
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        from anatomy.display import lung_html
+
+        return lung_html(self)
+
     @property
     def has_fissures(self) -> bool:
         """Whether a fissure mask came with the patient."""

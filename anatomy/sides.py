@@ -47,7 +47,7 @@ def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
     step = tuple(max(1, round(COARSE_VOXEL_MM / float(s))) for s in grid.spacing_mm)
     tissue = lung & ~airway
     core = ~_pooled(~tissue, step)
-    sides = _grow_sides(core, _pooled(tissue, step), grid.lps_from_ijk[:3, :3] * step)
+    sides = grow_sides(core, _pooled(tissue, step), grid.lps_from_ijk[:3, :3] * step)
     return None if sides is None else _border(sides, step, tissue)
 
 
@@ -61,7 +61,7 @@ def _pooled(mask: Mask, step: tuple[int, ...]) -> Mask:
     return pooled
 
 
-def _grow_sides(core: Mask, tissue: Mask, axes: Float) -> NDArray[np.int32] | None:
+def grow_sides(core: Mask, tissue: Mask, axes: Float) -> NDArray[np.int32] | None:
     """Label the two lungs 1 and 2 over `tissue`, told apart by `core`, the voxels that are all tissue.
 
     The columns of `axes` are the voxel axes in LPS mm.

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.build import FORMAT, build_lung, lung_key
+from anatomy.cache import default_cache
 from anatomy.errors import FileError, LungaccessError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Float, Grid, Volume, read_only
@@ -38,15 +39,6 @@ DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, Ba
 FIELD_NAMES = ("airway", "vessel", "pleura", "fissure", "obstacle", "obstacle_fissure")
 
 
-def default_cache() -> Path:
-    """Return the folder for cached lungs: `$LUNGACCESS_CACHE`, or `lungaccess` in the user's cache."""
-    stated = os.environ.get("LUNGACCESS_CACHE")
-    if stated:
-        return Path(stated)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "lungaccess"
-
-
 def open_lung(
     sources: dict[str, str],
     read: Callable[[], PatientImages],
@@ -63,7 +55,7 @@ def open_lung(
     read : callable
         Reads the images; called only if the cache does not hold the lung.
     cache : Path, optional
-        Folder of the cache; `default_cache()` if None.
+        Folder of the cache; `anatomy.cache.default_cache()` if None.
     progress : callable, optional
         Told each step as it begins.
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.cache import default_cache
 from anatomy.errors import FileError
 from anatomy.grid import read_only
 from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
 from anatomy.settings import to_mapping
-from anatomy.store import default_cache
 from lungaccess.atlas import SITE_SPACING_MM, Atlas, build_atlas
 from lungaccess.system import System
 from stages.needle.bundles import StartIndex
@@ -47,7 +47,7 @@ def open_atlas(
     Parameters
     ----------
     cache : Path, optional
-        Folder of the cache; `anatomy.store.default_cache()` if None.
+        Folder of the cache; `anatomy.cache.default_cache()` if None.
 
     Raises
     ------

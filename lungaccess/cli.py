@@ -6,13 +6,12 @@ refuses it; 2, the input is bad.
 
 from __future__ import annotations
 
-import json as json_format
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Parameter
 from rich.panel import Panel
 
 from anatomy.errors import AnatomyError, LungaccessError, SettingsError
@@ -21,12 +20,17 @@ from anatomy.io.frames import Frame
 from lungaccess import terminal
 from lungaccess.commands_advise import advise
 from lungaccess.commands_alternatives import alternatives
+from lungaccess.commands_doctor import completion, doctor
+from lungaccess.commands_export import export
 from lungaccess.commands_reach import reach
+from lungaccess.commands_report import report
 from lungaccess.commands_risk import risk
 from lungaccess.commands_route import route
+from lungaccess.commands_segment import segment
 from lungaccess.commands_tour import tour
 from lungaccess.commands_tubes import tubes
 from lungaccess.inputs import load_device, load_lung, require_one_target
+from lungaccess.progress import SearchDisplay, progress
 from lungaccess.terminal import console, error_console
 
 if TYPE_CHECKING:
@@ -84,6 +88,32 @@ app.command(tour)
 app.command(tubes)
 app.command(risk)
 app.command(reach)
+app.command(segment)
+app.command(report)
+app.command(export)
+app.command(doctor)
+app.command(completion)
+
+
+# Cyclopts would end the process by itself.
+app.meta.suppress_keyboard_interrupt = False
+
+
+@app.meta.default
+def _run(
+    *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")] = False,
+) -> int | None:
+    """Run a command.
+
+    Parameters
+    ----------
+    quiet : bool
+        Print neither results nor progress, only errors and what --json asks for.
+    """
+    terminal.set_quiet(quiet)
+    code: int | None = app(words, exit_on_error=False, error_console=error_console)
+    return code
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -96,7 +126,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = app(_with_nodule_number(words), exit_on_error=False, error_console=error_console)
+        code = app.meta(_with_nodule_number(words), exit_on_error=False, error_console=error_console)
     except CycloptsError:
         return BAD_INPUT
     except LungaccessError as error:
@@ -145,7 +175,9 @@ def plan(
     method: Method = "atlas",
     allow_fissures: bool | None = None,
     processes: int = 1,
+    thick_slices: bool = False,
     out: Path = Path("lungaccess-plan"),
+    json: bool = False,
     cache: Path | None = None,
 ) -> int:
     """Plan the way to a target, check the plan, and write plan, pictures and cost over time.
@@ -176,8 +208,12 @@ def plan(
         Whether fissures may be crossed; as the system says if not given.
     processes : int
         How many processes refine the plan at the same time.
+    thick_slices : bool
+        Plan on masks from slices of more than 3 mm, which lack small airways and vessels.
     out : Path
         Folder for plan.json, overview.png, cost_over_time.png and cost_over_time.csv.
+    json : bool
+        Print JSON instead of tables.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
@@ -187,7 +223,7 @@ def plan(
     _require_budget(budget, iterations)
     require_writable_folder(out)
     device = load_device(system, allow_fissures)
-    lung = load_lung(patient, cache)
+    lung = load_lung(patient, cache, thick_slices=thick_slices)
     if objective in ("cost-map", "voxel-sum") and lung.cost is None:
         raise SettingsError(
             f"Patient {lung.name} has no cost map",
@@ -208,7 +244,7 @@ def plan(
         cache=cache,
         processes=processes,
     )
-    return _plan_and_report(lung, request, out)
+    return _plan_and_report(lung, request, out, json)
 
 
 @app.command
@@ -226,6 +262,7 @@ def needle(
     iterations: int | None = None,
     seed: int = 0,
     allow_fissures: bool | None = None,
+    json: bool = False,
     cache: Path | None = None,
 ) -> int:
     """Plan the needle alone from a given pose, or prove that no path exists.
@@ -258,6 +295,8 @@ def needle(
         Seed of the random numbers.
     allow_fissures : bool
         Whether fissures may be crossed; as the system says if not given.
+    json : bool
+        Print JSON instead of tables.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
@@ -268,18 +307,26 @@ def needle(
     _require_budget(budget, iterations)
     device = load_device(system, allow_fissures)
     lung = load_lung(patient, cache)
-    answer = plan_needle(
-        lung,
-        device,
-        _start_pose(lung, start, frame),
-        resolve_target(lung, target, nodule),
-        planner=planner,
-        objective=objective,
-        seed=seed,
-        iterations=iterations,
-        time_s=DEFAULT_BUDGET_S if budget is None and iterations is None else budget,
-    )
-    terminal.show(terminal.needle_tables(answer))
+    limit_s = DEFAULT_BUDGET_S if budget is None and iterations is None else budget
+    pose, aim = _start_pose(lung, start, frame), resolve_target(lung, target, nodule)
+    with progress("searching" if limit_s is None else f"searching, at most {limit_s:g} s"):
+        answer = plan_needle(
+            lung,
+            device,
+            pose,
+            aim,
+            planner=planner,
+            objective=objective,
+            seed=seed,
+            iterations=iterations,
+            time_s=limit_s,
+        )
+    if json:
+        from lungaccess.records import needle_record
+
+        terminal.show_json(needle_record(answer))
+    else:
+        terminal.show(terminal.needle_tables(answer))
     return NO_PLAN if answer.path is None else OK
 
 
@@ -327,17 +374,16 @@ def check(
 
     stored = Plan.load(plan)
     device = None if system is None else load_device(system, None)
-    report = judge(stored, load_lung(patient, cache), system=device)
+    report = judge(stored, load_lung(patient, cache, thick_slices=True), system=device)
     if json:
-        text = json_format.dumps(report.to_mapping(), indent=2)
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        terminal.show_json(report.to_mapping())
         return OK if report.accepted else NO_PLAN
     terminal.show(terminal.check_tables(report))
     return _verdict(report.accepted)
 
 
 @app.command
-def info(patient: Path, *, out: Path | None = None, cache: Path | None = None) -> int:
+def info(patient: Path, *, out: Path | None = None, json: bool = False, cache: Path | None = None) -> int:
     """Show what was understood of a patient: volumes, airway tree, sources and warnings.
 
     Parameters
@@ -346,27 +392,47 @@ def info(patient: Path, *, out: Path | None = None, cache: Path | None = None) -
         Folder of masks.
     out : Path
         Folder for tree.png, a picture of the airway tree.
+    json : bool
+        Print JSON instead of tables.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
     if out is not None:
         require_writable_folder(out)
-    lung = load_lung(patient, cache)
-    terminal.show(terminal.anatomy_tables(lung))
-    _print_warnings(lung)
+    lung = load_lung(patient, cache, thick_slices=True)
+    if json:
+        from lungaccess.records import lung_record
+
+        terminal.show_json(lung_record(lung))
+    else:
+        terminal.show(terminal.anatomy_tables(lung))
+        _print_warnings(lung)
     if out is not None:
         from lungaccess.report import tree_png
 
-        console.print(f"Picture of the tree: {tree_png(lung, out / 'tree.png')}")
+        picture = tree_png(lung, out / "tree.png")
+        if not json:
+            console.print(f"Picture of the tree: {picture}")
     return OK
 
 
 @app.command
-def presets() -> int:
-    """List the systems that ship with lungaccess."""
+def presets(*, json: bool = False) -> int:
+    """List the systems that ship with lungaccess.
+
+    Parameters
+    ----------
+    json : bool
+        Print JSON, with every setting, instead of a table.
+    """
+    from anatomy.settings import to_mapping
     from lungaccess.system import load_system, preset_names
 
-    console.print(terminal.preset_table({name: load_system(name) for name in preset_names()}))
+    systems = {name: load_system(name) for name in preset_names()}
+    if json:
+        terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
+    else:
+        console.print(terminal.preset_table(systems))
     return OK
 
 
@@ -376,6 +442,7 @@ def demo(
     out: Path = Path("demo-output"),
     budget: float = 3.0,
     seed: int = DEMO_SEED,
+    json: bool = False,
     cache: Path | None = None,
 ) -> int:
     """Make a synthetic patient, plan to one of its nodules, check the plan and draw it.
@@ -388,6 +455,8 @@ def demo(
         Planning time in seconds.
     seed : int
         Seed of the patient and of the search.
+    json : bool
+        Print JSON instead of tables.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
@@ -395,17 +464,18 @@ def demo(
 
     _require_budget(budget, None)
     require_writable_folder(out)
-    with console.status("making a synthetic patient") as status:
-        lung = demo_lung(seed, cache, status.update)
-    terminal.show(terminal.anatomy_tables(lung)[1:3])
+    with progress("making a synthetic patient") as shown:
+        lung = demo_lung(seed, cache, shown.step)
+    if not json:
+        terminal.show(terminal.anatomy_tables(lung)[1:3])
     request = SearchRequest(system=load_device(DEFAULT_SYSTEM, None), seed=seed, time_s=budget, cache=cache)
-    code = _first_reachable_nodule(lung, request, out)
-    if code == OK:
+    code = _first_reachable_nodule(lung, request, out, json)
+    if code == OK and not json:
         console.print(terminal.what_to_look_at(out))
     return code
 
 
-def _first_reachable_nodule(lung: Lung, request: SearchRequest, out: Path) -> int:
+def _first_reachable_nodule(lung: Lung, request: SearchRequest, out: Path, json: bool) -> int:
     """Plan to the nodules in their order until one can be reached."""
     from dataclasses import replace
 
@@ -414,46 +484,59 @@ def _first_reachable_nodule(lung: Lung, request: SearchRequest, out: Path) -> in
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
-            return _plan_and_report(lung, replace(request, nodule=number), out)
+            return _search_and_report(lung, replace(request, nodule=number), out, json)
         except NoPlan as error:
-            console.print(f"Nodule {number} cannot be reached; trying the next one.")
+            terminal.progress_console.print(f"Nodule {number} cannot be reached; trying the next one.")
             failure = error
     raise failure or AnatomyError("The synthetic patient has no nodule", remedy="Choose another --seed")
 
 
-def _plan_and_report(lung: Lung, request: SearchRequest, out: Path) -> int:
+def _plan_and_report(lung: Lung, request: SearchRequest, out: Path, json: bool) -> int:
+    """Do as `_search_and_report`; that there is no plan is printed as JSON, too, if JSON is asked for."""
+    from lungaccess.noplan import NoPlan
+    from lungaccess.records import no_plan_record
+
+    try:
+        return _search_and_report(lung, request, out, json)
+    except NoPlan as failure:
+        if not json:
+            raise
+        terminal.show_json(no_plan_record(failure))
+        return NO_PLAN
+
+
+def _search_and_report(lung: Lung, request: SearchRequest, out: Path, json: bool) -> int:
     """Search, check, write everything to `out`, show it, and return the exit code."""
     from lungaccess.checking import check as judge
+    from lungaccess.records import plan_record
     from lungaccess.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
     from lungaccess.run import run_search
     from lungaccess.target import resolve_target
 
     target = resolve_target(lung, request.target, request.nodule)
-    found, history = run_search(
-        lung, target, request, terminal.SearchDisplay(request.time_s, request.iterations)
-    )
+    found, history = run_search(lung, target, request, SearchDisplay(request.time_s, request.iterations))
     found.save(out / "plan.json")
-    with console.status("checking and drawing the plan"):
+    with progress("checking and drawing the plan"):
         report = judge(found, lung, system=request.system, target_lps=target.lps_mm)
         overview_png(found, lung, out / "overview.png")
         tree_png(lung, out / "tree.png")
         cost_over_time_csv(history, out / "cost_over_time.csv")
         cost_over_time_png(history, out / "cost_over_time.png", terminal.objective_words(found.objective))
+    written = ("plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv")
+    if json:
+        terminal.show_json(plan_record(found, report, out, written))
+        return OK if report.accepted else NO_PLAN
     terminal.show(terminal.plan_tables(found))
     _print_warnings(lung)
     if not report.accepted:
         terminal.show(terminal.check_tables(report, refusals_only=True))
-    written = ", ".join(("plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv"))
-    console.print(terminal.escaped(f"Written to {out}: {written}"))
+    console.print(terminal.escaped(f"Written to {out}: {', '.join(written)}"))
     return _verdict(report.accepted)
 
 
 def _verdict(accepted: bool) -> int:
-    if accepted:
-        console.print("[bold green]The independent check accepts the plan.[/]")
-        return OK
-    console.print("[bold red]The independent check refuses the plan.[/]")
-    return NO_PLAN
+    terminal.show_verdict(accepted)
+    return OK if accepted else NO_PLAN
 
 
 def _print_warnings(lung: Lung) -> None:

@@ -9,6 +9,7 @@ from anatomy.io.files import require_writable_folder
 from anatomy.io.frames import parse_point
 from lungaccess import terminal
 from lungaccess.inputs import load_device, load_lung, require_one_target
+from lungaccess.progress import progress
 
 if TYPE_CHECKING:
     from lungaccess.advise import ScopeAdvice
@@ -25,6 +26,7 @@ def advise(
     system: str = "lung-default",
     seed: int = 0,
     out: Path = Path("lungaccess-advice"),
+    json: bool = False,
     cache: Path | None = None,
 ) -> int:
     """Advise the bronchoscope: turn by turn to a lesion, or as near as it gets, and why not nearer.
@@ -48,6 +50,8 @@ def advise(
         Seed of the random numbers.
     out : Path
         Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer.
+    json : bool
+        Print JSON instead of tables.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
@@ -59,10 +63,14 @@ def advise(
     device = load_device(system, None)
     lung = load_lung(patient, cache)
     centre = parse_point(target) if target is not None else nodule_target(lung, nodule or 1).lps_mm
-    advice = advise_scope(lung, device, centre, lesion_radius, seed=seed)
+    with progress("steering the scope"):
+        advice = advise_scope(lung, device, centre, lesion_radius, seed=seed)
     save_advice(advice, out)
-    _show(advice)
-    terminal.console.print(terminal.escaped(f"Written to {out}: {ADVICE_FILE}, {CAMERA_FILE}"))
+    if json:
+        terminal.show_json(advice.as_json())
+    else:
+        _show(advice)
+        terminal.console.print(terminal.escaped(f"Written to {out}: {ADVICE_FILE}, {CAMERA_FILE}"))
     return REACHED if advice.path.reached else NOT_REACHED
 
 

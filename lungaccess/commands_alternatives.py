@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from anatomy.io.files import require_writable_folder
 from lungaccess import terminal
 from lungaccess.inputs import load_device, load_lung, require_one_target
+from lungaccess.progress import progress
 
 if TYPE_CHECKING:
     from lungaccess.alternatives import Alternative
@@ -29,6 +30,7 @@ def alternatives(
     objective: str = "inverse_clearance",
     allow_fissures: bool | None = None,
     out: Path = Path("lungaccess-alternatives"),
+    json: bool = False,
     cache: Path | None = None,
 ) -> int:
     """Show plans to one target that differ, check each, and write them; those no other beats are marked.
@@ -53,6 +55,8 @@ def alternatives(
         Whether fissures may be crossed; as the system says if not given.
     out : Path
         Folder for plan-01.json and so on.
+    json : bool
+        Print JSON instead of a table.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
@@ -66,15 +70,38 @@ def alternatives(
     device = load_device(system, allow_fissures)
     lung = load_lung(patient, cache)
     aim = resolve_target(lung, target, nodule)
-    atlas = open_atlas(lung, device, cache=cache)
-    menu = find(lung, device, aim, objective=objective, count=count, apart_mm=apart, atlas=atlas)
-    refused = 0
-    for number, each in enumerate(menu, start=1):
-        each.plan.save(out / f"plan-{number:02d}.json")
-        refused += not check(each.plan, lung).accepted
+    with progress("enumerating what scope and tubes can do") as shown:
+        atlas = open_atlas(lung, device, cache=cache, progress=shown.share)
+    with progress("searching"):
+        menu = find(lung, device, aim, objective=objective, count=count, apart_mm=apart, atlas=atlas)
+    accepted = []
+    with progress("checking") as shown:
+        for number, each in enumerate(menu, start=1):
+            each.plan.save(out / f"plan-{number:02d}.json")
+            accepted.append(check(each.plan, lung).accepted)
+            shown.share(number / len(menu))
+    refused = accepted.count(False)
+    if json:
+        terminal.show_json(_records(menu, accepted, out))
+        return REFUSED if refused else ACCEPTED
     terminal.show([terminal.table(f"Ways to the target in {lung.name}", COLUMNS, _rows(menu))])
     terminal.console.print(terminal.escaped(f"Written to {out}; the check refuses {refused} of {len(menu)}"))
     return REFUSED if refused else ACCEPTED
+
+
+def _records(menu: tuple[Alternative, ...], accepted: list[bool], out: Path) -> list[dict[str, object]]:
+    """Return each plan's file, verdict and criteria as plain values."""
+    return [
+        {
+            "plan": str(out / f"plan-{number:02d}.json"),
+            "accepted": verdict,
+            "no_other_beats_it": bool(each.on_front),
+            "branch": int(each.plan.tube.exit.branch),
+            "generation": int(each.plan.scope.generation),
+            "criteria": {name: float(value) for name, value in each.criteria.items()},
+        }
+        for number, (each, verdict) in enumerate(zip(menu, accepted, strict=True), start=1)
+    ]
 
 
 def _rows(menu: tuple[Alternative, ...]) -> list[tuple[str, ...]]:

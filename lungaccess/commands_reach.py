@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from anatomy.io.files import atomic_write, require_writable_folder
 from lungaccess import terminal
 from lungaccess.inputs import load_device, load_lung
+from lungaccess.progress import progress
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -27,6 +28,7 @@ def reach(
     compare: str | None = None,
     allow_fissures: bool | None = None,
     out: Path = Path("lungaccess-reach"),
+    page: Path | None = None,
     json: bool = False,
     cache: Path | None = None,
 ) -> int:
@@ -50,6 +52,8 @@ def reach(
         Whether fissures may be crossed; as each system says if not given.
     out : Path
         Folder for the volumes, the pictures and reach.json.
+    page : Path
+        HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
     json : bool
         Print JSON instead of tables.
     cache : Path
@@ -61,33 +65,38 @@ def reach(
     names = [system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
     systems = [load_device(name, allow_fissures) for name in dict.fromkeys(names)]
     folder = require_writable_folder(out)
+    if page is not None:
+        require_writable_folder(page.parent)
     lung = load_lung(patient, cache)
-    with terminal.error_console.status("scanning") as status:
+    with progress("scanning") as shown:
         maps = compare_systems(
             lung,
             systems,
             spacing_mm=spacing,
             trees=search,
             work=folder,
-            progress=lambda name, share: status.update(
-                terminal.escaped(f"{name}: {share:.0%} of the layers")
-            ),
+            progress=shown.step,
         )
     stems = _stems(maps)
     for stem, each in zip(stems, maps, strict=True):
         each.save(folder, stem)
         reach_png(each, lung, folder / f"{stem}.png")
-    text = json_format.dumps([record(each) for each in maps], indent=2)
+    written = [record(each) for each in maps]
     with atomic_write(folder / "reach.json") as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(json_format.dumps(written, indent=2) + "\n", encoding="utf-8")
+    if page is not None:
+        from lungaccess.report.html import reach_page
+
+        reach_page(maps, lung, page)
     if json:
-        terminal.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        terminal.show_json(written)
         return OK
     terminal.show([_region_table(each) for each in maps])
     if len(maps) > 1:
         terminal.show([_comparison_table(maps)])
-    written = ", ".join(f"{stem}.nrrd, {stem}-cost.nrrd, {stem}-clearance.nrrd, {stem}.png" for stem in stems)
-    terminal.console.print(terminal.escaped(f"Written to {out}: {written}, reach.json"))
+    files = ", ".join(f"{stem}.nrrd, {stem}-cost.nrrd, {stem}-clearance.nrrd, {stem}.png" for stem in stems)
+    also = "" if page is None else f"; {page}"
+    terminal.console.print(terminal.escaped(f"Written to {out}: {files}, reach.json{also}"))
     return OK
 
 

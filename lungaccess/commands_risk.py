@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lungaccess import terminal
 from lungaccess.inputs import load_lung
+from lungaccess.progress import progress
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -61,11 +61,12 @@ def risk(
     model = ErrorModel() if errors is None else load_errors(errors)
     stored = Plan.load(plan)
     lung = load_lung(patient, cache)
-    report = assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
-    kept = tolerances(stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius)
+    with progress("deviating the plan"):
+        report = assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
+    with progress("looking for the largest errors"):
+        kept = tolerances(stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius)
     if json:
-        text = json_format.dumps(record(report, kept), indent=2)
-        terminal.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        terminal.show_json(record(report, kept))
     else:
         terminal.show([_outcome_table(report), _tolerance_table(kept)])
     return OK

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import json as json_format
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -10,6 +10,7 @@ from anatomy.errors import SettingsError
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.io.frames import Frame, parse_point
 from lungaccess import terminal
+from lungaccess.progress import progress
 
 if TYPE_CHECKING:
     from stages.scope.route.planner import Route
@@ -31,6 +32,7 @@ def route(
     frame: Frame | None = None,
     pixel: float | None = None,
     out: Path = Path("lungaccess-route"),
+    json: bool = False,
     cache: Path | None = None,
 ) -> int:
     """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, and draw it.
@@ -61,6 +63,8 @@ def route(
         Size of a pixel of a drawing, mm.
     out : Path
         Folder for route.json and route.png.
+    json : bool
+        Print JSON instead of a table.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
@@ -80,15 +84,19 @@ def route(
     if seed < 0:
         raise SettingsError(f"--seed is {seed}", expected="at least 0")
     require_writable_folder(out)
-    with terminal.console.status("reading the tubes") as status:
+    with progress("route") as shown:
+        shown.step("reading the tubes")
         opened = open_source(source, frame=frame, pixel_mm=pixel, cache=cache)
-        status.update("planning")
+        shown.step("planning")
         first = widest_end(opened.centreline) if begin is None else begin
         found = try_route(opened.centreline, first, end, limits, repair=repair, seed=seed)
     written = record(opened, found)
     with atomic_write(out / "route.json") as temporary:
-        temporary.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(json_format.dumps(written, indent=2) + "\n", encoding="utf-8")
     route_png(opened.name, opened.centreline, found, out / "route.png")
+    if json:
+        terminal.show_json(written)
+        return PROVED if found.proved else NO_ROUTE
     terminal.show([terminal.table(f"Route along {opened.name}", ("", "", "limit"), _rows(found, written))])
     terminal.console.print(terminal.escaped(f"Written to {out}: route.json, route.png"))
     return _verdict(found)

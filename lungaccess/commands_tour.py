@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import json as json_format
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import atomic_write, require_writable_folder
 from lungaccess import terminal
+from lungaccess.inputs import load_lung
+from lungaccess.progress import progress
 
 if TYPE_CHECKING:
     from lungaccess.tour import TourAnswer
@@ -30,6 +32,7 @@ def tour(
     speed: float = 10.0,
     per_lesion: float = 300.0,
     out: Path = Path("lungaccess-tour"),
+    json: bool = False,
     cache: Path | None = None,
 ) -> int:
     """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out.
@@ -58,11 +61,12 @@ def tour(
         Time that each lesion takes besides, s.
     out : Path
         Folder for tour.json and tour.png.
+    json : bool
+        Print JSON instead of tables.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.atlas_store import open_atlas
-    from lungaccess.patients import load_patient
     from lungaccess.report.tour import tour_png
     from lungaccess.system import load_system
     from lungaccess.tour import plan_tour, read_lesions, record
@@ -77,13 +81,11 @@ def tour(
     lesions = read_lesions(targets)
     require_writable_folder(out)
     device = load_system(system)
-    with terminal.console.status("reading the patient") as status:
-        lung = load_patient(patient, cache=cache, progress=status.update)
-        atlas = None
-        if vet:
-            status.update("enumerating what scope and tubes can do")
-            atlas = open_atlas(lung, device, cache=cache)
-        status.update("planning")
+    lung, atlas = load_lung(patient, cache), None
+    if vet:
+        with progress("enumerating what scope and tubes can do") as shown:
+            atlas = open_atlas(lung, device, cache=cache, progress=shown.share)
+    with progress("planning the tour"):
         answer = plan_tour(
             lung,
             lesions,
@@ -94,8 +96,11 @@ def tour(
             atlas=atlas,
         )
     with atomic_write(out / "tour.json") as temporary:
-        temporary.write_text(json.dumps(record(answer), indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(json_format.dumps(record(answer), indent=2) + "\n", encoding="utf-8")
     tour_png(answer, lung, out / "tour.png")
+    if json:
+        terminal.show_json(record(answer))
+        return SOME_LEFT_OUT if answer.left_out else ALL_REACHED
     _show(answer, speed, per_lesion)
     terminal.console.print(terminal.escaped(f"Written to {out}: tour.json, tour.png"))
     for number, why in answer.left_out.items():

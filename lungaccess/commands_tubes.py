@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -171,8 +170,7 @@ def _show_json(answer: TubeAnswer, propose: bool) -> None:
         written["refused_sequences"] = comparison.refused
         if answer.system is not None:
             written["proposals"] = [_proposal(each) for each in design_choices(answer)[1]]
-    text = json.dumps(written, indent=2)
-    terminal.console.print(text, markup=False, highlight=False, soft_wrap=True)
+    terminal.show_json(written)
 
 
 def _proposal(proposal: DesignProposal) -> dict[str, object]:

@@ -6,6 +6,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
+from lungaccess.nearest import did_you_mean
 from stages.needle import costs
 from stages.needle.path import ArcPath
 from stages.needle.space import Arrays
@@ -17,7 +18,9 @@ def require_objective(objective: str) -> None:
     """Raise SettingsError unless the objective is known."""
     if objective not in OBJECTIVES:
         raise SettingsError(
-            f"There is no objective {objective!r}", expected=f"one of {', '.join(OBJECTIVES)}"
+            f"There is no objective {objective!r}",
+            expected=f"one of {', '.join(OBJECTIVES)}",
+            remedy=did_you_mean(objective, OBJECTIVES),
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
@@ -76,7 +77,11 @@ def _received(end: Connection) -> Step | None:
 
 
 def _work(search: AtlasSearch, number: int, processes: int, end: Connection) -> None:
-    """Go on with the search in this process: a round for each message, which is the best of all."""
+    """Go on with the search in this process: a round for each message, which is the best of all.
+
+    An interruption from the keyboard reaches every process; only the one that holds the best heeds it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     search.take_part(number, processes)
     steps = search.further_steps()
     while True:

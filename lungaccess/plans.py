@@ -260,6 +260,12 @@ class Plan(_Record):
     iterations: int
     timing: Mapping[str, float]
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        from lungaccess.plan_display import plan_html
+
+        return plan_html(self)
+
     @property
     def digest(self) -> str:
         """SHA-256 (hex) of the canonical JSON of everything except `timing`."""

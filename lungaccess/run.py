@@ -29,6 +29,9 @@ class Display(AbstractContextManager[Any], Protocol):
     def better(self, elapsed_s: float, cost: float) -> None:
         """Show that a better plan was found."""
 
+    def interrupted(self) -> None:
+        """Show that the user ended the search."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SearchRequest:
@@ -132,6 +135,7 @@ def run_search(
         except KeyboardInterrupt:
             if best is None:
                 raise
+            display.interrupted()
     if best is None:
         raise _ended_silently()
     return best, history.points

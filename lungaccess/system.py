@@ -15,6 +15,7 @@ from pydantic import Field
 from anatomy.errors import FileError, SettingsError
 from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, settings, switch, text, to_mapping
+from lungaccess.nearest import did_you_mean
 from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes
@@ -111,7 +112,7 @@ def load_system(name_or_path: str | os.PathLike[str]) -> System:
         raise SettingsError(
             f"There is no system called {given!r}",
             expected=f"a preset ({', '.join(preset_names())}) or the path of a .toml file",
-            remedy="docs/devices.md shows how to write one",
+            remedy=did_you_mean(given, preset_names()) or "docs/devices.md shows how to write one",
         )
     else:
         content = _read(Path(name_or_path))

@@ -1,16 +1,16 @@
-"""What the command line shows: tables, short panels for errors, and the progress of a search."""
+"""What the command line shows: tables, JSON, and short panels for errors."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
 from rich.panel import Panel
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -24,8 +24,38 @@ if TYPE_CHECKING:
 
 console = Console()
 error_console = Console(stderr=True)
+progress_console = Console(stderr=True)
 
 Row = tuple[str, ...]
+
+
+def set_quiet(quiet: bool) -> None:
+    """Let commands print neither results nor progress, or let them again; JSON and errors still come."""
+    console.quiet = progress_console.quiet = quiet
+
+
+def show_json(value: object) -> None:
+    """Print plain values as JSON on standard output, also for quiet commands; null for what is not finite."""
+    console.file.write(json.dumps(_finite(value), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: object) -> object:
+    """Replace numbers that JSON does not know."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return value
+
+
+def show_verdict(accepted: bool) -> None:
+    """Print the verdict of the independent check."""
+    if accepted:
+        console.print("[bold green]The independent check accepts the plan.[/]")
+    else:
+        console.print("[bold red]The independent check refuses the plan.[/]")
 
 
 def table(title: str, headings: Iterable[str], rows: Iterable[Row]) -> Table:
@@ -250,16 +280,10 @@ def _repair_rows(lung: Lung) -> list[Row]:
 
 
 def _volume_rows(lung: Lung) -> list[Row]:
-    from anatomy import structures
+    from lungaccess.records import structure_voxels
 
-    outside = np.count_nonzero(lung.labels & structures.OUTSIDE)
-    counts = {"inside the lung": lung.labels.size - outside}
-    for name in ("airway", "lumen", "vessel", "fissure"):
-        counts[name] = np.count_nonzero(lung.labels & structures.BITS[name])
-    if lung.nodules is not None:
-        counts["nodules"] = np.count_nonzero(lung.nodules.array)
     ml = lung.grid.voxel_volume_mm3 / 1000.0
-    return [(name, f"{count * ml:.1f}", f"{count}") for name, count in counts.items() if count]
+    return [(name, f"{count * ml:.1f}", f"{count}") for name, count in structure_voxels(lung).items()]
 
 
 def _generation_rows(lung: Lung) -> list[Row]:
@@ -311,40 +335,3 @@ def what_to_look_at(out: Path) -> Panel:
         f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
     )
     return Panel("\n".join(escaped(line) for line in lines), title="what to look at", title_align="left")
-
-
-class SearchDisplay:
-    """Shows a search while it runs: what it does, how much of the budget is used, the best cost."""
-
-    def __init__(self, time_s: float | None, iterations: int | None) -> None:
-        self._time_s, self._iterations = time_s, iterations
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[best]}"),
-            console=console,
-            transient=True,
-        )
-        total = float(iterations) if iterations is not None else time_s
-        self._task = self._progress.add_task("searching", total=total, best="no plan yet")
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
-
-    def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
-        """Show the state of the search."""
-        done = float(iteration) if self._iterations is not None else elapsed_s
-        best = "no plan yet" if best_cost is None else f"best cost {best_cost:.4g}"
-        self._progress.update(self._task, description=description, completed=done, best=best)
-
-    def better(self, elapsed_s: float, cost: float) -> None:
-        """Leave a line about a better plan above the bar."""
-        self._progress.console.print(f"  {elapsed_s:8.2f} s   cost {cost:.5g}", highlight=False)

@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("PATIENT", "phantom-1"):
         write_phantom(patient, here / name)
     lung = la.load_patient(here / "PATIENT", cache=here / "cache")
-    system = la.load_system("lung-default")
+    system = la.load_system("ultrathin")
     found = next(la.plan(lung, system, la.resolve_target(lung), iterations=0))
     np.savetxt(here / "pose.txt", LPS_FROM_RAS @ found.tube.lps_from_tip)
     lesions = [",".join(f"{x:.2f}" for x in nodule.centre_lps) for nodule in patient.nodules[:2]]

@@ -102,10 +102,17 @@ def read_labels(path: str | Path) -> Mapping[int, str]:
     return nrrd_labels(read_nrrd_header(path)) if suffix in NRRD else {}
 
 
-def write_volume(path: str | Path, volume: Volume) -> None:
-    """Write a volume as .nii, .nii.gz or .nrrd, with its frame stated; masks become 0 and 1.
+def write_volume(path: str | Path, volume: Volume, *, header: Mapping[str, str] | None = None) -> None:
+    """Write a volume as .nii, .nii.gz, .nrrd or .seg.nrrd, with its frame stated; masks become 0 and 1.
 
     The file appears complete or not at all.
+
+    Parameters
+    ----------
+    path : path
+    volume : Volume
+    header : mapping of str to str, optional
+        `key:=value` lines of a .nrrd file, such as those that name the segments of .seg.nrrd.
 
     Raises
     ------
@@ -115,14 +122,20 @@ def write_volume(path: str | Path, volume: Volume) -> None:
     import SimpleITK
 
     path = Path(path)
-    if image_suffix(path) not in (".nii", ".nii.gz", ".nrrd"):
-        raise FileError(f"{path} has no ending that can be written", expected=".nii, .nii.gz or .nrrd")
+    if image_suffix(path) not in (".nii", ".nii.gz", ".nrrd", ".seg.nrrd"):
+        raise FileError(
+            f"{path} has no ending that can be written", expected=".nii, .nii.gz, .nrrd or .seg.nrrd"
+        )
+    if header and path.suffix != ".nrrd":
+        raise FileError(f"{path} cannot hold a header of keys and values", expected="a name ending in .nrrd")
     array = volume.array.view(np.uint8) if volume.array.dtype == np.bool_ else volume.array
     image = SimpleITK.GetImageFromArray(array.T)
     spacing = volume.grid.spacing_mm
     image.SetSpacing(spacing.tolist())
     image.SetOrigin(volume.grid.lps_from_ijk[:3, 3].tolist())
     image.SetDirection((volume.grid.lps_from_ijk[:3, :3] / spacing).ravel().tolist())
+    for key, value in (header or {}).items():
+        image.SetMetaData(key, value)
     with atomic_write(path) as temporary:
         try:
             SimpleITK.WriteImage(image, str(temporary), useCompression=path.suffix != ".nii")

@@ -16,7 +16,7 @@ from anatomy.io.images import read_volume
 from anatomy.io.label_names import stored_names
 from anatomy.io.masks import MaskSource, assemble, read_masks, require_cost
 from anatomy.patient import PatientImages
-from anatomy.settings import parse, settings
+from anatomy.settings import parse, quantity, settings
 
 DESCRIPTION = "patient.toml"
 _ROLES = {
@@ -51,6 +51,9 @@ class PatientFile:
         Literal["", "inspiration", "expiration", "free-breathing"], _key("State of breathing")
     ] = ""
     targets: Annotated[tuple[str, ...], _key("Points with their frame")] = ()
+    thick_slices_mm: Annotated[
+        float, quantity("Distance of slices too thick to show small airways and vessels", at_least=0.0)
+    ] = 0.0
 
 
 def load_own_masks(description: Path) -> PatientImages:
@@ -85,6 +88,31 @@ def load_own_masks(description: Path) -> PatientImages:
         targets_lps=targets,
         breath_hold=keys.breath_hold or None,
         sources=hashes,
+        warnings=_thick_slices(keys.thick_slices_mm),
+    )
+
+
+def thick_slices_mm(path: str | Path) -> float:
+    """Return the distance of the slices of a patient's CT if its description marks them as thick, else 0.
+
+    Raises
+    ------
+    SettingsError
+        If there is a description, and it is wrong.
+    """
+    path = Path(path)
+    description = path / DESCRIPTION if path.is_dir() else path
+    if description.suffix != ".toml" or not description.is_file():
+        return 0.0
+    return _read_description(description).thick_slices_mm
+
+
+def _thick_slices(distance_mm: float) -> tuple[str, ...]:
+    if not distance_mm:
+        return ()
+    return (
+        f"The masks were made from slices {distance_mm:.1f} mm apart: small airways and vessels are missing, "
+        "so a path that looks free may not be.",
     )
 
 

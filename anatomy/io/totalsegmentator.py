@@ -11,6 +11,7 @@ from anatomy.io.files import sha256
 from anatomy.io.images import image_stem, image_suffix
 from anatomy.io.label_names import label_values, published_names, stored_names
 from anatomy.io.masks import Mask, MaskSet, MaskSource, assemble, read_masks
+from anatomy.morphology import grown_by_one
 from anatomy.patient import PatientImages
 
 ROLES: Mapping[str, str] = {
@@ -58,15 +59,7 @@ def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> Patien
     AnatomyError
         If a structure is missing or empty, or labels cannot be told apart.
     """
-    sources: list[MaskSource] = []
-    statements: list[str] = []
-    for path in _images(folder):
-        if path == label_map or image_stem(path) == "lung_vessels" or image_stem(path) not in ROLES:
-            names, statement = _label_names(path, must_have=path == label_map)
-            sources += _named_sources(path, names)
-            statements += statement
-        else:
-            sources.append(MaskSource(role=ROLES[image_stem(path)], path=path))
+    sources, statements = mask_sources(folder, label_map)
     masks = read_masks(sources)
     filled = fill_lung(masks)
     sidecars = [path for path in folder.glob("*.json") if path.is_file()]
@@ -78,6 +71,23 @@ def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> Patien
         warnings=tuple(statements),
         sources={path.name: sha256(path) for path in sidecars},
     )
+
+
+def mask_sources(folder: Path, label_map: Path | None = None) -> tuple[list[MaskSource], list[str]]:
+    """Return the files and labels of a folder that make up each mask, and what had to be inferred.
+
+    The parameters and errors are those of `load_totalsegmentator`.
+    """
+    sources: list[MaskSource] = []
+    statements: list[str] = []
+    for path in _images(folder):
+        if path == label_map or image_stem(path) == "lung_vessels" or image_stem(path) not in ROLES:
+            names, statement = _label_names(path, must_have=path == label_map)
+            sources += _named_sources(path, names)
+            statements += statement
+        else:
+            sources.append(MaskSource(role=ROLES[image_stem(path)], path=path))
+    return sources, statements
 
 
 def _images(folder: Path) -> list[Path]:
@@ -124,8 +134,8 @@ def fill_lung(masks: MaskSet) -> MaskSet:
     tubes: Mask = np.logical_or.reduce(roles)
     lung: Mask = lobes | tubes
     box = _box(lung)
-    closed = ~_dilate(~_dilate(lung[box]))
-    lung[box] |= closed & _dilate(tubes[box]) & _dilate(_dilate(lobes[box]))
+    closed = ~grown_by_one(~grown_by_one(lung[box]))
+    lung[box] |= closed & grown_by_one(tubes[box]) & grown_by_one(grown_by_one(lobes[box]))
     return MaskSet(
         grid=masks.grid,
         masks={**masks.masks, "lung": lung},
@@ -140,15 +150,3 @@ def _box(mask: Mask) -> tuple[slice, ...]:
     lines = np.any(mask, axis=(1, 2)), np.any(along_jk, axis=1), np.any(along_jk, axis=0)
     hits = [np.flatnonzero(line) for line in lines]
     return tuple(slice(max(0, int(hit[0]) - 2), int(hit[-1]) + 3) for hit in hits)
-
-
-def _dilate(mask: Mask) -> Mask:
-    """Grow a mask by one voxel in all 26 directions (one axis after the other)."""
-    for axis in range(3):
-        lower = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
-        upper = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
-        grown = mask.copy(order="F")
-        grown[lower] |= mask[upper]
-        grown[upper] |= mask[lower]
-        mask = grown
-    return mask

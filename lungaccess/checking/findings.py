@@ -83,6 +83,12 @@ class CheckReport:
     accepted: bool
     findings: tuple[Finding, ...]
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        from lungaccess.checking.display import report_html
+
+        return report_html(self)
+
     @property
     def refusals(self) -> tuple[Finding, ...]:
         """The findings that are not ok."""

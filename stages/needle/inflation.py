@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from anatomy.errors import SettingsError
 from anatomy.grid import Volume, read_only
+from anatomy.inflation import grown_by_voxels, inflation_voxels
 from anatomy.structures import OUTSIDE
 from stages.needle.kernels import limits as index
 from stages.needle.path import ArcPath, blocker_on_path
@@ -24,22 +25,6 @@ from stages.needle.space import NeedleSpace
 
 LEAST_STEP_MM = 1e-3
 """Shorter steps are no steps."""
-ROUNDING = 1e-6
-"""Relative: quotients and squared distances are whole numbers and fractions of small ones."""
-
-
-def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> NDArray[np.int64]:
-    """Return by how many voxels obstacles grow along i, j and k: `ceil(r_total / s_i)` [Fu2018, sec. IV-B].
-
-    Parameters
-    ----------
-    spacing_mm : (3,) float64
-        Voxel size along i, j, k.
-    total_radius_mm : float
-        Radius of the needle and safety margin.
-    """
-    quotient = total_radius_mm / np.asarray(spacing_mm, dtype=np.float64)
-    return np.ceil(quotient * (1.0 - ROUNDING)).astype(np.int64)
 
 
 def largest_step_mm(spacing_mm: ArrayLike, total_radius_mm: float) -> float:
@@ -90,10 +75,10 @@ def inflated_space(space: NeedleSpace) -> NeedleSpace:
     axes = inflation_voxels(space.grid.spacing_mm, space.required_clearance_mm)
     grown = np.zeros(space.grid.shape, dtype=np.uint16, order="F")
     for bit in (1 << n for n in range(16) if bits >> n & 1):
-        grown |= np.where(_dilated((labels & bit) != 0, axes), np.uint16(bit), np.uint16(0))
+        grown |= np.where(grown_by_voxels((labels & bit) != 0, axes), np.uint16(bit), np.uint16(0))
     costs = space.cost_map
     if costs is not None:
-        barred = _dilated(np.isposinf(costs.array), axes)
+        barred = grown_by_voxels(np.isposinf(costs.array), axes)
         grown |= np.where(barred & (grown == 0), np.uint16(OUTSIDE), np.uint16(0))
         bits |= OUTSIDE if barred.any() else 0
         values = np.where(grown != 0, np.float32(math.inf), costs.array)
@@ -127,14 +112,3 @@ def refuting_labels(space: NeedleSpace, paths: Iterable[ArcPath], branch: int = 
             expected="the space from which it was made",
         )
     return np.array([blocker_on_path(space, path, branch) for path in paths], dtype=np.int64)
-
-
-def _dilated(mask: NDArray[np.bool_], axes: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return the voxels within an ellipsoid of semi-axes `axes`, in voxels, about a voxel of `mask`."""
-    import edt
-
-    if not mask.any():
-        return mask
-    sides = tuple(float(1.0 / a) for a in axes)
-    distance = edt.edt(np.asfortranarray(~mask), anisotropy=sides, order="F", black_border=False, parallel=1)
-    return np.asarray(distance <= 1.0 + ROUNDING)

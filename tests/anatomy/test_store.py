@@ -21,10 +21,11 @@ import pytest
 from anatomy import store
 from anatomy.airway_tree import GapBridged, LoopOpened, SpurPruned
 from anatomy.build import build_lung, lung_key
+from anatomy.cache import default_cache
 from anatomy.errors import AnatomyError, FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
-from anatomy.store import META, default_cache, open_lung
+from anatomy.store import META, open_lung
 from tests.anatomy import toys
 from tests.anatomy.toys import toy
 

@@ -35,7 +35,7 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def never_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fail a test that reads a patient although its input is bad."""
 
-    def fail(*_: Any) -> None:
+    def fail(*_: Any, **__: Any) -> None:
         raise AssertionError("the patient was read")
 
     monkeypatch.setattr(cli, "load_lung", fail)
@@ -78,7 +78,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         )
         return CheckReport(accepted=seen["accepted"], findings=(bad,))
 
-    monkeypatch.setattr(cli, "load_lung", lambda patient, cache: toy_lung)
+    monkeypatch.setattr(cli, "load_lung", lambda *_, **__: toy_lung)
     monkeypatch.setattr(run, "_atlas", lambda *_: None)
     monkeypatch.setattr(run, "_planner", lambda: search)
     monkeypatch.setattr(
@@ -334,7 +334,7 @@ def test_an_unwritable_output_folder_is_found_before_planning(
 def test_a_typed_error_is_a_panel_and_exits_2(
     error: type[Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(*_: Any) -> None:
+    def fail(*_: Any, **__: Any) -> None:
         raise error("The mask [airway] is empty", expected="one voxel", remedy="Look at it")
 
     monkeypatch.setattr(cli, "load_lung", fail)
@@ -350,7 +350,7 @@ def test_a_missing_plan_exits_2(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_lack_of_memory_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def fail(*_: Any) -> None:
+    def fail(*_: Any, **__: Any) -> None:
         raise MemoryError
 
     monkeypatch.setattr(cli, "load_lung", fail)

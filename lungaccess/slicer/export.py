@@ -1,0 +1,149 @@
+"""Write a plan and its patient as a folder for 3D Slicer, and say what is in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from anatomy.errors import PlanFileError
+from anatomy.io.centerlines import write_centerlines
+from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.lung import Lung
+from lungaccess.checking import CheckReport, check
+from lungaccess.courses import Course, courses
+from lungaccess.plans import Plan
+from lungaccess.slicer.custusx import route_text
+from lungaccess.slicer.markups import TARGET_COLOUR, curve, points_of_interest
+from lungaccess.slicer.models import device_surface, structure_surface, write_ply
+from lungaccess.slicer.readme import readme
+from lungaccess.slicer.scene import Item, scene
+from lungaccess.slicer.segments import write_segmentation
+
+SCENE_FILE, README_FILE, ROUTE_FILE, PLAN_FILE = "scene.mrml", "README.txt", "route_custusx.txt", "plan.json"
+SEGMENTATION_FILE, TREE_FILE, POINTS_FILE = "anatomy.seg.nrrd", "airway_tree.vtp", "points.mrk.json"
+
+STRUCTURES: dict[str, tuple[tuple[float, float, float], float]] = {
+    "lung": ((0.77, 0.64, 0.58), 0.12),
+    "airway": ((0.62, 0.85, 0.90), 0.35),
+    "vessel": ((0.84, 0.15, 0.16), 0.6),
+    "fissure": ((0.58, 0.40, 0.74), 0.3),
+    "nodule": (TARGET_COLOUR, 0.8),
+}
+"""Models of the anatomy: colour and opacity."""
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exported:
+    """What was written.
+
+    Parameters
+    ----------
+    files : tuple of str
+        Names in the folder.
+    report : CheckReport
+        What the independent check says of the plan; the scene and the README repeat it.
+    """
+
+    files: tuple[str, ...]
+    report: CheckReport
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {"files": list(self.files), "accepted": self.report.accepted}
+
+
+def export_slicer(
+    plan: Plan, lung: Lung, folder: str | Path, *, progress: Progress | None = None
+) -> Exported:
+    """Write a plan and its patient into a folder that 3D Slicer opens by its `scene.mrml`.
+
+    Everything is in LPS mm and says so; every file appears complete or not at all.  A plan that the
+    independent check refuses is written too, and named so in the scene.
+
+    Parameters
+    ----------
+    plan : Plan
+    lung : Lung
+        The patient it was made for.
+    folder : path
+        Made if it is missing.
+    progress : callable, optional
+        Told each step and the share that is done.
+
+    Raises
+    ------
+    PlanFileError
+        If the plan was made for another patient, or for other masks of this one.
+    FileError
+        If the folder cannot be written.
+    """
+    if plan.lung_key != lung.key:
+        raise PlanFileError(
+            f"The plan was made for {plan.patient_name}, whose content differs from {lung.name}",
+            expected=f"content {plan.lung_key[:16]}, not {lung.key[:16]}",
+            remedy="Name the patient folder that was planned on",
+        )
+    target = require_writable_folder(folder)
+    tell = progress or (lambda _step, _share: None)
+    tell("checking the plan", 0.0)
+    report = check(plan, lung)
+    devices = courses(plan)
+    items = _write_devices(plan, devices, target, refused=not report.accepted)
+    items += _write_anatomy(lung, target, tell)
+    _write_text(target / SCENE_FILE, scene(items))
+    _write_text(target / ROUTE_FILE, route_text(plan, devices))
+    plan.save(target / PLAN_FILE)
+    files = (SCENE_FILE, *(item.file for item in items), ROUTE_FILE, PLAN_FILE, README_FILE)
+    _write_text(target / README_FILE, readme(plan, report, files))
+    tell("done", 1.0)
+    return Exported(files=files, report=report)
+
+
+def _write_devices(plan: Plan, devices: tuple[Course, ...], folder: Path, *, refused: bool) -> list[Item]:
+    """Write curves, tubes and points; a refused plan is named so wherever its devices show."""
+    prefix = "REFUSED by the check: " if refused else ""
+    items = []
+    for course in devices:
+        curve_file, model_file = f"{course.name}.mrk.json", f"{course.name}.ply"
+        _write_json(folder / curve_file, _named(curve(course), prefix))
+        write_ply(folder / model_file, device_surface(course))
+        name = f"{prefix}{course.name}"
+        items.append(Item(kind="MarkupsCurve", name=name, file=curve_file, colour=course.colour))
+        items.append(Item(kind="Model", name=f"{name} surface", file=model_file, colour=course.colour))
+    _write_json(folder / POINTS_FILE, _named(points_of_interest(plan), prefix))
+    points = Item(kind="MarkupsFiducial", name=f"{prefix}points", file=POINTS_FILE, colour=TARGET_COLOUR)
+    return [*items, points]
+
+
+def _named(markups: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """Put a prefix before the name of every markup."""
+    return markups | {"markups": [each | {"name": prefix + each["name"]} for each in markups["markups"]]}
+
+
+def _write_anatomy(lung: Lung, folder: Path, tell: Progress) -> list[Item]:
+    write_centerlines(folder / TREE_FILE, lung.tree)
+    items = [Item(kind="Model", name="airway tree", file=TREE_FILE, colour=(0.0, 0.2, 0.6), visible=False)]
+    for done, (name, (colour, opacity)) in enumerate(STRUCTURES.items(), start=1):
+        tell(f"surface of {name}", done / (len(STRUCTURES) + 2))
+        mesh = structure_surface(lung, name)
+        if mesh is None:
+            continue
+        write_ply(folder / f"{name}.ply", mesh)
+        items.append(Item(kind="Model", name=name, file=f"{name}.ply", colour=colour, opacity=opacity))
+    tell("segmentation", (len(STRUCTURES) + 1) / (len(STRUCTURES) + 2))
+    write_segmentation(folder / SEGMENTATION_FILE, lung)
+    return [*items, Item(kind="Segmentation", name="anatomy", file=SEGMENTATION_FILE, opacity=0.5)]
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    _write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")

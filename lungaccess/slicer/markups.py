@@ -1,0 +1,99 @@
+"""Markups for 3D Slicer: curves with radius and pose at every point, and points with a name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lungaccess.courses import Course
+from lungaccess.plans import Plan
+from stages.scope.fly_through import MARKUPS_SCHEMA
+
+TARGET_COLOUR = (0.17, 0.63, 0.17)
+
+
+def curve(course: Course) -> dict[str, Any]:
+    """Return the content of a `.mrk.json` file: an open curve in LPS mm.
+
+    `orientation` holds the pose of the device at each point, row by row: its columns are the x, y and z
+    axes of the device.  `Radius` is the radius of the device at each point.
+    """
+    points = [
+        _point(number, f"{course.name} {along:.1f} mm", frame)
+        for number, (frame, along) in enumerate(
+            zip(course.lps_from_device, course.along_mm.tolist(), strict=True), start=1
+        )
+    ]
+    radius = {
+        "name": "Radius",
+        "enabled": True,
+        "units": "mm",
+        "description": "outer radius of the device",
+        "controlPointValues": course.radius_mm.tolist(),
+    }
+    return _file("Curve", course.name, points, course.colour, labels=False, measurements=[radius])
+
+
+def points_of_interest(plan: Plan) -> dict[str, Any]:
+    """Return the content of a `.mrk.json` file: scope tip, exit through the wall and target, LPS mm."""
+    places = (
+        ("scope tip", plan.scope.lps_from_scope_tip[:3, 3]),
+        ("exit through the wall", plan.tube.exit.point_lps),
+        ("target", plan.target_lps),
+    )
+    points = [
+        {
+            "id": f"{number}",
+            "label": name,
+            "position": place.tolist(),
+            "locked": True,
+            "visibility": True,
+            "positionStatus": "defined",
+        }
+        for number, (name, place) in enumerate(places, start=1)
+    ]
+    return _file("Fiducial", "points", points, TARGET_COLOUR, labels=True, measurements=[])
+
+
+def _point(number: int, label: str, frame: Any) -> dict[str, Any]:
+    return {
+        "id": f"{number}",
+        "label": label,
+        "position": frame[:3, 3].tolist(),
+        "orientation": frame[:3, :3].ravel().tolist(),
+        "locked": True,
+        "visibility": True,
+        "positionStatus": "defined",
+    }
+
+
+def _file(
+    kind: str,
+    name: str,
+    points: list[dict[str, Any]],
+    colour: tuple[float, float, float],
+    *,
+    labels: bool,
+    measurements: list[dict[str, Any]],
+) -> dict[str, Any]:
+    display = {
+        "visibility": True,
+        "opacity": 1.0,
+        "color": list(colour),
+        "selectedColor": list(colour),
+        "propertiesLabelVisibility": not labels,
+        "pointLabelsVisibility": labels,
+        "glyphType": "Sphere3D",
+        "glyphScale": 2.0 if labels else 0.5,
+    }
+    markup = {
+        "type": kind,
+        "name": name,
+        "coordinateSystem": "LPS",
+        "coordinateUnits": "mm",
+        "locked": True,
+        "fixedNumberOfControlPoints": True,
+        "controlPoints": points,
+        "measurements": measurements,
+        "display": display,
+    }
+    return {"@schema": MARKUPS_SCHEMA, "markups": [markup]}

@@ -1,0 +1,53 @@
+"""The text that lies in an exported folder and says what is in it."""
+
+from __future__ import annotations
+
+from lungaccess.checking import CheckReport
+from lungaccess.plans import Plan
+
+_MEANING = {
+    "scene.mrml": "drag this into 3D Slicer (5.0 or later): it loads everything below it",
+    "scope.mrk.json": "the bronchoscope: curve, pose and radius at every point",
+    "tubes.mrk.json": "the tubes beyond the scope: curve, pose and radius at every point",
+    "needle.mrk.json": "the needle: curve, pose and radius at every point",
+    "points.mrk.json": "scope tip, exit through the airway wall, target",
+    "scope.ply": "the bronchoscope, true to its radius",
+    "tubes.ply": "the tubes, true to their radius",
+    "needle.ply": "the needle, true to its radius",
+    "airway_tree.vtp": "centreline of the airways with Radius, Generation and Branch; hidden at first",
+    "anatomy.seg.nrrd": "the masks that were planned on, one label a voxel, with names and terminology",
+    "route_custusx.txt": "the route for CustusX and Fraxinus: x y z flag, from target to trachea",
+    "plan.json": "the plan itself, for lungaccess",
+    "README.txt": "this text",
+}
+
+
+def readme(plan: Plan, report: CheckReport, files: tuple[str, ...]) -> str:
+    """Return what is in the folder, in which frame, and what the check says of the plan."""
+    target = ", ".join(f"{c:.1f}" for c in plan.target_lps)
+    ras = ", ".join(f"{c:.1f}" for c in (-plan.target_lps[0], -plan.target_lps[1], plan.target_lps[2]))
+    verdict = "ACCEPTS" if report.accepted else "REFUSES"
+    width = max(len(name) for name in files)
+    lines = [
+        f"Plan for {plan.patient_name}, {plan.system.name}, made with lungaccess {plan.software_version}",
+        f"Plan {plan.digest[:16]}, anatomy {plan.lung_key[:16]}",
+        "",
+        f"The independent check {verdict} this plan.",
+        *(f"  {finding}" for finding in report.refusals),
+        "",
+        "Research software, not a medical device. Not for the treatment of patients.",
+        "",
+        "FRAME. All files are in LPS millimetres and say so: x grows to the patient's left, y to the back,",
+        "z to the head. 3D Slicer shows RAS: x and y change sign on its screen, nothing is mirrored.",
+        f"Target in the files (LPS): {target}",
+        f"Target on 3D Slicer's screen (RAS): {ras}",
+        "",
+        "POSES. The orientation of a control point holds a rotation row by row; its columns are the x, y and",
+        "z axes of the device, and z points the way it moves.",
+        "",
+        "MODELS are for display: those of the anatomy are simplified. Measure on anatomy.seg.nrrd.",
+        "",
+        *(f"{name.ljust(width)}  {_MEANING.get(name, 'surface of ' + name.split('.')[0])}" for name in files),
+        "",
+    ]
+    return "\n".join(lines)

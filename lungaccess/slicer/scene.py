@@ -1,0 +1,105 @@
+"""The scene file: one `.mrml` that makes 3D Slicer load every file of the folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+from xml.sax.saxutils import quoteattr
+
+Kind = Literal["Model", "MarkupsCurve", "MarkupsFiducial", "Segmentation"]
+
+_DISPLAY: dict[Kind, str] = {
+    "Model": "ModelDisplay",
+    "MarkupsCurve": "MarkupsDisplay",
+    "MarkupsFiducial": "MarkupsFiducialDisplay",
+    "Segmentation": "SegmentationDisplay",
+}
+_STORAGE: dict[Kind, str] = {
+    "Model": "ModelStorage",
+    "MarkupsCurve": "MarkupsJsonStorage",
+    "MarkupsFiducial": "MarkupsJsonStorage",
+    "Segmentation": "SegmentationStorage",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Item:
+    """One thing in a scene.
+
+    Parameters
+    ----------
+    kind : str
+        Its node class, without `vtkMRML` and `Node`.
+    name : str
+        As people see it.
+    file : str
+        Its file, beside the scene.
+    colour : tuple of float
+        Red, green, blue in [0, 1].
+    opacity : float
+    visible : bool
+    """
+
+    kind: Kind
+    name: str
+    file: str
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    opacity: float = 1.0
+    visible: bool = True
+
+
+def scene(items: Iterable[Item]) -> str:
+    """Return the text of a scene; each item has a node, its display and its storage, stated to be LPS."""
+    lines = ['<MRML version="Slicer5" userTags="">']
+    for number, item in enumerate(items, start=1):
+        display, storage = (f"vtkMRML{tags[item.kind]}Node{number}" for tags in (_DISPLAY, _STORAGE))
+        node = {
+            "id": f"vtkMRML{item.kind}Node{number}",
+            "name": item.name,
+            "selectable": "true",
+            "references": f"display:{display};storage:{storage};",
+        }
+        lines += [
+            _element(_DISPLAY[item.kind], {"id": display, **_look(item)}),
+            _element(_STORAGE[item.kind], {"id": storage, **_place(item)}),
+            _element(item.kind, node | _own(item)),
+        ]
+    return "\n".join([*lines, "</MRML>", ""])
+
+
+def _look(item: Item) -> dict[str, str]:
+    colour = " ".join(f"{c:g}" for c in item.colour)
+    look = {
+        "name": f"{item.name} display",
+        "color": colour,
+        "opacity": f"{item.opacity:g}",
+        "visibility": str(item.visible).lower(),
+    }
+    if item.kind == "Model":
+        look |= {"visibility2D": "true", "backfaceCulling": "false", "scalarVisibility": "false"}
+    elif item.kind == "Segmentation":
+        look |= {"visibility3D": "false", "visibility2DFill": "true", "visibility2DOutline": "true"}
+    else:
+        fiducial = item.kind == "MarkupsFiducial"
+        look |= {
+            "selectedColor": colour,
+            "glyphScale": "2" if fiducial else "0.5",
+            "pointLabelsVisibility": str(fiducial).lower(),
+            "propertiesLabelVisibility": str(not fiducial).lower(),
+        }
+    return look
+
+
+def _place(item: Item) -> dict[str, str]:
+    place = {"name": f"{item.name} storage", "fileName": item.file}
+    return place if item.kind == "Segmentation" else place | {"coordinateSystem": "LPS"}
+
+
+def _own(item: Item) -> dict[str, str]:
+    return {"curveType": "linear", "locked": "1"} if item.kind == "MarkupsCurve" else {}
+
+
+def _element(tag: str, attributes: dict[str, str]) -> str:
+    words = " ".join(f"{key}={quoteattr(value)}" for key, value in attributes.items())
+    return f" <{tag} {words}></{tag}>"

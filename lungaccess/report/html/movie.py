@@ -1,0 +1,179 @@
+"""Virtual bronchoscopy as an animated picture: rays marched through the depth of the lumen."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float
+from anatomy.io.files import atomic_write
+from anatomy.structures import LUMEN
+from lungaccess.report.html.deployment import arc_lengths, camera_axes
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.plans import Plan
+
+Picture = NDArray[np.uint8]
+
+PIXELS, FRAMES, FRAME_MS, LAST_MS = 240, 72, 90, 1500
+HALF_ANGLE_RAD = np.deg2rad(48.0)
+MARCHES, FARTHEST_MM, LEAST_STEP_MM = 120, 160.0, 0.2
+NEAR_WALL_MM = 2.5
+"""The smooth wall is looked for only where the voxels' wall is so near."""
+AROUND_MM = 45.0
+BLUR_VOXELS = 0.9
+HALF = 0.5
+NORMAL_MM = 0.7
+FALL_OFF_MM2 = 520.0
+DARK, BRIGHT = np.array([0.50, 0.16, 0.13]), np.array([0.98, 0.72, 0.64])
+"""Colours of the wall with little and with much light."""
+
+
+def bronchoscopy_webp(
+    plan: Plan,
+    lung: Lung,
+    path: str | os.PathLike[str],
+    *,
+    frames: int = FRAMES,
+    pixels: int = PIXELS,
+) -> Path:
+    """Write what the scope's camera sees on its way to the plan's site as an animated WebP.
+
+    The patient's front is up in the trachea, and the camera does not roll.  The wall is where the blurred
+    lumen is half full, so that voxels do not show; no device is drawn.
+
+    Parameters
+    ----------
+    plan : Plan
+    lung : Lung
+    path : path of a WebP file in an existing folder
+    frames, pixels : int
+        Number of pictures, and their width and height.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    from PIL import Image
+
+    lumen = SmoothLumen(lung, np.asarray(plan.scope.points_lps))
+    pictures = [Image.fromarray(view(lumen, pose, pixels)) for pose in camera_poses(plan, frames)]
+    target = Path(path)
+    with atomic_write(target) as temporary:
+        pictures[0].save(
+            temporary, format="WEBP", save_all=True, append_images=pictures[1:], quality=70, method=4, loop=0,
+            duration=[FRAME_MS] * (len(pictures) - 1) + [LAST_MS],
+        )  # fmt: skip
+    return target
+
+
+def camera_poses(plan: Plan, frames: int) -> list[Float]:
+    """Return `lps_from_camera` (4, 4) at even distances along the route; +z forward, -y up."""
+    points = np.asarray(plan.scope.points_lps)
+    forward, up = camera_axes(points, plan.scope.lps_from_scope_tip)
+    along = arc_lengths(points)
+    poses = []
+    for place in np.linspace(0.0, along[-1], max(frames, 1)):
+        eye, ahead, above = (
+            np.array([np.interp(place, along, values[:, axis]) for axis in range(3)])
+            for values in (points, forward, up)
+        )
+        ahead /= np.linalg.norm(ahead)
+        above -= (above @ ahead) * ahead
+        above /= np.linalg.norm(above)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([np.cross(ahead, above), -above, ahead], axis=1)
+        pose[:3, 3] = eye
+        poses.append(pose)
+    return poses
+
+
+class SmoothLumen:
+    """The lumen around a route with a smooth wall, for rays.
+
+    Parameters
+    ----------
+    lung : Lung
+    points_lps : (N, 3) float64, LPS mm
+        What lies farther than `AROUND_MM` from the box of these is not seen.
+    """
+
+    def __init__(self, lung: Lung, points_lps: Float) -> None:
+        from scipy.ndimage import gaussian_filter
+
+        grid = lung.grid
+        places = grid.ijk(points_lps)
+        room = AROUND_MM / grid.spacing_mm
+        start = np.maximum(np.floor(places.min(axis=0) - room), 0).astype(int)
+        stop = np.minimum(np.ceil(places.max(axis=0) + room) + 1, grid.shape).astype(int)
+        part = lung.labels[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
+        filled = ((part & LUMEN) != 0).astype(np.float32)
+        self._share = gaussian_filter(filled, BLUR_VOXELS * grid.spacing_mm.max() / grid.spacing_mm)
+        self._grid = grid.crop(start, stop)
+        self._depth = lung.lumen_depth
+
+    def share(self, lps: Float) -> Float:
+        """Return how full of lumen `(N,)` the surroundings of points `(N, 3)` are; `HALF` at the wall."""
+        from scipy.ndimage import map_coordinates
+
+        return np.asarray(map_coordinates(self._share, self._grid.ijk(lps).T, order=1, mode="constant"))
+
+    def wall_distance(self, eye_lps: Float, rays: Float) -> Float:
+        """Return how far the wall is in mm along each ray, at most `FARTHEST_MM`.
+
+        A ray goes on by the distance that is free all around [Hart1996], near the wall by short steps.
+
+        Parameters
+        ----------
+        eye_lps : (3,) float64, LPS mm
+        rays : (N, 3) float64
+            Unit vectors.
+        """
+        away = np.full(len(rays), LEAST_STEP_MM)
+        going = np.arange(len(rays))
+        for _ in range(MARCHES):
+            points = eye_lps + away[going, None] * rays[going]
+            depth = self._depth.lower_bound_mm(points)
+            near = depth < NEAR_WALL_MM
+            at_wall = np.zeros(len(going), dtype=np.bool_)
+            at_wall[near] = self.share(points[near]) < HALF
+            going, depth = going[~at_wall], depth[~at_wall]
+            away[going] += np.maximum(depth, LEAST_STEP_MM)
+            going = going[away[going] < FARTHEST_MM]
+            if not len(going):
+                break
+        return np.asarray(np.minimum(away, FARTHEST_MM))
+
+    def normals(self, wall_lps: Float) -> Float:
+        """Return unit vectors `(N, 3)` from the wall into the lumen."""
+        slopes = [
+            self.share(wall_lps + NORMAL_MM * axis) - self.share(wall_lps - NORMAL_MM * axis)
+            for axis in np.eye(3)
+        ]
+        inwards = np.stack(slopes, axis=1)
+        return np.asarray(inwards / np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-9))
+
+
+def view(lumen: SmoothLumen, lps_from_camera: Float, pixels: int) -> Picture:
+    """Return what a camera in the lumen sees, `(pixels, pixels, 3)`; black beyond the round picture."""
+    steps = (np.arange(pixels) + 0.5) / pixels * 2.0 - 1.0
+    across, down = np.meshgrid(steps, steps)
+    inside = across**2 + down**2 <= 1.0
+    spread = np.tan(HALF_ANGLE_RAD)
+    rays = np.stack([across[inside] * spread, down[inside] * spread, np.ones(int(inside.sum()))], axis=1)
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ lps_from_camera[:3, :3].T
+    eye = np.asarray(lps_from_camera[:3, 3])
+    away = lumen.wall_distance(eye, rays)
+    straight = np.clip(-(lumen.normals(eye + away[:, None] * rays) * rays).sum(axis=1), 0.0, 1.0)
+    # More light comes back from near, and from a wall seen face on.
+    light = (0.25 + 0.85 * straight) / (1.0 + away**2 / FALL_OFF_MM2)
+    picture: NDArray[Any] = np.zeros((pixels, pixels, 3))
+    share = np.clip(1.15 * light, 0.0, 1.0)[:, None]
+    picture[inside] = ((1.0 - share) * DARK + share * BRIGHT) * np.clip(1.5 * light, 0.0, 1.0)[:, None]
+    return np.asarray(np.rint(255.0 * picture), dtype=np.uint8)

@@ -1,0 +1,161 @@
+"""The page of a plan: it plays in the anatomy, with slices, charts, limits, risk and provenance."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lungaccess.report.html import tables, words
+from lungaccess.report.html.deployment import device_points, packed_plan
+from lungaccess.report.html.document import write_page
+from lungaccess.report.html.meshes import structure_meshes
+from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, ct_volumes, label_volumes
+
+if TYPE_CHECKING:
+    from anatomy.grid import Volume
+    from anatomy.lung import Lung
+    from lungaccess.checking import CheckReport
+    from lungaccess.plans import Plan
+
+MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
+RISK_SAMPLES, RISK_SEED = 2000, 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PageOptions:
+    """What a plan's page shows besides the plan.
+
+    Parameters
+    ----------
+    alternatives : sequence of Plan
+        Other plans of the same lung, shown on demand.
+    ct : Volume or None
+        CT in HU; the slices show the structures without it.
+    ct_name : str
+        What the CT is, for people.
+    cost_over_time : path or None
+        CSV that `lungaccess plan` wrote beside the plan.
+    risk_samples, risk_seed : int
+        See `lungaccess.risk.assess`; 0 samples for none.
+    instructions : bool
+        Whether the scope's way is searched and told turn by turn.
+    """
+
+    alternatives: Sequence[Plan] = ()
+    ct: Volume | None = None
+    ct_name: str = ""
+    cost_over_time: Path | None = None
+    risk_samples: int = RISK_SAMPLES
+    risk_seed: int = RISK_SEED
+    instructions: bool = True
+
+
+def plan_page(
+    plan: Plan, lung: Lung, path: str | os.PathLike[str], options: PageOptions | None = None
+) -> Path:
+    """Write the page of a plan to one HTML file that opens offline.
+
+    The surfaces are smoothed and simplified and only for looking at; every number comes from the plan, the
+    check and the exact distances.
+
+    Parameters
+    ----------
+    plan : Plan
+    lung : Lung
+        The patient that the plan was made for.
+    path : path of an HTML file in an existing folder
+    options : PageOptions, optional
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    PlanFileError
+        If the plan was made for another lung.
+    AnatomyError
+        If the CT does not hold the plan.
+    """
+    from lungaccess.checking.judge import Checker
+    from lungaccess.risk import assess
+
+    chosen = options or PageOptions()
+    plans = (plan, *chosen.alternatives)
+    checker = Checker(lung)
+    verdicts = [checker.check(each) for each in plans]
+    risk = (
+        tables.risk_section(assess(plan, lung, samples=chosen.risk_samples, seed=chosen.risk_seed))
+        if chosen.risk_samples
+        else "<p>Not estimated.</p>"
+    )
+    parts = {
+        "title": words.text(f"Plan for {plan.patient_name}"),
+        "verdict": words.verdict(
+            verdicts[0].accepted, "accepted by the independent check", "REFUSED by the independent check"
+        ),
+        "summary": _summary(plan, lung),
+        "image_source": words.text(image_source(lung, chosen.ct_name if chosen.ct is not None else "")),
+        "plans": tables.plans_section(plans, verdicts),
+        "key_numbers": tables.key_section(plan),
+        "limits": tables.check_section(verdicts[0]),
+        "instructions": tables.instructions_section(plan, lung)
+        if chosen.instructions
+        else "<p>Left out.</p>",
+        "risk": risk,
+        "provenance": tables.provenance_section(plan, lung),
+    }
+    return write_page(path, "plan.html", MODULES, page_data(plans, verdicts, lung, chosen), parts)
+
+
+def page_data(
+    plans: Sequence[Plan], verdicts: Sequence[CheckReport], lung: Lung, options: PageOptions
+) -> dict[str, Any]:
+    """Return what the scripts of the page draw, as plain JSON values."""
+    near = np.concatenate([device_points(each) for each in plans])
+    return {
+        "page": "plan",
+        "patient": lung.name,
+        "structures": structure_meshes(lung),
+        "plans": [
+            {**packed_plan(each, lung, tables.plan_name(n)), "accepted": verdict.accepted}
+            for n, (each, verdict) in enumerate(zip(plans, verdicts, strict=True))
+        ],
+        "codes": CODES,
+        "labels": label_volumes(lung, near),
+        "ct": None if options.ct is None else ct_volumes(options.ct, lung, near),
+        "hounsfield": {"lowest": LOWEST_HU, "per_step": HU_PER_STEP},
+        "cost_over_time": cost_history(options.cost_over_time),
+    }
+
+
+def image_source(lung: Lung, ct_name: str) -> str:
+    """Say what the slices show."""
+    if ct_name:
+        return f"CT: {ct_name}"
+    return f"No CT was given: the slices show the structures of the masks of {lung.name}"
+
+
+def cost_history(path: Path | None) -> list[list[float]]:
+    """Return seconds and best cost from a CSV of `lungaccess plan`; empty if there is none."""
+    if path is None or not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    return [[float(row["elapsed_s"]), float(row["best_cost"])] for row in rows if row.get("best_cost")]
+
+
+def _summary(plan: Plan, lung: Lung) -> str:
+    x, y, z = (float(c) for c in plan.target_lps)
+    facts = (
+        f"{plan.system.name}; scope to generation {plan.scope.generation}, "
+        f"{plan.scope.length_from_carina_mm:.0f} mm beyond the carina; tubes "
+        f"{plan.tube.outer_insertion_mm:.1f} and {plan.tube.inner_insertion_mm:.1f} mm; needle "
+        f"{plan.needle.length_mm:.1f} mm in {len(plan.needle.arcs)} arc(s); target at LPS "
+        f"{x:.1f}, {y:.1f}, {z:.1f} mm"
+    )
+    return words.text(facts)

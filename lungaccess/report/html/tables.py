@@ -1,0 +1,204 @@
+"""What is known about a plan, as tables of the page: limits, instructions, risk, provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from anatomy.errors import LungaccessError
+from lungaccess.report.html import words
+from lungaccess.report.panels import key_numbers
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.checking import CheckReport
+    from lungaccess.checking.findings import Finding
+    from lungaccess.plans import Plan
+    from lungaccess.risk import RiskReport, Share
+
+GOAL_RADIUS_MM = 2.0
+AXES_AGREE = "largest angle between the axes"
+STAGE_NAMES = {
+    "scope": "Bronchoscope",
+    "tube": "Tubes",
+    "needle": "Needle",
+    "exemption": "The pierced wall",
+}
+
+
+def check_section(report: CheckReport) -> str:
+    """Return the limits of the devices, tightest first in each stage, and folded what else was looked at."""
+    limits = [f for f in report.findings if f.margin is not None and not _compares_record(f)]
+    record = [f for f in report.findings if f.margin is not None and _compares_record(f)]
+    others = [f for f in report.findings if f.margin is None]
+    stages = [name for name in STAGE_NAMES if any(f.stage == name for f in limits)]
+    stages += sorted({f.stage for f in limits} - set(stages))
+    shown = [_limits(STAGE_NAMES.get(name, name), [f for f in limits if f.stage == name]) for name in stages]
+    rows = [(words.text(f.name), words.verdict(f.ok), _value(f), words.text(f.detail)) for f in others]
+    unlimited = words.table("Without a limit", ("what", "verdict", "found", "detail"), rows)
+    return "".join(
+        [
+            _refusals(report),
+            *shown,
+            _folded(f"{len(record)} comparisons of what the plan states with what the check recomputed",
+                    _limits("Stated and recomputed", record)),
+            _folded(f"{len(others)} findings without a limit", unlimited),
+        ]
+    )  # fmt: skip
+
+
+def _compares_record(finding: Finding) -> bool:
+    """Tell whether a finding is about the plan's own statements, not about a limit of a device."""
+    return ".stated" in finding.name or "stated" in finding.detail or finding.detail == AXES_AGREE
+
+
+def _folded(summary: str, content: str) -> str:
+    return f"<details><summary>{words.text(summary)}</summary>{content}</details>"
+
+
+def _refusals(report: CheckReport) -> str:
+    if report.accepted:
+        return f"<p>{words.verdict(True, 'accepted')}: all {len(report.findings)} findings are ok.</p>"
+    items = "".join(f"<li>{words.text(finding)}</li>" for finding in report.refusals)
+    return f"<p>{words.verdict(False)}: do not use this plan.</p><ul>{items}</ul>"
+
+
+def _limits(title: str, findings: Sequence[Finding]) -> str:
+    ordered = sorted(findings, key=lambda f: (f.ok, _headroom(f)))
+    rows = [
+        (
+            words.text(f.name),
+            _value(f),
+            _limit(f),
+            f"{words.number(f.margin)} {words.text(f.unit)}",
+            words.verdict(f.ok),
+            words.text(f.detail),
+        )
+        for f in ordered
+    ]
+    return words.table(title, ("what", "found", "limit", "margin", "verdict", "detail"), rows, "limits")
+
+
+def _limit(finding: Finding) -> str:
+    spare = f" (tolerance {words.number(finding.tolerance, 2)})" if finding.tolerance else ""
+    return words.text(f"{finding.side or ''} {words.number(finding.limit)} {finding.unit}{spare}")
+
+
+def _headroom(finding: Finding) -> float:
+    """Return the margin as a share of the limit, which compares findings of different units."""
+    return (finding.margin or 0.0) / max(abs(finding.limit or 0.0), 1e-9)
+
+
+def _value(finding: Finding) -> str:
+    return f"{words.number(finding.value)} {words.text(finding.unit)}" if finding.value is not None else "–"
+
+
+def plans_section(plans: Sequence[Plan], verdicts: Sequence[CheckReport]) -> str:
+    """Return a table that compares plans."""
+    from lungaccess.alternatives import criteria
+
+    rows = []
+    for number, (plan, verdict) in enumerate(zip(plans, verdicts, strict=True)):
+        values = criteria(plan)
+        rows.append(
+            (
+                words.text(plan_name(number)),
+                words.text(plan.tube.exit.branch),
+                words.text(plan.scope.generation),
+                words.number(values["clearance_mm"]),
+                words.number(values["pleura_mm"]),
+                words.number(values["length_in_tissue_mm"]),
+                words.number(values["inverse_clearance"], 4),
+                words.verdict(verdict.accepted, "accepted"),
+            )
+        )
+    headings = (
+        "plan", "branch pierced", "generation of the scope's tip", "least clearance, mm",
+        "from the pleura, mm", "in tissue, mm", "integral of 1/clearance", "check",
+    )  # fmt: skip
+    return words.table("Plans to this target", headings, rows)
+
+
+def plan_name(number: int) -> str:
+    """Return the name of a plan by its place on the page; the first is the one that was given."""
+    return "The plan" if number == 0 else f"Alternative {number}"
+
+
+def key_section(plan: Plan) -> str:
+    """Return the key numbers of a plan."""
+    return "".join(words.pairs(heading, rows) for heading, rows in key_numbers(plan) if rows)
+
+
+def instructions_section(plan: Plan, lung: Lung) -> str:
+    """Return turn by turn how the scope gets to where the plan has its tip, or why that is not known."""
+    from lungaccess.advise import advise_scope
+
+    tip = np.array(plan.scope.lps_from_scope_tip[:3, 3])
+    try:
+        advice = advise_scope(lung, plan.system, tip, GOAL_RADIUS_MM)
+    except LungaccessError as error:
+        return f"<p>No instructions: {words.text(error)}</p>"
+    path = advice.path
+    told = words.steps(one.text() for one in advice.told)
+    end = (
+        "This way reaches the place of the plan's tip."
+        if path.reached
+        else f"This way ends {path.distance_mm:.1f} mm before that place: {advice.why_stopped}"
+    )
+    note = (
+        f"Insertion {path.length_mm:.0f} mm, {path.retreats} retreats. Found by the search for the scope "
+        "alone, with its true radius clear of the wall; twist 0 is as the scope enters the trachea."
+    )
+    return f"{told}<p>{words.text(end)}</p><p class='note'>{words.text(note)}</p>"
+
+
+def risk_section(report: RiskReport) -> str:
+    """Return how likely the plan succeeds if the devices deviate from it."""
+    rows = [("reaches the goal and touches nothing forbidden", _share(report.succeeds))]
+    rows.append((f"ends within {report.radius_mm:.1f} mm of the target", _share(report.reaches)))
+    rows += [
+        (f"touches: {name}" if name != "stays in the airway" else name, _share(share))
+        for name, share in report.touches.items()
+    ]
+    rows += [
+        (f"miss that {100.0 * share:.0f} % do not exceed", f"{miss:.2f} mm")
+        for share, miss in report.miss_mm.items()
+    ]
+    alone = [(name, _share(share)) for name, share in report.alone.items()]
+    note = (
+        f"{report.samples} deviated plans, seed {report.seed}, open loop, default error model: all of its "
+        f"sizes are assumed. Radius of the goal: {report.radius_origin}. The range is the 95 % interval."
+    )
+    return (
+        f"<p class='note'>{words.text(note)}</p>"
+        + words.pairs("If the devices deviate", rows)
+        + words.pairs("Success with errors of one kind only", alone)
+    )
+
+
+def _share(share: Share) -> str:
+    low, high = share.interval
+    return f"{100.0 * share.value:.1f} % ({100.0 * low:.1f} to {100.0 * high:.1f})"
+
+
+def provenance_section(plan: Plan, lung: Lung) -> str:
+    """Return where a plan came from."""
+    rows: list[tuple[str, object]] = [
+        ("plan made with lungaccess", plan.software_version),
+        ("digest of the plan", plan.digest),
+        ("patient", plan.patient_name),
+        ("lung", plan.lung_key),
+        ("breath hold", plan.breath_hold or "not stated"),
+        ("target from", plan.target_origin),
+        ("system", plan.system.name),
+        ("fingerprint of the system", plan.system_fingerprint),
+        ("method, seed, iterations", f"{plan.method}, {plan.seed}, {plan.iterations}"),
+        ("objective", plan.objective),
+        *((f"seconds: {name}", f"{seconds:.2f}") for name, seconds in plan.timing.items()),
+    ]
+    warnings = "".join(f"<li>{words.text(warning)}</li>" for warning in lung.warnings)
+    files = words.pairs("SHA-256 of the image files", sorted(plan.sources.items()))
+    noted = f"<p>Warnings of the anatomy:</p><ul>{warnings}</ul>" if warnings else ""
+    return words.pairs("Plan", rows) + noted + f"<details><summary>Image files</summary>{files}</details>"

@@ -1,0 +1,59 @@
+"""HTML made of plain values: escaped text, tables, lists."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+
+Cell = str
+
+
+def text(value: object) -> str:
+    """Return a value as HTML text."""
+    return escape(str(value), quote=True)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number of so many significant digits, a dash for none."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
+
+
+def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[Cell]], kind: str = "") -> str:
+    """Return a table; its cells are HTML already, the first one of each row is its heading.
+
+    Parameters
+    ----------
+    caption : str
+    headings : sequence of str
+        Empty for a table of names and values.
+    rows : iterable of sequences of str
+    kind : str
+        Class of the table for the style sheet.
+    """
+    head = "".join(f'<th scope="col">{text(name)}</th>' for name in headings)
+    head = f"<thead><tr>{head}</tr></thead>" if headings else ""
+    body = "".join(
+        f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in rest)}</tr>'
+        for first, *rest in rows
+    )
+    return (
+        f'<div class="wide" tabindex="0" role="region" aria-label="{text(caption)}">'
+        f'<table class="{text(kind)}"><caption>{text(caption)}</caption>'
+        f"{head}<tbody>{body}</tbody></table></div>"
+    )
+
+
+def pairs(caption: str, rows: Iterable[tuple[str, object]]) -> str:
+    """Return a table of names and values, both plain text."""
+    return table(caption, (), [(text(name), text(value)) for name, value in rows], "pairs")
+
+
+def steps(items: Iterable[str]) -> str:
+    """Return a numbered list of plain sentences."""
+    return "<ol>" + "".join(f"<li>{text(item)}</li>" for item in items) + "</ol>"
+
+
+def verdict(ok: bool, yes: str = "ok", no: str = "REFUSED") -> str:
+    """Return a word with a mark, so that it does not depend on its colour."""
+    return f'<span class="good">✓ {text(yes)}</span>' if ok else f'<span class="bad">✗ {text(no)}</span>'

@@ -1,0 +1,122 @@
+// A plan in motion: what is where when the slider stands somewhere.
+import { unpack } from "./decode.js";
+import { minus, mix, point, rgb, unit } from "./vectors.js";
+
+export const STAGES = ["scope", "both tubes", "inner tube", "needle"];
+const WEIGHTS = [0.36, 0.14, 0.18, 0.32];
+
+// Clearance to spare along the needle: from none, over MID_MM, to WIDE_MM and more.
+const TIGHT = rgb("#D81B60"), WIDE = rgb("#56B4E9");
+export const WIDE_MM = 5;
+
+export function marginColour(margin) {
+  return mix(TIGHT, WIDE, Math.min(Math.max(margin / WIDE_MM, 0), 1));
+}
+
+export class Motion {
+  static async of(packed) {
+    const motion = new Motion();
+    motion.plan = packed;
+    const { scope, tubes, needle, profile } = packed;
+    [
+      motion.route, motion.routeMm, motion.forward, motion.up, motion.tubes, motion.innerMm, motion.outerMm,
+      motion.needle, motion.needleMm, motion.margin,
+    ] = await Promise.all([
+      scope.points, scope.along_mm, scope.forward, scope.up, tubes.points, tubes.inner_mm, tubes.outer_mm,
+      needle.points, needle.along_mm, profile.margin_mm,
+    ].map(unpack));
+    motion.tubePoints = tubes.points.shape[1];
+    const last = (array) => array[array.length - 1];
+    motion.ends = { scope: last(motion.routeMm), outer: last(motion.outerMm), inner: last(motion.innerMm),
+      needle: last(motion.needleMm) };
+    motion.starts = stageStarts(motion.ends);
+    return motion;
+  }
+
+  // Return everything at a place of the slider, 0 to 1.
+  at(position) {
+    const { starts, ends } = this;
+    const share = STAGES.map((_, n) => clamp((position - starts[n]) / Math.max(starts[n + 1] - starts[n], 1e-9)));
+    let stage = STAGES.length - 1;
+    while (stage > 0 && (share[stage] <= 0 || starts[stage] === starts[stage + 1])) stage -= 1;
+    const scopeMm = ends.scope * share[0];
+    const flush = ends.outer * (starts[1] === starts[2] ? 1 : share[1]);
+    const innerMm = share[2] > 0 ? ends.outer + (ends.inner - ends.outer) * share[2] : flush;
+    const needleMm = ends.needle * share[3];
+    const state = { position, stage, scopeMm, outerMm: Math.min(flush, ends.outer), innerMm, needleMm };
+    state.scope = cut(this.route, this.routeMm, scopeMm);
+    state.camera = this.camera(scopeMm);
+    [state.outer, state.inner] = share[0] < 1 ? [[], []] : this.tube(innerMm);
+    state.needle = needleMm > 0 ? cut(this.needle, this.needleMm, needleMm) : [];
+    state.needleColours = state.needle.map((_, n) => marginColour(this.margin[Math.min(n, this.margin.length - 1)]));
+    const line = [state.needle, state.inner, state.outer].find((points) => points.length > 1);
+    state.tip = line ? line[line.length - 1] : state.scope[state.scope.length - 1];
+    state.direction = line ? unit(minus(line[line.length - 1], line[line.length - 2])) : state.camera.forward;
+    return state;
+  }
+
+  camera(scopeMm) {
+    const [n, share] = place(this.routeMm, scopeMm);
+    const between = (array) => mix(point(array, n), point(array, Math.min(n + 1, this.routeMm.length - 1)), share);
+    return { eye: between(this.route), forward: unit(between(this.forward)), up: unit(between(this.up)) };
+  }
+
+  // Return the points of the outer tube and of what the inner one reaches beyond it.
+  tube(innerMm) {
+    const [n, share] = place(this.innerMm, innerMm);
+    const next = Math.min(n + 1, this.innerMm.length - 1);
+    const count = this.tubePoints;
+    const outerMm = this.outerMm[n] + share * (this.outerMm[next] - this.outerMm[n]);
+    const points = [];
+    for (let k = 0; k < count; k++) {
+      points.push(mix(point(this.tubes, n * count + k), point(this.tubes, next * count + k), share));
+    }
+    const at = innerMm > 0 ? (outerMm / innerMm) * (count - 1) : 0;
+    const whole = Math.min(Math.floor(at), count - 1);
+    const border = mix(points[whole], points[Math.min(whole + 1, count - 1)], at - whole);
+    return [[...points.slice(0, whole + 1), border], outerMm < innerMm ? [border, ...points.slice(whole + 1)] : []];
+  }
+
+  // Say in words where the deployment is.
+  words(state) {
+    const mm = (value, end) => `${value.toFixed(1)} of ${end.toFixed(1)} mm`;
+    const { ends } = this;
+    return [
+      `Scope: ${mm(state.scopeMm, ends.scope)}`, `Both tubes: ${mm(state.outerMm, ends.outer)}`,
+      `Inner tube: ${mm(state.innerMm, ends.inner)}`, `Needle: ${mm(state.needleMm, ends.needle)}`,
+    ][state.stage];
+  }
+
+  // Return the distance from the scope's tip along tubes and needle, as the charts count it.
+  alongMm(state) {
+    return state.needleMm > 0 ? this.ends.inner + state.needleMm : state.innerMm;
+  }
+}
+
+// Return where each stage begins on the slider, and 1; a stage of no length has no room.
+function stageStarts(ends) {
+  const lengths = [ends.scope, ends.outer, ends.inner - ends.outer, ends.needle];
+  const weights = WEIGHTS.map((weight, n) => (lengths[n] > 1e-6 ? weight : 0));
+  const total = weights.reduce((sum, weight) => sum + weight, 0);
+  const starts = [0];
+  for (const weight of weights) starts.push(starts[starts.length - 1] + weight / total);
+  starts[STAGES.length] = 1;
+  return starts;
+}
+
+const clamp = (value) => Math.min(Math.max(value, 0), 1);
+
+// Return the index before a length and the share of the way to the next one.
+function place(along, mm) {
+  let n = 0;
+  while (n + 2 < along.length && along[n + 1] <= mm) n += 1;
+  return [n, clamp((mm - along[n]) / Math.max(along[n + 1] - along[n], 1e-9))];
+}
+
+function cut(points, along, mm) {
+  const [n, share] = place(along, mm);
+  const kept = [];
+  for (let k = 0; k <= n; k++) kept.push(point(points, k));
+  kept.push(mix(point(points, n), point(points, n + 1), share));
+  return kept;
+}

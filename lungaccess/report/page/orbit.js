@@ -1,0 +1,110 @@
+// The camera that goes round the patient: by mouse, by fingers and by keys.
+import { add, cross, letters, times, unit } from "./vectors.js";
+
+const TURN_KEYS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+const VIEWS = { front: [0, 0], left: [Math.PI / 2, 0], right: [-Math.PI / 2, 0], back: [Math.PI, 0], feet: [0, -1.45] };
+
+export class Orbit {
+  // changed is called after each movement.
+  constructor(canvas, centre, distance, changed) {
+    this.home = { centre, distance };
+    this.changed = changed;
+    this.fingers = new Map();
+    this.look("front");
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    });
+    canvas.addEventListener("pointermove", (event) => this.drag(event));
+    for (const kind of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(kind, (event) => this.fingers.delete(event.pointerId));
+    }
+    canvas.addEventListener("wheel", (event) => {
+      if (document.activeElement !== canvas && !event.ctrlKey) return;
+      event.preventDefault();
+      this.zoom(Math.exp(event.deltaY * 0.0012));
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  // Look from a named side, all of the patient in view.
+  look(name) {
+    [this.yaw, this.pitch] = VIEWS[name];
+    this.centre = [...this.home.centre];
+    this.distance = this.home.distance;
+    this.changed();
+  }
+
+  // Look at a point from near by, from the side we are on.
+  approach(point, distance) {
+    this.centre = [...point];
+    this.distance = distance;
+    this.changed();
+  }
+
+  zoom(factor) {
+    this.distance = Math.min(Math.max(this.distance * factor, 15), 4000);
+    this.changed();
+  }
+
+  turn(yaw, pitch) {
+    this.yaw += yaw;
+    this.pitch = Math.min(Math.max(this.pitch + pitch, -1.5), 1.5);
+    this.changed();
+  }
+
+  pan(x, y) {
+    const { right, above } = this.camera();
+    const scale = this.distance * 0.0012;
+    this.centre = add(this.centre, add(times(right, -x * scale), times(above, y * scale)));
+    this.changed();
+  }
+
+  drag(event) {
+    const before = this.fingers.get(event.pointerId);
+    if (!before) return;
+    const now = [event.clientX, event.clientY];
+    const [x, y] = [now[0] - before[0], now[1] - before[1]];
+    if (this.fingers.size > 1) {
+      const other = [...this.fingers].find(([id]) => id !== event.pointerId)[1];
+      const apart = (a) => Math.hypot(a[0] - other[0], a[1] - other[1]) || 1;
+      this.fingers.set(event.pointerId, now);
+      this.zoom(apart(before) / apart(now));
+      this.pan(x / 2, y / 2);
+      return;
+    }
+    this.fingers.set(event.pointerId, now);
+    if (event.shiftKey || event.buttons === 2) this.pan(x, y);
+    else this.turn(-x * 0.008, y * 0.008);
+  }
+
+  key(event) {
+    const turn = TURN_KEYS[event.key];
+    if (turn && event.shiftKey) this.pan(-turn[0] * 200, turn[1] * 200);
+    else if (turn) this.turn(...turn);
+    else if (event.key === "+" || event.key === "=") this.zoom(0.87);
+    else if (event.key === "-") this.zoom(1.15);
+    else if (event.key === "0" || event.key === "Home") this.look("front");
+    else return;
+    event.preventDefault();
+  }
+
+  // Yaw 0 is seen from the front, so that the patient's left is on the right.
+  camera() {
+    const cosine = Math.cos(this.pitch);
+    const back = [Math.sin(this.yaw) * cosine, -Math.cos(this.yaw) * cosine, Math.sin(this.pitch)];
+    const forward = times(back, -1);
+    const right = unit(cross(forward, [0, 0, 1]));
+    const above = cross(right, forward);
+    return {
+      eye: add(this.centre, times(back, this.distance)), forward, up: [0, 0, 1], right, above,
+      distance: this.distance,
+    };
+  }
+
+  // The patient's sides at the edges of the picture: left, right, bottom, top.
+  edges() {
+    const { right, above } = this.camera();
+    return [letters(times(right, -1)), letters(right), letters(times(above, -1)), letters(above)];
+  }
+}

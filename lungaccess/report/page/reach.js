@@ -1,0 +1,223 @@
+// The page of a reachability map.
+import { reportData, unpack } from "./decode.js";
+import { Orbit } from "./orbit.js";
+import { Scene } from "./scene.js";
+import { Slice, STANDARD, VoxelImage } from "./slices.js";
+import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { mix, rgb } from "./vectors.js";
+
+// Viridis in five steps: even in lightness, for every colour vision.
+const RAMP = ["#440154", "#3B528B", "#21918C", "#5EC962", "#FDE725"].map(rgb);
+const NO_PATH = [150, 150, 150];
+const OVER_SHARE = 0.85;
+
+const find = (id) => document.getElementById(id);
+const bytes = (colour) => colour.map((value) => Math.round(255 * value));
+
+function ramp(share) {
+  const at = Math.min(Math.max(share, 0), 1) * (RAMP.length - 1);
+  const n = Math.min(Math.floor(at), RAMP.length - 2);
+  return bytes(mix(RAMP[n], RAMP[n + 1], at - n));
+}
+
+class ReachPage {
+  constructor(data) {
+    this.data = data;
+    this.place = [...data.centre_lps];
+    this.number = 0;
+    this.redraw = oncePerFrame(() => this.draw());
+  }
+
+  async open() {
+    this.maps = await Promise.all(this.data.maps.map(async (map) => ({
+      ...map, kindOf: await unpack(map.kind), clearanceOf: await unpack(map.clearance),
+    })));
+    await this.openScene();
+    this.image = await VoxelImage.of(this.data);
+    this.listControls();
+    this.openSlices();
+    this.draw();
+  }
+
+  get map() {
+    return this.maps[this.number];
+  }
+
+  async openScene() {
+    try {
+      this.scene = new Scene(find("scene"));
+    } catch (error) {
+      find("no-scene").hidden = false;
+      find("no-scene").textContent = `No 3-D view: ${error.message}.`;
+      return;
+    }
+    const surfaces = this.data.structures.map((packed) => ({ ...packed, shown: ["airway", "lung"].includes(packed.key) }));
+    for (const packed of surfaces) await this.scene.addSurface(packed);
+    for (const [n, map] of this.maps.entries()) {
+      for (const packed of map.surfaces) {
+        await this.scene.addSurface({ ...packed, key: `${n}: ${packed.key}`, shown: n === 0 && packed.shown });
+      }
+    }
+    const box = surfaces.find(({ key }) => key === "lung") || surfaces[0];
+    const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
+    this.orbit = new Orbit(find("scene"), centre, 2.1 * Math.max(...box.size_mm), this.redraw);
+    connectViews(find("scene-figure"), this.orbit);
+    new ResizeObserver(this.redraw).observe(find("scene"));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
+  }
+
+  listControls() {
+    this.data.structures.forEach((packed) => {
+      const shown = this.scene ? this.scene.surfaces.get(packed.key).shown : false;
+      addSwitch(find("structures"), { ...packed, shown }, (on) => {
+        if (this.scene) this.scene.surfaces.get(packed.key).shown = on;
+        this.redraw();
+      });
+    });
+    this.boxes = new Map();
+    for (const { key, name, colour, shown } of this.maps[0].surfaces) {
+      this.boxes.set(key, addSwitch(find("surfaces"), { key, name, colour, shown }, () => this.showSurfaces()));
+    }
+    this.maps.forEach((map, n) => find("system").append(new Option(map.name, n)));
+    find("system").addEventListener("change", (event) => {
+      this.number = Number(event.target.value);
+      this.showSurfaces();
+    });
+    find("quantity").addEventListener("change", this.redraw);
+  }
+
+  showSurfaces() {
+    if (this.scene) {
+      for (const [key, surface] of this.scene.surfaces) {
+        const [n, name] = key.split(": ");
+        if (name) surface.shown = Number(n) === this.number && this.boxes.has(name) && this.boxes.get(name).checked;
+      }
+    }
+    this.redraw();
+  }
+
+  openSlices() {
+    const volume = this.image.labels[0];
+    const sizes = [volume.width, volume.height, volume.depth];
+    this.widthMm = Math.max(...sizes) * volume.spacing;
+    this.middle = volume.first.map((first, axis) => first + ((sizes[axis] - 1) * volume.spacing) / 2);
+    this.slices = Object.fromEntries(Object.keys(STANDARD).map((name) => [name, new Slice(find(`slice-${name}`), this.image)]));
+    for (let axis = 0; axis < 3; axis++) {
+      const slider = find(`place-${axis}`);
+      slider.min = Math.ceil(volume.first[axis]);
+      slider.max = Math.floor(volume.first[axis] + (sizes[axis] - 1) * volume.spacing);
+      slider.value = this.place[axis];
+      slider.addEventListener("input", () => {
+        this.place[axis] = Number(slider.value);
+        this.redraw();
+      });
+    }
+    for (const slice of Object.values(this.slices)) {
+      slice.canvas.addEventListener("click", (event) => {
+        const scale = slice.canvas.width / slice.canvas.clientWidth;
+        this.moveTo(slice.pointAt(event.offsetX * scale, event.offsetY * scale));
+      });
+    }
+  }
+
+  moveTo(place) {
+    this.place = place;
+    place.forEach((value, axis) => {
+      find(`place-${axis}`).value = value;
+    });
+    this.redraw();
+  }
+
+  // Return the index of the map's voxel that holds a point, -1 beyond the map.
+  voxel(x, y, z) {
+    const [ni, nj, nk] = this.map.shape;
+    const m = this.map.ijk_from_lps;
+    const [i, j, k] = [0, 1, 2].map((r) => Math.round(m[r][0] * x + m[r][1] * y + m[r][2] * z + m[r][3]));
+    return i >= 0 && j >= 0 && k >= 0 && i < ni && j < nj && k < nk ? (k * nj + j) * ni + i : -1;
+  }
+
+  // Return what paints the map over the structures.
+  painter() {
+    const { map } = this;
+    const colours = [];
+    for (const [name, code] of Object.entries(map.kinds)) colours[code] = bytes(rgb(this.data.colours[name]));
+    const reached = [map.kinds["direct arc"], map.kinds.search];
+    const byClearance = find("quantity").value === "clearance";
+    const [low, high] = this.data.clearance_range_mm;
+    const shades = Array.from({ length: 256 }, (_, n) => ramp((n / map.steps_per_mm - low) / (high - low)));
+    return (x, y, z) => {
+      const at = this.voxel(x, y, z);
+      const kind = at < 0 ? 0 : map.kindOf[at];
+      if (!kind) return null;
+      const colour = byClearance ? (reached.includes(kind) ? shades[map.clearanceOf[at]] : NO_PATH) : colours[kind];
+      return colour.map((value) => OVER_SHARE * value);
+    };
+  }
+
+  draw() {
+    if (this.scene) {
+      this.scene.fit();
+      this.scene.draw(this.orbit.camera(), sceneBackground());
+      showEdges(find("scene-figure"), this.orbit);
+    }
+    if (!this.slices) return;
+    this.image.overlay = this.painter();
+    for (const [name, plane] of Object.entries(STANDARD)) {
+      const away = [...this.middle];
+      const normal = { axial: 2, coronal: 1, sagittal: 0 }[name];
+      away[normal] = this.place[normal];
+      this.slices[name].draw(plane, away, this.widthMm, { cross: this.place });
+    }
+    find("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(0)).join(", ")} mm: ${this.words()}.`;
+    this.showKey();
+  }
+
+  // Say what the map says at the place.
+  words() {
+    const at = this.voxel(...this.place);
+    const kind = at < 0 ? 0 : this.map.kindOf[at];
+    const named = Object.entries(this.map.kinds).find(([, code]) => code === kind);
+    if (!named) return "not counted";
+    const clearance = this.map.clearanceOf[at] / this.map.steps_per_mm;
+    return clearance > 0 ? `${named[0]}, clearance ${clearance.toFixed(1)} mm` : named[0];
+  }
+
+  showKey() {
+    const clearance = find("quantity").value === "clearance";
+    const entries = clearance
+      ? [0, 0.25, 0.5, 0.75, 1].map((share) => {
+        const mm = this.data.clearance_range_mm[1] * share;
+        return [`${mm} mm${share === 1 ? " and more" : ""}`, `rgb(${ramp(share).join(",")})`];
+      }).concat([["no path", `rgb(${NO_PATH.join(",")})`]])
+      : Object.entries(this.data.colours);
+    find("key").replaceChildren(...entries.map(([name, colour]) => {
+      const item = document.createElement("li");
+      const swatch = document.createElement("span");
+      swatch.className = "swatch";
+      swatch.style.background = colour;
+      item.append(swatch, ` ${name}`);
+      return item;
+    }));
+  }
+
+  // What a test may read; docs/report.md names the fields.
+  report() {
+    return {
+      system: this.map.name, quantity: find("quantity").value, place_lps: this.place, words: this.words(),
+      structures: this.scene ? Object.fromEntries([...this.scene.surfaces].map(([key, s]) => [key, s.shown])) : {},
+      triangles: this.scene ? [...this.scene.surfaces.values()].reduce((sum, s) => sum + s.count / 3, 0) : 0,
+      gl_error: this.scene ? this.scene.gl.getError() : null,
+      slice_edges: Object.fromEntries(Object.entries(this.slices).map(([key, s]) => [key, s.edges])),
+    };
+  }
+}
+
+const reachPage = new ReachPage(reportData());
+window.lungaccessReport = {
+  ready: reachPage.open(),
+  state: () => reachPage.report(),
+  set: (place) => {
+    reachPage.moveTo(place);
+    reachPage.draw();
+  },
+};

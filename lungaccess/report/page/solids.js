@@ -1,0 +1,76 @@
+// Tubes around lines, and balls, as triangles with a colour at each vertex.
+import { add, cross, dot, minus, times, unit } from "./vectors.js";
+
+const SIDES = 14;
+
+// Collects triangles of solid bodies.
+export class Solids {
+  constructor() {
+    this.places = [];
+    this.normals = [];
+    this.colours = [];
+    this.faces = [];
+  }
+
+  vertex(place, normal, colour) {
+    this.places.push(...place);
+    this.normals.push(...normal);
+    this.colours.push(...colour);
+    return this.places.length / 3 - 1;
+  }
+
+  // A round tube along points; colours is one for all, or one for each point.
+  tube(points, radius, colours) {
+    if (points.length < 2) return;
+    let side = null;
+    let before = null;
+    points.forEach((place, n) => {
+      const forward = unit(minus(points[Math.min(n + 1, points.length - 1)], points[Math.max(n - 1, 0)]));
+      const start = side || (Math.abs(forward[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]);
+      side = unit(minus(start, times(forward, dot(start, forward))));
+      const other = cross(forward, side);
+      const colour = Array.isArray(colours[0]) ? colours[n] : colours;
+      const ring = this.ring(place, side, other, radius, colour);
+      if (before !== null) this.join(before, ring);
+      if (n === 0) this.cap(ring, place, times(forward, -1), colour);
+      if (n === points.length - 1) this.cap(ring, place, forward, colour);
+      before = ring;
+    });
+  }
+
+  ring(place, side, other, radius, colour) {
+    let first = -1;
+    for (let k = 0; k < SIDES; k++) {
+      const angle = (2 * Math.PI * k) / SIDES;
+      const normal = add(times(side, Math.cos(angle)), times(other, Math.sin(angle)));
+      const number = this.vertex(add(place, times(normal, radius)), normal, colour);
+      if (k === 0) first = number;
+    }
+    return first;
+  }
+
+  join(a, b) {
+    for (let k = 0; k < SIDES; k++) {
+      const next = (k + 1) % SIDES;
+      this.faces.push(a + k, a + next, b + k, a + next, b + next, b + k);
+    }
+  }
+
+  cap(ring, centre, normal, colour) {
+    const middle = this.vertex(centre, normal, colour);
+    for (let k = 0; k < SIDES; k++) this.faces.push(middle, ring + k, ring + ((k + 1) % SIDES));
+  }
+
+  ball(centre, radius, colour, rows = 10) {
+    const first = this.places.length / 3;
+    for (let i = 0; i <= rows; i++) {
+      const polar = (Math.PI * i) / rows;
+      for (let k = 0; k < SIDES; k++) {
+        const angle = (2 * Math.PI * k) / SIDES;
+        const normal = [Math.sin(polar) * Math.cos(angle), Math.sin(polar) * Math.sin(angle), Math.cos(polar)];
+        this.vertex(add(centre, times(normal, radius)), normal, colour);
+      }
+    }
+    for (let i = 0; i < rows; i++) this.join(first + i * SIDES, first + (i + 1) * SIDES);
+  }
+}

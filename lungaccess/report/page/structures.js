@@ -1,0 +1,54 @@
+// The switches: one labelled box for each thing that can be shown.
+
+// Add a switch to a list; changed is told whether it is on.
+export function addSwitch(list, { key, name, colour, shown }, changed) {
+  const item = document.createElement("li");
+  const label = document.createElement("label");
+  const box = document.createElement("input");
+  const swatch = document.createElement("span");
+  box.type = "checkbox";
+  box.checked = shown;
+  box.dataset.key = key;
+  swatch.className = "swatch";
+  swatch.style.background = colour;
+  swatch.setAttribute("aria-hidden", "true");
+  label.append(box, swatch, document.createTextNode(name));
+  item.append(label);
+  list.append(item);
+  box.addEventListener("change", () => changed(box.checked));
+  return box;
+}
+
+// Return the colour behind the scene, 0 to 1, as the page's style states it.
+export function sceneBackground() {
+  const value = getComputedStyle(document.documentElement).getPropertyValue("--scene").trim();
+  return [1, 3, 5].map((n) => parseInt(value.slice(n, n + 2), 16) / 255);
+}
+
+// Call a function at most once for each picture of the screen.
+export function oncePerFrame(task) {
+  let waiting = false;
+  return () => {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => {
+      waiting = false;
+      task();
+    });
+  };
+}
+
+// Connect the buttons of the views, the canvas and the letters at its edges with a camera.
+export function connectViews(figure, orbit) {
+  for (const button of figure.querySelectorAll("button[data-view]")) {
+    button.addEventListener("click", () => orbit.look(button.dataset.view));
+  }
+}
+
+// Write the patient's sides at the edges of the scene.
+export function showEdges(figure, orbit) {
+  const names = orbit.edges();
+  figure.querySelectorAll(".edge").forEach((element, n) => {
+    element.textContent = names[n];
+  });
+}

@@ -29,7 +29,7 @@ from anatomy.sides import septum
 Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
 
-FORMAT = 2
+FORMAT = 3
 """Version of the processing: raise it when the same images give another lung."""
 
 PAD_VOXELS = 2

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from anatomy.errors import GridMismatchError
 from anatomy.grid import Float, Grid, read_only
 from anatomy.kernels import field as kernel
 
@@ -23,6 +24,8 @@ SOLID = 0.5
 """Obstacles are voxels as solid boxes."""
 CENTRES = 0.0
 """Obstacles are the centres of their voxels."""
+
+GEOMETRY_SHAPE = (3, 6)
 
 ROUNDING_MM = 2e-5
 FLOAT32_ROUNDING = 2.0**-24
@@ -56,6 +59,11 @@ class DistanceField:
         Distance at each voxel corner in 1/256 mm, rounded down, at most 255.99 mm.
     geometry : (3, 6) float64
         See `corner_geometry`.
+
+    Raises
+    ------
+    GridMismatchError
+        If the geometry has another shape: kernels would read beyond it.
     """
 
     name: str
@@ -66,6 +74,12 @@ class DistanceField:
         # One array type, memory-mapped or not, so that kernels are compiled once.
         object.__setattr__(self, "corners", read_only(np.asarray(self.corners)))
         object.__setattr__(self, "geometry", read_only(np.asarray(self.geometry)))
+        if self.geometry.shape != GEOMETRY_SHAPE or self.corners.ndim != 3:
+            raise GridMismatchError(
+                f"The {self.name} field has a geometry of the shape {self.geometry.shape}",
+                expected=f"{GEOMETRY_SHAPE} and three axes of corners",
+                remedy="Make it with corner_geometry(grid)",
+            )
 
     def lower_bound_mm(self, points_lps: ArrayLike) -> Float:
         """Return `(N,)` distances in mm that the true ones are never below, for `(N, 3)` LPS mm points.

@@ -6,7 +6,7 @@ import importlib.metadata
 
 project = "lungaccess"
 author = "The lungaccess contributors"
-copyright = f"2026, {author}"  # noqa: A001
+copyright = f"2026, {author}"
 release = importlib.metadata.version("lungaccess")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]

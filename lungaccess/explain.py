@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from lungaccess.noplan import NoPlan
 from lungaccess.remedies import Remedy, remedies
 from lungaccess.searches import AtlasSearch

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from anatomy.errors import GridMismatchError
 from anatomy.fields import MAX_STORED, corner_geometry, distance_corners, distance_field, touched_corners
 from anatomy.fields import DistanceField as Field
 from anatomy.grid import Grid
@@ -179,3 +180,11 @@ def test_geometry_counts_corners_from_the_outer_corner() -> None:
     geometry = corner_geometry(grid)
     np.testing.assert_allclose(geometry[:, :3] @ (6.5, 7.0, 8.75) + geometry[:, 3], 0.0, atol=1e-12)
     np.testing.assert_allclose(geometry[:, 4], (1.0, 4.0, 0.25))
+
+
+def test_a_geometry_of_another_shape_is_refused() -> None:
+    """Kernels do not look at shapes: they would read beyond it."""
+    grid = Grid.from_spacing((3, 3, 3), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    corners = np.zeros((4, 4, 4), dtype=np.uint16, order="F")
+    with pytest.raises(GridMismatchError, match="shape"):
+        Field(name="x", corners=corners, geometry=corner_geometry(grid)[:, :5])

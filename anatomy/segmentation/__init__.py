@@ -1,0 +1,1 @@
+"""From a CT of the chest to the masks and the cost map of a patient."""

@@ -1,0 +1,176 @@
+"""Lumen and wall of the airways from a CT [Fu2018, III-A.2]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.grid import Float, Volume, read_only
+from anatomy.segmentation.airway_warnings import airway_warnings
+from anatomy.segmentation.coarse import bounds, window
+from anatomy.segmentation.growing import Ground, grow
+from anatomy.segmentation.local_minima import local_minima_map
+
+if TYPE_CHECKING:
+    from anatomy.segmentation.lungs import Lungs
+
+Mask = NDArray[np.bool_]
+Int16 = NDArray[np.int16]
+
+BOX_MARGIN_MM = 3.0
+EDGE_MM = 3.0
+"""How far the wall may lie from the rough central airway."""
+SMOOTH_MM = 0.6
+"""Standard deviation of the smoothing that tells a dark voxel from noise."""
+NOISE_PERCENTILE = 97.0
+"""So much of the lung lies below the shallowest minimum that is followed."""
+LEAST_DEPTH_HU = 20.0
+SAMPLE_STEP = 7
+"""Every so many voxels of the lung are looked at to learn its noise."""
+GREATEST_HU = 3071
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Airways:
+    """The airways of both lungs on the grid of the CT.
+
+    Parameters
+    ----------
+    lumen, wall : (ni, nj, nk) bool
+        The lumen is one piece, connected by faces, from the trachea on; they share no voxel.
+    warnings : tuple of str
+        What should be looked at.
+    leak_mm3 : float
+        Volume that was grown and taken back as a leak.
+    """
+
+    lumen: Mask
+    wall: Mask
+    warnings: tuple[str, ...] = ()
+    leak_mm3: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("lumen", "wall"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+
+def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] | None = None) -> Airways:
+    """Segment lumen and wall of the airways.
+
+    Parameters
+    ----------
+    ct : Volume
+        Hounsfield units.
+    lungs : Lungs
+        Both lungs, with a seed in the trachea and the rough central airway, on the grid of `ct`.
+    progress : callable, optional
+        Told what is being done.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no air at the seed.
+    GridMismatchError
+        If `lungs` lie on another grid.
+
+    References
+    ----------
+    [Fu2018], III-A.2; [Aykac2003]
+    """
+    tell = progress or (lambda text: None)
+    inside = lungs.mask
+    if inside.shape != ct.array.shape:
+        raise GridMismatchError(
+            f"The lungs are of shape {inside.shape}, the CT of {ct.array.shape}",
+            expected="lungs segmented in this CT",
+        )
+    tell("airway: map of local minima")
+    box = _box(inside | lungs.central_airway, ct.grid.spacing_mm)
+    hu = _hounsfield(ct.array[box])
+    lung = np.ascontiguousarray(inside[box].T)
+    spacing_mm = ct.grid.spacing_mm[::-1]
+    smooth = _smoothed(hu, spacing_mm)
+    upright = 2 - int(np.argmax(np.abs(ct.grid.lps_from_ijk[2, :3] / ct.grid.spacing_mm)))
+    depth = local_minima_map(hu, spacing_mm, upright)
+    rough = np.ascontiguousarray(lungs.central_airway[box].T)
+    sample = lung.reshape(-1)[::SAMPLE_STEP]
+    tissue_hu = np.median(smooth.reshape(-1)[::SAMPLE_STEP][sample])
+    noise = float(np.percentile(depth.reshape(-1)[::SAMPLE_STEP][sample], NOISE_PERCENTILE))
+    ground = Ground(
+        hu=hu,
+        smooth=smooth,
+        depth=depth,
+        spacing_mm=spacing_mm,
+        dark_hu=float(np.median(smooth[rough]) + tissue_hu) / 2,
+        least_depth=max(noise, LEAST_DEPTH_HU),
+    )
+    tell("airway: growth")
+    seed = lungs.trachea_seed_ijk - [s.start for s in box]
+    grown = grow(ground, _start(ground, rough, (int(seed[2]), int(seed[1]), int(seed[0]))))
+    lumen, wall = (np.zeros(inside.shape, dtype=np.bool_, order="F") for _ in range(2))
+    solid = _filled(grown.lumen)
+    lumen[box] = solid.T
+    wall[box] = (grown.wall & ~solid).T
+    return Airways(
+        lumen=lumen,
+        wall=wall,
+        warnings=airway_warnings(Volume(grid=ct.grid, array=lumen), lungs.left, lungs.right),
+        leak_mm3=grown.undone * ct.grid.voxel_volume_mm3,
+    )
+
+
+def _box(mask: Mask, spacing_mm: Float) -> tuple[slice, slice, slice]:
+    low, high = bounds(mask)
+    margin = np.ceil(BOX_MARGIN_MM / spacing_mm).astype(np.int64)
+    return window(np.maximum(low - margin, 0), np.minimum(high + margin, mask.shape))
+
+
+def _hounsfield(values: NDArray[np.generic]) -> Int16:
+    """Return the transposed values as int16, C-contiguous."""
+    if values.dtype != np.int16:
+        values = np.rint(np.clip(values.astype(np.float32), -1024, GREATEST_HU))
+    return np.ascontiguousarray(values.T, dtype=np.int16)
+
+
+def _smoothed(hu: Int16, spacing_mm: Float) -> Int16:
+    from scipy.ndimage import gaussian_filter
+
+    smooth = hu.astype(np.float32)
+    gaussian_filter(smooth, SMOOTH_MM / spacing_mm, output=smooth, truncate=2.0, mode="nearest")
+    return np.asarray(np.rint(smooth, out=smooth), dtype=np.int16)
+
+
+def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
+    """Return the air of trachea and main bronchi up to their walls, the piece with the seed."""
+    from scipy import ndimage
+
+    air = ground.smooth < ground.dark_hu
+    certain = rough & air
+    low, high = bounds(certain)
+    reach = int(np.ceil(EDGE_MM / ground.spacing_mm.min()))
+    inner = window(np.maximum(low - reach, 0), np.minimum(high + reach, rough.shape))
+    certain[inner] = ndimage.binary_dilation(certain[inner], iterations=reach, mask=air[inner])
+    labels, _ = ndimage.label(certain)
+    label = int(labels[seed]) if all(0 <= n < m for n, m in zip(seed, labels.shape, strict=True)) else 0
+    if label == 0:
+        raise AnatomyError(
+            f"There is no air at the seed in the trachea, voxel {seed[::-1]} of the box of the lungs",
+            expected="a voxel in the lumen of the trachea",
+            remedy="Give another seed",
+        )
+    return np.asarray(labels == label)
+
+
+def _filled(lumen: Mask) -> Mask:
+    """Fill the holes that the lumen encloses."""
+    from scipy import ndimage
+
+    low, high = bounds(lumen)
+    inner = window(low, high)
+    lumen[inner] = ndimage.binary_fill_holes(lumen[inner])
+    return lumen

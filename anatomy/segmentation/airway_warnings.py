@@ -1,0 +1,53 @@
+"""What a user should look at in a segmented airway before trusting it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Volume
+
+Mask = NDArray[np.bool_]
+
+LEAST_TRACHEA_MM = 25.0
+LEAST_ENDS = 4
+LEAST_SHARE = 0.2
+"""A lung with fewer ends than this share of the other's has lost most of its airways."""
+BRANCHINGS_PER_MM = 0.2
+"""Denser trees than this are leaks: airways seen in a CT are longer between branchings."""
+GREATEST_LOOPS_SHARE = 0.25
+"""An airway with so many rings per end has grown into lung."""
+
+
+def airway_warnings(lumen: Volume, left: Mask, right: Mask) -> tuple[str, ...]:
+    """Judge a lumen by its tree: trachea cut, airway that stops early, leak.
+
+    Parameters
+    ----------
+    lumen : Volume
+        The lumen, bool.
+    left, right : (ni, nj, nk) bool
+        The lungs, on the same grid.
+    """
+    from anatomy.tree import tree_from_mask
+
+    try:
+        tree = tree_from_mask(lumen)
+    except AnatomyError as error:
+        return (f"No tree can be made from the airway: {error.found}.",)
+    warnings = []
+    trachea = tree.distance_from_root_mm[tree.branch_start[1] - 1]
+    if trachea < LEAST_TRACHEA_MM:
+        warnings.append(f"The trachea is cut: only {trachea:.0f} mm of it are in the airway.")
+    ends = np.setdiff1d(np.arange(len(tree.branch_parent)), tree.branch_parent)
+    tips = tree.points_lps[tree.branch_start[ends + 1] - 1]
+    at = tuple(np.clip(np.rint(lumen.grid.ijk(tips)).astype(np.int64), 0, np.array(left.shape) - 1).T)
+    counts = {"left": int(left[at].sum()), "right": int(right[at].sum())}
+    for side, count in counts.items():
+        if count < max(LEAST_ENDS, LEAST_SHARE * max(counts.values())):
+            warnings.append(f"The airway stops early in the {side} lung: it has {count} ends there.")
+    loops = len(tree.report.loops_opened)
+    if loops > max(GREATEST_LOOPS_SHARE * len(ends), 2):
+        warnings.append(f"Leak suspected: the airway has {loops} rings.")
+    return tuple(warnings)

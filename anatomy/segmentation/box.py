@@ -1,0 +1,63 @@
+"""The box around the lungs and trachea, in which the slower steps run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Grid, Volume
+from anatomy.segmentation.coarse import bounds, window
+from anatomy.segmentation.lungs import Lungs
+
+BOX_PAD_MM = 10.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Box:
+    """A box of voxels `low <= ijk < high` of a grid."""
+
+    grid: Grid
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+
+    @classmethod
+    def around(cls, lungs: Lungs, grid: Grid) -> Box:
+        """Return the box of lungs and central airway, 10 mm wider where the image allows."""
+        parts = [bounds(mask) for mask in (lungs.left, lungs.right, lungs.central_airway) if mask.any()]
+        pad = np.ceil(BOX_PAD_MM / grid.spacing_mm).astype(np.int64)
+        low = np.maximum(np.min([low for low, _ in parts], axis=0) - pad, 0)
+        high = np.minimum(np.max([high for _, high in parts], axis=0) + pad, grid.shape)
+        return cls(grid=grid, low=low, high=high)
+
+    @property
+    def inner(self) -> Grid:
+        """The grid of the box."""
+        return self.grid.crop(self.low, self.high)
+
+    def cut(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Copy the part of an array in the box."""
+        return np.array(array[window(self.low, self.high)], order="F")
+
+    def volume(self, volume: Volume) -> Volume:
+        """Return the part of a volume in the box."""
+        return Volume(grid=self.inner, array=self.cut(volume.array))
+
+    def lungs(self, lungs: Lungs) -> Lungs:
+        """Return lungs on the grid of the box."""
+        return Lungs(
+            left=self.cut(lungs.left),
+            right=self.cut(lungs.right),
+            trachea_seed_ijk=lungs.trachea_seed_ijk - self.low,
+            central_airway=self.cut(lungs.central_airway),
+            threshold_hu=lungs.threshold_hu,
+            warnings=lungs.warnings,
+        )
+
+    def whole(self, part: NDArray[Any], fill: float = 0) -> NDArray[Any]:
+        """Return an array on the whole grid that holds `part` in the box, and `fill` elsewhere."""
+        whole = np.full(self.grid.shape, fill, dtype=part.dtype, order="F")
+        whole[window(self.low, self.high)] = part
+        return whole

@@ -1,0 +1,253 @@
+"""Trachea and main bronchi on coarse voxels: found as a round column of air, followed to the lungs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float, Volume
+from anatomy.segmentation.coarse import CoarseCt, bounds, window
+
+Mask = NDArray[np.bool_]
+Int = NDArray[np.int64]
+
+COLUMN_HU = -850.0
+"""The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`."""
+COLUMN_MEDIAN_HU = -920.0
+COLUMN_AREA_MM2 = (40.0, 800.0)
+"""Cross-sections of a trachea, up to where it widens to the carina."""
+GREATEST_ELONGATION = 2.5
+FROM_MIDLINE_MM = 50.0
+SHORTEST_COLUMN_MM = 20.0
+SEED_SHARE = 0.3
+"""How far down the column the seed lies."""
+
+GROWTH_HU = tuple(float(t) for t in range(-960, -699, 20))
+GREATEST_STEP_SHARE, GREATEST_STEP_ML = 0.5, 12.0
+"""Growing by more than both from one threshold to the next is a leak into the lung."""
+GREATEST_ML = 180.0
+"""Lumen of a large trachea and the bronchi that coarse voxels show."""
+SMOOTHING_VOXELS = 1.0
+"""Standard deviation of the filter for images too noisy to follow the trachea in."""
+WIDE_SHARE = 0.35
+"""Of the radius of the trachea: what is narrower is left to the segmentation of the airways."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CentralAirway:
+    """The large airways on coarse voxels.
+
+    Parameters
+    ----------
+    grown : (Ni, Nj, Nk) bool
+        Trachea and all bronchi that could be followed without a leak.
+    main : (Ni, Nj, Nk) bool
+        Of these, trachea and main bronchi.
+    seed : (3,) int64
+        A coarse voxel in the middle of the trachea.
+    warnings : tuple of str
+    """
+
+    grown: Mask
+    main: Mask
+    seed: Int
+    warnings: tuple[str, ...] = ()
+
+
+def find_central_airway(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) -> CentralAirway:
+    """Find trachea and main bronchi.
+
+    Parameters
+    ----------
+    ct : CoarseCt
+    outside : (Ni, Nj, Nk) bool
+        Air around the patient.
+    seed_lps : (3,) float64, optional
+        A point in the trachea, LPS mm, in place of the automatic search.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no column of air like a trachea, or the point does not lie in air.
+    """
+    try:
+        return _find(ct, outside, seed_lps)
+    except AnatomyError as error:
+        try:
+            return _find(_smoothed(ct), outside, seed_lps)
+        except AnatomyError:
+            raise error from None
+
+
+def _smoothed(ct: CoarseCt) -> CoarseCt:
+    """Return the image with less noise, in which a low-dose trachea is air throughout."""
+    from scipy.ndimage import gaussian_filter
+
+    return replace(ct, hu=np.asfortranarray(gaussian_filter(ct.hu, SMOOTHING_VOXELS, mode="nearest")))
+
+
+def _find(ct: CoarseCt, outside: Mask, seed_lps: Float | None) -> CentralAirway:
+    if seed_lps is None:
+        seed_lps = ct.grid.lps(_trachea_seed(ct, outside))
+    found = grow_from(ct, outside, seed_lps)
+    low, high = bounds(found.grown)
+    length_mm = float((high - low)[2] * ct.spacing_mm[2])
+    if length_mm < SHORTEST_COLUMN_MM:
+        raise AnatomyError(
+            f"Only {length_mm:.0f} mm of the trachea could be followed",
+            expected=f"at least {SHORTEST_COLUMN_MM:g} mm",
+            remedy="Give the masks with --lungs and --airway; the image may be too noisy",
+        )
+    return found
+
+
+def grow_from(ct: CoarseCt, outside: Mask, seed_lps: Float) -> CentralAirway:
+    """Follow the large airways from a point in them, staying out of `outside`.
+
+    Raises
+    ------
+    AnatomyError
+        If the point does not lie in air, or that air is not enclosed by a wall.
+    """
+    seed = _given_seed(ct, seed_lps)
+    grown = grow(ct, seed, outside)
+    main, warnings = _main_part(ct, grown)
+    return CentralAirway(grown=grown, main=main, seed=seed, warnings=warnings)
+
+
+def _given_seed(ct: CoarseCt, seed_lps: Float) -> Int:
+    block = ct.block(seed_lps)
+    if block is None or ct.hu[block] > GROWTH_HU[-1]:
+        found = "outside the image" if block is None else f"at {ct.hu[block]:.0f} HU"
+        raise AnatomyError(
+            f"The seed {np.round(seed_lps, 1).tolist()} (LPS mm) lies {found}",
+            expected=f"a point in the air of the trachea, below {GROWTH_HU[-1]:.0f} HU",
+        )
+    return np.array(block, dtype=np.int64)
+
+
+def _trachea_seed(ct: CoarseCt, outside: Mask) -> Int:
+    """Return the middle of the column of air that is most like a trachea."""
+    from scipy import ndimage
+
+    columns = _column_cross_sections(ct, outside)
+    pieces, count = ndimage.label(columns)
+    best, most = 0, 0
+    boxes = ndimage.find_objects(pieces)
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    for piece, box in enumerate(boxes, start=1):
+        height_mm = (box[2].stop - box[2].start) * ct.spacing_mm[2]
+        if height_mm >= SHORTEST_COLUMN_MM and sizes[piece] > most:
+            best, most = piece, int(sizes[piece])
+    if not best:
+        raise AnatomyError(
+            "No trachea was found: no column of air near the middle is "
+            f"{SHORTEST_COLUMN_MM:g} mm long and as wide as a trachea",
+            expected="a CT of the chest that shows the trachea down to the carina",
+            remedy="Give a point in the trachea with --seed, if the image shows it",
+        )
+    levels = boxes[best - 1][2]
+    level = levels.stop - 1 - int(SEED_SHARE * (levels.stop - 1 - levels.start))
+    inside = ndimage.distance_transform_edt(pieces[:, :, level] == best, sampling=ct.spacing_mm[:2])
+    i, j = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return np.array([i, j, level], dtype=np.int64)
+
+
+def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
+    """Mark, in every axial slice, pieces of air as large, round and central as a trachea."""
+    from scipy import ndimage
+
+    dx, dy, _ = ct.spacing_mm
+    least, most = (area / (dx * dy) for area in COLUMN_AREA_MM2)
+    chosen = np.zeros(ct.hu.shape, dtype=np.bool_)
+    middle = _midline(ct, outside)
+    for k in range(ct.hu.shape[2]):
+        plane = ct.hu[:, :, k]
+        pieces, count = ndimage.label((plane < COLUMN_HU) & ~outside[:, :, k])
+        sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+        for piece, box in enumerate(ndimage.find_objects(pieces), start=1):
+            width, depth = (s.stop - s.start for s in box)
+            centre = 0.5 * (box[0].start + box[0].stop - 1)
+            fits = least <= sizes[piece] <= most and abs(centre - middle) * dx <= FROM_MIDLINE_MM
+            if not fits or max(width * dx, depth * dy) > GREATEST_ELONGATION * min(width * dx, depth * dy):
+                continue
+            inside = pieces[box] == piece
+            if np.median(plane[box][inside]) <= COLUMN_MEDIAN_HU:
+                chosen[(*box, k)] |= inside
+    return chosen
+
+
+def _midline(ct: CoarseCt, outside: Mask) -> float:
+    """Return the middle of the body along the axis from right to left, as an index."""
+    body = np.count_nonzero(~outside, axis=(1, 2)).astype(np.float64)
+    return float((body * np.arange(len(body))).sum() / body.sum())
+
+
+def grow(ct: CoarseCt, seed: Int, outside: Mask) -> Mask:
+    """Return the air connected to `seed`, at the highest threshold before it leaks into the lung.
+
+    The thresholds rise; a leak is a growth by more than a share and a volume at once, or to a volume that
+    no airway has.
+    """
+    from scipy import ndimage
+
+    low, high = bounds(~outside)
+    box = window(low, high)
+    air = np.asfortranarray(np.where(outside[box], np.float32(0.0), ct.hu[box]))
+    at = tuple(int(n) for n in seed - low)
+    grown = np.zeros(air.shape, dtype=np.bool_, order="F")
+    volume_ml = 0.0
+    for threshold in GROWTH_HU:
+        if air[at] >= threshold:
+            continue
+        pieces = ndimage.label((air < threshold).T)[0].T
+        candidate = pieces == pieces[at]
+        candidate_ml = np.count_nonzero(candidate) * ct.voxel_ml
+        step_ml = candidate_ml - volume_ml
+        leaks = volume_ml > 0 and step_ml > max(GREATEST_STEP_SHARE * volume_ml, GREATEST_STEP_ML)
+        if leaks or candidate_ml > GREATEST_ML:
+            break
+        grown, volume_ml = candidate, candidate_ml
+    if not volume_ml:
+        raise AnatomyError(
+            f"The air around the trachea (coarse voxel {at}) is connected to the lung or the outside",
+            expected="a trachea with a wall around it",
+            remedy="Give a point in the trachea with --seed, or the masks with --lungs and --airway",
+        )
+    whole = np.zeros(ct.hu.shape, dtype=np.bool_, order="F")
+    whole[box] = grown
+    return whole
+
+
+def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
+    """Return trachea and main bronchi: the parts nearest to the two first generations of the tree."""
+    import edt
+    from scipy.spatial import cKDTree
+
+    from anatomy.tree import tree_from_mask
+
+    low, high = bounds(grown)
+    low, high = np.maximum(low - 1, 0), np.minimum(high + 1, grown.shape)
+    box = window(low, high)
+    part = np.asfortranarray(grown[box])
+    depth = edt.edt(part, anisotropy=ct.spacing_mm, black_border=True)
+    wide_mm = WIDE_SHARE * float(np.percentile(depth[depth > 0], 99))
+    core = depth >= wide_mm
+    near = edt.edt(np.asfortranarray(~core), anisotropy=ct.spacing_mm) <= wide_mm
+    wide = part & near
+    grid = ct.grid.crop(low, high)
+    main = np.zeros(grown.shape, dtype=np.bool_, order="F")
+    try:
+        tree = tree_from_mask(Volume(grid=grid, array=wide))
+    except AnatomyError as error:
+        main[box] = wide
+        return main, (f"The main bronchi could not be told from the lobar ones: {error.found}",)
+    voxels = np.argwhere(wide)
+    _, nearest = cKDTree(tree.points_lps).query(grid.lps(voxels))
+    first = tree.generation[tree.branch_of_point[nearest]] <= 1
+    chosen = voxels[first] + low
+    main[tuple(chosen.T)] = True
+    return main, ()

@@ -1,0 +1,179 @@
+"""A CT on coarse voxels with axes along LPS, where decisions about the whole chest are cheap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float, Grid, Volume
+
+Mask = NDArray[np.bool_]
+
+COARSE_MM = 1.5
+"""Blocks of voxels come as near to this size as whole numbers of voxels allow."""
+LEAST_HU = -1024
+"""Scanners write lower values where they measured nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CoarseCt:
+    """Means over blocks of a CT's voxels; axis 0 runs most nearly to the left, 1 to the back, 2 up.
+
+    Parameters
+    ----------
+    hu : (Ni, Nj, Nk) float32
+        Hounsfield units, not below -1024; contiguous along axis 0.
+    grid : Grid
+        The grid of `hu`.
+    fine_shape : (3,) int
+        Shape of the CT.
+    step : (3,) int
+        Voxels in a block, along the axes of the CT.
+    order : (3,) int
+        Axis of the CT that each axis here follows.
+    flipped : (3,) bool
+        Whether an axis here runs against that axis of the CT.
+    """
+
+    hu: NDArray[np.float32]
+    grid: Grid
+    fine_shape: tuple[int, int, int]
+    step: tuple[int, int, int]
+    order: tuple[int, int, int]
+    flipped: tuple[bool, bool, bool]
+
+    @classmethod
+    def of(cls, ct: Volume) -> Self:
+        """Average the blocks of a CT; blocks at the end may hold fewer voxels."""
+        step = tuple(max(1, round(COARSE_MM / float(s))) for s in ct.grid.spacing_mm)
+        blocks = _block_means(ct.array, step)
+        order, flipped = _towards_lps(ct.grid.lps_from_ijk[:3, :3])
+        made = cls(
+            hu=blocks,
+            grid=_turned_grid(_block_grid(ct.grid, blocks.shape, step), order, flipped),
+            fine_shape=ct.grid.shape,
+            step=(step[0], step[1], step[2]),
+            order=order,
+            flipped=flipped,
+        )
+        object.__setattr__(made, "hu", np.asfortranarray(made._turned(blocks)))
+        return made
+
+    @property
+    def spacing_mm(self) -> tuple[float, float, float]:
+        """Size of a block along the axes here."""
+        a, b, c = (float(s) for s in self.grid.spacing_mm)
+        return a, b, c
+
+    @property
+    def voxel_ml(self) -> float:
+        """Volume of a block."""
+        return self.grid.voxel_volume_mm3 / 1000.0
+
+    def to_ct(self, blocks: NDArray[Any], low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the values of the blocks that the CT's voxels `low <= ijk < high` lie in."""
+        # Transposed, so that the last pass, over the most voxels, copies whole planes.
+        values = np.ascontiguousarray(self._turned_back(blocks).T)
+        for axis in range(3):
+            index = np.arange(low[axis], high[axis]) // self.step[axis]
+            values = np.take(values, index, axis=2 - axis)
+        return values.T
+
+    def box_in_ct(self, mask: Mask, pad_mm: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return `low` and `high` of the CT's voxels around a mask of blocks, wider by `pad_mm`."""
+        low, high = bounds(self._turned_back(mask))
+        step = np.asarray(self.step)
+        size = np.asarray(self.spacing_mm)[list(np.argsort(self.order))] / step
+        pad = np.ceil(pad_mm / size).astype(np.int64)
+        return np.maximum(low * step - pad, 0), np.minimum(high * step + pad, self.fine_shape)
+
+    def ct_voxel(self, block: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the voxel of the CT in the middle of a block."""
+        place = np.asarray(block, dtype=np.int64).copy()
+        for axis in range(3):
+            if self.flipped[axis]:
+                place[axis] = self.hu.shape[axis] - 1 - place[axis]
+        native = place[list(np.argsort(self.order))]
+        middle = native * self.step + np.asarray(self.step) // 2
+        return np.asarray(np.minimum(middle, np.asarray(self.fine_shape) - 1), dtype=np.int64)
+
+    def block(self, lps: Float) -> tuple[int, int, int] | None:
+        """Return the block that a point lies in, or None outside the CT."""
+        i, j, k = (int(n) for n in np.floor(self.grid.ijk(lps) + 0.5))
+        return (i, j, k) if bool(self.grid.contains(lps)) else None
+
+    def _turned(self, blocks: NDArray[Any]) -> NDArray[Any]:
+        turned: NDArray[Any] = np.flip(np.transpose(blocks, self.order), axis=self._reversed_axes())
+        return turned
+
+    def _turned_back(self, blocks: NDArray[Any]) -> NDArray[Any]:
+        unflipped: NDArray[Any] = np.flip(blocks, axis=self._reversed_axes())
+        return np.transpose(unflipped, np.argsort(self.order))
+
+    def _reversed_axes(self) -> tuple[int, ...]:
+        return tuple(axis for axis in range(3) if self.flipped[axis])
+
+
+def bounds(mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return `low` and `high` such that every True voxel has `low <= ijk < high`; zeros if there is none."""
+    low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    lines = (mask.any(axis=(1, 2)), mask.any(axis=(0, 2)), mask.any(axis=(0, 1)))
+    for axis, line in enumerate(lines):
+        hits = np.flatnonzero(line)
+        if hits.size:
+            low[axis], high[axis] = hits[0], hits[-1] + 1
+    return low, high
+
+
+def window(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, slice, slice]:
+    """Return the slices of a box."""
+    i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    return i, j, k
+
+
+def _block_means(values: NDArray[Any], step: tuple[int, ...]) -> NDArray[np.float32]:
+    shape = tuple(-(-n // s) for n, s in zip(values.shape, step, strict=True))
+    total = np.zeros(shape, dtype=np.float32, order="F")
+    count = np.zeros(shape, dtype=np.float32, order="F")
+    for offset in np.ndindex(*step):
+        part = values[tuple(slice(first, None, s) for first, s in zip(offset, step, strict=True))]
+        where = tuple(slice(0, n) for n in part.shape)
+        total[where] += np.maximum(part, LEAST_HU)
+        count[where] += 1.0
+    total /= count
+    return total
+
+
+def _block_grid(grid: Grid, shape: tuple[int, ...], step: tuple[int, ...]) -> Grid:
+    matrix = grid.lps_from_ijk.copy()
+    matrix[:3, :3] = matrix[:3, :3] * step
+    matrix[:3, 3] = grid.lps((np.asarray(step) - 1) / 2)
+    return Grid(shape=(shape[0], shape[1], shape[2]), lps_from_ijk=matrix)
+
+
+def _towards_lps(axes: Float) -> tuple[tuple[int, int, int], tuple[bool, bool, bool]]:
+    """Return which axis runs most nearly along x, y and z, and whether against it."""
+    from scipy.optimize import linear_sum_assignment
+
+    cosines = axes / np.linalg.norm(axes, axis=0)
+    _, columns = linear_sum_assignment(-np.abs(cosines))
+    x, y, z = (int(c) for c in columns)
+    against = [bool(cosines[row, column] < 0) for row, column in enumerate((x, y, z))]
+    return (x, y, z), (against[0], against[1], against[2])
+
+
+def _turned_grid(grid: Grid, order: tuple[int, int, int], flipped: tuple[bool, bool, bool]) -> Grid:
+    """Return the grid after its axes were put into another order and some of them turned around."""
+    matrix = grid.lps_from_ijk.copy()
+    shape = [grid.shape[axis] for axis in order]
+    columns = grid.lps_from_ijk[:3, list(order)]
+    last = np.zeros(3)
+    for axis in range(3):
+        if flipped[axis]:
+            last[order[axis]] = shape[axis] - 1
+    matrix[:3, :3] = columns * np.where(flipped, -1.0, 1.0)
+    matrix[:3, 3] = grid.lps(last)
+    return Grid(shape=(shape[0], shape[1], shape[2]), lps_from_ijk=matrix)

@@ -1,0 +1,76 @@
+"""The `patient.toml` of a folder while its images change."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+
+from anatomy.grid import Float
+from anatomy.io.files import atomic_write, sha256
+from anatomy.segmentation.folder import SegmentationFolder
+
+
+class Description:
+    """The `patient.toml` of a folder: set aside while images change, so that no half-made patient is read.
+
+    A person's own edits are kept.
+
+    Parameters
+    ----------
+    folder : SegmentationFolder
+    """
+
+    def __init__(self, folder: SegmentationFolder, name: str) -> None:
+        self._folder = folder
+        self._path = folder.path / name
+        self._aside = folder.path / f".{name}.aside"
+
+    def set_aside(self) -> None:
+        """Take the description away until `finish`; harmless when it is away already."""
+        if self._path.is_file():
+            os.replace(self._path, self._aside)
+
+    def finish(self, text: str) -> bool:
+        """Put the description back: `text`, or what a person edited; return True if the latter."""
+        self.set_aside()
+        written = self._folder.recorded("description") or []
+        if self._aside.is_file() and sha256(self._aside) not in written:
+            os.replace(self._aside, self._path)
+            return True
+        digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
+        self._folder.save(description=[*written[-1:], digest])
+        with atomic_write(self._path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        self._aside.unlink(missing_ok=True)
+        return False
+
+
+def description_text(name: str, has_nodule: bool, target_lps: Float | None, thick_slices_mm: float) -> str:
+    """Return the `patient.toml` of a segmentation.
+
+    Parameters
+    ----------
+    name : str
+        How reports call the patient; left out if empty.
+    has_nodule : bool
+    target_lps : (3,) float64 or None
+        LPS mm.
+    thick_slices_mm : float
+        Distance of slices that were accepted although they are thick, else 0.
+    """
+    lines = [f"name = {json.dumps(name, ensure_ascii=False)}"] if name else []
+    lines += [
+        'lumen = "airway.nii.gz"',
+        'wall = "airway_wall.nii.gz"',
+        'vessels = "vessels.nii.gz"',
+        'lung = "lungs.nii.gz"',
+        'cost = "cost.nii.gz"',
+    ]
+    if has_nodule:
+        lines.append('nodule = "nodule.nii.gz"')
+    if target_lps is not None:
+        lines.append('targets = ["lps:{:.3f},{:.3f},{:.3f}"]'.format(*target_lps))
+    if thick_slices_mm:
+        lines.append(f"thick_slices_mm = {thick_slices_mm:.3f}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,208 @@
+"""The folder a segmentation writes: what was made from what, and which masks a person corrected."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.grid import Grid, Volume
+from anatomy.io.files import atomic_write, read_text, require_writable_folder, sha256
+from anatomy.io.images import SUFFIXES, read_volume, write_volume
+
+STATE = "segmentation.json"
+FORMAT = 1
+_MADE_SUFFIX = ".nii.gz"
+CORRECTIONS = "corrections"
+IMAGES = ("lungs", "airway", "airway_wall", "nodule", "vessels", "all_vessels")
+"""What a person may correct."""
+_SHIFT_TOLERANCE = 0.05
+"""Largest deviation from a whole number of voxels, in voxels."""
+
+
+class SegmentationFolder:
+    """Images of one CT in a folder, with a record that tells made ones from corrected ones.
+
+    An image counts as corrected if its file is not one that was written here, or if a file of the same
+    name with another ending (`airway.seg.nrrd`) lies beside it.  Corrected files are moved to the folder
+    `corrections`, and count until they are removed from there.  The record is written before a file gets
+    its name, so that a run that was killed at any moment leaves no made file that looks corrected.
+
+    Parameters
+    ----------
+    folder : path
+        Made if needed.
+    grid : Grid
+        The grid of the CT, which all images get.
+    ct_digest : str
+        Content of the CT.
+
+    Raises
+    ------
+    AnatomyError
+        If the folder holds corrections made for another CT.
+    FileError
+        If the folder cannot be written to.
+    """
+
+    def __init__(self, folder: str | Path, grid: Grid, ct_digest: str) -> None:
+        self.path = require_writable_folder(folder)
+        self.grid = grid
+        self._record = _read_record(self.path / STATE)
+        for left in self.path.glob(f".*-*{_MADE_SUFFIX}"):  # of a run that was killed
+            left.unlink(missing_ok=True)
+        self._collect_corrections()
+        self._refuse_other_ct(ct_digest)
+        self._record["ct"] = ct_digest
+
+    def path_of(self, name: str) -> Path:
+        """Return the file of an image."""
+        return self.path / f"{name}{_MADE_SUFFIX}"
+
+    def correction(self, name: str) -> Path | None:
+        """Return the file that a person put in place of an image, or None."""
+        for suffix in SUFFIXES:
+            path = self.path / CORRECTIONS / f"{name}{suffix}"
+            if path.is_file():
+                return path
+        return None
+
+    def _collect_corrections(self) -> None:
+        """Move images that were not written here to the corrections."""
+        for name in IMAGES:
+            for suffix in SUFFIXES:
+                path = self.path / f"{name}{suffix}"
+                made_here = suffix == _MADE_SUFFIX and self._is_made(path, name)
+                if path.is_file() and not made_here:
+                    require_writable_folder(self.path / CORRECTIONS)
+                    os.replace(path, self.path / CORRECTIONS / path.name)
+
+    def _is_made(self, path: Path, name: str) -> bool:
+        return path.is_file() and sha256(path) in self._entry(name).get("written", ())
+
+    def read(self, path: Path) -> Volume:
+        """Read an image and put it on the grid of the CT."""
+        return onto_grid(read_volume(path), self.grid, path.name)
+
+    def digest_if_made_from(self, name: str, key: str) -> str | None:
+        """Return the digest of an image if its file is the one made from `key`, else None."""
+        entry = self._entry(name)
+        path = self.path_of(name)
+        if entry.get("key") != key or not path.is_file() or sha256(path) != entry.get("file"):
+            return None
+        return str(entry["voxels"])
+
+    def write(self, name: str, array: NDArray[Any], key: str) -> str:
+        """Write an image made from `key`, and return the digest of its voxels."""
+        digest = digest_of(array)
+        path = self.path_of(name)
+        with atomic_write(path) as temporary:
+            write_volume(temporary, Volume(grid=self.grid, array=array))
+            file = sha256(temporary)
+            known = [*self._entry(name).get("written", ())][-1:]
+            entry = {"key": key, "file": file, "voxels": digest, "written": [*known, file]}
+            self._record.setdefault("images", {})[name] = entry
+            self.save()
+        return digest
+
+    def facts(self, step: str) -> dict[str, Any]:
+        """Return what a step noted beside its images."""
+        return dict(self._record.get("facts", {}).get(step, {}))
+
+    def note(self, step: str, facts: Mapping[str, Any]) -> None:
+        """Keep what a step found beside its images."""
+        self._record.setdefault("facts", {})[step] = dict(facts)
+
+    def save(self, **others: Any) -> None:
+        """Write the record, with further entries if given."""
+        self._record.update(others)
+        with atomic_write(self.path / STATE) as temporary:
+            temporary.write_text(json.dumps(self._record, indent=1) + "\n", encoding="utf-8")
+
+    def recorded(self, entry: str) -> Any:
+        """Return an entry of the record, or None."""
+        return self._record.get(entry)
+
+    def _entry(self, name: str) -> dict[str, Any]:
+        return dict(self._record.get("images", {}).get(name, {}))
+
+    def _refuse_other_ct(self, ct_digest: str) -> None:
+        before = self._record.get("ct")
+        if before in (None, ct_digest):
+            return
+        corrected = [name for name in IMAGES if self.correction(name)]
+        if corrected:
+            raise AnatomyError(
+                f"{self.path} holds images of another CT that were corrected: {', '.join(corrected)}",
+                expected="the CT these corrections were made for, or an empty folder",
+                remedy="Choose another folder with --out",
+            )
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """Return the record of a folder; empty if there is none, or of another format."""
+    if not path.is_file():
+        return {"format": FORMAT}
+    try:
+        record = json.loads(read_text(path))
+    except json.JSONDecodeError:
+        return {"format": FORMAT}
+    usable = isinstance(record, dict) and record.get("format") == FORMAT
+    return record if usable else {"format": FORMAT}
+
+
+def digest_of(array: NDArray[Any]) -> str:
+    """Return the SHA-256 of the voxels of an image, whatever their order in memory."""
+    plain = np.asfortranarray(array)
+    plain = plain.view(np.uint8) if plain.dtype == np.bool_ else plain
+    found = hashlib.sha256(f"{plain.dtype.str}{plain.shape}".encode())
+    found.update(np.ascontiguousarray(plain.T).data)
+    return found.hexdigest()
+
+
+def grid_digest(grid: Grid) -> str:
+    """Return the SHA-256 of a grid."""
+    text = f"{grid.shape}{grid.lps_from_ijk.tobytes().hex()}"
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def key_of(step: str, **parts: Any) -> str:
+    """Return the key of a step: the hash of its name, its settings and what it is made from."""
+    text = json.dumps({"step": step, **parts}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
+    """Place an image whose voxels coincide with those of `grid`, but which may cover another box.
+
+    Raises
+    ------
+    GridMismatchError
+        If the voxels do not coincide.
+    """
+    if volume.grid.is_close(grid):
+        return Volume(grid=grid, array=volume.array)
+    start = grid.ijk(volume.grid.lps((0, 0, 0)))
+    shift = np.rint(start).astype(np.int64)
+    axes = grid.ijk_from_lps[:3, :3] @ volume.grid.lps_from_ijk[:3, :3]
+    steps = np.abs(axes - np.eye(3)).max() * max(volume.grid.shape)
+    if max(float(np.abs(start - shift).max()), float(steps)) > _SHIFT_TOLERANCE:
+        raise GridMismatchError(
+            f"The voxels of {name} are not those of the CT: {volume.grid.describe()}",
+            expected=f"a box of voxels of {grid.describe()}",
+            remedy="Export the mask with the CT as its reference image",
+        )
+    placed = np.zeros(grid.shape, dtype=volume.array.dtype, order="F")
+    low, high = np.maximum(shift, 0), np.minimum(shift + volume.grid.shape, grid.shape)
+    if (low < high).all():
+        into = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        source = tuple(slice(int(a), int(b)) for a, b in zip(low - shift, high - shift, strict=True))
+        placed[into] = volume.array[source]
+    return Volume(grid=grid, array=placed)

@@ -1,0 +1,170 @@
+"""Grow the airway through a map of local minima, and around it its wall [Fu2018, III-A.2]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float
+from anatomy.segmentation.kernels import growing as kernel
+from anatomy.segmentation.kernels import lumen_edge
+
+Mask = NDArray[np.bool_]
+Int = NDArray[np.int64]
+Int16 = NDArray[np.int16]
+
+AIR_HU = -1024
+"""Around the image is air, which is neither wall nor, for want of depth, lumen."""
+GREATEST_LUMEN_ML = 400.0
+"""More than the airways of any patient hold; what would make more is a leak."""
+FIRST_LEVEL_HU = 600.0
+LEVEL_RATIO = 0.92
+"""Each level of the growth lies this much below the one before."""
+LEAST_LAYERS = 4
+FRONT_FACTOR, FRONT_SLACK_MM2 = 3.0, 200.0
+"""A piece has burst whose front is this much larger than where it began."""
+WIDE_MM2 = 20.0
+"""A bronchus of this cross-section or more is dark inside."""
+RIM_MM = 1.5
+"""What lies so near to a wider one that is not dark is its rim."""
+SKIN_SHARE = 0.5
+"""The edge of a lumen is where the map is half as deep as inside."""
+
+EDGE_MM = 1.2
+"""The edge of a lumen is blurred over about so much."""
+
+WALL_LEAST_HU = -600.0
+WALL_DIFFERENCE_HU = 10.0
+"""T_abs and T_dif of the paper."""
+WALL_MM = 2.0
+"""The wall reaches no farther than this beyond its first layer."""
+
+ROOM_FACTOR = 128
+"""Edge and wall have at most so many voxels for one that was grown."""
+
+_MARGIN = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ground:
+    """What the airway grows in; arrays `(nk, nj, ni)`, C-contiguous.
+
+    Parameters
+    ----------
+    hu : int16
+        The CT.
+    smooth : int16
+        The CT with less noise.
+    depth : int16
+        Its map of local minima.
+    spacing_mm : (3,) float64
+        Voxel size along these axes.
+    dark_hu : float
+        Half-way between air and the tissue of the lung.
+    least_depth : float
+        Shallower minima are noise.
+    """
+
+    hu: Int16
+    smooth: Int16
+    depth: Int16
+    spacing_mm: Float
+    dark_hu: float
+    least_depth: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grown:
+    """Lumen and wall, bool `(nk, nj, ni)`, and the number of voxels that were grown and undone."""
+
+    lumen: Mask
+    wall: Mask
+    undone: int
+
+
+def grow(ground: Ground, start: Mask) -> Grown:
+    """Grow lumen and wall of the airway.
+
+    Parameters
+    ----------
+    ground : Ground
+    start : (nk, nj, ni) bool
+        Lumen that is certain: trachea and main bronchi.
+    """
+    state = _padded(start.astype(np.uint8))
+    hu, smooth = _padded(ground.hu, AIR_HU), _padded(ground.smooth, AIR_HU)
+    shape = np.array(state.shape, dtype=np.int64)
+    flat = state.reshape(-1)
+    seeds = np.flatnonzero(flat)
+    count = len(seeds)
+    most = min(flat.size, 2 * count + int(1000.0 * GREATEST_LUMEN_ML / float(np.prod(ground.spacing_mm))))
+    lumen = np.zeros(most, dtype=np.int64)
+    lumen[:count] = seeds
+    pixel_mm2 = float(np.prod(ground.spacing_mm) ** (2 / 3))
+    queue = np.zeros(2 * most, dtype=np.int64)
+    parent = np.zeros(most, dtype=np.int64)
+    behind = np.zeros((2, most), dtype=np.int64)
+    layer_ends = np.zeros(most, dtype=np.int64)
+    count, undone = kernel.grow_airway(
+        _padded(ground.depth).reshape(-1),
+        smooth.reshape(-1),
+        flat,
+        shape,
+        lumen,
+        count,
+        levels(ground.least_depth),
+        LEAST_LAYERS,
+        FRONT_FACTOR,
+        FRONT_SLACK_MM2 / pixel_mm2,
+        max(WIDE_MM2 / pixel_mm2, 2.0),
+        max(round(RIM_MM / float(np.sqrt(pixel_mm2))), 1),
+        ground.dark_hu,
+        SKIN_SHARE,
+        queue,
+        parent,
+        behind,
+        layer_ends,
+    )
+    flat[flat != lumen_edge.LUMEN] = 0
+    _edge_and_wall(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, lumen[:count])
+    return Grown(
+        lumen=_inner(state == lumen_edge.LUMEN), wall=_inner(state == lumen_edge.WALL), undone=int(undone)
+    )
+
+
+def _edge_and_wall(
+    ground: Ground, hu: Int16, smooth: Int16, state: NDArray[np.uint8], shape: Int, grown: Int
+) -> None:
+    """Bring the lumen in `state` to its edge and put the wall around it; all arrays padded and flat."""
+    near, faces = kernel.box_offsets(shape, 1), kernel.face_offsets(shape)
+    count = len(grown)
+    lumen = np.zeros(min(state.size, ROOM_FACTOR * count), dtype=np.int64)
+    lumen[:count] = grown
+    core_hu = np.zeros(len(lumen), dtype=np.int16)
+    lumen_edge.darkest_beside(smooth, state, near, lumen, count, core_hu)
+    for _ in range(max(round(EDGE_MM / float(ground.spacing_mm.mean())), 1)):
+        count = lumen_edge.refine_edge(
+            hu, state, faces, int(shape[2]), int(ground.least_depth), lumen, count, core_hu
+        )
+    count = lumen_edge.join_corners(hu, state, shape, lumen, count)
+    layers = int(np.ceil(WALL_MM / ground.spacing_mm.mean()))
+    wall = np.zeros(min(state.size, ROOM_FACTOR * count), dtype=np.int64)
+    lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, WALL_LEAST_HU, WALL_DIFFERENCE_HU, wall)
+
+
+def levels(least_depth: float) -> NDArray[np.int64]:
+    """Return the falling levels of the growth, HU."""
+    count = max(int(np.log(least_depth / FIRST_LEVEL_HU) / np.log(LEVEL_RATIO)), 0) + 1
+    return np.asarray(FIRST_LEVEL_HU * LEVEL_RATIO ** np.arange(count)).astype(np.int64)
+
+
+def _padded(values: NDArray[Any], border: int = 0) -> NDArray[Any]:
+    return np.pad(values, _MARGIN, constant_values=border)
+
+
+def _inner(values: Mask) -> Mask:
+    inner = slice(_MARGIN, -_MARGIN)
+    return values[inner, inner, inner]

@@ -1,0 +1,136 @@
+"""Is this a CT of the chest that can be segmented?  What cannot be is refused, what is doubtful told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Volume
+
+AIR_HU, TISSUE_HU = -700.0, (-200.0, 200.0)
+LEAST_SHARE = 0.002
+"""Air and soft tissue each fill at least this share of a CT of the chest."""
+LEAST_PRESENT_HU = -400.0
+"""The lowest value of an image whose offset of -1000 is missing is about 0, and above this."""
+LEAST_SIZE_MM = 100.0
+SPACING_MM = (0.2, 2.5)
+"""Sizes of voxels within a slice that are not doubted."""
+THICK_SLICE_MM = 3.0
+THICKEST_SLICE_MM = 10.0
+ODD_HU = 5000.0
+"""Metal reaches the 3071 HU of most scanners; more than this is another scale."""
+
+
+def slice_mm(ct: Volume) -> float:
+    """Return the distance of the slices: the largest of the three voxel sizes."""
+    return float(ct.grid.spacing_mm.max())
+
+
+def has_thick_slices(ct: Volume) -> bool:
+    """Tell whether the slices are too far apart for small airways and vessels."""
+    return slice_mm(ct) > THICK_SLICE_MM
+
+
+def require_chest_ct(ct: Volume, *, thick_slices: bool = False) -> tuple[str, ...]:
+    """Refuse images that cannot be a CT of the chest in Hounsfield units.
+
+    Parameters
+    ----------
+    ct : Volume
+    thick_slices : bool
+        Whether slices of more than 3 mm are accepted.
+
+    Returns
+    -------
+    tuple of str
+        Warnings.
+
+    Raises
+    ------
+    AnatomyError
+        If a voxel is not a number, the values are no Hounsfield units, air or tissue are missing, the
+        image is too small, or its slices are too thick.
+    """
+    _require_numbers(ct.array)
+    _require_hounsfield(ct.array)
+    return (*_require_size(ct, thick_slices), *_odd_values(ct.array))
+
+
+def _require_numbers(values: NDArray[Any]) -> None:
+    if values.dtype.kind not in "iuf":
+        raise AnatomyError(f"The image has voxels of the type {values.dtype}", expected="numbers in HU")
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        count = int(np.count_nonzero(~np.isfinite(values)))
+        raise AnatomyError(
+            f"The image holds {count} voxels that are not a number (NaN or infinite)",
+            expected="Hounsfield units in every voxel",
+            remedy="Replace them by -1024, the value for nothing measured",
+        )
+
+
+def _require_hounsfield(values: NDArray[Any]) -> None:
+    least, greatest = float(values.min()), float(values.max())
+    if least == greatest:
+        raise AnatomyError(
+            f"Every voxel of the image is {least:g}",
+            expected="a CT in Hounsfield units",
+            remedy="Export the image again",
+        )
+    if least > LEAST_PRESENT_HU:
+        raise AnatomyError(
+            f"The lowest value of the image is {least:g}: its offset of about -1000 HU seems to be missing",
+            expected="Hounsfield units, where air is about -1000 and water 0",
+            remedy="Apply the rescale intercept (often -1024) when exporting, or give the DICOM folder",
+        )
+    count = values.size
+    air = np.count_nonzero(values < AIR_HU) / count
+    tissue = np.count_nonzero((values > TISSUE_HU[0]) & (values < TISSUE_HU[1])) / count
+    if min(air, tissue) < LEAST_SHARE:
+        missing = "air (below -700 HU)" if air < LEAST_SHARE else "soft tissue (-200 to 200 HU)"
+        raise AnatomyError(
+            f"The image, {least:g} to {greatest:g}, holds hardly any {missing}",
+            expected="a CT of the chest in Hounsfield units, with lungs and the body around them",
+            remedy="Choose the series of the chest, and check that its values are Hounsfield units",
+        )
+
+
+def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
+    spacing = ct.grid.spacing_mm
+    extent = spacing * np.asarray(ct.grid.shape)
+    if extent.min() < LEAST_SIZE_MM:
+        raise AnatomyError(
+            f"The image measures {' x '.join(f'{e:.0f}' for e in extent)} mm",
+            expected=f"at least {LEAST_SIZE_MM:g} mm in every direction, to hold a lung",
+            remedy="Give the whole scan; check the voxel size in the header",
+        )
+    thickness = slice_mm(ct)
+    if thickness > THICKEST_SLICE_MM or (thickness > THICK_SLICE_MM and not thick_slices):
+        allowed = thickness <= THICKEST_SLICE_MM
+        raise AnatomyError(
+            f"The slices are {thickness:.1f} mm apart",
+            expected=f"at most {THICK_SLICE_MM:g} mm: small airways and vessels are lost between such slices",
+            remedy="Reconstruct thinner slices"
+            + ("; or accept the loss with --thick-slices" if allowed else ""),
+        )
+    warnings = []
+    if thickness > THICK_SLICE_MM:
+        warnings.append(
+            f"The slices are {thickness:.1f} mm apart: small airways and vessels are missing, "
+            "so a path that looks free may not be."
+        )
+    if not SPACING_MM[0] <= spacing.min() <= SPACING_MM[1]:
+        warnings.append(
+            f"The smallest voxel size is {spacing.min():.2f} mm; {SPACING_MM[0]:g} to {SPACING_MM[1]:g} mm "
+            "are usual."
+        )
+    return tuple(warnings)
+
+
+def _odd_values(values: NDArray[Any]) -> tuple[str, ...]:
+    greatest = float(values.max())
+    if greatest <= ODD_HU:
+        return ()
+    return (f"The image reaches {greatest:g} HU: metal, or not Hounsfield units.",)

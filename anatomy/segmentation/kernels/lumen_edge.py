@@ -1,0 +1,171 @@
+"""The edge of the airway lumen: refined towards the wall, made connected by faces, and the wall around it.
+
+Volumes are `(nk, nj, ni)`, C-contiguous, with a border of at least one voxel; voxels are named by their
+flat index.  Lists of voxels are filled up to the returned count.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+LUMEN = np.uint8(1)
+WALL = np.uint8(2)
+REPLACING_HU = np.int16(0)
+"""r: what the lumen is painted with before it is closed."""
+
+
+@numba.njit(cache=True)
+def closing_at(hu, state, at, row):
+    """Close the image with its lumen painted, with a pixel and its four neighbours, at one voxel.
+
+    `row` is the flat step from one row of a slice to the next.
+    """
+    least = np.int16(32767)
+    for m in range(5):
+        middle = at + cross(m, row)
+        most = np.int16(-32768)
+        for n in range(5):
+            x = middle + cross(n, row)
+            most = max(most, REPLACING_HU if state[x] == LUMEN else hu[x])
+        least = min(least, most)
+    return least
+
+
+@numba.njit(cache=True)
+def cross(n, row):
+    """Return the flat step to a pixel (0) or one of its four neighbours (1 to 4) in a slice."""
+    if n == 0:
+        return 0
+    if n == 1:
+        return 1
+    if n == 2:
+        return -1
+    return row if n == 3 else -row
+
+
+@numba.njit(cache=True)
+def darkest_beside(hu, state, near, lumen, count, core_hu):
+    """Write for every voxel of the lumen the lowest HU among it and its neighbours in the lumen."""
+    for s in range(count):
+        least = hu[lumen[s]]
+        for d in near:
+            if state[lumen[s] + d] == LUMEN:
+                least = min(least, hu[lumen[s] + d])
+        core_hu[s] = least
+
+
+@numba.njit(cache=True)
+def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
+    """Add the voxels beside the lumen that are faceser to its HU than to those of the closing around them.
+
+    A voxel joins if the closing with painted lumen lies at least `least_depth` above it, and farther above
+    it than it lies above the core of the lumen beside it, `core_hu`, which it then shares.  All voxels are
+    judged before the first one joins.
+    """
+    known = count
+    for s in range(known):
+        for d in faces:
+            at = lumen[s] + d
+            if state[at] != 0:
+                continue
+            depth = np.int32(closing_at(hu, state, at, row)) - hu[at]
+            if depth >= least_depth and depth > np.int32(hu[at]) - core_hu[s]:
+                lumen[count] = at
+                core_hu[count] = core_hu[s]
+                count += 1
+                state[at] = WALL
+    for s in range(known, count):
+        state[lumen[s]] = LUMEN
+    return count
+
+
+@numba.njit(cache=True)
+def join_corners(hu, state, shape, lumen, count):
+    """Add the darkest voxels between voxels of the lumen that touch by an edge or corner alone.
+
+    Two voxels that differ by one along two or three axes get a way of faces between them.
+    """
+    steps = np.zeros(3, dtype=np.int64)
+    known = count
+    for s in range(known):
+        here = lumen[s]
+        for dk in range(-1, 2):
+            for dj in range(-1, 2):
+                for di in range(-1, 2):
+                    if (dk != 0) + (dj != 0) + (di != 0) < 2:
+                        continue
+                    steps[0] = dk * shape[1] * shape[2]
+                    steps[1] = dj * shape[2]
+                    steps[2] = di
+                    if here > here + steps.sum() or state[here + steps.sum()] != LUMEN:
+                        continue
+                    count = _corner_way(hu, state, here, steps, lumen, count)
+    return count
+
+
+@numba.njit(cache=True)
+def _corner_way(hu, state, here, steps, lumen, count):
+    """Join a voxel to `here + sum of steps` by the face-connected way whose brightest voxel is darkest."""
+    best = np.int32(1 << 20)
+    first = 0
+    second = 0
+    for a in range(3):
+        for b in range(3):
+            c = 3 - a - b
+            if a == b or steps[a] == 0 or (steps[b] == 0 and steps[c] != 0):
+                continue
+            one = here + steps[a]
+            two = one + steps[b] if steps[c] != 0 else one
+            worst = max(
+                np.int32(-2000) if state[one] == LUMEN else np.int32(hu[one]),
+                np.int32(-2000) if state[two] == LUMEN else np.int32(hu[two]),
+            )
+            if worst < best:
+                best = worst
+                first = one
+                second = two
+    for at in (first, second):
+        if state[at] != LUMEN:
+            state[at] = LUMEN
+            lumen[count] = at
+            count += 1
+    return count
+
+
+@numba.njit(cache=True)
+def grow_wall(hu, state, near, lumen, count, layers, least_hu, greatest_difference, wall):
+    """Mark the wall: all neighbours of the lumen, then layers of voxels like those already in it.
+
+    A voxel joins a further layer if it is above `least_hu` and differs from every neighbour in the wall so
+    far by less than `greatest_difference`.  Returns the number of voxels listed in `wall`.
+    """
+    size = 0
+    for s in range(count):
+        for d in near:
+            at = lumen[s] + d
+            if state[at] == 0:
+                state[at] = WALL
+                wall[size] = at
+                size += 1
+    first = 0
+    for _ in range(layers):
+        last = size
+        for s in range(first, last):
+            for d in near:
+                at = wall[s] + d
+                if state[at] != 0 or hu[at] <= least_hu:
+                    continue
+                alike = True
+                for e in near:
+                    if state[at + e] == WALL and abs(np.int32(hu[at + e]) - hu[at]) >= greatest_difference:
+                        alike = False
+                        break
+                if alike:
+                    state[at] = WALL + 1
+                    wall[size] = at
+                    size += 1
+        for s in range(last, size):
+            state[wall[s]] = WALL
+        first = last
+    return size

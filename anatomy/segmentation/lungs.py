@@ -1,0 +1,283 @@
+"""Both lungs in a CT of the chest: filled, apart from each other, without trachea and main bronchi."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Grid, Volume, read_only
+from anatomy.morphology import grown_by_one
+from anatomy.segmentation.central_airway import CentralAirway, find_central_airway
+from anatomy.segmentation.closing import closed, largest_piece, without_holes
+from anatomy.segmentation.coarse import CoarseCt, bounds, window
+from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right
+from anatomy.segmentation.outside_air import outside_air
+from anatomy.segmentation.pleural_nodules import notches
+from anatomy.segmentation.truncation import truncation
+
+Mask = NDArray[np.bool_]
+Progress = Callable[[str], None]
+
+FIRST_THRESHOLD_HU = -500.0
+THRESHOLD_RANGE_HU = (-600.0, -300.0)
+TISSUE_HU = (-150.0, 250.0)
+"""Soft tissue: its median is one side of the threshold, that of the lung the other."""
+
+CLOSING_MM = 5.0
+"""Ball of the closing: vessels, bronchi and notches of up to 10 mm across become lung."""
+WALL_MM = 2.0
+"""What is this close to the lumen of trachea and main bronchi is their wall, not lung."""
+
+SMALLEST_LUNG_ML = 150.0
+SMALLER_SHARE = 0.1
+GAS_HU, GAS_PERCENTILE = -975.0, 25.0
+"""A piece is gas in the bowel, not lung, if this share of it lies below."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lungs:
+    """Both lungs of a CT.
+
+    Parameters
+    ----------
+    left, right : (ni, nj, nk) bool
+        The patient's left and right lung on the grid of the CT, filled: vessels and small airways belong
+        to them, trachea and main bronchi with their walls do not.  They share no voxel.
+    trachea_seed_ijk : (3,) int64
+        A voxel in the air of the trachea.
+    central_airway : (ni, nj, nk) bool
+        Lumen of trachea and main bronchi, roughly.
+    threshold_hu : float
+        What was taken for lung lies below.
+    warnings : tuple of str
+    """
+
+    left: Mask
+    right: Mask
+    trachea_seed_ijk: NDArray[np.int64]
+    central_airway: Mask
+    threshold_hu: float
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("left", "right", "trachea_seed_ijk", "central_airway"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @property
+    def mask(self) -> Mask:
+        """Both lungs."""
+        return self.left | self.right
+
+
+def segment_lungs(
+    ct: Volume,
+    *,
+    ex_vivo: bool = False,
+    seed_lps: ArrayLike | None = None,
+    progress: Progress | None = None,
+) -> Lungs:
+    """Segment both lungs by region growing and closing.
+
+    Parameters
+    ----------
+    ct : Volume
+        Hounsfield units.
+    ex_vivo : bool
+        The image shows an inflated lung in air, not a patient.
+    seed_lps : (3,) float64, optional
+        A point in the trachea (of a lung ex vivo: in its main bronchus), LPS mm; found by itself if None.
+    progress : callable, optional
+        Told each step as it begins.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no trachea or no lung.
+
+    References
+    ----------
+    [Fu2018], III-A.1: seeded region growing and closing; [Hu2001] for the threshold.
+    """
+    tell = progress or (lambda _step: None)
+    tell("lungs: coarse image")
+    coarse = CoarseCt.of(ct)
+    seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
+    added: tuple[Mask | None, Mask | None]
+    if ex_vivo:
+        from anatomy.segmentation.ex_vivo import coarse_lung_ex_vivo
+
+        threshold, airway, sides, warnings = coarse_lung_ex_vivo(coarse, seed)
+        added = (None, None)
+    else:
+        tell("lungs: trachea")
+        outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
+        airway = find_central_airway(coarse, outside, seed)
+        tell("lungs: left and right")
+        threshold = lung_threshold(coarse.hu, outside)
+        sides, warnings = _coarse_sides(coarse, outside, airway, threshold)
+        tell("lungs: nodules on the pleura")
+        added = notches(coarse, sides == RIGHT, sides == LEFT, CLOSING_MM)
+    tell("lungs: boundary")
+    right, left = (
+        _fine_lung(ct, coarse, sides == side, notch, airway, threshold)
+        for side, notch in zip((RIGHT, LEFT), added, strict=True)
+    )
+    _part(right, left)
+    central = _on_ct(coarse, airway.main)
+    central &= ct.array < threshold
+    return Lungs(
+        left=left,
+        right=right,
+        trachea_seed_ijk=coarse.ct_voxel(airway.seed),
+        central_airway=central,
+        threshold_hu=threshold,
+        warnings=(*airway.warnings, *warnings, *truncation(left | right, ct.grid)),
+    )
+
+
+def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | None = None) -> Lungs:
+    """Make `Lungs` of masks from elsewhere: closed and filled like our own, and with our own trachea.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no trachea.
+    """
+    coarse = CoarseCt.of(ct)
+    outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
+    airway = find_central_airway(coarse, outside, None if seed_lps is None else np.asarray(seed_lps, float))
+    main = _on_ct(coarse, _with_wall(coarse, airway.main))
+    sides = [_filled(side, ct.grid) & ~main for side in (left, right)]
+    _part(sides[1], sides[0])
+    return Lungs(
+        left=sides[0],
+        right=sides[1],
+        trachea_seed_ijk=coarse.ct_voxel(airway.seed),
+        central_airway=_on_ct(coarse, airway.main) & (ct.array < FIRST_THRESHOLD_HU),
+        threshold_hu=FIRST_THRESHOLD_HU,
+        warnings=(*airway.warnings, *truncation(sides[0] | sides[1], ct.grid)),
+    )
+
+
+def _filled(mask: Mask, grid: Grid) -> Mask:
+    """Close and fill a mask in the box around it."""
+    low, high = bounds(mask)
+    pad = np.ceil(2.0 * CLOSING_MM / grid.spacing_mm).astype(np.int64)
+    box = window(np.maximum(low - pad, 0), np.minimum(high + pad, mask.shape))
+    filled = np.array(mask, order="F")
+    if mask.any():
+        filled[box] = without_holes(closed(np.asfortranarray(mask[box]), CLOSING_MM, grid.spacing_mm))
+    return filled
+
+
+def _on_ct(coarse: CoarseCt, mask: Mask) -> Mask:
+    """Return a mask of coarse voxels on the grid of the CT."""
+    whole = np.zeros(coarse.fine_shape, dtype=np.bool_, order="F")
+    low, high = coarse.box_in_ct(mask, 0.0)
+    whole[window(low, high)] = coarse.to_ct(mask, low, high)
+    return whole
+
+
+def lung_threshold(hu: NDArray[np.float32], outside: Mask) -> float:
+    """Return the middle between the median of the lung and that of soft tissue, in HU."""
+    lung = hu[(hu < FIRST_THRESHOLD_HU) & ~outside]
+    tissue = hu[(hu > TISSUE_HU[0]) & (hu < TISSUE_HU[1])]
+    if not lung.size or not tissue.size:
+        raise _no_lung("holds no air inside a body")
+    middle = 0.5 * (float(np.median(lung)) + float(np.median(tissue)))
+    return float(np.clip(middle, *THRESHOLD_RANGE_HU))
+
+
+def _coarse_sides(
+    coarse: CoarseCt, outside: Mask, airway: CentralAirway, threshold: float
+) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+    """Label the right lung 1 and the left lung 2 on coarse voxels."""
+    walls = grown_by_one(airway.grown)
+    air = (coarse.hu < threshold) & ~outside & ~walls
+    tissue = _lung_pieces(coarse, air)
+    sides = sides_from_right(tissue, coarse)
+    return (sides, ()) if sides is not None else _one_side(coarse, tissue, airway)
+
+
+def _lung_pieces(coarse: CoarseCt, air: Mask) -> Mask:
+    """Keep the pieces of air that are as large as a lung and hold tissue."""
+    from scipy import ndimage
+
+    pieces, _ = ndimage.label(air)
+    volumes_ml = np.bincount(pieces.ravel()) * coarse.voxel_ml
+    volumes_ml[0] = 0.0
+    lung = np.zeros(len(volumes_ml), dtype=np.bool_)
+    for piece in np.flatnonzero(volumes_ml >= SMALLEST_LUNG_ML):
+        lung[piece] = np.percentile(coarse.hu[pieces == piece], GAS_PERCENTILE) > GAS_HU
+    if not lung.any():
+        raise _no_lung(f"holds no lung: the largest piece of air inside has {volumes_ml.max():.0f} ml")
+    lung &= volumes_ml >= SMALLER_SHARE * volumes_ml[lung].max()
+    chosen: Mask = np.asfortranarray(lung[pieces])
+    return chosen
+
+
+def _one_side(
+    coarse: CoarseCt, tissue: Mask, airway: CentralAirway
+) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+    """Name a single lung by the side of the trachea it lies on."""
+    centre = float(np.argwhere(tissue)[:, 0].mean())
+    side, name = (RIGHT, "right") if centre < airway.seed[0] else (LEFT, "left")
+    warning = f"Only one lung was found, or the two could not be told apart; it is taken as the {name} one."
+    return np.asfortranarray(tissue * np.int32(side)), (warning,)
+
+
+def _fine_lung(
+    ct: Volume, coarse: CoarseCt, side: Mask, notch: Mask | None, airway: CentralAirway, threshold: float
+) -> Mask:
+    """Return one lung on the voxels of the CT: region below the threshold and notches, closed and filled.
+
+    The region may reach one coarse voxel beyond `side`; not so ex vivo, where `notch` is None and the lung
+    has air around it.
+    """
+    lung = np.zeros(ct.grid.shape, dtype=np.bool_, order="F")
+    if not side.any():
+        return lung
+    low, high = coarse.box_in_ct(side, 2.0 * CLOSING_MM)
+    box = window(low, high)
+    near = coarse.to_ct(side if notch is None else grown_by_one(side), low, high)
+    airways = coarse.to_ct(airway.grown, low, high)
+    region = np.asfortranarray(ct.array[box] < threshold)
+    region &= near & ~airways
+    if notch is not None:
+        region |= coarse.to_ct(notch, low, high)
+    region = largest_piece(region)
+    filled = without_holes(closed(region, CLOSING_MM, ct.grid.spacing_mm))
+    filled &= ~coarse.to_ct(_with_wall(coarse, airway.main), low, high)
+    lung[box] = largest_piece(filled)
+    return lung
+
+
+def _with_wall(coarse: CoarseCt, main: Mask) -> Mask:
+    """Grow the main airways by the thickness of their wall."""
+    import edt
+
+    low, high = bounds(main)
+    low, high = np.maximum(low - 3, 0), np.minimum(high + 3, main.shape)
+    box = window(low, high)
+    grown = np.zeros(main.shape, dtype=np.bool_, order="F")
+    grown[box] = edt.edt(np.asfortranarray(~main[box]), anisotropy=coarse.spacing_mm) <= WALL_MM
+    return grown
+
+
+def _part(right: Mask, left: Mask) -> None:
+    """Leave what both closings filled to neither lung: it is the pleura between them."""
+    both = right & left
+    right &= ~both
+    left &= ~both
+
+
+def _no_lung(what: str) -> AnatomyError:
+    return AnatomyError(
+        f"The image {what}",
+        expected="a CT of the chest with both lungs",
+        remedy="Choose the series of the chest; for an inflated lung outside a body use --ex-vivo",
+    )

@@ -1,0 +1,198 @@
+"""The target of a procedure: radiologists' contours, a mask or a point; and its removal from the vessels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import FileError, GridMismatchError
+from anatomy.grid import Float, Grid
+from anatomy.io.files import read_text
+from anatomy.segmentation.closing import distance_mm, largest_piece
+from anatomy.segmentation.coarse import bounds, window
+
+Mask = NDArray[np.bool_]
+
+RIM_MM = 2.0
+"""A nodule blurs this far into the lung around it, and may be taken for a vessel there."""
+ATTACHED_MM = 1.5
+"""Within the rim, what is this close to a vessel beyond it stays vessel."""
+
+
+def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
+    """Draw the nodules that radiologists outlined in a CT, by the majority of those who outlined each.
+
+    The file is JSON: `{"annotations": [{"contours": [{"z_mm": -510.8, "ij": [[184, 245], ...],
+    "inclusion": true}, ...]}, ...]}`, one annotation a radiologist and nodule, as the LIDC-IDRI
+    database has them [Armato2011].  `ij` are columns and rows of the DICOM slice at `z_mm` (LPS); a contour
+    runs through the first pixels outside the nodule, and one with `"inclusion": false` cuts a hole.
+
+    Parameters
+    ----------
+    path : path
+    grid : Grid
+        The grid of the CT; its axes run along the LPS axes.
+
+    Returns
+    -------
+    (ni, nj, nk) bool
+        A voxel belongs to a nodule if at least half of those who outlined this nodule have it inside.
+
+    Raises
+    ------
+    FileError
+        If the file has another form, or holds no contour.
+    GridMismatchError
+        If a contour lies outside the image, or the slices of the image are not axial.
+    """
+    annotations = _annotations(Path(path))
+    _require_axial(grid)
+    masks = [_annotation_mask(annotation, grid, Path(path)) for annotation in annotations]
+    votes = np.zeros(grid.shape, dtype=np.int16, order="F")
+    for mask in masks:
+        votes += mask
+    return _majority(votes, masks)
+
+
+def _annotations(path: Path) -> list[Mapping[str, Any]]:
+    try:
+        content = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise _not_contours(path, f"is not JSON ({error})") from error
+    annotations = content.get("annotations") if isinstance(content, Mapping) else None
+    if not isinstance(annotations, list) or not annotations:
+        raise _not_contours(path, "has no annotations")
+    for annotation in annotations:
+        contours = annotation.get("contours") if isinstance(annotation, Mapping) else None
+        if not isinstance(contours, list) or not contours or not all(map(_is_contour, contours)):
+            raise _not_contours(path, "has an annotation without proper contours")
+    return annotations
+
+
+def _is_contour(contour: Any) -> bool:
+    if not isinstance(contour, Mapping) or not isinstance(contour.get("z_mm"), int | float):
+        return False
+    try:
+        points = np.asarray(contour.get("ij"), dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return points.ndim == 2 and points.shape[1] == 2 and len(points) > 0 and bool(np.isfinite(points).all())
+
+
+def _not_contours(path: Path, what: str) -> FileError:
+    return FileError(
+        f"{path} {what}",
+        expected='{"annotations": [{"contours": [{"z_mm": ..., "ij": [[column, row], ...]}]}]}',
+        remedy="docs/segmentation.md describes the file; a mask can be given with --nodule-mask",
+    )
+
+
+def _require_axial(grid: Grid) -> None:
+    direction = np.abs(grid.lps_from_ijk[:3, :3] / grid.spacing_mm)
+    if np.abs(direction - np.eye(3)).max() > 1e-3:
+        raise GridMismatchError(
+            "Contours in columns and rows were given for an image that is not axial",
+            expected="the CT whose slices the contours were drawn in",
+            remedy="Give the nodule as a mask with --nodule-mask",
+        )
+
+
+def _annotation_mask(annotation: Mapping[str, Any], grid: Grid, path: Path) -> Mask:
+    """Return the inside of the contours of one annotation."""
+    mask = np.zeros(grid.shape, dtype=np.bool_, order="F")
+    for included in (True, False):
+        for contour in annotation["contours"]:
+            if bool(contour.get("inclusion", True)) is included:
+                k, inside = _inside(contour, grid, path)
+                mask[:, :, k] = (mask[:, :, k] | inside) if included else (mask[:, :, k] & ~inside)
+    return mask
+
+
+def _inside(contour: Mapping[str, Any], grid: Grid, path: Path) -> tuple[int, Mask]:
+    """Return the slice of a contour and the voxels inside it; those on it if none are."""
+    from skimage.draw import polygon2mask, polygon_perimeter
+
+    columns_rows = np.asarray(contour["ij"], dtype=np.float64)
+    level = (float(contour["z_mm"]) - grid.lps_from_ijk[2, 3]) / grid.lps_from_ijk[2, 2]
+    k = int(np.floor(level + 0.5))
+    shape = np.asarray(grid.shape[:2])
+    if not 0 <= k < grid.shape[2] or (columns_rows < 0).any() or (columns_rows > shape - 1).any():
+        raise GridMismatchError(
+            f"{path} holds a contour at z = {contour['z_mm']:.1f} mm that lies outside the image",
+            expected=f"contours within {grid.describe()}",
+            remedy="Give the contours of this CT",
+        )
+    # Columns and rows count along +x and +y, whichever way the voxels of this image do.
+    against = np.diag(grid.lps_from_ijk)[:2] < 0
+    points = np.where(against, shape - 1 - columns_rows, columns_rows)
+    filled = polygon2mask(tuple(shape), points) if len(points) > 2 else np.zeros(shape, dtype=np.bool_)
+    line = np.zeros(shape, dtype=np.bool_)
+    line[polygon_perimeter(points[:, 0], points[:, 1], shape=tuple(shape), clip=True)] = True
+    inside = filled & ~line
+    return k, inside if inside.any() else line
+
+
+def _majority(votes: NDArray[np.int16], masks: list[Mask]) -> Mask:
+    """Keep, of each connected nodule, the voxels that half of its own annotations have inside."""
+    from scipy import ndimage
+
+    low, high = bounds(votes > 0)
+    box = window(low, high)
+    pieces, count = ndimage.label(votes[box] > 0)
+    of_piece = np.zeros(count + 1, dtype=np.int64)
+    for mask in masks:
+        touched = np.unique(pieces[mask[box]])
+        of_piece[touched[touched > 0]] += 1
+    nodule = np.zeros(votes.shape, dtype=np.bool_, order="F")
+    nodule[box] = (pieces > 0) & (2 * votes[box] >= of_piece[pieces])
+    return nodule
+
+
+def centre_of(nodule: Mask, grid: Grid) -> Float:
+    """Return the voxel of the largest nodule that is deepest inside it, LPS mm `(3,)`."""
+    import edt
+
+    low, high = bounds(nodule)
+    part = np.asfortranarray(largest_piece(nodule[window(low, high)]))
+    depth = edt.edt(part, anisotropy=tuple(map(float, grid.spacing_mm)), order="F", black_border=True)
+    deepest = np.unravel_index(int(np.argmax(depth)), depth.shape)
+    return grid.lps(low + np.asarray(deepest))
+
+
+def without_nodule(vessels: Mask, nodule: Mask, grid: Grid) -> Mask:
+    """Return the vessels without the nodule, which is a target and no obstacle.
+
+    Around the nodule, the rim of `RIM_MM` that its blur turned into vessel is taken away too, except for
+    what lies within `ATTACHED_MM` of a vessel that runs on beyond the rim.
+
+    Parameters
+    ----------
+    vessels, nodule : (ni, nj, nk) bool
+    grid : Grid
+        The grid of both.
+    """
+    from scipy import ndimage
+
+    cleared = np.array(vessels, dtype=np.bool_, order="F")
+    if not nodule.any():
+        return cleared
+    pad = np.ceil((RIM_MM + 2.0 * ATTACHED_MM) / grid.spacing_mm).astype(np.int64)
+    low, high = bounds(nodule)
+    box = window(np.maximum(low - pad, 0), np.minimum(high + pad, nodule.shape))
+    distance = distance_mm(~nodule[box], grid.spacing_mm)
+    gone = distance <= RIM_MM
+    pieces, count = ndimage.label(cleared[box] & ~gone)
+    runs_on = np.zeros(count + 1, dtype=np.bool_)
+    runs_on[np.unique(pieces[distance > RIM_MM + ATTACHED_MM])] = True
+    runs_on[0] = False
+    beyond = runs_on[pieces]
+    gone |= (pieces > 0) & ~beyond
+    if beyond.any():
+        gone &= (distance_mm(~beyond, grid.spacing_mm) > ATTACHED_MM) | nodule[box]
+    cleared[box] &= ~gone
+    return cleared

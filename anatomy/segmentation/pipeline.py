@@ -1,0 +1,179 @@
+"""From a CT to a patient folder: every step that is not up to date, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anatomy.grid import Float, Grid, Volume
+from anatomy.io.frames import parse_point
+from anatomy.io.own_masks import DESCRIPTION
+from anatomy.segmentation.description import Description, description_text
+from anatomy.segmentation.folder import SegmentationFolder, digest_of, grid_digest, key_of
+from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
+from anatomy.segmentation.nodules import centre_of
+from anatomy.segmentation.request import SegmentationRequest
+from anatomy.segmentation.steps import VERSION, Parts, Steps
+
+Progress = Callable[[str], None]
+
+BYTES_PER_VOXEL = 40
+"""Peak memory over the voxels of the CT."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Segmentation:
+    """What a segmentation wrote.
+
+    Parameters
+    ----------
+    folder : Path
+    grid : Grid
+        The grid of the CT, and of all images.
+    parts : Parts
+    recomputed : tuple of str
+        Steps that were run; the others were up to date.
+    corrected : tuple of str
+        Images taken from a person.
+    kept_description : bool
+        Whether an edited `patient.toml` was kept.
+    warnings : tuple of str
+    """
+
+    folder: Path
+    grid: Grid
+    parts: Parts
+    recomputed: tuple[str, ...]
+    corrected: tuple[str, ...]
+    kept_description: bool
+    warnings: tuple[str, ...]
+
+
+def memory_estimate_gib(grid: Grid) -> float:
+    """Return about how much memory the segmentation of a CT on this grid needs at most, in GiB."""
+    return float(np.prod(grid.shape)) * BYTES_PER_VOXEL / 2**30
+
+
+def segment(request: SegmentationRequest, progress: Progress | None = None) -> Segmentation:
+    """Segment a CT and write a patient folder that `anatomy.io.load_patient` reads.
+
+    Steps whose inputs, settings and results are unchanged since the last run are not repeated; images that
+    a person replaced in the folder are kept.  `patient.toml` is away while images change.
+
+    Parameters
+    ----------
+    request : SegmentationRequest
+    progress : callable, optional
+        Told each step as it begins.
+
+    Raises
+    ------
+    AnatomyError
+        If the CT cannot be segmented, or the folder holds corrections of another CT.
+    GridMismatchError
+        If a given mask does not fit the CT.
+    FileError
+        If a file cannot be read or written.
+    """
+    tell = progress or (lambda _step: None)
+    tell("checking the CT")
+    warnings = list(require_chest_ct(request.ct, thick_slices=request.thick_slices))
+    grid = request.ct.grid
+    stated = request.given.target
+    target = None if stated is None else parse_point(stated)
+    ct_digest = key_of("ct", voxels=digest_of(request.ct.array), grid=grid_digest(grid))
+    folder = SegmentationFolder(request.out, grid, ct_digest)
+    description = Description(folder, DESCRIPTION)
+    steps = Steps(request, folder, description, ct_digest, tell)
+    parts = steps.run()
+    if parts.nodule.any() and target is None:
+        target = centre_of(parts.nodule, grid)
+    warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
+    folder.save(provenance=_provenance(request, steps, warnings))
+    thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
+    text = description_text(request.name, bool(parts.nodule.any()), target, thick_mm)
+    return Segmentation(
+        folder=folder.path,
+        grid=grid,
+        parts=parts,
+        recomputed=tuple(steps.recomputed),
+        corrected=tuple(steps.corrected),
+        kept_description=description.finish(text),
+        warnings=tuple(warnings),
+    )
+
+
+def target_warnings(target_lps: Float | None, parts: Parts, grid: Grid) -> list[str]:
+    """Warn of a target that lies outside the lungs or in an obstacle."""
+    if target_lps is None:
+        return []
+    place = f"The target at LPS ({', '.join(f'{x:.1f}' for x in target_lps)}) mm"
+    if not bool(grid.contains(target_lps)):
+        return [f"{place} lies outside the image: check its frame."]
+    i, j, k = (int(n) for n in np.floor(grid.ijk(target_lps) + 0.5))
+    if parts.nodule[i, j, k]:
+        return []
+    if not (parts.left[i, j, k] or parts.right[i, j, k]):
+        return [f"{place} lies outside the lungs; give the nodule as a mask or contours if it is one."]
+    if parts.large_vessels[i, j, k]:
+        return [f"{place} lies in what was taken for a large vessel; give the nodule as a mask or contours."]
+    return []
+
+
+def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str]) -> Mapping[str, Any]:
+    try:
+        program = version("lungaccess")
+    except PackageNotFoundError:
+        program = "unknown (not installed)"
+    return {
+        "lungaccess": program,
+        "steps_version": VERSION,
+        "numpy": np.__version__,
+        "grid": request.ct.grid.describe(),
+        "ct_files": dict(request.sources),
+        "given_files": request.given.hashes(),
+        "ex_vivo": request.ex_vivo,
+        "thick_slices": request.thick_slices,
+        "seed_lps": None if request.seed_lps is None else request.seed_lps.tolist(),
+        "corrected": steps.corrected,
+        "warnings": warnings,
+    }
+
+
+def read_ct(path: str | Path, series_uid: str | None = None) -> tuple[Volume, dict[str, str]]:
+    """Read a CT from an image file or a folder of DICOM files.
+
+    Returns
+    -------
+    Volume
+    dict of str to str
+        The files read, and their SHA-256.
+
+    Raises
+    ------
+    FileError, FrameError
+        If there is no CT, or it cannot be read; see `anatomy.io.read_dicom` and `anatomy.io.read_volume`.
+    """
+    from anatomy.errors import FileError
+    from anatomy.io.dicom import list_series, read_dicom
+    from anatomy.io.files import sha256
+    from anatomy.io.images import image_suffix, read_volume
+
+    path = Path(path)
+    if path.is_dir():
+        volume = read_dicom(path, series_uid)
+        chosen = [s for s in list_series(path) if series_uid in (None, s.uid)]
+        files = sorted(file for series in chosen for file in series.paths)
+        return volume, {file.relative_to(path).as_posix(): sha256(file) for file in files}
+    if path.is_file() and image_suffix(path) is None:
+        raise FileError(
+            f"{path} is no image of a known kind",
+            expected="a folder of DICOM files, or a NIfTI, NRRD or MetaImage file",
+            remedy="Give the folder that holds the DICOM series",
+        )
+    return read_volume(path), {path.name: sha256(path)}

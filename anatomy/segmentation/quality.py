@@ -1,0 +1,116 @@
+"""Figures of a segmentation that tell a person where to look before trusting it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.errors import AnatomyError
+from anatomy.grid import Grid, Volume
+from anatomy.segmentation.steps import Parts
+
+WIDENING = 1.6
+LEAST_WIDE_MM = 2.5
+"""A branch this much wider than its parent, and at least so wide, looks like a leak into the lung."""
+USUAL_LUNGS_L = (1.5, 9.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Quality:
+    """Figures and warnings about one segmentation.
+
+    Parameters
+    ----------
+    volumes_l : dict of str to float
+        Volumes in litres.
+    tree : AirwayTree or None
+        None if no tree could be made of the airway.
+    ends : int
+        Ends of the airway.
+    warnings : tuple of str
+    """
+
+    volumes_l: dict[str, float]
+    tree: AirwayTree | None
+    ends: int
+    warnings: tuple[str, ...]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for a record."""
+        tree = self.tree
+        return {
+            "volumes_l": {name: round(volume, 5) for name, volume in self.volumes_l.items()},
+            "airway": {
+                "ends": self.ends,
+                "branches": 0 if tree is None else int(tree.n_branches),
+                "deepest_generation": 0 if tree is None else int(tree.generation.max()),
+                "length_mm": 0.0 if tree is None else round(float(tree.branch_length_mm.sum()), 1),
+                "gaps_bridged": 0 if tree is None else len(tree.report.gaps_bridged),
+                "loops_opened": 0 if tree is None else len(tree.report.loops_opened),
+            },
+            "warnings": list(self.warnings),
+        }
+
+
+def quality_of(parts: Parts, grid: Grid) -> Quality:
+    """Measure a segmentation.
+
+    Parameters
+    ----------
+    parts : Parts
+    grid : Grid
+        Its grid.
+    """
+    from anatomy.tree import tree_from_mask
+
+    litre = grid.voxel_volume_mm3 * 1e-6
+    counted = {
+        "right lung": parts.right,
+        "left lung": parts.left,
+        "airway lumen": parts.lumen,
+        "airway wall": parts.wall,
+        "large vessels": parts.large_vessels,
+        "all vessels": parts.all_vessels,
+        "nodule": parts.nodule,
+    }
+    volumes = {name: float(np.count_nonzero(mask)) * litre for name, mask in counted.items()}
+    warnings = _volume_warnings(volumes)
+    try:
+        tree = tree_from_mask(Volume(grid=grid, array=parts.lumen))
+    except AnatomyError as error:
+        failed = f"No airway tree could be made: {error}"
+        return Quality(volumes_l=volumes, tree=None, ends=0, warnings=(*warnings, failed))
+    ends = tree_ends(tree)
+    warnings += [*tree.report.warnings, *_leaks(tree)]
+    return Quality(volumes_l=volumes, tree=tree, ends=len(ends), warnings=tuple(warnings))
+
+
+def tree_ends(tree: AirwayTree) -> list[int]:
+    """Return the branches without children."""
+    return [branch for branch in range(tree.n_branches) if len(tree.children(branch)) == 0]
+
+
+def _volume_warnings(volumes: dict[str, float]) -> list[str]:
+    both = volumes["right lung"] + volumes["left lung"]
+    least, most = USUAL_LUNGS_L
+    if least <= both <= most:
+        return []
+    return [f"The lungs have {both:.2f} l in all; {least:g} to {most:g} l are usual in adults."]
+
+
+def _leaks(tree: AirwayTree) -> list[str]:
+    """Warn of branches that are much wider than what they grow from."""
+    radius = np.asarray(tree.branch_mean_radius_mm)
+    parent = np.asarray(tree.branch_parent)
+    wide = (parent >= 0) & (radius >= LEAST_WIDE_MM) & (radius > WIDENING * radius[np.maximum(parent, 0)])
+    found = []
+    for branch in np.flatnonzero(wide):
+        place = ", ".join(f"{x:.0f}" for x in tree.points_lps[tree.branch_start[branch + 1] - 1])
+        found.append(
+            f"Leak suspected at LPS ({place}) mm: an airway of {radius[branch]:.1f} mm radius grows "
+            f"from one of {radius[parent[branch]]:.1f} mm."
+        )
+    return found

@@ -1,0 +1,295 @@
+"""The steps of a segmentation; each is run only if what it is made from has changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Volume
+from anatomy.io.files import sha256
+from anatomy.segmentation.box import Box
+from anatomy.segmentation.description import Description
+from anatomy.segmentation.folder import IMAGES, SegmentationFolder, digest_of, grid_digest, key_of
+from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
+from anatomy.segmentation.larynx import without_larynx
+from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
+from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
+from anatomy.segmentation.request import Given, SegmentationRequest
+from anatomy.segmentation.wall import wall_around
+
+if TYPE_CHECKING:
+    from anatomy.segmentation.airway import Airways
+
+Mask = NDArray[np.bool_]
+Images = dict[str, NDArray[Any]]
+Compute = Callable[[], tuple[Images, dict[str, Any]]]
+Progress = Callable[[str], None]
+
+VERSION = 1
+"""Raise it when a step makes other images from the same input."""
+_NOT_MASKS = ("lungs", "vesselness", "cost")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Parts:
+    """The images of a segmentation on the grid of the CT, `(ni, nj, nk)`.
+
+    Parameters
+    ----------
+    left, right, central_airway, lumen, wall : bool
+    nodule : bool
+        Empty if none was given.
+    vesselness : float32
+        In [0, 1].
+    large_vessels, all_vessels : bool
+        Obstacles, and everything taken for a vessel.
+    cost : float32
+        In [0, 1], or infinite in obstacles.
+    """
+
+    left: Mask
+    right: Mask
+    central_airway: Mask
+    lumen: Mask
+    wall: Mask
+    nodule: Mask
+    vesselness: NDArray[np.float32]
+    large_vessels: Mask
+    all_vessels: Mask
+    cost: NDArray[np.float32]
+
+
+class Steps:
+    """Runs lungs, airway, nodule, vessels and cost map in this order.
+
+    Parameters
+    ----------
+    request : SegmentationRequest
+    folder : SegmentationFolder
+    description : Description
+        Set aside before the first image changes.
+    ct_digest : str
+    progress : callable
+        Told each step as it begins.
+    """
+
+    def __init__(
+        self,
+        request: SegmentationRequest,
+        folder: SegmentationFolder,
+        description: Description,
+        ct_digest: str,
+        progress: Progress,
+    ) -> None:
+        self._request, self._folder, self._description = request, folder, description
+        self._ct_digest, self._tell = ct_digest, progress
+        self._digests: dict[str, str] = {}
+        self.recomputed: list[str] = []
+        self.corrected: list[str] = []
+        self.warnings: list[str] = []
+        self._sources = request.given.images(folder.grid)
+        for name in IMAGES:
+            path = folder.correction(name)
+            if path is not None:
+                self._sources[name] = folder.read(path)
+                self.corrected.append(name)
+
+    def run(self) -> Parts:
+        """Bring every step up to date and return all images."""
+        lungs = self._lungs()
+        airway = self._airway(lungs)
+        nodule = self._nodule()
+        vessels = self._vessels(lungs, airway, nodule)
+        cost = self._cost(lungs, airway, nodule, vessels)
+        return Parts(
+            left=lungs.left,
+            right=lungs.right,
+            central_airway=lungs.central_airway,
+            lumen=airway["airway"],
+            wall=airway["airway_wall"],
+            nodule=nodule,
+            vesselness=vessels["vesselness"],
+            large_vessels=vessels["vessels"],
+            all_vessels=vessels["all_vessels"],
+            cost=cost,
+        )
+
+    def _lungs(self) -> Lungs:
+        request = self._request
+        seed = None if request.seed_lps is None else request.seed_lps.tolist()
+        key = self._key("lungs", sources=("lungs",), ct=self._ct_digest, ex_vivo=request.ex_vivo, seed=seed)
+
+        def compute() -> tuple[Images, dict[str, Any]]:
+            if "lungs" in self._sources:
+                left, right = sides_of(self._sources["lungs"], "The mask of the lungs")
+                lungs = lungs_given(request.ct, left, right, seed_lps=seed)
+            else:
+                lungs = segment_lungs(request.ct, ex_vivo=request.ex_vivo, seed_lps=seed, progress=self._tell)
+            images = {
+                "lungs": lung_labels(lungs.left, lungs.right),
+                "central_airway": lungs.central_airway,
+            }
+            seed_ijk = [int(n) for n in lungs.trachea_seed_ijk]
+            facts = {"seed": seed_ijk, "threshold_hu": lungs.threshold_hu, "warnings": list(lungs.warnings)}
+            return images, facts
+
+        images, facts = self._bring_up_to_date("lungs", ("lungs", "central_airway"), key, compute)
+        return Lungs(
+            left=images["lungs"] == LEFT,
+            right=images["lungs"] == RIGHT,
+            trachea_seed_ijk=np.array(facts["seed"], dtype=np.int64),
+            central_airway=images["central_airway"],
+            threshold_hu=float(facts["threshold_hu"]),
+            warnings=tuple(facts["warnings"]),
+        )
+
+    def _airway(self, lungs: Lungs) -> Images:
+        key = self._key(
+            "airway", sources=("airway", "airway_wall"), of=("lungs", "central_airway"), ct=self._ct_digest
+        )
+
+        def compute() -> tuple[Images, dict[str, Any]]:
+            from anatomy.segmentation.airway import segment_airway
+            from anatomy.segmentation.airway_warnings import airway_warnings
+
+            lumen, wall = self._source_mask("airway"), self._source_mask("airway_wall")
+            warnings: tuple[str, ...] = ()
+            if lumen is None:
+                box = Box.around(lungs, self._folder.grid)
+                found = segment_airway(box.volume(self._request.ct), box.lungs(lungs), progress=self._tell)
+                trachea, cut_mm = without_larynx(found.lumen, lungs.trachea_seed_ijk - box.low, box.inner)
+                lumen, warnings = box.whole(trachea), found.warnings
+                # The wall of what was cut off stays: it is an obstacle.
+                wall = box.whole(found.wall | (found.lumen & ~trachea)) if wall is None else wall
+                if cut_mm:
+                    warnings = (
+                        *warnings,
+                        f"The upper {cut_mm:.0f} mm of the airway were too narrow for a trachea: left out.",
+                    )
+            else:
+                volume = Volume(grid=self._folder.grid, array=lumen)
+                warnings = airway_warnings(volume, lungs.left, lungs.right)
+                wall = wall_around(lumen, self._folder.grid) if wall is None else wall
+            return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": list(warnings)}
+
+        return self._bring_up_to_date("airway", ("airway", "airway_wall"), key, compute)[0]
+
+    def _nodule(self) -> Mask:
+        given, grid = self._request.given, self._folder.grid
+        files = {name: sha256(path) for name, path in _nodule_files(given).items()}
+        key = self._key("nodule", sources=("nodule",), grid=grid_digest(grid), files=files)
+
+        def compute() -> tuple[Images, dict[str, Any]]:
+            corrected = self._source_mask("nodule")
+            if corrected is not None:
+                return {"nodule": corrected}, {}
+            nodule = np.zeros(grid.shape, dtype=np.bool_, order="F")
+            if given.nodule_contours is not None:
+                nodule |= nodule_from_contours(given.nodule_contours, grid)
+            if given.nodule_mask is not None:
+                nodule |= self._folder.read(given.nodule_mask).array != 0
+            return {"nodule": nodule}, {}
+
+        return self._bring_up_to_date("nodule", ("nodule",), key, compute)[0]["nodule"]
+
+    def _vessels(self, lungs: Lungs, airway: Images, nodule: Mask) -> Images:
+        names = ("vesselness", "vessels", "all_vessels")
+        made_of = ("lungs", "airway", "airway_wall", "nodule")
+        key = self._key("vessels", sources=names[1:], of=made_of, ct=self._ct_digest)
+
+        def compute() -> tuple[Images, dict[str, Any]]:
+            from anatomy.segmentation.vessels import segment_vessels
+
+            box = Box.around(lungs, self._folder.grid)
+            inside = box.lungs(lungs).mask
+            found = segment_vessels(
+                box.volume(self._request.ct), inside, _airways(box, airway), progress=self._tell
+            )
+            target = box.cut(nodule)
+            masks = {"vessels": found.large, "all_vessels": found.mask}
+            for name, mask in masks.items():
+                source = self._source_mask(name)
+                masks[name] = (
+                    without_nodule(mask, target, box.inner) if source is None else box.cut(source & ~nodule)
+                )
+            masks["all_vessels"] |= masks["vessels"]
+            response = np.where(found.mask & ~masks["all_vessels"], np.float32(0.0), found.vesselness)
+            images = {"vesselness": response, **masks}
+            whole = {name: box.whole(image) for name, image in images.items()}
+            return whole, {"threshold": float(found.threshold), "warnings": list(found.warnings)}
+
+        return self._bring_up_to_date("vessels", names, key, compute)[0]
+
+    def _cost(self, lungs: Lungs, airway: Images, nodule: Mask, vessels: Images) -> NDArray[np.float32]:
+        made_of = ("lungs", "airway", "airway_wall", "nodule", "vesselness", "vessels", "all_vessels")
+        key = self._key("cost map", of=made_of)
+
+        def compute() -> tuple[Images, dict[str, Any]]:
+            from anatomy.segmentation.cost_map import cost_map
+            from anatomy.segmentation.vessels import Vessels
+
+            box = Box.around(lungs, self._folder.grid)
+            parts = {name: box.cut(image) for name, image in vessels.items()}
+            found = Vessels(
+                vesselness=parts["vesselness"],
+                large=parts["vessels"],
+                mask=parts["all_vessels"],
+                threshold=float(self._folder.facts("vessels")["threshold"]),
+            )
+            inside = box.lungs(lungs).mask | box.cut(nodule)
+            cost = cost_map(found, _airways(box, airway), inside, box.inner)
+            return {"cost": box.whole(cost.array, fill=np.inf)}, {}
+
+        self._tell("cost map")
+        return self._bring_up_to_date("cost map", ("cost",), key, compute)[0]["cost"]
+
+    def _key(
+        self, step: str, *, sources: tuple[str, ...] = (), of: tuple[str, ...] = (), **others: Any
+    ) -> str:
+        """Return the key of a step: its settings, the images before it, and what replaces its own."""
+        replaced = {name: digest_of(self._sources[name].array) for name in sources if name in self._sources}
+        before = {name: self._digests[name] for name in of}
+        return key_of(step, version=VERSION, replaced=replaced, before=before, **others)
+
+    def _source_mask(self, name: str) -> Mask | None:
+        volume = self._sources.get(name)
+        return None if volume is None else np.asfortranarray(volume.array != 0)
+
+    def _bring_up_to_date(
+        self, step: str, names: tuple[str, ...], key: str, compute: Compute
+    ) -> tuple[Images, dict[str, Any]]:
+        """Return the images of a step and its facts, computed and written only if they are not up to date."""
+        digests = {name: self._folder.digest_if_made_from(name, key) for name in names}
+        if all(digests.values()):
+            images = {name: self._read(name) for name in names}
+        else:
+            self._description.set_aside()
+            images, facts = compute()
+            self._tell(f"writing {', '.join(names)}")
+            self._folder.note(step, facts)
+            digests = {name: self._folder.write(name, images[name], key) for name in names}
+            self.recomputed.append(step)
+        self._digests |= {name: str(digest) for name, digest in digests.items()}
+        facts = self._folder.facts(step)
+        self.warnings += facts.get("warnings", [])
+        return images, facts
+
+    def _read(self, name: str) -> NDArray[Any]:
+        array = self._folder.read(self._folder.path_of(name)).array
+        return array if name in _NOT_MASKS else np.asfortranarray(array != 0)
+
+
+def _nodule_files(given: Given) -> dict[str, Path]:
+    files = {"contours": given.nodule_contours, "mask": given.nodule_mask}
+    return {name: path for name, path in files.items() if path is not None}
+
+
+def _airways(box: Box, airway: Images) -> Airways:
+    from anatomy.segmentation.airway import Airways
+
+    return Airways(lumen=box.cut(airway["airway"]), wall=box.cut(airway["airway_wall"]))

@@ -1,0 +1,72 @@
+"""How much each voxel of the lung looks like a vessel: multi-scale vesselness [Fu2018, sec. IV-A.3]."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.segmentation.scale_space import ScaleSpace
+
+ALPHA, BETA, C_HU = 0.5, 0.5, 70.0
+
+
+def vesselness(
+    hu: NDArray[np.int16] | NDArray[np.float32],
+    lung: NDArray[np.bool_],
+    spacing_mm: ArrayLike,
+    *,
+    alpha: float = ALPHA,
+    beta: float = BETA,
+    c_hu: float = C_HU,
+    threads: int = 0,
+) -> NDArray[np.float32]:
+    """Return the greatest response over the scales that apply at each voxel [Fu2018, eqs. 3-5].
+
+    Parameters
+    ----------
+    hu : (ni, nj, nk) int16 or float32
+        The CT in Hounsfield units.
+    lung : (ni, nj, nk) bool
+        Lungs with their vessels; the distance to its surface decides which scales apply.
+    spacing_mm : (3,) float64
+        Voxel size along i, j, k.
+    alpha, beta : float
+        Sensitivity to plates and to blobs.
+    c_hu : float
+        Strength of the Hessian, in HU, at which the response has 39 % of its greatest value.
+    threads : int
+        0 for all processors; the result does not depend on it.
+
+    Returns
+    -------
+    (ni, nj, nk) float32
+        In [0, 1], Fortran-contiguous; 0 outside the lung.
+
+    Raises
+    ------
+    GridMismatchError
+        If the shapes differ.
+    AnatomyError
+        If the lung is empty.
+    """
+    space = ScaleSpace.of(hu, lung, spacing_mm, threads=threads)
+    best = np.zeros(space.hu.shape, dtype=np.float32)
+    settings = np.array([alpha, beta, c_hu])
+    for scale, (sigma, image) in enumerate(space.images()):
+        add_vesselness_of(space, scale, sigma, image, settings, best)
+    return space.whole(best, hu.shape)
+
+
+def add_vesselness_of(
+    space: ScaleSpace,
+    scale: int,
+    sigma: float,
+    image: NDArray[np.float32],
+    settings: NDArray[np.float64],
+    best: NDArray[np.float32],
+) -> None:
+    """Raise `best` to the response at one scale; `settings` are alpha, beta, c."""
+    from anatomy.segmentation.kernels.hessian import add_vesselness
+
+    factors, index = space.hessian_factors(sigma), np.int64(scale)
+    space.share(lambda a, b: add_vesselness(image, a, b, space.n_scales, index, factors, settings, best))

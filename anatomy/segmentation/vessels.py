@@ -1,0 +1,224 @@
+"""Vessels of the lung from a CT: large ones, which a needle must never meet, and all others [Fu2018]."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import GridMismatchError
+from anatomy.grid import Float, Volume
+from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
+from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, add_vesselness_of
+
+if TYPE_CHECKING:
+    from anatomy.segmentation.airway import Airways
+
+Mask = NDArray[np.bool_]
+
+VESSEL_THRESHOLD = 0.25
+"""Fixed on made cylinders and the phantom, see docs/segmentation.md."""
+LARGE_RADIUS_MM = 2.0 * math.sqrt(2.0)
+REFERENCE_HU, BRIGHTEST_HU = 300.0, 200.0
+"""I_ref and I_max of R_L."""
+LARGE_RESPONSE = 0.3
+"""R_T for R_L with min(I, I_max), calibrated on made cylinders."""
+LEAST_LARGE_MM3 = 350.0
+"""1000 voxels of 0.7 mm."""
+SIGMA_TOLERANCE_MM = 1e-6
+BLOOD_HU = 40.0
+"""Blood without contrast medium."""
+SOLID_SHARE, EDGE_SHARE = 0.5, 0.35
+"""Way from the lung's median to blood: where a voxel counts as solid, and as the edge of a vessel."""
+EDGE_VOXELS = 2
+"""How far the response of a vessel's core carries to its edge."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Vessels:
+    """Vessels of both lungs on the grid of the CT, all `(ni, nj, nk)`.
+
+    Parameters
+    ----------
+    vesselness : float32
+        Response in [0, 1]: 1 in large vessels, 0 in airways and their walls and outside the lung.
+    large : bool
+        Vessels of more than about 2.8 mm radius.
+    mask : bool
+        All vessels: `vesselness >= threshold`.
+    threshold : float
+        Fixed on other data.
+    warnings : tuple of str
+        What was unusual.
+    """
+
+    vesselness: NDArray[np.float32]
+    large: Mask
+    mask: Mask
+    threshold: float
+    warnings: tuple[str, ...] = ()
+
+
+def segment_vessels(
+    ct: Volume,
+    lungs: Mask,
+    airways: Airways,
+    *,
+    threshold: float = VESSEL_THRESHOLD,
+    large_radius_mm: float = LARGE_RADIUS_MM,
+    threads: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Vessels:
+    """Find the vessels inside the lungs.
+
+    Parameters
+    ----------
+    ct : Volume
+        Hounsfield units.
+    lungs : (ni, nj, nk) bool
+        Both lungs, filled.
+    airways : Airways
+        Its lumen and wall never become vessel.
+    threshold : float
+        Vesselness from which a voxel counts as vessel.
+    large_radius_mm : float
+        Radius from which a vessel is large.
+    threads : int
+        0 for all processors; the result does not depend on it.
+    progress : callable or None
+        Gets what is being done.
+
+    Raises
+    ------
+    GridMismatchError
+        If the shapes differ.
+    AnatomyError
+        If the lung is empty.
+    """
+    shape = ct.array.shape
+    for name, mask in (("lung", lungs), ("lumen", airways.lumen), ("wall", airways.wall)):
+        if mask.shape != shape:
+            raise GridMismatchError(
+                f"The {name} has the shape {mask.shape}", expected=f"that of the CT, {shape}"
+            )
+    space = ScaleSpace.of(ct.array, lungs, ct.grid.spacing_mm, threads=threads)
+    airway = np.ascontiguousarray((airways.lumen[space.box] | airways.wall[space.box]).T)
+    lung_hu = space.hu[space.n_scales > 0]
+    solid = space.hu >= towards_blood(lung_hu, SOLID_SHARE)
+    best, response, at_scale = _responses(space, solid & ~airway, progress)
+    large = _large(space, solid, airway, response, at_scale, large_radius_mm)
+    best[airway] = 0.0
+    edges = (space.hu >= towards_blood(lung_hu, EDGE_SHARE)) & ~airway & (space.n_scales > 0)
+    for _ in range(EDGE_VOXELS):
+        best = _raised_at_edges(space, best, edges)
+    best[large] = 1.0
+    found = space.whole(best, shape)
+    everywhere = np.zeros(shape, dtype=np.bool_, order="F")
+    everywhere[space.box] = large.T
+    mask = found >= np.float32(threshold)
+    warnings = () if large.any() else ("No large vessel was found: is the CT one of the chest?",)
+    return Vessels(vesselness=found, large=everywhere, mask=mask, threshold=threshold, warnings=warnings)
+
+
+def towards_blood(lung_hu: NDArray[np.int16] | NDArray[np.float32], share: float) -> float:
+    """Return what lies a share of the way from the lung's median to blood without contrast medium, in HU.
+
+    With contrast medium the edge of a vessel so lies a little outside the true one: the safe side.
+    """
+    median = float(np.median(lung_hu))
+    return median + share * (BLOOD_HU - median)
+
+
+def _responses(
+    space: ScaleSpace, solid: Mask, progress: Callable[[str], None] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Return vesselness, R_L of solid voxels, and the scale of the greatest R_L."""
+    best = np.zeros(space.hu.shape, dtype=np.float32)
+    response = np.zeros_like(best)
+    at_scale = np.zeros(best.shape, dtype=np.uint8)
+    settings = np.array([ALPHA, BETA, C_HU])
+    solid_scales = space.n_scales * solid
+    for scale, (sigma, image) in enumerate(space.images()):
+        if progress is not None:
+            progress(f"vessels: scale {sigma:.1f} mm")
+        add_vesselness_of(space, scale, sigma, image, settings, best)
+        _add_large(space, scale, sigma, image, solid_scales, response, at_scale)
+    return best, response, at_scale
+
+
+def _add_large(
+    space: ScaleSpace,
+    scale: int,
+    sigma: float,
+    image: NDArray[np.float32],
+    scales: NDArray[np.uint8],
+    response: NDArray[np.float32],
+    at_scale: NDArray[np.uint8],
+) -> None:
+    """Raise `response` to R_L at one scale where `scales` lets it apply, and note the scale in `at_scale`."""
+    from anatomy.segmentation.kernels.hessian import add_large_response
+
+    index, limits = np.int64(scale), (np.float64(REFERENCE_HU), np.float64(BRIGHTEST_HU))
+    given = (scales, index, space.hessian_factors(sigma), *limits, response, at_scale)
+    space.share(lambda first, last: add_large_response(image, space.hu, first, last, *given))
+
+
+def _large(
+    space: ScaleSpace,
+    solid: Mask,
+    airway: Mask,
+    response: NDArray[np.float32],
+    at_scale: NDArray[np.uint8],
+    radius_mm: float,
+) -> Mask:
+    """Return the large vessels in the box: the solid voxels within `radius_mm` of what tells their inside.
+
+    That is a great R_L at a large scale, or the centre of a solid ball of `radius_mm`: where vessels are
+    wider than the greatest scale R_L has faded, and at their edges smaller scales respond most.  The ball
+    must have its centre in the lung and in no airway, but may reach beyond: at the hilum the lung's mask cuts
+    through vessels, and masks of walls reach into the vessels beside them.
+    """
+    tissue = (space.n_scales > 0) & ~airway
+    first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= radius_mm - SIGMA_TOLERANCE_MM)
+    sides, h = space.spacing_mm[::-1], float(space.spacing_mm.mean())
+    inside = (response >= LARGE_RESPONSE) & (at_scale >= first)
+    inside |= tissue & (_distance_mm(solid, sides, space.threads) >= radius_mm + 0.5 * h)
+    if not inside.any():
+        return inside
+    found = solid & tissue & (_distance_mm(~inside, sides, space.threads) <= radius_mm)
+    return _without_small(found, LEAST_LARGE_MM3 / float(np.prod(sides)))
+
+
+def _without_small(mask: Mask, least_voxels: float) -> Mask:
+    """Drop the connected pieces (26 neighbours) with fewer voxels."""
+    from scipy.ndimage import label
+
+    pieces, _ = label(mask, structure=np.ones((3, 3, 3), dtype=np.bool_))
+    keep = np.bincount(pieces.ravel()) >= least_voxels
+    keep[0] = False
+    return np.asarray(keep[pieces])
+
+
+def _distance_mm(mask: Mask, sides: Float, threads: int) -> NDArray[np.float32]:
+    """Return the distance from each voxel of `mask` to the nearest that is not; the image's end is none."""
+    import edt
+
+    return np.asarray(
+        edt.edt(np.array(mask, order="C"), anisotropy=tuple(sides), black_border=False, parallel=threads)
+    )
+
+
+def _raised_at_edges(space: ScaleSpace, best: NDArray[np.float32], edges: Mask) -> NDArray[np.float32]:
+    """Give the voxels of `edges` the greatest vesselness of their 26 neighbours: vessels keep their width.
+
+    The response fades before the vessel ends.
+    """
+    from anatomy.segmentation.kernels.neighbours import take_greatest_neighbour
+
+    raised = best.copy()
+    space.share(lambda first, last: take_greatest_neighbour(best, first, last, edges, raised))
+    return raised

@@ -1,0 +1,24 @@
+"""A wall for airways that came without one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Grid
+from anatomy.segmentation.box import Box
+from anatomy.segmentation.closing import distance_mm
+from anatomy.segmentation.coarse import bounds
+
+Mask = NDArray[np.bool_]
+
+WALL_MM = 1.5
+
+
+def wall_around(lumen: Mask, grid: Grid) -> Mask:
+    """Return the wall of airways that came without one: all within `WALL_MM` of the lumen."""
+    low, high = bounds(lumen)
+    pad = np.ceil(WALL_MM / grid.spacing_mm).astype(np.int64) + 1
+    box = Box(grid=grid, low=np.maximum(low - pad, 0), high=np.minimum(high + pad, grid.shape))
+    inside = box.cut(lumen)
+    return box.whole((distance_mm(~inside, grid.spacing_mm) <= WALL_MM) & ~inside)

@@ -1,0 +1,75 @@
+"""Bounds of the cost map, what is infinite in it, and its growing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.grid import Grid
+from anatomy.io.masks import require_cost
+from anatomy.patient import PatientImages
+from anatomy.segmentation.airway import Airways
+from anatomy.segmentation.cost_map import cost_map, obstacles_of
+from anatomy.segmentation.vessels import Vessels
+
+SHAPE = (14, 12, 10)
+GRID = Grid.from_spacing(SHAPE, (0.7, 0.8, 1.0), (0.0, 0.0, 0.0))
+
+
+def parts(seed: int) -> tuple[Vessels, Airways, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    large, lumen, wall, lung = (rng.random(SHAPE) < p for p in (0.02, 0.02, 0.02, 0.97))
+    response = rng.random(SHAPE, dtype=np.float32)
+    vessels = Vessels(vesselness=response, large=large, mask=response > 0.5, threshold=0.5)
+    return vessels, Airways(lumen=lumen, wall=wall & ~lumen), lung
+
+
+@given(st.integers(0, 10_000), st.floats(0.0, 3.0))
+@settings(max_examples=40, deadline=None)
+def test_bounds_and_obstacles(seed: int, radius_mm: float) -> None:
+    vessels, airways, lung = parts(seed)
+    cost = cost_map(vessels, airways, lung, GRID, total_radius_mm=radius_mm)
+    finite = np.isfinite(cost.array)
+    barred = ~lung | airways.lumen | airways.wall | vessels.large
+    assert cost.array.dtype == np.float32
+    assert not finite[barred].any()
+    assert (obstacles_of(cost) == ~finite).all()
+    assert (cost.array[finite] == vessels.vesselness[finite]).all()
+    assert ((cost.array[finite] >= 0.0) & (cost.array[finite] <= 1.0)).all()
+    if radius_mm == 0.0:
+        assert (finite == ~barred).all()
+
+
+def test_it_serves_as_the_cost_of_a_patient() -> None:
+    vessels, airways, lung = parts(1)
+    cost = cost_map(vessels, airways, lung, GRID)
+    volume = require_cost(cost, GRID, Path("cost.nii.gz"))
+    lungs, lumen, mask = (type(cost)(grid=GRID, array=a) for a in (lung, airways.lumen, vessels.mask))
+    PatientImages(name="p", kind="masks", grid=GRID, lumen=lumen, vessels=mask, lung=lungs, cost=volume)
+
+
+def test_grows_by_whole_voxels() -> None:
+    """ceil(1.5 / (0.7, 0.8, 1.0)) = (3, 2, 2) voxels."""
+    nothing = np.zeros(SHAPE, dtype=bool)
+    large = nothing.copy()
+    large[7, 6, 5] = True
+    vessels = Vessels(vesselness=np.zeros(SHAPE, np.float32), large=large, mask=large, threshold=0.5)
+    cost = cost_map(vessels, Airways(lumen=nothing, wall=nothing), ~nothing, GRID, total_radius_mm=1.5)
+    grown = obstacles_of(cost)
+    assert np.argwhere(grown).min(axis=0).tolist() == [4, 4, 3]
+    assert np.argwhere(grown).max(axis=0).tolist() == [10, 8, 7]
+    assert not grown[10, 8, 7]
+
+
+def test_refuses_other_shapes_and_radii() -> None:
+    vessels, airways, lung = parts(1)
+    with pytest.raises(GridMismatchError, match="lung"):
+        cost_map(vessels, airways, lung[:-1], GRID)
+    for radius in (-1.0, np.nan, np.inf):
+        with pytest.raises(SettingsError, match="radius"):
+            cost_map(vessels, airways, lung, GRID, total_radius_mm=radius)

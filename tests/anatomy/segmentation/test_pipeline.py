@@ -1,0 +1,316 @@
+"""From a CT to a patient folder: what is written, what is done again, what a person's corrections do."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from anatomy.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.grid import Grid, Volume
+from anatomy.io import load_patient, read_volume
+from anatomy.io.images import write_volume
+from anatomy.phantom import LABELS, Phantom, phantom
+from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, digest_of, onto_grid
+from anatomy.segmentation.labels import sides_of
+from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
+from anatomy.segmentation.quality import quality_of
+from anatomy.segmentation.request import Given, SegmentationRequest
+
+ALL = ("lungs", "airway", "nodule", "vessels", "cost map")
+IMAGES = ("lungs", "central_airway", "airway", "airway_wall", "nodule", "vesselness", "vessels", "cost")
+
+
+@pytest.fixture(scope="module")
+def patient() -> Phantom:
+    return phantom(seed=3, size="small")
+
+
+@pytest.fixture(scope="module")
+def made(patient: Phantom, tmp_path_factory: pytest.TempPathFactory) -> Segmentation:
+    folder = tmp_path_factory.mktemp("made")
+    nodule = folder / "given-nodule.nii.gz"
+    assert patient.images.nodules is not None
+    write_volume(nodule, patient.images.nodules)
+    return segment(_request(patient, folder / "patient", nodule_mask=nodule))
+
+
+@pytest.fixture
+def copy(made: Segmentation, tmp_path: Path) -> Path:
+    """A folder that is up to date, to do things to."""
+    return Path(shutil.copytree(made.folder, tmp_path / "patient"))
+
+
+def _request(patient: Phantom, out: Path, **given: Any) -> SegmentationRequest:
+    return SegmentationRequest(ct=patient.ct, out=out, name="P", given=Given(**given))
+
+
+def _again(patient: Phantom, made: Segmentation, folder: Path) -> Segmentation:
+    return segment(_request(patient, folder, nodule_mask=made.folder.parent / "given-nodule.nii.gz"))
+
+
+def _voxels(folder: Path) -> dict[str, str]:
+    return {name: digest_of(read_volume(folder / f"{name}.nii.gz").array) for name in IMAGES}
+
+
+def test_the_folder_is_a_patient(patient: Phantom, made: Segmentation) -> None:
+    images = load_patient(made.folder)
+    truth = patient.images
+    assert images.name == "P"
+    assert images.grid.is_close(patient.ct.grid)
+    both = np.count_nonzero(images.lung.array & truth.lung.array)
+    assert 2 * both / (np.count_nonzero(images.lung.array) + np.count_nonzero(truth.lung.array)) > 0.98
+    assert images.cost is not None
+    assert np.isinf(images.cost.array[~images.lung.array & (made.parts.nodule == 0)]).all()
+    assert np.isinf(images.cost.array[images.lumen.array | images.vessels.array]).all()
+    free = images.lung.array & ~np.isinf(images.cost.array)
+    assert np.count_nonzero(free) > 0.8 * np.count_nonzero(images.lung.array)
+    assert made.recomputed == ALL
+    assert made.corrected == ()
+
+
+def test_the_nodule_is_the_target_and_no_vessel(patient: Phantom, made: Segmentation) -> None:
+    images = load_patient(made.folder)
+    assert images.nodules is not None
+    assert not (images.vessels.array & images.nodules.array).any()
+    assert len(images.targets_lps) == 1
+    nearest = min(np.linalg.norm(images.targets_lps[0] - n.centre_lps) for n in patient.nodules)
+    assert nearest < 2.0
+    assert images.cost is not None
+    assert np.isfinite(images.cost.array[images.nodules.array & ~made.parts.lumen & ~made.parts.wall]).all()
+
+
+def test_the_record_says_what_was_made_from_what(made: Segmentation) -> None:
+    record = json.loads((made.folder / STATE).read_text())
+    assert set(record["images"]) >= set(IMAGES)
+    assert record["provenance"]["lungaccess"]
+    assert len(next(iter(record["provenance"]["given_files"].values()))) == 64
+
+
+def test_nothing_is_done_twice(patient: Phantom, made: Segmentation, copy: Path) -> None:
+    before = {path.name: path.stat().st_mtime_ns for path in copy.glob("*.nii.gz")}
+    again = _again(patient, made, copy)
+    assert again.recomputed == ()
+    assert {path.name: path.stat().st_mtime_ns for path in copy.glob("*.nii.gz")} == before
+    for name in ("left", "lumen", "all_vessels", "cost"):
+        assert (getattr(again.parts, name) == getattr(made.parts, name)).all()
+
+
+def test_the_same_ct_gives_the_same_images(patient: Phantom, made: Segmentation, tmp_path: Path) -> None:
+    assert _voxels(_again(patient, made, tmp_path / "other").folder) == _voxels(made.folder)
+
+
+def _cut_airway(made: Segmentation) -> np.ndarray:
+    """The airway without its lowest part, as a person would erase a leak."""
+    lumen = np.array(made.parts.lumen)
+    lumen[:, :, : int(np.median(np.argwhere(lumen)[:, 2]))] = False
+    return lumen
+
+
+def test_a_corrected_mask_is_kept_and_only_what_follows_is_done_again(
+    patient: Phantom, made: Segmentation, copy: Path
+) -> None:
+    cut = _cut_airway(made)
+    write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=cut))
+    again = _again(patient, made, copy)
+    assert again.corrected == ("airway",)
+    assert again.recomputed == ("airway", "vessels", "cost map")
+    assert (again.parts.lumen == cut).all()
+    assert (load_patient(copy).lumen.array == cut).all()
+    assert np.isfinite(again.parts.cost[made.parts.lumen & ~cut & made.parts.left]).any()
+    settled = _again(patient, made, copy)
+    assert settled.recomputed == ()
+    assert settled.corrected == ("airway",)
+
+
+def test_taking_a_correction_back_restores_what_was_made(
+    patient: Phantom, made: Segmentation, copy: Path
+) -> None:
+    write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=_cut_airway(made)))
+    _again(patient, made, copy)
+    (copy / CORRECTIONS / "airway.nii.gz").unlink()
+    restored = _again(patient, made, copy)
+    assert restored.corrected == ()
+    assert _voxels(copy) == _voxels(made.folder)
+
+
+def test_a_segmentation_of_slicer_over_a_part_of_the_image_is_taken(
+    patient: Phantom, made: Segmentation, copy: Path
+) -> None:
+    lungs = made.parts.left * np.uint8(2) + made.parts.right * np.uint8(1)
+    lungs[:, :, -60:] = 0
+    low, high = (5, 5, 0), tuple(n - 5 for n in lungs.shape)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    part = Volume(grid=made.grid.crop(low, high), array=lungs[box].copy())
+    write_volume(copy / "lungs.seg.nrrd", part)
+    again = _again(patient, made, copy)
+    assert again.corrected == ("lungs",)
+    assert again.recomputed == ("lungs", "airway", "vessels", "cost map")
+    assert not (copy / "lungs.seg.nrrd").exists()
+    assert not (again.parts.left | again.parts.right)[:, :, -50:].any()
+
+
+def test_a_correction_on_other_voxels_is_refused(patient: Phantom, made: Segmentation, copy: Path) -> None:
+    grid = Grid.from_spacing((20, 20, 20), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    write_volume(copy / "airway.nrrd", Volume(grid=grid, array=np.ones(grid.shape, dtype=bool)))
+    with pytest.raises(GridMismatchError, match="not those of the CT"):
+        _again(patient, made, copy)
+
+
+def test_corrections_of_another_ct_are_not_used(patient: Phantom, made: Segmentation, copy: Path) -> None:
+    other = Volume(grid=patient.ct.grid, array=np.asarray(patient.ct.array) + np.int16(1))
+    request = SegmentationRequest(ct=other, out=copy)
+    SegmentationFolder(copy, made.grid, "another")  # without corrections, another CT may be segmented into it
+    write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=_cut_airway(made)))
+    with pytest.raises(AnatomyError, match="another CT.*airway"):
+        segment(request)
+
+
+class _Killed(BaseException):
+    """Stands for kill -9: nothing catches it."""
+
+
+@pytest.mark.parametrize(
+    "moment", [3, 9, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 6, 14, 20))]
+)
+def test_a_killed_run_leaves_no_patient_and_is_made_good(
+    patient: Phantom, made: Segmentation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
+) -> None:
+    replace, calls = os.replace, []
+
+    def killing(source: Any, target: Any) -> None:
+        calls.append(target)
+        if len(calls) == moment:
+            raise _Killed
+        replace(source, target)
+
+    folder = tmp_path / "patient"
+    with monkeypatch.context() as patched, pytest.raises(_Killed):
+        patched.setattr(os, "replace", killing)
+        _again(patient, made, folder)
+    (folder / ".0123456789ab-cost.nii.gz").write_bytes(b"half")
+    assert not (folder / "patient.toml").exists()
+    again = _again(patient, made, folder)
+    assert again.corrected == ()
+    assert _voxels(folder) == _voxels(made.folder)
+    assert not list(folder.glob(".*-*"))
+
+
+def test_an_edited_description_is_kept(patient: Phantom, made: Segmentation, copy: Path) -> None:
+    description = copy / "patient.toml"
+    edited = description.read_text().replace('name = "P"', 'name = "Patient A"')
+    description.write_text(edited)
+    write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=_cut_airway(made)))
+    again = _again(patient, made, copy)
+    assert again.kept_description
+    assert description.read_text() == edited
+    assert not _again(patient, made, made.folder).kept_description
+
+
+def test_a_point_outside_the_lung_is_warned_of(patient: Phantom, copy: Path, made: Segmentation) -> None:
+    heart = made.grid.lps(np.argwhere(patient.labels.array == LABELS["heart"]).mean(axis=0))
+    point = ",".join(f"{x:.2f}" for x in heart)
+    result = segment(_request(patient, copy, target=f"lps:{point}"))
+    assert any("outside the lungs" in warning for warning in result.warnings)
+    assert load_patient(copy).targets_lps[0] == pytest.approx(heart, abs=0.01)
+    far = segment(_request(patient, copy, target="lps:9000,0,0"))
+    assert any("outside the image" in warning for warning in far.warnings)
+
+
+def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentation, tmp_path: Path) -> None:
+    folder = tmp_path / "totalsegmentator"
+    folder.mkdir()
+    truth = patient.images
+    assert truth.wall is not None
+    x = np.indices(truth.lung.array.shape)[0] > truth.lung.array.shape[0] / 2
+    lobes = truth.lung.array & ~truth.lumen.array & ~truth.vessels.array
+    parts = {
+        "lung_airways": truth.lumen.array,
+        "lung_airways_wall": truth.wall.array,
+        "lung_arteries": truth.vessels.array & x,
+        "lung_veins": truth.vessels.array & ~x,
+        "lung_upper_lobe_left": lobes & x,
+        "lung_upper_lobe_right": lobes & ~x,
+    }
+    for name, mask in parts.items():
+        write_volume(folder / f"{name}.nii.gz", Volume(grid=made.grid, array=mask))
+    result = segment(_request(patient, tmp_path / "out", totalsegmentator=folder))
+    assert (result.parts.lumen == truth.lumen.array).all()
+    assert (result.parts.large_vessels == truth.vessels.array).all()
+    both = np.count_nonzero((result.parts.left | result.parts.right) & truth.lung.array)
+    assert both > 0.95 * np.count_nonzero(truth.lung.array)
+    with pytest.raises(FileError, match="holds no lobes"):
+        segment(_request(patient, tmp_path / "out", totalsegmentator=tmp_path))
+
+
+def test_label_maps_of_lungs_are_understood(made: Segmentation) -> None:
+    left, right = made.parts.left, made.parts.right
+    ours = Volume(grid=made.grid, array=left * np.uint8(2) + right * np.uint8(1))
+    lobes = ours.array.copy()
+    middle = lobes.shape[2] // 2
+    lobes[..., :middle][left[..., :middle]] = 1
+    lobes[right] = 4
+    lobes[..., :middle][right[..., :middle]] = 5
+    one = Volume(grid=made.grid, array=left | right)
+    for volume in (ours, Volume(grid=made.grid, array=lobes), one):
+        found = sides_of(volume, "lungs")
+        assert np.count_nonzero(found[0] != left) < 0.01 * np.count_nonzero(left)
+        assert np.count_nonzero(found[1] != right) < 0.01 * np.count_nonzero(right)
+    with pytest.raises(AnatomyError, match="values"):
+        sides_of(Volume(grid=made.grid, array=ours.array * np.uint8(9)), "lungs")
+    with pytest.raises(AnatomyError, match="no lung"):
+        sides_of(Volume(grid=made.grid, array=np.zeros_like(ours.array)), "lungs")
+
+
+def test_thick_slices_are_marked(patient: Phantom, tmp_path: Path) -> None:
+    step = 4
+    matrix = patient.ct.grid.lps_from_ijk.copy()
+    matrix[:3, 2] *= step
+    hu = np.stack(
+        [patient.ct.array[:, :, k : k + step].mean(axis=2) for k in range(0, patient.ct.grid.shape[2], step)],
+        axis=2,
+    )
+    grid = Grid(shape=hu.shape, lps_from_ijk=matrix)
+    ct = Volume(grid=grid, array=hu.astype(np.int16))
+    with pytest.raises(AnatomyError, match="5.0 mm apart"):
+        segment(SegmentationRequest(ct=ct, out=tmp_path))
+    assert not (tmp_path / "patient.toml").exists()
+    segment(SegmentationRequest(ct=ct, out=tmp_path, thick_slices=True))
+    assert any("5.0 mm apart" in warning for warning in load_patient(tmp_path).warnings)
+
+
+def test_an_image_is_placed_by_its_voxels() -> None:
+    grid = Grid.from_spacing((10, 11, 12), (1.0, 2.0, 3.0), (0, 0, 0))
+    part = Volume(grid=grid.crop((-2, 3, 4), (5, 20, 9)), array=np.ones((7, 17, 5), dtype=np.uint8))
+    placed = onto_grid(part, grid, "part").array
+    assert placed[:5, 3:, 4:9].all()
+    assert placed.sum() == 5 * 8 * 5
+    matrix = part.grid.lps_from_ijk.copy()
+    matrix[0, 3] += 0.3
+    shifted = Grid(shape=part.grid.shape, lps_from_ijk=matrix)
+    with pytest.raises(GridMismatchError):
+        onto_grid(Volume(grid=shifted, array=part.array), grid, "part")
+
+
+def test_quality_counts_ends_and_volumes(patient: Phantom, made: Segmentation) -> None:
+    quality = quality_of(made.parts, made.grid)
+    assert quality.tree is not None
+    assert quality.ends == np.count_nonzero(
+        [not len(quality.tree.children(b)) for b in range(quality.tree.n_branches)]
+    )
+    litres = np.count_nonzero(made.parts.right) * made.grid.voxel_volume_mm3 * 1e-6
+    assert quality.volumes_l["right lung"] == pytest.approx(litres)
+    assert json.loads(json.dumps(quality.to_mapping()))["airway"]["ends"] == quality.ends
+
+
+def test_a_file_that_is_no_image_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "slice.dcm").write_bytes(b"x")
+    with pytest.raises(FileError, match="folder"):
+        read_ct(tmp_path / "slice.dcm")
+    with pytest.raises(FileError):
+        read_ct(tmp_path / "missing.nii.gz")

@@ -445,12 +445,12 @@ def demo(
     json: bool = False,
     cache: Path | None = None,
 ) -> int:
-    """Make a synthetic patient, plan to one of its nodules, check the plan and draw it.
+    """Make a synthetic patient, plan to one of its nodules, check the plan, draw it and write a page about it.
 
     Parameters
     ----------
     out : Path
-        Folder for plan.json and the pictures.
+        Folder for plan.json, the pictures and report.html.
     budget : float
         Planning time in seconds.
     seed : int
@@ -470,9 +470,22 @@ def demo(
         terminal.show(terminal.anatomy_tables(lung)[1:3])
     request = SearchRequest(system=load_device(DEFAULT_SYSTEM, None), seed=seed, time_s=budget, cache=cache)
     code = _first_reachable_nodule(lung, request, out, json)
-    if code == OK and not json:
-        console.print(terminal.what_to_look_at(out))
+    if code == OK:
+        with progress("making the page"):
+            _write_page(lung, out)
+        if not json:
+            console.print(terminal.what_to_look_at(out))
     return code
+
+
+def _write_page(lung: Lung, out: Path) -> None:
+    """Write report.html about the plan in `out`."""
+    from lungaccess.commands_report import HISTORY_FILE
+    from lungaccess.plans import Plan
+    from lungaccess.report.html import PageOptions, plan_page
+
+    options = PageOptions(cost_over_time=out / HISTORY_FILE)
+    plan_page(Plan.load(out / "plan.json"), lung, out / "report.html", options)
 
 
 def _first_reachable_nodule(lung: Lung, request: SearchRequest, out: Path, json: bool) -> int:

@@ -333,5 +333,6 @@ def what_to_look_at(out: Path) -> Panel:
         "R and L are the patient's right and left. In the two cuts, no full red or grey reaches the",
         "dashed lines; in the graph, no curve enters the red area outside the blue one.",
         f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
+        f"{out / 'report.html'}: all of it in 3-D, playing along a slider; open it in a browser.",
     )
     return Panel("\n".join(escaped(line) for line in lines), title="what to look at", title_align="left")

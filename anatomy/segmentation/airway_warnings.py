@@ -14,8 +14,6 @@ LEAST_TRACHEA_MM = 25.0
 LEAST_ENDS = 4
 LEAST_SHARE = 0.2
 """A lung with fewer ends than this share of the other's has lost most of its airways."""
-BRANCHINGS_PER_MM = 0.2
-"""Denser trees than this are leaks: airways seen in a CT are longer between branchings."""
 GREATEST_LOOPS_SHARE = 0.25
 """An airway with so many rings per end has grown into lung."""
 

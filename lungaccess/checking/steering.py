@@ -31,6 +31,7 @@ LENGTH_TOLERANCE_MM = 1e-6
 LIMIT_TOLERANCE = 1e-9
 COST_TOLERANCE = 0.02
 COST_STEP_MM = 0.1
+COST_REACH_MM = 100.0
 CLEARANCE_FLOOR_MM = 0.1
 GREATEST_VOXEL_COST = 1.0
 """Of one voxel: so much may two sums differ because one grazes a voxel that the other does not."""
@@ -203,12 +204,16 @@ def inverse_clearance(plan: Plan, scene: Scene, curve: Curve) -> float:
     """Return the integral of 1 / clearance over the needle's length [Kuntz2015], by the trapezoid rule.
 
     The clearance to the nearest obstacle, voxels as solid boxes, is not taken below 0.1 mm nor above
-    `REACH_MM`, where the integrand is at most 0.05 / mm.
+    `COST_REACH_MM`, which is farther than any point of a lung lies from its pleura.
     """
     length = float(curve.arc_mm[-1])
     arc = np.linspace(0.0, length, max(int(np.ceil(length / COST_STEP_MM)), 1) + 1)
     points = np.stack([np.interp(arc, curve.arc_mm, curve.points[:, axis]) for axis in range(3)], axis=1)
-    clearance = scene.boxes(has(forbidden_bits(plan)), REACH_MM).distance_mm(points)
+    obstacles = has(forbidden_bits(plan))
+    clearance = scene.boxes(obstacles, REACH_MM).distance_mm(points)
+    far = clearance >= REACH_MM
+    if far.any():
+        clearance[far] = scene.boxes(obstacles, COST_REACH_MM).distance_mm(points[far])
     return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
 
 

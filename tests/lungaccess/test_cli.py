@@ -150,7 +150,7 @@ def test_an_accepted_plan_writes_everything_and_exits_0(
 ) -> None:
     out = tmp_path / "out"
     assert cli.main(["plan", "toy", "--target", "lps:1,2,3", "--out", str(out)]) == cli.OK
-    assert {file.name for file in out.iterdir()} == WRITTEN
+    assert {file.name for file in out.iterdir()} == WRITTEN | {"report.html"}
     assert Plan.load(out / "plan.json").digest == toy_plan.digest
     with (out / "cost_over_time.csv").open(newline="", encoding="utf-8") as file:
         costs = [row["best_cost"] for row in csv.DictReader(file)]
@@ -277,7 +277,7 @@ def test_the_demonstration_ends_with_an_accepted_plan(
     out = tmp_path / "out"
     words = ["demo", "--budget", "1", "--out", str(out), "--cache", str(tmp_path / "cache")]
     assert cli.main(words) == cli.OK, capsys.readouterr().out
-    assert {file.name for file in out.iterdir()} == WRITTEN
+    assert {file.name for file in out.iterdir()} == WRITTEN | {"report.html"}
 
 
 # Bad input ---------------------------------------------------------------------------------------

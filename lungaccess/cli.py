@@ -445,7 +445,7 @@ def demo(
     json: bool = False,
     cache: Path | None = None,
 ) -> int:
-    """Make a synthetic patient, plan to one of its nodules, check the plan, draw it and write a page about it.
+    """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page about it.
 
     Parameters
     ----------

@@ -38,8 +38,12 @@ HEAVY = (
 WITHOUT_RESULT = {"completion"}
 """Commands that print a script."""
 
-HANGS_AFTER_S = 600.0
-START = "import sys; from lungaccess.cli import main; sys.exit(main())"
+HANGS_AFTER_S = 120.0
+START = (
+    "import signal, sys; from lungaccess.cli import main;"
+    # A job in the background of a shell begins with this signal ignored.
+    "signal.signal(signal.SIGINT, signal.default_int_handler); sys.exit(main())"
+)
 
 
 @pytest.fixture(autouse=True)

@@ -21,6 +21,8 @@ LUNGACCESS = Path(sys.executable).with_name("lungaccess")
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 ELSEWHERE = ("make ", ". .venv", "git ", "cd ", "lungaccess segment ")
 """Commands that other tests run, or that belong to a shell."""
+MAY_SAY_NO = ("advise", "needle", "tubes")
+"""Commands that end with 1 where a device does not get there, which depends on the patient."""
 
 
 def commands(text: str) -> list[list[str]]:
@@ -78,4 +80,5 @@ def test_every_block_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPat
                 text=True,
                 check=False,
             )
-            assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+            answers = {0, 1} if words[1] in MAY_SAY_NO else {0}
+            assert done.returncode in answers, f"{words}\n{done.stdout}\n{done.stderr}"

@@ -150,7 +150,7 @@ def test_an_accepted_plan_writes_everything_and_exits_0(
 ) -> None:
     out = tmp_path / "out"
     assert cli.main(["plan", "toy", "--target", "lps:1,2,3", "--out", str(out)]) == cli.OK
-    assert {file.name for file in out.iterdir()} == WRITTEN | {"report.html"}
+    assert {file.name for file in out.iterdir()} == WRITTEN
     assert Plan.load(out / "plan.json").digest == toy_plan.digest
     with (out / "cost_over_time.csv").open(newline="", encoding="utf-8") as file:
         costs = [row["best_cost"] for row in csv.DictReader(file)]

@@ -39,8 +39,10 @@ from stages.tube.shape import centreline
 from tests.stages.scenes import brute_clearance
 
 SYSTEM = la.load_system("ultrathin")
-BETWEEN_SAMPLES_MM = 0.06
-"""By how much a device may be nearer to a voxel than at its samples."""
+SAMPLES_MM = 0.02
+"""Between the points at which these tests look."""
+UNSEEN_MM = 0.5 * kernel.STEP_MM
+"""No point is farther from one that the kernel looks at, so no deeper in what the kernel does not see."""
 NOTHING = ErrorModel(
     scope_position_mm=0.0,
     scope_direction_deg=0.0,
@@ -77,14 +79,14 @@ def in_two(plan: Plan) -> Plan:
 
 
 def chain(plan: Plan, deviations: Deviations, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points every 0.02 mm of one deviated plan and their arc lengths, by 4x4 matrices."""
+    """Return points every SAMPLES_MM of one deviated plan and their arc lengths, by 4x4 matrices."""
     frame = np.array(plan.scope.lps_from_scope_tip)
     tilt = frame[:3, :2] @ deviations.tilt_rad[n]
     frame[:3, :3] = Rotation.from_rotvec(tilt).as_matrix() @ frame[:3, :3]
     frame[:3, 3] += deviations.scope_mm[n]
     points, lengths, total = [], [], 0.0
     for length, roll, curvature, _radius in deviated_pieces(plan, deviations)[n]:
-        steps = np.linspace(0.0, length, max(2, math.ceil(length / 0.02)))
+        steps = np.linspace(0.0, length, 1 + max(1, math.ceil(length / SAMPLES_MM)))
         points += [(frame @ arc_transform(s, roll, curvature))[:3, 3] for s in steps]
         lengths += (total + steps).tolist()
         frame = frame @ arc_transform(length, roll, curvature)
@@ -148,14 +150,14 @@ def test_what_is_touched_agrees_with_distances_to_all_voxels(plan: Plan, small_l
         }  # fmt: skip
         for bit, part in parts.items():
             gap = brute_clearance(small_lung.labels, small_lung.grid, points[part], bit, 3.0) - radius[part]
-            if gap.min() < -BETWEEN_SAMPLES_MM:
+            if gap.min() < -UNSEEN_MM:
                 assert outcomes.touched[n] & bit
                 seen += 1
-            if gap.min() < BETWEEN_SAMPLES_MM or bit == AIRWAY:
+            if gap.min() < 0.5 * SAMPLES_MM or bit == AIRWAY:
                 continue
             tube = lengths <= tube_mm
             on_tube = brute_clearance(small_lung.labels, small_lung.grid, points[tube], bit, 3.0)
-            if on_tube.min() > SYSTEM.tubes.outer.radius_mm + BETWEEN_SAMPLES_MM:
+            if on_tube.min() > pieces[n, :TUBE_PIECES, kernel.RADIUS].max() + 0.5 * SAMPLES_MM:
                 assert not outcomes.touched[n] & bit
     assert seen > 10
 

@@ -1,7 +1,7 @@
 """Attack the check: it must accept every plan of the planner, and refuse every mutated one.
 
-    python experiments/check_attack.py PATIENT|phantom [--plans 200] [--seed 0] [--out FILE] [--keep FOLDER]
-    python experiments/check_attack.py --table FILE
+    python -m experiments.check_attack PATIENT|phantom [--plans 200] [--seed 0] [--out FILE] [--keep FOLDER]
+    python -m experiments.check_attack --table FILE
 
 Plans come in batches: a random system (a preset or one of its own), a coarse atlas, targets all over the
 lung, several plans a target from the menu of alternatives, the search, its refinement, Algorithm 1 of
@@ -24,15 +24,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mutants import Case, Mutant
-from plan_mutations import mutate
-from random_plans import plans_of_batch
 
 import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.phantom import phantom
+from experiments.mutants import Case, Mutant
+from experiments.plan_mutations import mutate
+from experiments.random_plans import plans_of_batch
 from lungaccess import explain
 from lungaccess.checking import Checker, CheckReport
 from lungaccess.plans import Plan

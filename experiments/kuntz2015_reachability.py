@@ -1,101 +1,162 @@
 """Share of random peripheral targets with a plan, by planning time, as in [Kuntz2015, fig. 8].
 
-    python experiments/kuntz2015_reachability.py PATIENT [--targets 50] [--time 10] [--method atlas]
+    python -m experiments.kuntz2015_reachability [--quick] [--results FOLDER] [--patients NAME ...]
 
 Targets are drawn per lung, 5 to 25 mm from the pleura and at least 3 mm clear of airway, vessels and
-pleura.  Their lung is a commercial model that cannot be had, so the numbers compare methods and devices
-on your patient, not with the paper.
+pleura.  Their lung is a commercial model that cannot be had, so the numbers compare methods and devices, not
+lungs.  Each search ends with its first plan, which the check then judges.  The runs are a study
+(`lungaccess study`): `--runs DB` keeps them, and what it holds is not run again.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-import time
-from dataclasses import replace
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-import lungaccess as la
 from anatomy.grid import Float
-from anatomy.lung import Lung
-from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from lungaccess.atlas import Atlas
-from lungaccess.target import point_target
+from experiments.results import (
+    PHANTOM,
+    Result,
+    default_anatomies,
+    require_data,
+    setting_of,
+    study_parser,
+    write_result,
+)  # fmt: skip
+from lungaccess.report import style
+from lungaccess.study.driver import run_study
+from lungaccess.study.results import ResultsFile
+from lungaccess.study.settings import study_of
 
-PLEURA_MM = (5.0, 25.0)
-CLEAR_MM = 3.0
-TIMES_S = (0.1, 1.0, 10.0, 60.0, 3600.0)
-PAPER = {1.0: 36, 60.0: 70, 3600.0: 75}
-
-
-def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
-    """Return `(2 per_lung, 3)` LPS mm points, the patient's left lung first."""
-    rng = np.random.default_rng(seed)
-    midline = lung.tree.carina_lps[0]
-    points = []
-    for side in (1.0, -1.0):
-        while len(points) < per_lung * (1 if side > 0 else 2):
-            point = lung.grid.lps(rng.uniform(-0.5, np.array(lung.grid.shape) - 0.5))
-            if (point[0] - midline) * side > 0 and _is_peripheral(lung, point):
-                points.append(point)
-    return np.array(points)
-
-
-def _is_peripheral(lung: Lung, point: Float) -> bool:
-    if lung.label_at(point) & (AIRWAY | VESSEL | OUTSIDE | FISSURE):
-        return False
-    low, high = PLEURA_MM
-    return bool(
-        low <= lung.fields["pleura"].lower_bound_mm(point)[0] <= high
-        and lung.fields["obstacle"].lower_bound_mm(point)[0] >= CLEAR_MM
-    )
+PAPER_SHARES = {1.0: 36.0, 60.0: 70.0, 3600.0: 75.0}
+TIMES_S = (0.1, 1.0, 10.0, 60.0, 120.0)
+Times = dict[tuple[str, str], tuple[Float, int]]
+OURS, PAPERS = "atlas", "Algorithm 1"
+QUERY = """
+SELECT p.case_name, c.name, CASE WHEN r.solved THEN r.first_solution_time END, r.correct_solution
+FROM runs r JOIN plannerConfigs c ON c.id = r.plannerid JOIN problems p ON p.experimentid = r.experimentid
+     JOIN outcomes o ON o.runid = r.id
+WHERE NOT o.failed ORDER BY p.case_name, c.name, p.target"""
 
 
-def time_to_first_plan(atlas: Atlas, point: Float, method: str, time_s: float, seed: int) -> float:
-    """Return the planning time of the first plan, infinite if there is none within `time_s`."""
-    began = time.perf_counter()
-    target = point_target(atlas.lung, point)
-    try:
-        plans = la.plan(
-            atlas.lung, atlas.system, target, atlas=atlas, method=method, time_s=time_s, seed=seed
-        )
-        found = next(plans)
-    except la.NoPlan:
-        return float("inf")
-    elapsed = time.perf_counter() - began
-    report = la.check(found, atlas.lung)
-    if not report.accepted:
-        refused = [finding.name for finding in report.findings if not finding.ok]
-        sys.stdout.write(f"REFUSED by check: {point.tolist()}: {refused}\n")
-    return elapsed
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """Targets a lung, seconds a target of our search and of Algorithm 1, and the systems."""
+
+    per_lung: int
+    ours_s: float
+    papers_s: float
+    systems: tuple[tuple[str, bool], ...]
+
+
+FULL = Size(
+    per_lung=50, ours_s=120.0, papers_s=10.0,
+    systems=(
+        ("ultrathin", True), ("flexure-needle", True), ("ultrathin", False), ("lung-default", True),
+    ),
+)  # fmt: skip
+QUICK = Size(per_lung=5, ours_s=5.0, papers_s=5.0, systems=(("ultrathin", True),))
+NOT_REPRODUCED = [
+    "The lung of the paper and its nodules; it is a commercial model that cannot be had.",
+    "One hour a target: our own search was given two minutes.",
+]
+
+
+def study(patients: list[str], size: Size, planner: str) -> dict[str, Any]:
+    """Return the study of one planner as its TOML would say it."""
+    cases = [
+        {
+            "name": f"{patient}, {system}, fissures {'crossed' if allowed else 'forbidden'}",
+            "anatomy": patient if patient == PHANTOM else str(require_data(f"med-rad/{patient}").resolve()),
+            "system": system, "fissures_allowed": allowed,
+            "peripheral": {"per_lung": size.per_lung, "seed": 0},
+        }
+        for patient in patients for system, allowed in size.systems
+    ]  # fmt: skip
+    method, seconds = ("atlas", size.ours_s) if planner == OURS else ("kuntz2015", size.papers_s)
+    return {
+        "name": "kuntz2015_reachability", "case": cases, "planner": [{"name": planner, "method": method}],
+        "seeds": [0], "budget": {"time_s": seconds, "first_plan": True},
+    }  # fmt: skip
+
+
+def times_by_case(file: Path) -> Times:
+    """Return by case and planner the times of first plans, inf for none, and how many plans were refused."""
+    found: dict[tuple[str, str], list[tuple[float, bool]]] = {}
+    with ResultsFile(file) as results:
+        for case, planner, seconds, accepted in results.rows(QUERY):
+            refused = seconds is not None and not accepted
+            found.setdefault((case, planner), []).append((np.inf if seconds is None else seconds, refused))
+    return {
+        key: (np.array([at for at, _refused in values]), sum(refused for _at, refused in values))
+        for key, values in found.items()
+    }
+
+
+def add_case(result: Result, label: str, times: Float, refused: int, limit_s: float) -> None:
+    """Add the shares of a case, and how soon those came that came at all."""
+    solved = times[np.isfinite(times)]
+    for limit in (t for t in TIMES_S if t <= limit_s):
+        share = 100.0 * float((times <= limit).mean())
+        result.add(
+            f"{label}: within {limit:g} s", share, PAPER_SHARES.get(limit), "%",
+            f"of {len(times)} targets" + (f"; the check refused {refused}" if refused else ""),
+        )  # fmt: skip
+    if len(solved):
+        early = 100.0 * float((solved <= 0.1).mean())
+        note = f"{len(solved)} solved; within 1 s {100.0 * float((solved <= 1.0).mean()):.1f} %; "
+        note += f"median {np.median(solved):.3f} s"
+        result.add(f"{label}: of the solved, within 0.1 s", early, unit="%", note=note)
+
+
+def draw(found: Times, limit_s: float) -> Figure:
+    """Draw the share solved over planning time, with the paper's three points."""
+    figure = style.new_figure(7.5, 4.2)
+    axes = figure.subplots()
+    grid = np.geomspace(0.005, limit_s, 300)
+    for (case, planner), (times, _refused) in found.items():
+        share = [100.0 * float((times <= at).mean()) for at in grid]
+        axes.plot(grid, share, "-" if planner == OURS else ":", linewidth=1.2, label=f"{case}, {planner}")
+    paper = {at: share for at, share in PAPER_SHARES.items() if at <= limit_s}
+    axes.plot(list(paper), list(paper.values()), "o", color=style.INK, label="paper, its own lung")
+    axes.set(xscale="log", xlabel="planning time (s)", ylabel="targets with a plan (%)", ylim=(0, 100))
+    axes.legend(frameon=False, fontsize=6, loc="lower right")
+    return figure
 
 
 def main() -> None:
-    """Run the study and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("patient")
-    parser.add_argument("--targets", type=int, default=50, help="per lung")
-    parser.add_argument("--time", type=float, default=10.0, help="planning time per target, s")
-    parser.add_argument("--method", default="atlas")
-    parser.add_argument("--system", default="lung-default")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cache", default=None)
+    """Run the study and store its result."""
+    parser = study_parser(__doc__)
+    parser.add_argument("--patients", nargs="+", default=list(default_anatomies()))
+    parser.add_argument("--runs", type=Path, default=Path(".studies/kuntz2015_reachability.db"))
+    parser.add_argument("--workers", type=int, default=None)
     options = parser.parse_args()
-    lung = la.load_patient(options.patient, cache=options.cache)
-    points = peripheral_targets(lung, options.targets, options.seed)
-    preset = la.load_system(options.system)
-    for name, allowed in (("fissures are obstacles", False), ("fissures may be crossed", True)):
-        system = replace(preset, name=f"{preset.name}, {name}", fissures_allowed=allowed)
-        atlas = la.build_atlas(lung, system)
-        times = np.array(
-            [time_to_first_plan(atlas, p, options.method, options.time, options.seed) for p in points]
-        )
-        sys.stdout.write(f"{lung.name}, {options.method}, {name}: atlas {atlas.build_s:.1f} s\n")
-        for limit in (t for t in TIMES_S if t <= options.time):
-            share = 100.0 * float((times <= limit).mean())
-            paper = f"  (paper, another lung: {PAPER[limit]} %)" if limit in PAPER else ""
-            sys.stdout.write(f"  within {limit:g} s: {share:.0f} %{paper}\n")
+    size = QUICK if options.quick else FULL
+    patients = options.patients[:1] if options.quick else options.patients
+    result = Result(
+        name="kuntz2015_reachability", title="Peripheral targets with a plan, by planning time",
+        source="[Kuntz2015, fig. 8]", setting=setting_of(options), seeds=[0],
+        conditions={
+            "targets": f"{size.per_lung} on each side, 5 to 25 mm from the pleura",
+            "time": "wall, without the atlas; as many searches at once as there are workers",
+            "searches": f"{OURS}: up to {size.ours_s:g} s; {PAPERS} on our kernels: up to {size.papers_s:g} s",
+        },
+        not_reproduced=list(NOT_REPRODUCED),
+    )  # fmt: skip
+    file = options.runs.with_stem(f"{options.runs.stem}-{result.setting}")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    for planner in (OURS, PAPERS):
+        run_study(study_of(study(patients, size, planner)), file, workers=options.workers)
+    found = times_by_case(file)
+    for (case, planner), (times, refused) in found.items():
+        limit_s = size.ours_s if planner == OURS else size.papers_s
+        add_case(result, f"{case}, {planner}", times, refused, limit_s)
+    result.figure = draw(found, size.ours_s)
+    write_result(result, options.results)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way
 
 from anatomy.grid import Float
+from experiments.mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way
 from lungaccess.plans import Plan
 from stages.needle.path import ArcPath
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from mutants import Case, Mutant, Mutation, Rng, changed, far, rotation, signed, way
-from mutants_of_motion import end_of
 
 from anatomy.grid import Float
+from experiments.mutants import Case, Mutant, Mutation, Rng, changed, far, rotation, signed, way
+from experiments.mutants_of_motion import end_of
 from lungaccess.plans import NeedleArc, Plan
 
 PIECES = ("scope", "tube", "needle", "exit", "target")

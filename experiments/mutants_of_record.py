@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way, with_system
 
 from anatomy.errors import SettingsError
 from anatomy.settings import override, to_mapping
+from experiments.mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way, with_system
 
 SEEN_MM = 0.05
 """A stated clearance may be so much too large."""

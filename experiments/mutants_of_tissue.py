@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from mutants import Case, Mutant, Mutation, Rng, changed, way
 
 from anatomy import structures
 from anatomy.grid import Float
+from experiments.mutants import Case, Mutant, Mutation, Rng, changed, way
 from lungaccess.plans import NeedleArc, Plan
 from stages.needle.path import ArcPath, direct_path
 from stages.tube.shape import centreline

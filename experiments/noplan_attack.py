@@ -1,6 +1,6 @@
 """Look for plans where the planner says there is none: reference mode on the targets with NoPlan.
 
-    python experiments/noplan_attack.py PATIENT RESULTS.json [--system lung-default] [--time 60]
+    python -m experiments.noplan_attack PATIENT RESULTS.json [--system lung-default] [--time 60]
 
 Random peripheral targets, as in kuntz2015_reachability.py.  Where the planner gives up, Algorithm 1 of
 [Kuntz2015] searches with FCL on meshes for `--time` s of processor time.  A plan of it that the check
@@ -21,14 +21,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from kuntz2015_reachability import peripheral_targets
-
 import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.io.files import atomic_write
 from lungaccess.assemble import Candidate, Task, assemble
 from lungaccess.atlas import Atlas
+from lungaccess.peripheral import peripheral_targets
 from lungaccess.plans import Plan
 from lungaccess.reference import ReferenceSearch
 from lungaccess.reference.obstacles import Obstacles

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import mutants_of_motion
-import mutants_of_place
-import mutants_of_record
-import mutants_of_tissue
-from mutants import Case, Mutant, Mutation, Rng
+from experiments import mutants_of_motion, mutants_of_place, mutants_of_record, mutants_of_tissue
+from experiments.mutants import Case, Mutant, Mutation, Rng
 
 MUTATIONS: dict[str, Mutation] = {
     mutation.__name__: mutation

@@ -8,7 +8,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from mutants import Rng
 
 import lungaccess as la
 from anatomy import structures
@@ -16,6 +15,7 @@ from anatomy.errors import SettingsError, TargetError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.settings import override
+from experiments.mutants import Rng
 from lungaccess.alternatives import alternatives
 from lungaccess.assemble import Task, assemble
 from lungaccess.atlas import Atlas

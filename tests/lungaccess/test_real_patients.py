@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import lungaccess as la
 from anatomy import structures
 from anatomy.grid import transform_points
 from anatomy.lung import Lung
+from lungaccess.peripheral import peripheral_targets
 from lungaccess.target import point_target
 from stages.needle.path import ArcPath
 
@@ -144,9 +144,6 @@ def test_patient1_nodule_is_behind_a_fissure(data_dir: Path, cache: Path) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("patient", ["Patient1", "Patient2"])
 def test_random_peripheral_targets(data_dir: Path, cache: Path, patient: str) -> None:
-    sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-    from kuntz2015_reachability import peripheral_targets
-
     lung = la.load_patient(data_dir / "med-rad" / patient, cache=cache)
     system = la.load_system("lung-default")
     atlas = la.build_atlas(lung, system)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from collections import Counter
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +19,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
+from experiments import noplan_attack
 from lungaccess.assemble import Task
 from lungaccess.plans import Plan
 from lungaccess.reference import ReferenceSearch, ReferenceSearchWithoutRejection
@@ -355,10 +354,8 @@ class TestNeedle:
 
 
 def test_the_attack_reports_what_the_planner_missed(
-    atlas: la.Atlas, target: Target, obstacles: Obstacles, monkeypatch: pytest.MonkeyPatch
+    atlas: la.Atlas, target: Target, obstacles: Obstacles
 ) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "experiments"))
-    noplan_attack = importlib.import_module("noplan_attack")
     # A planner without time finds nothing, though there is a plan.
     attack = noplan_attack.Attack(atlas, 0.0, math.inf, 1, obstacles)
     record, plan = attack.result(target.lps_mm)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +13,11 @@ from hypothesis import strategies as st
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.settings import override
+from experiments import check_attack, random_plans
+from experiments.mutants import Case
+from experiments.plan_mutations import MUTATIONS
 from lungaccess.checking import Checker, check
 from lungaccess.plans import Plan
-
-sys.path.insert(0, str(Path(__file__).parents[3] / "experiments"))
-
-import check_attack
-import random_plans
-from mutants import Case
-from plan_mutations import MUTATIONS
 
 PLANS_A_SYSTEM = 8
 MUTANTS_OF_A_KIND = 4

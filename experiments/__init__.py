@@ -1,0 +1,1 @@
+"""Studies of the planners, one script each: `python -m experiments.NAME [--quick]`."""

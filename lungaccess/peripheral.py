@@ -1,0 +1,66 @@
+"""Random targets in the periphery of the lung, as in the studies of [Kuntz2015]."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.errors import TargetError
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+
+PLEURA_MM = (5.0, 25.0)
+CLEAR_MM = 3.0
+DRAWS_A_POINT = 100_000
+"""So many points drawn in a row without a target end the search for one."""
+
+
+def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
+    """Draw targets 5 to 25 mm from the pleura and at least 3 mm clear of airway, vessels and pleura.
+
+    Parameters
+    ----------
+    lung : Lung
+    per_lung : int
+        How many on each side of the carina.
+    seed : int
+        The same seed and number give the same points.
+
+    Returns
+    -------
+    (2 per_lung, 3) float64, LPS mm
+        Those of the patient's left lung first.
+
+    Raises
+    ------
+    TargetError
+        If one side has no room for such a target.
+    """
+    rng = np.random.default_rng(seed)
+    points = [_peripheral_point(lung, rng, side) for side in (1.0, -1.0) for _ in range(per_lung)]
+    return np.array(points, dtype=np.float64).reshape(-1, 3)
+
+
+def _peripheral_point(lung: Lung, rng: np.random.Generator, side: float) -> Float:
+    midline = lung.tree.carina_lps[0]
+    for _ in range(DRAWS_A_POINT):
+        point = lung.grid.lps(rng.uniform(-0.5, np.array(lung.grid.shape) - 0.5))
+        if (point[0] - midline) * side > 0 and _is_peripheral(lung, point):
+            return point
+    raise TargetError(
+        f"{lung.name} has no peripheral target in its {'left' if side > 0 else 'right'} lung: "
+        f"none of {DRAWS_A_POINT} random points is one",
+        expected=f"lung tissue {PLEURA_MM[0]:g} to {PLEURA_MM[1]:g} mm from the pleura and "
+        f"{CLEAR_MM:g} mm clear of airways and vessels, on both sides of the carina",
+        remedy="State the targets one by one",
+    )
+
+
+def _is_peripheral(lung: Lung, point: Float) -> bool:
+    if lung.label_at(point) & (AIRWAY | VESSEL | OUTSIDE | FISSURE):
+        return False
+    low, high = PLEURA_MM
+    return bool(
+        low <= lung.fields["pleura"].lower_bound_mm(point)[0] <= high
+        and lung.fields["obstacle"].lower_bound_mm(point)[0] >= CLEAR_MM
+    )

@@ -26,7 +26,6 @@ METHODS = {
     "reference-without-rejection": ReferenceSearchWithoutRejection,
 }
 PROGRESS_EVERY_S = 0.1
-HOPELESS_ITERATIONS = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +163,7 @@ def _run(
             best = step.cost
             timing = {"planning_s": clock.elapsed_s, "atlas_s": search.atlas.build_s}
             yield assemble(task, search.atlas.sites, step.candidate, iteration=iteration, timing=timing)
-        if best is None and _hopeless(search, step):
+        if best is None and search.is_hopeless(step.iteration):
             break
         if clock.due():
             tell(
@@ -180,13 +179,6 @@ def _spent(step: Step, clock: Clock, iterations: int | None, time_s: float | Non
     if iterations is not None and step.iteration > iterations:
         return True
     return clock.elapsed_s > (math.inf if time_s is None else time_s)
-
-
-def _hopeless(search: AtlasSearch, step: Step) -> bool:
-    """Tell whether varying deployments has not brought the target into any workspace."""
-    if search.atlas.sites.count == 0 or search.atlas.deployments.count == 0:
-        return True
-    return not len(search.in_workspace) and step.iteration >= HOPELESS_ITERATIONS
 
 
 class Clock:

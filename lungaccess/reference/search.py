@@ -74,6 +74,7 @@ class ReferenceSearch(AtlasSearch):
 
     rejects = True
     """Whether line 8 is carried out."""
+    from_atlas = False
 
     def __init__(
         self,

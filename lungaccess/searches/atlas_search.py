@@ -42,6 +42,8 @@ PLANNER_SLACK = 1.3
 """A needle planner may return what is so much dearer than the best: a climb will make it cheaper."""
 WORTH_PRICING = 0.999
 """A climb is priced exactly when its estimated cost has fallen by this factor."""
+HOPELESS_ITERATIONS = 2000
+"""So many without a deployment that has the target in its needle's workspace, and the search is given up."""
 JOINT_EVERY = 2
 """Rounds after which what was found is refined by a nonlinear program."""
 
@@ -54,6 +56,9 @@ class AtlasSearch:
     task : Task
     atlas : Atlas
     """
+
+    from_atlas = True
+    """Whether placements begin with the atlas, or are drawn at random for as long as the caller waits."""
 
     def __init__(self, task: Task, atlas: Atlas) -> None:
         self.task = task
@@ -74,6 +79,14 @@ class AtlasSearch:
         """Search forever; the caller stops."""
         yield from self.direct_steps()
         yield from self.further_steps()
+
+    def is_hopeless(self, iteration: int) -> bool:
+        """Tell whether going on is of no use: the target has come into no workspace."""
+        if not self.from_atlas:
+            return not self.atlas.sites.count
+        if not self.atlas.deployments.count:
+            return True
+        return not len(self.in_workspace) and iteration >= HOPELESS_ITERATIONS
 
     def take_part(self, number: int, parts: int) -> None:
         """Do one part of the work of several processes, with random numbers of its own."""

@@ -26,6 +26,7 @@ class KuntzSearch(AtlasSearch):
 
     rejects = True
     """Whether line 8 is carried out."""
+    from_atlas = False
 
     def steps(self) -> Iterator[Step]:
         """Search forever; the caller stops."""

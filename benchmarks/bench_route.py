@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.fresh import FreshProcess
 from stages.scope.route.centreline import Centreline, from_tree
 from stages.scope.route.planner import Replanner, plan_route, try_route
 from stages.scope.route.proof import prove
@@ -15,6 +16,13 @@ from stages.scope.tour.models import random_airway, random_lesions
 from stages.scope.tour.shortest import shortest_tour
 from stages.scope.tour.ways import ways_to
 
+COLD_RUN = """
+from benchmarks.bench_route import Routes, Tours
+Routes().setup()
+tours = Tours()
+tours.setup(5)
+tours.time_circuits(5)
+"""
 LIMITS = RouteLimits(max_curvature_per_mm=0.08, device_radius_mm=0.5)
 
 
@@ -78,3 +86,13 @@ class Tours:
         """All circuits, up to nine lesions."""
         if lesions <= 9:
             circuits(self.ways)
+
+
+class Compile(FreshProcess):
+    """All kernels of routes and tours in a new process, without and with cached ones."""
+
+    code = COLD_RUN
+
+    def time_routes_and_tours(self, cold: bool) -> None:
+        """A route, a replan, a tour and its circuits."""
+        self.run()

@@ -2,51 +2,25 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from benchmarks.fresh import FreshProcess
-from stages.tube.device import Tube
+from benchmarks.scenes import configurations, mechanics
 from stages.tube.mechanics import TubeMechanics
 
-SIZES = ((1.1, 0.9), (1.5, 1.3), (1.9, 1.65))
 CONFIGURATIONS = 4000
 COLD_RUN = """
-from benchmarks.bench_tube import configurations, mechanics
+from benchmarks.scenes import configurations, mechanics
 made = mechanics(3)
 made.batch(*configurations(made, 10))
 made.given_base_angles(*(values[0] for values in configurations(made, 1))).jacobian
 """
 
 
-def mechanics(count: int) -> TubeMechanics:
-    """Return nested tubes, all of them curved, that never snap."""
-    lengths = (200.0, 160.0, 120.0)[:count]
-    return TubeMechanics(
-        [
-            Tube(
-                outer_diameter_mm=outer, inner_diameter_mm=inner, length_mm=length, curved_length_mm=40.0,
-                precurvature_per_mm=0.006,
-            )
-            for length, (outer, inner) in zip(lengths, SIZES[-count:], strict=True)
-        ]
-    )  # fmt: skip
-
-
-def configurations(made: TubeMechanics, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return base angles and rear ends, drawn at random."""
-    rng = np.random.default_rng(0)
-    ahead = np.sort(rng.uniform(10.0, 60.0, (count, made.count)), axis=1)[:, ::-1]
-    beta = np.minimum(ahead - made.lengths_mm, 0.0)
-    beta = np.minimum.accumulate(beta[:, ::-1], axis=1)[:, ::-1]
-    return rng.uniform(-math.pi, math.pi, beta.shape), beta
-
-
 class Solves:
     """Base angles given, with stability and tip frame."""
 
-    params = (1, 2, 3)
+    params = (1, 2, 3, 4, 5)
     param_names = ("tubes",)
 
     def setup(self, tubes: int) -> None:

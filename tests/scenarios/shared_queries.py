@@ -1,0 +1,39 @@
+"""Recorded needle queries on real patients, with the path of each planner judged voxel by voxel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from experiments.needle_queries import Judge, Obstacles, hard_queries, load_obstacles
+from stages.needle import searches
+from stages.needle.planners import PLANNERS
+from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES
+from tests.scenarios.runs import Answer
+
+
+class SharedQueries:
+    """The recorded queries of `SHARED_QUERIES`; masks are read once."""
+
+    def __init__(self, data: Path) -> None:
+        found = {query.name: query for query in hard_queries(data / "needle")}
+        self._queries = [found[name] for name in SHARED_QUERIES]
+        self._obstacles: dict[int, Obstacles] = {
+            number: load_obstacles(data / "med-rad" / f"Patient{number}")
+            for number in sorted({query.patient for query in self._queries})
+        }
+
+    def answers(self, planner: str) -> list[Answer]:
+        """Plan for each query by length, and walk each path again against all obstacle voxels."""
+        out = []
+        for query in self._queries:
+            space = self._obstacles[query.patient].space(query)
+            asked = searches.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
+            search = PLANNERS[planner](space, asked, 0)
+            search.advance(NEEDLE_ITERATIONS)
+            path = search.path
+            if path is None:
+                out.append(Answer(cost=None, digest=""))
+                continue
+            faults = tuple(Judge(space, query).faults(path))
+            out.append(Answer(cost=search.cost, digest=path.arcs.tobytes().hex(), faults=faults))
+        return out

@@ -5,8 +5,9 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.14 python3; 
 	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
-.PHONY: help demo test lint format docs bench clean
+.PHONY: help demo test lint format docs bench results results-quick clean
 
 help:
 	@echo "make demo    plan on a synthetic patient, results in demo-output/"
@@ -15,6 +16,8 @@ help:
 	@echo "make format  let ruff rewrite the code"
 	@echo "make docs    build the documentation into site/"
 	@echo "make bench   run the benchmarks"
+	@echo "make results-quick  all studies in the quick setting, and RESULTS.md"
+	@echo "make results        all studies in the full setting (hours), and RESULTS.md"
 	@echo "make clean   remove everything that was built, but not .venv"
 
 $(BIN)/python:
@@ -48,7 +51,14 @@ docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs site
 
 bench: $(VENV)/.installed-dev
-	cd benchmarks && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr
+	cd benchmarks && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr $(BENCH_ARGS)
+
+# Real anatomy is used where LUNGACCESS_DATA names its folder.
+results: $(VENV)/.installed-study
+	$(BIN)/python -m experiments.run_all
+
+results-quick: $(VENV)/.installed-study
+	$(BIN)/python -m experiments.run_all --quick
 
 clean:
 	rm -rf site docs/reference build dist demo-output *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .asv

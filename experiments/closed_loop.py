@@ -1,31 +1,36 @@
 """Needles that do not follow their plans exactly, inserted blindly and with replanning on the way.
 
-    python experiments/closed_loop.py PATIENT|phantom [--quick] [--system lung-default] [--png FILE]
+    python -m experiments.closed_loop [--quick] [--seed 1] [--results FOLDER] [--patient NAME] [--system NAME]
 
 Random peripheral targets are planned for with `lungaccess.plan`.  From each start the needle is inserted
-many times with errors drawn at random, in open and in closed loop.  Three tables: by size of the errors, by
-curvature held in reserve for a needle that bends too little, and CPU time of the replans.  What the errors
-are, and what counts as reached: docs/replanning.md.
+many times with errors drawn at random, in open and in closed loop: by size of the errors, and by curvature
+held in reserve for a needle that bends too little.  What the errors are, and what counts as reached:
+docs/replanning.md.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-import matplotlib
 import numpy as np
-from kuntz2015_reachability import peripheral_targets
 
 import lungaccess as la
-from anatomy.build import build_lung
+from anatomy.errors import TargetError
 from anatomy.grid import Float
 from anatomy.lung import Lung
-from anatomy.phantom import phantom
+from experiments.insertion_figure import draw_insertions
+from experiments.results import (
+    PHANTOM,
+    Result,
+    anatomy,
+    default_anatomies,
+    setting_of,
+    study_parser,
+    write_result,
+)
+from lungaccess.peripheral import peripheral_targets
 from lungaccess.target import point_target
 from stages.needle.insertion.closed_loop import TOLERANCE_MM, Outcome
 from stages.needle.insertion.replanning import ITERATIONS, Replanner, ReplanSettings, with_reserve
@@ -41,6 +46,10 @@ PLANNING_ITERATIONS = 3000
 RESERVE = 0.1
 RESERVES = (0.0, 0.1, 0.2)
 REPLAN_LIMIT_MS = 20.0
+SIZES = {"quick": (2, 8, 60), "full": (12, 30, 1000)}
+"""Targets, insertions for each target and mode and level, and replans to time."""
+SYSTEMS = {PHANTOM: "flexure-needle"}
+DRAWN_RUNS = 12
 
 
 def errors_of_size(size: float) -> Errors:
@@ -59,7 +68,7 @@ def errors_of_size(size: float) -> Errors:
     )
 
 
-LEVELS = {"none": 0.0, "half": 0.5, "full": 1.0, "double": 2.0}
+LEVELS = {"no": 0.0, "half": 0.5, "full": 1.0, "double": 2.0}
 WEAK = Errors(curvature_bias=-0.15, curvature_sd=0.05, position_noise_mm=0.2, direction_noise_deg=0.3)
 
 
@@ -120,28 +129,28 @@ def inserted(space: NeedleSpace, cases: Sequence[Case], errors: Errors, reserve:
     )
 
 
-def row(name: str, mode: str, made: Summary) -> str:
-    """Return a line of a table."""
-    percent = {outcome: 100.0 * count / len(made.insertions) for outcome, count in made.outcomes.items()}
+def add_study(result: Result, label: str, made: Study) -> None:
+    """Add the rows of open and closed loop."""
+    for mode, found in (("open loop", made.open_loop), ("closed loop", made.closed_loop)):
+        result.add(f"{label}, {mode}: reached", _percent(found, Outcome.REACHED), unit="%", note=_note(found))
+
+
+def _percent(found: Summary, outcome: Outcome) -> float:
+    return 100.0 * found.outcomes.get(outcome, 0) / len(found.insertions)
+
+
+def _note(found: Summary) -> str:
+    no_path = _percent(found, Outcome.NO_PATH) + _percent(found, Outcome.OUT_OF_LENGTH)
     return (
-        f"{name:>8} {mode:>7} {percent[Outcome.REACHED]:6.1f} "
-        f"[{100 * made.reached_low:5.1f},{100 * made.reached_high:6.1f}] {percent[Outcome.HIT]:6.1f} "
-        f"{percent[Outcome.NO_PATH] + percent[Outcome.OUT_OF_LENGTH]:8.1f} {percent[Outcome.MISSED]:7.1f} "
-        f"{made.median_error_mm:8.2f} {made.error_95_mm:7.2f} {made.clearance_mm:10.2f}\n"
+        f"{len(found.insertions)} insertions, 95 % interval {100.0 * found.reached_low:.1f} to "
+        f"{100.0 * found.reached_high:.1f}; hit an obstacle {_percent(found, Outcome.HIT):.1f} %; no path "
+        f"{no_path:.1f} %; tip error median "
+        f"{found.median_error_mm:.2f} mm, 95 % within {found.error_95_mm:.2f} mm; least clearance "
+        f"{found.clearance_mm:.2f} mm"
     )
 
 
-def table(title: str, rows: Iterable[tuple[str, Study]]) -> None:
-    """Print a table."""
-    sys.stdout.write(
-        f"\n{title}\n{'':>8} {'':>7} {'reach%':>6} {'[95 % interv.]':>14} {'hit%':>6} {'no path%':>8} "
-        f"{'missed%':>7} {'med. mm':>8} {'95% mm':>7} {'clear. mm':>10}\n"
-    )
-    for name, made in rows:
-        sys.stdout.write(row(name, "open", made.open_loop) + row(name, "closed", made.closed_loop))
-
-
-def replan_times_ms(space: NeedleSpace, cases: Sequence[Case], poses: int, seed: int = 0) -> Float:
+def replan_times_ms(space: NeedleSpace, cases: Sequence[Case], poses: int, seed: int) -> Float:
     """Return the CPU time of replans from poses beside the plans, the first of each kind left out.
 
     Each pose is off the plan by 0.5 mm in each coordinate and by 1 degree about two axes, the target by
@@ -178,113 +187,63 @@ def frame_at(plan: ArcPath, length_mm: float) -> Float:
     return np.array(frame)
 
 
-def draw(lung: Lung, case: Case, at_case: Study, by_level: dict[str, Study], runs: int, file: str) -> None:
-    """Draw the true paths to one target over a slice of the lung, and the tip errors of all."""
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13.0, 5.2), gridspec_kw={"width_ratios": [1.5, 1.0]})
-    draw_paths(left, lung, case, at_case)
-    for colour, (level, made) in zip(("C0", "C1", "C2"), list(by_level.items())[1:], strict=False):
-        for style, mode in (("--", made.open_loop), ("-", made.closed_loop)):
-            errors = np.sort([run.tip_error_mm for run in mode.insertions])
-            kind = "open loop" if style == "--" else "closed loop"
-            share = np.arange(1, len(errors) + 1) / len(errors)
-            right.step(
-                errors, 100.0 * share, style, where="post", color=colour, label=f"{level} errors, {kind}"
-            )
-    right.axvline(TOLERANCE_MM, color="0.5", lw=0.8)
-    right.set(
-        xscale="log", xlim=(0.05, 100.0), ylim=(0.0, 100.0), xlabel="tip error, mm", ylabel="insertions, %"
-    )
-    right.set_title(
-        f"Tip error of {len(made.open_loop.insertions)} insertions each ({lung.name})", fontsize=10
-    )
-    right.legend(fontsize=8, loc="lower right")
-    right.grid(alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(file, dpi=130)
-    plt.close(figure)
-    sys.stdout.write(f"\n{file}: paths of {runs} insertions to one target, and tip errors\n")
+def add_replans(result: Result, times_ms: Float) -> None:
+    """Add the CPU time of replans."""
+    within = 100.0 * (times_ms < REPLAN_LIMIT_MS).mean()
+    result.add(
+        f"replan of {ITERATIONS} iterations: CPU time, median", float(np.median(times_ms)), unit="ms",
+        note=f"{len(times_ms)} poses; 99 % within {np.quantile(times_ms, 0.99):.1f} ms, largest "
+        f"{times_ms.max():.1f} ms; {within:.1f} % within {REPLAN_LIMIT_MS:g} ms",
+    )  # fmt: skip
 
 
-def draw_paths(axes: Any, lung: Lung, case: Case, made: Study) -> None:
-    """Draw true paths in the plane of the plan, with what the plane cuts in grey."""
-    start, target = case.query.lps_from_start, case.query.target
-    ahead = (target - start[:3, 3]) / np.linalg.norm(target - start[:3, 3])
-    aside = start[:3, 2] - (start[:3, 2] @ ahead) * ahead
-    aside = aside / np.linalg.norm(aside) if np.linalg.norm(aside) > 1e-6 else start[:3, 0]
-
-    def flat(points: Float) -> Float:
-        return np.stack([(points - start[:3, 3]) @ ahead, (points - start[:3, 3]) @ aside], axis=-1)
-
-    length = float(np.linalg.norm(target - start[:3, 3]))
-    u, v = np.meshgrid(np.arange(-6.0, length + 10.0, 0.25), np.arange(-14.0, 14.0, 0.25), indexing="xy")
-    cut = start[:3, 3] + u[..., None] * ahead + v[..., None] * aside
-    inside = np.array([lung.label_at(point) != 0 for point in cut.reshape(-1, 3)]).reshape(u.shape)
-    extent = (u.min(), u.max(), v.min(), v.max())
-    axes.imshow(inside, origin="lower", extent=extent, cmap="Greys", vmin=0.0, vmax=2.5, aspect="auto")
-    for colour, mode, name in (("C1", made.open_loop, "open loop"), ("C0", made.closed_loop, "closed loop")):
-        for n, run in enumerate(mode.insertions):
-            points, goal = flat(run.lps_from_tip[:, :3, 3]), flat(run.target_lps)
-            axes.plot(*points.T, color=colour, lw=0.8, alpha=0.7, label=None if n else name)
-            axes.plot(*points[-1], "x" if run.outcome is Outcome.HIT else ".", color=colour, ms=5)
-            axes.plot(*np.stack([points[-1], goal]).T, color=colour, lw=0.6, ls=":")
-            axes.plot(*goal, "+", color="0.2", ms=4)
-    axes.plot([], [], "+", color="0.2", ms=4, label="where the target is in the end")
-    axes.plot(*flat(case.plans[RESERVE].sample(0.5)[0]).T, "k--", lw=1.0, label="plan")
-    axes.set(xlabel="towards the target, mm", ylabel="aside, mm", ylim=(-14.0, 14.0))
-    axes.set_title("True paths to one target, full errors; grey: what the plane cuts", fontsize=10)
-    axes.legend(fontsize=8, loc="lower left")
+def insert_all(result: Result, space: NeedleSpace, cases: list[Case], runs: int) -> dict[str, Study]:
+    """Add the rows by size of the errors and by reserve; return the studies of all sizes above 0."""
+    by_level = {}
+    for name, size in LEVELS.items():
+        by_level[name] = inserted(space, cases, errors_of_size(size), RESERVE, runs)
+        add_study(result, f"{name} errors", by_level[name])
+    for reserve in RESERVES:
+        made = inserted(space, cases, WEAK, reserve, runs)
+        add_study(result, f"needle that bends 15 % too little, reserve {reserve:g}", made)
+    return {name: made for name, made in by_level.items() if LEVELS[name] > 0.0}
 
 
 def main() -> None:
-    """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("patient", help="folder of a patient, or 'phantom'")
-    parser.add_argument("--targets", type=int, default=10)
-    parser.add_argument("--runs", type=int, default=40, help="insertions per target, mode and level")
-    parser.add_argument("--poses", type=int, default=1000, help="replans to time")
-    parser.add_argument("--system", default="lung-default")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--png", default="closed_loop.png")
-    parser.add_argument("--quick", action="store_true", help="2 targets, 5 insertions, 50 replans")
+    """Run the study and store its result."""
+    parser = study_parser(__doc__)
+    parser.add_argument("--patient", default=default_anatomies()[-1], metavar="NAME")
+    parser.add_argument("--system", metavar="NAME", help="default: lung-default; phantom: flexure-needle")
     options = parser.parse_args()
-    if options.quick:
-        options.targets, options.runs, options.poses = 2, 5, 50
-    if options.patient == "phantom":
-        lung = build_lung(phantom(seed=3, size="small").images)
-    else:
-        lung = la.load_patient(options.patient)
-    system = la.load_system(options.system)
+    n_targets, runs, poses = SIZES[setting_of(options)]
+    result = Result(
+        name="closed_loop", title="Insertion with errors, in open and closed loop",
+        setting=setting_of(options), seeds=[options.seed],
+    )  # fmt: skip
+    lung = anatomy(options.patient)
+    system = la.load_system(options.system or SYSTEMS.get(options.patient, "lung-default"))
     fissures = lung.has_fissures and not system.fissures_allowed
     space = needle_space(lung, system.needle, system.margins, with_fissures=fissures)
-    cases = cases_of(lung, system, space, options.targets, options.seed)
+    cases = cases_of(lung, system, space, n_targets, options.seed)
     if not cases:
-        sys.exit(f"{lung.name}: no target was found that the needle can be planned to with every reserve")
+        raise TargetError(
+            f"{lung.name}: no target was found that the needle can be planned to with every reserve",
+            remedy="Choose another system or patient",
+        )
     lengths = [case.plans[RESERVE].length_mm for case in cases]
-    sys.stdout.write(
-        f"{lung.name}, {system.name}: {len(cases)} targets, plans of {min(lengths):.0f} to "
-        f"{max(lengths):.0f} mm, {options.runs} insertions each; reached: within {TOLERANCE_MM:g} mm\n"
-    )
-    by_level = {
-        name: inserted(space, cases, errors_of_size(size), RESERVE, options.runs)
-        for name, size in LEVELS.items()
+    result.conditions = {
+        "anatomy": f"{lung.name}, system {system.name}",
+        "targets": f"{len(cases)} peripheral ones, plans of {min(lengths):.0f} to {max(lengths):.0f} mm",
+        "insertions": f"{runs} for each target, mode and level; reached: within {TOLERANCE_MM:g} mm",
+        "errors": "full: curvature 8 % constant and 5 % along the way, roll 5 degrees and 10 degrees of "
+        "walk, tracker 0.4 mm and 0.6 degrees, target drift 2 mm and walk 1 mm; an assumption, not measured",
     }
-    table(f"By size of the errors, curvature reserve {RESERVE:g}", by_level.items())
-    by_reserve = {f"{reserve:g}": inserted(space, cases, WEAK, reserve, options.runs) for reserve in RESERVES}
-    table("By curvature reserve, needle that bends 15 % too little", by_reserve.items())
-    times = replan_times_ms(space, cases, options.poses)
-    sys.stdout.write(
-        f"\nReplans of {ITERATIONS} iterations, CPU time from {len(times)} poses: "
-        f"median {np.median(times):.1f} ms, 99 % {np.quantile(times, 0.99):.1f} ms, "
-        f"largest {times.max():.1f} ms, {100.0 * (times < REPLAN_LIMIT_MS).mean():.1f} % within "
-        f"{REPLAN_LIMIT_MS:g} ms\n"
-    )
+    by_level = insert_all(result, space, cases, runs)
+    add_replans(result, replan_times_ms(space, cases, poses, options.seed))
     longest = cases[int(np.argmax(lengths))]
-    runs = min(options.runs, 12)
-    at_case = inserted(space, [longest], errors_of_size(1.0), RESERVE, runs)
-    draw(lung, longest, at_case, by_level, runs, options.png)
+    at_target = inserted(space, [longest], errors_of_size(1.0), RESERVE, min(runs, DRAWN_RUNS))
+    result.figure = draw_insertions(lung, longest.query, longest.plans[RESERVE], at_target, by_level)
+    write_result(result, options.results)
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ def main() -> None:
         conditions={
             "targets": f"{size.per_lung} on each side, 5 to 25 mm from the pleura",
             "time": "wall, without the atlas; as many searches at once as there are workers",
-            "searches": f"{OURS}: up to {size.ours_s:g} s; {PAPERS} on our kernels: up to {size.papers_s:g} s",
+            "searches": f"{OURS} up to {size.ours_s:g} s, {PAPERS} on our kernels up to {size.papers_s:g} s",
         },
         not_reproduced=list(NOT_REPRODUCED),
     )  # fmt: skip

@@ -1,273 +1,238 @@
 """Needle planners on recorded queries, with the recorded results of another planner beside them.
 
-    python experiments/needle_planners.py DATA [--set hard|easy] [--time 1] [--seeds 3] [--decide 10]
-                                          [--recheck 5000] [--out FILE.json] [--quick]
+    python -m experiments.needle_planners [--quick] [--seed 1] [--results FOLDER] [--set hard|easy]
 
-DATA holds `needle/` (queries and results) and `med-rad/PatientN` (masks).  Times are CPU seconds of this
-process without loading.  A length includes the distance left to the target.  Every path is walked again in
-steps of 0.02 mm and measured to every obstacle voxel's centre.
+Where LUNGACCESS_DATA is not set, queries are drawn in the phantom, and nothing is recorded for them.  Times
+are CPU seconds of this process without loading.  A length includes the distance left to the target.  Every
+path is walked again in steps of 0.02 mm and measured to every obstacle voxel's centre.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import os
-import platform
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from importlib.metadata import version
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
-from needle_queries import Judge, Obstacles, Query, easy_queries, hard_queries, load_obstacles
+from matplotlib.figure import Figure
 
-from anatomy.io.files import atomic_write
-from stages.needle import searches
-from stages.needle.decision import Decision
-from stages.needle.planners import PLANNERS, MakeSearch
-from stages.needle.resolution import Resolution, ResolutionSearch
-from stages.needle.searches import RestartingRRT
-from stages.needle.space import NeedleSpace
-
-MARKS_S = (0.01, 0.1, 1.0, 10.0)
-SLICE = 200
-UNIT = Resolution(fine_mm=1.0, fine_rolls=16)
+from anatomy.build import build_lung
+from anatomy.phantom import phantom
+from experiments.needle_queries import (
+    Judge,
+    Obstacles,
+    Query,
+    easy_queries,
+    generated_queries,
+    hard_queries,
+    load_obstacles,
+    obstacles_of,
+)
+from experiments.needle_runs import (
+    MARKS_S,
+    SLICE,
+    Problem,
+    asked,
+    best_valid_mm,
+    decide,
+    recheck,
+    run,
+    solved_by_other,
+)
+from experiments.results import Result, data_folder, require_data, setting_of, study_parser, write_result
+from lungaccess.report import style
+from stages.needle.planners import PLANNERS
 
 NAMES = ("rrt", "optimal", "resolution", "decide")
+COLOURS = (style.SCOPE, style.TUBE, style.NODULE, style.FISSURE)
+QUERY_SETS = {"hard": "96 queries whose direct arc is blocked", "easy": "the poses shipped with the patients"}
+QUICK_EVERY = 8
+GENERATED = 96
+FULL = {"time_s": 1.0, "seeds": 3, "decide_s": 10.0, "recheck": 5000}
+QUICK = {"time_s": 0.1, "seeds": 1, "decide_s": 2.0, "recheck": 100}
+SAME_MM = 1e-3
+
+Rows = list[dict[str, Any]]
 
 
-def asked(query: Query) -> searches.Query:
-    """Return a recorded query as the needle stage takes it."""
-    return searches.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
+def problems(query_set: str, every: int, seed: int) -> Iterator[Problem]:
+    """Make the space of each query, one patient in memory at a time."""
+    if data_folder() is None:
+        images = phantom(seed=3, size="small").images
+        obstacles = obstacles_of(images)
+        for query in generated_queries(obstacles, build_lung(images).tree, GENERATED // every, seed):
+            yield _problem(obstacles, query)
+        return
+    folder, patients = require_data("needle"), require_data("med-rad")
+    queries = hard_queries(folder) if query_set == "hard" else easy_queries(folder, patients)
+    loaded = -1
+    for query in sorted(queries[::every], key=lambda q: q.patient):
+        if query.patient != loaded:
+            loaded, obstacles = query.patient, load_obstacles(patients / f"Patient{query.patient}")
+        yield _problem(obstacles, query)
 
 
-def run(
-    make: MakeSearch, space: NeedleSpace, query: Query, seed: int, time_s: float, judge: Judge
-) -> dict[str, Any]:
-    """Run one planner for some CPU time; return when it had which length, and its paths' faults."""
-    began = time.process_time()
-    search = make(space, asked(query), seed)
-    first: float | None = None
-    history: list[tuple[float, float]] = []
-    faults: list[str] = []
-    paths = 0
-    while not search.finished and (spent := time.process_time() - began) < time_s:
-        if search.advance(SLICE) and search.path is not None:
-            spent = time.process_time() - began
-            first = spent if first is None else first
-            history.append((spent, search.path.length_mm + judge.miss_mm(search.path)))
-            aside = time.process_time()
-            faults += judge.faults(search.path)
-            paths += 1
-            began += time.process_time() - aside
+def _problem(obstacles: Obstacles, query: Query) -> Problem:
+    space = obstacles.space(query)
+    return query, space, Judge(space, query)
+
+
+def run_all_planners(found: Problem, numbers: dict[str, Any], seed: int) -> dict[str, Any]:
+    """Run all planners on one query, and decide it."""
+    query, space, judge = found
+    runs = {
+        name: [
+            run(PLANNERS[name], space, query, each, numbers["time_s"], judge)
+            for each in range(seed, seed + (1 if name == "resolution" else numbers["seeds"]))
+        ]
+        for name in NAMES
+    }
     return {
-        "first_s": first,
-        "length_mm": min((length for _, length in history), default=None),
-        "at": {mark: min((v for t, v in history if t <= mark), default=None) for mark in MARKS_S},
-        "paths": paths,
-        "faults": faults,
+        "query": query,
+        "solved": any(each["first_s"] is not None for of_name in runs.values() for each in of_name),
+        "runs": runs,
+        "decision": decide(space, query, seed, numbers["decide_s"], judge),
     }
 
 
-def decide(space: NeedleSpace, query: Query, seed: int, time_s: float, judge: Judge) -> dict[str, Any]:
-    """Decide a query: a path, a proof that there is none, exhausted at a resolution, or undecided."""
-    began = time.process_time()
-    decision = Decision(space, asked(query), seed=seed)
-    while decision.outcome == "running" and time.process_time() - began < time_s:
-        decision.advance(SLICE)
-    found = {"outcome": decision.outcome, "s": time.process_time() - began, "faults": []}
-    if decision.path is not None:
-        found["faults"] = judge.faults(decision.path)
-    elif decision.outcome != "no path":
-        began = time.process_time()
-        search = ResolutionSearch(space, asked(query), resolution=UNIT)
-        while not search.finished and time.process_time() - began < time_s:
-            search.advance(SLICE)
-        exhausted = search.finished and search.path is None
-        found["outcome"] = "exhausted at resolution" if exhausted else "undecided"
-    return found
-
-
-def best_valid_mm(query: Query) -> float:
-    """Return the length of the other planner's best path that passes a strict check, and its miss."""
-    valid = [
-        run["best_length_mm"] + run["check"]["goal_err_mm"]
-        for run in query.runs
-        if run.get("solved") and run.get("check", {}).get("clearance_valid_strict")
-    ]
-    return min(valid, default=math.inf)
-
-
-def solved_by_other(query: Query) -> bool:
-    """Tell whether any recorded run solved the query."""
-    return any(run.get("solved") for run in query.runs)
-
-
-def recheck(problems: list[tuple[Query, NeedleSpace, Judge]], wanted: int) -> tuple[int, Counter[str]]:
-    """Plan many paths with many seeds; return how many, and the faults found."""
-    count, faults, seed = 0, Counter[str](), 0
-    while count < wanted and problems:
-        seed += 1
-        for query, space, judge in problems:
-            search = RestartingRRT(space, asked(query), seed=seed)
-            for _ in range(3):
-                if search.advance(5000) and search.path is not None:
-                    faults.update(judge.faults(search.path))
-                    count += 1
-            if count >= wanted:
-                break
-        if seed > 20 and count == 0:
-            break
-    return count, faults
-
-
-def problems_of(queries: list[Query], patients: Path) -> Iterator[tuple[Query, NeedleSpace, Judge]]:
-    """Make each query's space, one patient in memory at a time."""
-    obstacles: Obstacles | None = None
-    patient = -1
-    for query in sorted(queries, key=lambda q: q.patient):
-        if obstacles is None or query.patient != patient:
-            patient, obstacles = query.patient, load_obstacles(patients / f"Patient{query.patient}")
-        space = obstacles.space(query)
-        yield query, space, Judge(space, query)
-
-
-def warm_up(space: NeedleSpace, query: Query) -> None:
-    """Compile or load the kernels."""
-    for name in NAMES:
-        PLANNERS[name](space, asked(query), 1).advance(SLICE)
-
-
-def print_summary(results: list[dict[str, Any]], names: list[str], peers: Callable[[float], str]) -> None:
-    """Print the share solved by time, lengths against the other planner's, and verdicts."""
-    for radius in sorted({row["radius_mm"] for row in results}):
-        rows = [row for row in results if row["radius_mm"] == radius]
-        print(f"\nR = {radius:g} mm, {len(rows)} queries; other planner: {peers(radius)}")
-        for name in names:
-            runs = [run for row in rows for run in row["runs"][name]]
-            shares = [
-                100.0 * sum(r["first_s"] is not None and r["first_s"] <= mark for r in runs) / len(runs)
-                for mark in MARKS_S
-            ]
-            first = [1000.0 * r["first_s"] for r in runs if r["first_s"] is not None]
-            table = " / ".join(f"{share:.1f}" for share in shares)
-            print(
-                f"  {name:11s} solved {table} % at {' / '.join(f'{m:g}' for m in MARKS_S)} s; "
-                f"median first path {np.median(first) if first else math.nan:.2f} ms; "
-                f"faults {sum(len(r['faults']) for r in runs)} in {sum(r['paths'] for r in runs)} paths"
-            )
-            compared = [
-                (
-                    min((r["length_mm"] for r in row["runs"][name] if r["length_mm"]), default=math.inf),
-                    row["other_mm"],
-                )
-                for row in rows
-                if row["other_mm"] < math.inf
-            ]
-            if compared:
-                shorter = sum(ours <= other + 1e-3 for ours, other in compared)
-                ratio = [ours / other for ours, other in compared if ours < math.inf]
-                print(
-                    f"  {'':11s} not longer than its best valid path: {shorter} of {len(compared)}; "
-                    f"length ratio median {np.median(ratio):.4f}, largest {max(ratio):.4f}"
-                )
-        verdicts = Counter(row["decision"]["outcome"] for row in rows if row.get("decision"))
-        if verdicts:
-            slowest = max(row["decision"]["s"] for row in rows)
-            print(f"  decided: {dict(verdicts)}; slowest {slowest:.1f} s")
-        missed = [r["query"] for r in rows if r["other_solved"] and not r["solved"]]
-        print(f"  solved by the other planner and not here: {missed or 'none'}")
-
-
-def main() -> int:
-    """Run the study and print it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--set", choices=("hard", "easy"), default="hard")
-    parser.add_argument("--planners", nargs="+", default=list(NAMES), choices=NAMES)
-    parser.add_argument("--time", type=float, default=1.0, help="CPU seconds a run")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--decide", type=float, default=10.0, help="CPU seconds a decision, 0 for none")
-    parser.add_argument("--recheck", type=int, default=5000, help="paths planned only to be checked")
-    parser.add_argument("--patients", type=int, nargs="+", help="only these")
-    parser.add_argument("--out", type=Path, help="write all results as JSON")
-    parser.add_argument("--quick", action="store_true", help="one seed, 0.1 s, a few queries")
-    options = parser.parse_args()
-    if options.quick:
-        options.time, options.seeds, options.decide, options.recheck = 0.1, 1, 2.0, 100
-    folder, patients = options.data / "needle", options.data / "med-rad"
-    queries = hard_queries(folder) if options.set == "hard" else easy_queries(folder, patients)
-    queries = [q for q in queries if not options.patients or q.patient in options.patients]
-    if options.quick:
-        queries = queries[::8]
-    print(
-        f"lungaccess {version('lungaccess')}, Python {platform.python_version()}, {platform.machine()}, "
-        f"{os.cpu_count()} cores, seeds 1 to {options.seeds}, {options.time:g} s a run"
-    )
-    results, solvable = [], []
-    for number, (query, space, judge) in enumerate(problems_of(queries, patients)):
+def run_queries(found: Iterable[Problem], numbers: dict[str, Any], seed: int) -> tuple[Rows, list[Problem]]:
+    """Run all planners on all queries, after kernels are compiled; return the rows, and what was solved."""
+    rows, solvable = [], []
+    for number, problem in enumerate(found):
         if number == 0:
-            warm_up(space, query)
-        runs = {
-            name: [
-                run(PLANNERS[name], space, query, seed, options.time, judge)
-                for seed in range(1, (1 if name == "resolution" else options.seeds) + 1)
-            ]
-            for name in options.planners
-        }
-        row: dict[str, Any] = {
-            "query": query.name,
-            "radius_mm": query.radius_mm,
-            "other_mm": best_valid_mm(query),
-            "other_solved": solved_by_other(query),
-            "solved": any(r["first_s"] is not None for found in runs.values() for r in found),
-            "runs": runs,
-        }
-        if options.decide:
-            row["decision"] = decide(space, query, 1, options.decide, judge)
-        results.append(row)
-        if row["solved"]:
-            solvable.append((query, space, judge))
-        verdict = row.get("decision", {}).get("outcome", "")
-        print(
-            f"{query.name:18s} {'solved' if row['solved'] else '-':7s} {verdict}", file=sys.stderr, flush=True
+            for name in NAMES:
+                PLANNERS[name](problem[1], asked(problem[0]), 1).advance(SLICE)
+        rows.append(run_all_planners(problem, numbers, seed))
+        if rows[-1]["solved"]:
+            solvable.append(problem)
+        print(f"{problem[0].name}: {rows[-1]['decision']['outcome']}", file=sys.stderr, flush=True)
+    return rows, solvable
+
+
+def solved_share(rows: Rows, name: str, mark_s: float) -> float:
+    """Return the share of a planner's runs that had a path after some CPU time, %."""
+    first = [each["first_s"] for row in rows for each in row["runs"][name]]
+    return 100.0 * sum(s is not None and s <= mark_s for s in first) / len(first)
+
+
+def other_share(rows: Rows, mark_s: float) -> float | None:
+    """Return the share that the recorded planner's best kind of run solved after some CPU time, %."""
+    recorded = [row["query"] for row in rows if row["query"].runs]
+    kinds = {each["planner"] for query in recorded for each in query.runs}
+    shares = [
+        sum(
+            any(r["planner"] == kind and (r.get("first_cpu_s") or math.inf) <= mark_s for r in query.runs)
+            for query in recorded
         )
-    print_summary(results, options.planners, lambda radius: other_shares(queries, radius))
-    if options.recheck:
-        count, faults = recheck(solvable, options.recheck)
-        print(f"\n{count} more paths checked again: {dict(faults) or 'no fault'}")
-    if options.out:
-        with atomic_write(options.out) as temporary:
-            Path(temporary).write_text(json.dumps(results, indent=1))
-    return 0
+        / len(recorded)
+        for kind in kinds
+    ]
+    return 100.0 * max(shares) if shares else None
 
 
-def other_shares(queries: list[Query], radius: float) -> str:
-    """Return the shares that the other planner's best kind of run solved by time."""
-    mine = [q for q in queries if q.radius_mm == radius and q.runs]
-    if not mine:
-        return "no runs"
-    kinds = {run["planner"] for q in mine for run in q.runs}
-    out = []
-    for mark in MARKS_S[:3]:
-        share = {
-            kind: sum(
-                any(r["planner"] == kind and (r.get("first_cpu_s") or math.inf) <= mark for r in q.runs)
-                for q in mine
+def add_radius(result: Result, radius: float, rows: Rows, marks_s: list[float]) -> None:
+    """Add the rows of one needle: shares by time, first path, lengths, decisions."""
+    label = f"R = {radius:g} mm"
+    for mark in marks_s:
+        share = other_share(rows, mark)
+        if share is not None:
+            result.add(
+                f"{label}, recorded C++ planner: solved by {mark:g} s", share, unit="%",
+                note=f"{len(rows)} queries, best kind of run at this time",
+            )  # fmt: skip
+    for name in NAMES:
+        for mark in marks_s:
+            result.add(f"{label}, {name}: solved by {mark:g} s", solved_share(rows, name, mark), unit="%")
+        runs = [each for row in rows for each in row["runs"][name]]
+        first = [1e3 * each["first_s"] for each in runs if each["first_s"] is not None]
+        if first:
+            result.add(
+                f"{label}, {name}: first path, median", float(np.median(first)), unit="ms",
+                note=f"{sum(len(r['faults']) for r in runs)} faults in {sum(r['paths'] for r in runs)} paths",
+            )  # fmt: skip
+        _add_lengths(result, f"{label}, {name}", rows, name)
+    verdicts = Counter(row["decision"]["outcome"] for row in rows)
+    result.add(
+        f"{label}: queries decided", 100.0 * (verdicts["path"] + verdicts["no path"]) / len(rows), unit="%",
+        note=", ".join(f"{outcome} {count}" for outcome, count in sorted(verdicts.items()))
+        + f"; slowest {max(row['decision']['s'] for row in rows):.1f} s",
+    )  # fmt: skip
+
+
+def _add_lengths(result: Result, label: str, rows: Rows, name: str) -> None:
+    pairs = []
+    for row in rows:
+        ours = min((r["length_mm"] for r in row["runs"][name] if r["length_mm"]), default=math.inf)
+        pairs.append((ours, best_valid_mm(row["query"])))
+    pairs = [(ours, other) for ours, other in pairs if max(ours, other) < math.inf]
+    if not pairs:
+        return
+    longer = np.array([100.0 * (ours / other - 1.0) for ours, other in pairs])
+    never = sum(ours <= other + SAME_MM for ours, other in pairs)
+    result.add(
+        f"{label}: longer than the recorded planner's best valid path, median", float(np.median(longer)),
+        unit="%", note=f"largest {longer.max():.2f} %; not longer in {never} of {len(pairs)}",
+    )  # fmt: skip
+
+
+def draw(by_radius: dict[float, Rows], longest_s: float) -> Figure:
+    """Draw the share of solved runs over CPU time for each needle."""
+    figure = style.new_figure(10.0, 4.0)
+    times = np.geomspace(1e-4, longest_s, 120)
+    for panel, (axes, (radius, rows)) in enumerate(
+        zip(figure.subplots(1, len(by_radius), sharey=True, squeeze=False)[0], by_radius.items(), strict=True)
+    ):
+        for name, colour in zip(NAMES, COLOURS, strict=True):
+            axes.plot(times, [solved_share(rows, name, t) for t in times], color=colour, label=name)
+        if other_share(rows, longest_s) is not None:
+            axes.plot(
+                times, [other_share(rows, t) for t in times], "--", color=style.INK, label="recorded C++"
             )
-            / len(mine)
-            for kind in kinds
-        }
-        out.append(f"{100.0 * max(share.values()):.1f}")
-    return " / ".join(out) + " % at 0.01 / 0.1 / 1 s"
+        axes.set(xscale="log", xlabel="CPU time, s", ylim=(0.0, 100.0))
+        axes.set_title(f"R = {radius:g} mm, {len(rows)} queries", fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+        if panel == 0:
+            axes.set_ylabel("solved, %")
+            axes.legend(frameon=False, fontsize=9)
+    figure.tight_layout()
+    return figure
+
+
+def main() -> None:
+    """Run the study and store its result."""
+    parser = study_parser(__doc__)
+    parser.add_argument("--set", choices=tuple(QUERY_SETS), default="hard")
+    options = parser.parse_args()
+    numbers, every = (QUICK, QUICK_EVERY) if options.quick else (FULL, 1)
+    drawn = data_folder() is None
+    result = Result(
+        name="needle_planners", title="Needle planners on shared queries", setting=setting_of(options),
+        seeds=list(range(options.seed, options.seed + numbers["seeds"])),
+        conditions={
+            "queries": "drawn in the phantom" if drawn else f"{options.set}: {QUERY_SETS[options.set]}"
+            + (f", every {every}th" if every > 1 else ""),
+            "time": f"{numbers['time_s']:g} CPU s a run, {numbers['decide_s']:g} a decision, one core",
+            "clearance": "1 mm and half a voxel diagonal to every obstacle voxel's centre",
+        },
+    )  # fmt: skip
+    rows, solvable = run_queries(problems(options.set, every, options.seed), numbers, options.seed)
+    by_radius = {
+        radius: [row for row in rows if row["query"].radius_mm == radius]
+        for radius in sorted({row["query"].radius_mm for row in rows})
+    }
+    marks_s = [mark for mark in MARKS_S if mark <= numbers["time_s"]]
+    for radius, of_radius in by_radius.items():
+        add_radius(result, radius, of_radius, marks_s)
+    if not drawn:
+        missed = [r["query"].name for r in rows if solved_by_other(r["query"]) and not r["solved"]]
+        result.add("solved by the recorded planner and not here", float(len(missed)), note=", ".join(missed))
+    count, faults = recheck(solvable, numbers["recheck"])
+    result.add("more paths walked again: faults", float(sum(faults.values())), note=f"{count} paths")
+    result.figure = draw(by_radius, marks_s[-1])
+    write_result(result, options.results)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

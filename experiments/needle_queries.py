@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.fields import CENTRES
 from anatomy.grid import Float, Grid
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.io.med_rad import load_med_rad
+from anatomy.patient import PatientImages
 from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
 from stages.needle.device import Needle
 from stages.needle.path import ArcPath
@@ -32,6 +34,11 @@ GOAL_TOLERANCE_MM = 1.0
 MAX_LENGTH_MM = 150.0
 RECHECK_MM = 0.02
 BORDER_MM = 30.0
+GENERATED_RADII_MM = (50.0, 121.0)
+GENERATED_MM = (20.0, 50.0)
+GENERATED_CONE_RAD = 0.5
+ROOM_VOXELS = 3
+EXEMPT_MM = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,7 +103,11 @@ class Obstacles:
 
 def load_obstacles(folder: Path) -> Obstacles:
     """Read the masks of a Med-RAD patient."""
-    images = load_med_rad(folder)
+    return obstacles_of(load_med_rad(folder))
+
+
+def obstacles_of(images: PatientImages) -> Obstacles:
+    """Label the masks of a patient."""
     labels = np.zeros(images.grid.shape, dtype=np.uint16, order="F")
     labels[images.lumen.array] |= AIRWAY
     labels[images.vessels.array] |= VESSEL
@@ -144,6 +155,48 @@ def easy_queries(folder: Path, patients: Path) -> list[Query]:
             )
         )
     return queries
+
+
+def generated_queries(obstacles: Obstacles, tree: AirwayTree, count: int, seed: int) -> list[Query]:
+    """Draw queries of patient 0: from the ends of airways, to free points ahead; half of each radius.
+
+    Parameters
+    ----------
+    obstacles : Obstacles
+    tree : AirwayTree
+    count, seed : int
+    """
+    rng = np.random.default_rng(seed)
+    ends = [int(tree.branch_points(int(branch))[-1]) for branch in tree.leaf_branches]
+    queries: list[Query] = []
+    while len(queries) < count:
+        point = int(rng.choice(ends))
+        along = tree.tangents[point]
+        aside = np.cross(along, rng.normal(size=3))
+        aside /= np.linalg.norm(aside)
+        angle, far = rng.uniform(0.0, GENERATED_CONE_RAD), rng.uniform(*GENERATED_MM)
+        target = tree.points_lps[point] + far * (np.cos(angle) * along + np.sin(angle) * aside)
+        if not _has_room(obstacles, target):
+            continue
+        start = np.eye(4)
+        start[:3, :3] = np.stack([aside, np.cross(along, aside), along], axis=1)
+        start[:3, 3] = tree.points_lps[point]
+        number = len(queries)
+        queries.append(
+            Query(
+                name=f"generated {number + 1}", patient=0, radius_mm=GENERATED_RADII_MM[number % 2],
+                lps_from_start=start, target_lps=target, exempt_mm=float(tree.radius_mm[point]) + EXEMPT_MM,
+            )
+        )  # fmt: skip
+    return queries
+
+
+def _has_room(obstacles: Obstacles, target: Float) -> bool:
+    low = np.floor(obstacles.grid.ijk(target)).astype(int) - ROOM_VOXELS
+    high = low + 2 * ROOM_VOXELS + 2
+    if (low < 0).any() or (high > obstacles.grid.shape).any():
+        return False
+    return not obstacles.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].any()
 
 
 def _poses(folder: Path) -> tuple[tuple[Float, ...], Float]:

@@ -1,60 +1,86 @@
-"""Scores of the segmentation on a CT rendered from the masks of a patient, so that the truth is known.
-
-    python experiments/segmentation_scores.py PATIENT [--noise 25] [--vessel-hu 40] [--spacing 0.7]
-
-Vessels: F1 at 882 points, 281 in vessels, as in [Rudyanto2014]; of the others half lie within 3 mm of a
-vessel, an airway's wall or a fissure.  Readers mark points they are sure of, so no point outside lies in a
-voxel that touches a vessel; the score over all voxels is given beside it.  Airways: share of the tree's
-length and branches found, and share of the found volume that lies more than a voxel outside the true lumen.
-Lungs: Dice.  Vesselness alone against ObjectnessMeasure of SimpleITK over the same scales: time side by side,
-and area under the curve.
-"""
+"""Scores of a segmentation on a CT rendered from masks, so that the truth about every voxel is known."""
 
 from __future__ import annotations
 
-import argparse
-import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import edt
 import numpy as np
-import SimpleITK
 from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Grid, Volume
-from anatomy.io import load_patient
-from anatomy.segmentation.airway import Airways, segment_airway
-from anatomy.segmentation.lungs import segment_lungs
-from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
-from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, vesselness
-from anatomy.segmentation.vessels import Vessels, segment_vessels
-from anatomy.synthetic_ct import CtLook, SyntheticCt, render_ct
-from anatomy.tree import tree_from_mask
+from anatomy.grid import Grid
+from anatomy.segmentation.airway import Airways
+from anatomy.synthetic_ct import SyntheticCt
 
 Mask = NDArray[np.bool_]
-Rng = np.random.Generator
+Index = NDArray[np.int64]
+Values = NDArray[np.float32]
 
 POINTS, VESSEL_POINTS, NEAR_MM = 882, 281, 3.0
+"""As many as in VESSEL12's three scans [Rudyanto2014]; half of the others lie so near to what confuses."""
 THRESHOLDS = np.linspace(0.02, 0.98, 97)
-RADII_MM = (0.0, 0.75, 1.0, 1.5, 2.0, 2.83, 4.0, 20.0)
+RADII_MM = (0.0, 0.75, 1.0, 1.5, 2.0, 2.83, 4.0)
+"""Lower ends of the classes of vessels."""
 BRANCH_FOUND = 0.5
 AUC_SAMPLES = 200_000
 
 
-def distance_mm(mask: Mask, grid: Grid) -> NDArray[np.float32]:
+@dataclass(frozen=True, kw_only=True)
+class F1:
+    """Mean F1 of several draws of points: at the best threshold of each, and at the fixed one."""
+
+    best: float
+    best_threshold: float
+    fixed: float
+    fixed_deviation: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointGroups:
+    """Where points are drawn, as flat indices of the images' memory order.
+
+    `vessel` lie in vessels, `near` within 3 mm of a vessel, an airway's wall or a fissure, `far` elsewhere in
+    the lung.
+    """
+
+    vessel: Index
+    near: Index
+    far: Index
+
+    def draws(
+        self, values: Values, count: int, vessel: Index | None = None
+    ) -> Iterator[tuple[Values, Values]]:
+        """Yield the values at 281 points in `vessel` and at 601 others, `count` times; always the same."""
+        rng, n_near = np.random.default_rng(0), (POINTS - VESSEL_POINTS) // 2
+        groups = (self.vessel if vessel is None else vessel, self.near, self.far)
+        for _ in range(count):
+            parts = [
+                values[rng.choice(group, min(size, group.size), replace=False)]
+                for group, size in zip(
+                    groups, (VESSEL_POINTS, n_near, POINTS - VESSEL_POINTS - n_near), strict=True
+                )
+            ]
+            yield parts[0], np.concatenate(parts[1:])
+
+
+def distance_mm(mask: Mask, grid: Grid) -> Values:
     """Return the distance from each voxel to the nearest of `mask`."""
     sides = tuple(grid.spacing_mm)
     return np.asarray(edt.edt(np.array(~mask, order="F"), anisotropy=sides, order="F", parallel=2))
 
 
-def point_scores(
-    truth: SyntheticCt, score: NDArray[np.float32], fixed: float, draws: int, *, sure: bool
-) -> str:
-    """Return the mean F1 of `draws` sets of points, at the best threshold of each and at the fixed one."""
+def point_groups(truth: SyntheticCt, *, sure: bool) -> PointGroups:
+    """Return where points are drawn.
+
+    Parameters
+    ----------
+    truth : SyntheticCt
+    sure : bool
+        Whether points outside vessels keep off the voxels that touch one.  Those are partly vessel, and
+        readers mark points they are sure of.
+    """
     grid = truth.ct.grid
     tissue = truth.lung & ~truth.lumen
     other = tissue & ~truth.vessels
@@ -63,51 +89,72 @@ def point_scores(
         touching = distance_mm(truth.vessels, grid) < 2.0 * grid.spacing_mm.min() - 1e-3
         near, other = near & ~touching, other & ~touching
     groups = [np.flatnonzero(m.ravel(order="K")) for m in (tissue & truth.vessels, near, other & ~near)]
-    values = score.ravel(order="K")
-    n_near = (POINTS - VESSEL_POINTS) // 2
-    sizes = (VESSEL_POINTS, n_near, POINTS - VESSEL_POINTS - n_near)
+    return PointGroups(vessel=groups[0], near=groups[1], far=groups[2])
+
+
+def point_scores(
+    groups: PointGroups, score: Values, fixed: float, draws: int, vessel: Index | None = None
+) -> F1:
+    """Return F1 at `draws` sets of points; `vessel` are those to draw vessel points from, if not all."""
     best, at, held = [], [], []
-    rng = np.random.default_rng(0)
-    for _ in range(draws):
-        inside, *outside = [
-            values[rng.choice(g, n, replace=False)] for g, n in zip(groups, sizes, strict=True)
-        ]
-        curve = [f1(inside, np.concatenate(outside), t) for t in THRESHOLDS]
+    for inside, outside in groups.draws(score.ravel(order="K"), draws, vessel):
+        curve = [f1(inside, outside, t) for t in THRESHOLDS]
         best.append(max(curve))
         at.append(THRESHOLDS[int(np.argmax(curve))])
-        held.append(f1(inside, np.concatenate(outside), fixed))
-    return (
-        f"best {np.mean(best):.4f} (sd {np.std(best):.4f}, at {np.mean(at):.2f}), "
-        f"fixed {fixed:g}: {np.mean(held):.4f} (sd {np.std(held):.4f})"
+        held.append(f1(inside, outside, fixed))
+    return F1(
+        best=float(np.mean(best)),
+        best_threshold=float(np.mean(at)),
+        fixed=float(np.mean(held)),
+        fixed_deviation=float(np.std(held)),
     )
 
 
-def f1(inside: NDArray[np.float32], outside: NDArray[np.float32], threshold: float) -> float:
-    """Return 2 TP / (2 TP + FP + FN)."""
-    hits, wrong = float((inside >= threshold).sum()), float((outside >= threshold).sum())
+def f1(inside: Values, outside: Values, threshold: float) -> float:
+    """Return 2 TP / (2 TP + FP + FN), with the points outside weighted to be 601 for 281 inside."""
+    weight = (POINTS - VESSEL_POINTS) / VESSEL_POINTS * inside.size / outside.size
+    hits, wrong = float((inside >= threshold).sum()), weight * float((outside >= threshold).sum())
     return 2.0 * hits / max(hits + wrong + inside.size, 1.0)
 
 
-def recall_by_radius(truth: SyntheticCt, vessels: Vessels) -> list[str]:
-    """Return the share of vessel voxels found, by their depth in the vessel."""
+def vessels_by_radius(truth: SyntheticCt, groups: PointGroups) -> dict[str, Index]:
+    """Return the voxels of vessels by radius: that of the largest ball in it within a voxel of them."""
     grid = truth.ct.grid
-    depth = np.where(truth.vessels, distance_mm(~truth.vessels, grid), np.float32(0.0))
-    inside = truth.vessels & truth.lung & ~truth.lumen & ~truth.wall
-    lines = []
-    for low, high in zip(RADII_MM, RADII_MM[1:], strict=False):
-        core = (
-            (depth - 0.5 * grid.spacing_mm.min() >= low)
-            & (depth - 0.5 * grid.spacing_mm.min() < high)
-            & inside
-        )
-        n = max(int(core.sum()), 1)
-        found, large = (vessels.mask & core).sum() / n, (vessels.large & core).sum() / n
-        lines.append(f"depth {low:g} to {high:g} mm: {n} voxels, found {found:.3f}, large {large:.3f}")
-    return lines
+    sides = tuple(grid.spacing_mm)
+    inside = np.array(truth.vessels, order="F")
+    voxel_mm = float(grid.spacing_mm.min())
+    depth = edt.edt(inside, anisotropy=sides, order="F", parallel=2) - 0.5 * voxel_mm
+    radius = np.zeros(grid.shape, dtype=np.uint8, order="F")
+    for low in RADII_MM[1:]:
+        core = depth >= low
+        if core.any():
+            radius += inside & (distance_mm(core, grid) <= low + voxel_mm)
+    of_vessel = radius.ravel(order="K")[groups.vessel]
+    ends = (*RADII_MM[1:], np.inf)
+    names = [
+        f"{low:g} to {high:g} mm" if high < np.inf else f"over {low:g} mm"
+        for low, high in zip(RADII_MM, ends, strict=True)
+    ]
+    return {name: groups.vessel[of_vessel == n] for n, name in enumerate(names)}
 
 
-def airway_scores(truth: SyntheticCt, tree: AirwayTree, airways: Airways) -> str:
-    """Return share of length and of branches found, and the share of the lumen found that is none."""
+def share_of(mask: Mask, at: Index) -> float:
+    """Return the share of voxels, given by flat indices in memory order, that a mask holds."""
+    return float(mask.ravel(order="K")[at].mean())
+
+
+@dataclass(frozen=True, kw_only=True)
+class AirwayScores:
+    """Shares of the tree's length and branches found, and of the lumen found that is none."""
+
+    length: float
+    length_from_half_mm: float
+    branches: float
+    leakage: float
+
+
+def airway_scores(truth: SyntheticCt, tree: AirwayTree, airways: Airways) -> AirwayScores:
+    """Return how much of a tree was found, within a voxel, and how much lies more than a voxel outside."""
     grid = truth.ct.grid
     found = distance_mm(airways.lumen, grid) <= grid.spacing_mm.max() + 1e-3
     ijk = np.clip(np.rint(grid.ijk(tree.points_lps)).astype(np.int64), 0, np.array(grid.shape) - 1)
@@ -118,112 +165,32 @@ def airway_scores(truth: SyntheticCt, tree: AirwayTree, airways: Airways) -> str
     lengths = np.bincount(tree.branch_of_point, weights=step, minlength=n_branches)
     hits = np.bincount(tree.branch_of_point, weights=step * hit, minlength=n_branches)
     counted = lengths > 0.0
-    branches = (hits[counted] >= BRANCH_FOUND * lengths[counted]).mean()
     around = distance_mm(truth.lumen, grid) <= grid.spacing_mm.max() + 1e-3
-    leak = (airways.lumen & ~around).sum() / max(int(airways.lumen.sum()), 1)
-    share = hits.sum() / lengths.sum()
-    return f"length {share:.4f}, branches {branches:.4f} of {counted.sum()}, leakage {leak:.4f}"
+    wide = step * (tree.radius_mm >= 0.5)
+    return AirwayScores(
+        length=float(hits.sum() / lengths.sum()),
+        length_from_half_mm=float((wide * hit).sum() / wide.sum()),
+        branches=float((hits[counted] >= BRANCH_FOUND * lengths[counted]).mean()),
+        leakage=float((airways.lumen & ~around).sum() / max(int(airways.lumen.sum()), 1)),
+    )
 
 
-def objectness(ct: Volume, lung: Mask) -> Callable[[], NDArray[np.float32]]:
-    """Return SimpleITK's vesselness over the same scales and box, ready to be called; `(2, nk, nj, ni)`.
-
-    First the greatest response of the scales that apply at a voxel [Fu2018, eq. 4], then that of all.
-    """
-    space = ScaleSpace.of(ct.array, lung, ct.grid.spacing_mm)
-    image = SimpleITK.GetImageFromArray(space.hu.astype(np.float32))
-    image.SetSpacing([float(s) for s in ct.grid.spacing_mm])
-
-    def run() -> NDArray[np.float32]:
-        best = np.zeros((2, *space.hu.shape), dtype=np.float32)
-        for scale, sigma in enumerate(SIGMAS_MM):
-            smooth = SimpleITK.SmoothingRecursiveGaussian(image, sigma)
-            # ITK's Hessian is not normalised: C_HU / sigma^2 is the same strength.
-            response = SimpleITK.ObjectnessMeasure(smooth, ALPHA, BETA, C_HU / sigma**2, False, 1, True)
-            view = SimpleITK.GetArrayViewFromImage(response)
-            np.maximum(best[0], view, out=best[0], where=space.n_scales > scale)
-            np.maximum(best[1], view, out=best[1])
-        return best
-
-    return run
+def dice(first: Mask, second: Mask) -> float:
+    """Return twice what two masks share over what they hold."""
+    return float(2.0 * (first & second).sum() / (first.sum() + second.sum()))
 
 
-def auc(inside: NDArray[np.float32], outside: NDArray[np.float32]) -> float:
+def auc(inside: Values, outside: Values) -> float:
     """Return how often a value inside exceeds one outside; ties count half."""
     order = np.sort(outside)
     below, upto = np.searchsorted(order, inside, "left"), np.searchsorted(order, inside, "right")
     return float((below + upto).mean() / 2.0 / order.size)
 
 
-def timed(work: Callable[[], Any]) -> tuple[Any, float, float]:
-    """Return the result, wall seconds and processor seconds."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    result = work()
-    return result, time.perf_counter() - wall, time.process_time() - cpu
-
-
-def compare_with_simpleitk(truth: SyntheticCt, repeats: int) -> None:
-    """Print time and area under the curve of both, run in turns."""
-    ct, lung = truth.ct, truth.lung
-    theirs = objectness(ct, lung)
-    vesselness(ct.array, lung, ct.grid.spacing_mm)
-    rows = [
-        (timed(lambda: vesselness(ct.array, lung, ct.grid.spacing_mm)), timed(theirs)) for _ in range(repeats)
-    ]
-    ours = [r[0] for r in rows]
-    other = [r[1] for r in rows]
-    space = ScaleSpace.of(ct.array, lung, ct.grid.spacing_mm)
+def sampled_voxels(truth: SyntheticCt) -> tuple[Index, Index]:
+    """Return 200,000 voxels of vessels and as many of the other tissue, `(N, 3)` each."""
     rng = np.random.default_rng(0)
     tissue = truth.lung & ~truth.lumen
     groups = [np.argwhere(m) for m in (tissue & truth.vessels, tissue & ~truth.vessels)]
-    groups = [g[rng.choice(len(g), min(AUC_SAMPLES, len(g)), replace=False)] for g in groups]
-    start = [s.start for s in space.box]
-    a = auc(*[ours[0][0][tuple(g.T)] for g in groups])
-    b, everywhere = (auc(*[found[tuple((g - start).T[::-1])] for g in groups]) for found in other[0][0])
-    fastest = [[min(o[n] for o in rows) for n in (1, 2)] for rows in (ours, other)]
-    for name, (wall, cpu), area in zip(("ours", "SimpleITK"), fastest, (a, b), strict=True):
-        print(f"vesselness of {name}: {wall:.2f} s wall, {cpu:.2f} s processor, AUC {area:.4f}")
-    wall, cpu = (fastest[1][n] / fastest[0][n] for n in (0, 1))
-    print(f"  ours is {wall:.1f} times faster by wall, {cpu:.1f} by processor, best of {repeats}")
-    print(f"  SimpleITK with all scales everywhere: AUC {everywhere:.4f}")
-
-
-def main(arguments: list[str]) -> None:
-    """Render, segment and score."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("patient", type=Path)
-    parser.add_argument("--noise", type=float, default=25.0, help="standard deviation in HU")
-    parser.add_argument("--vessel-hu", type=float, default=40.0)
-    parser.add_argument("--spacing", type=float, default=0.7, help="mm")
-    parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--repeats", type=int, default=3, help="of the timing; 0 leaves it out")
-    given = parser.parse_args(arguments)
-    images = load_patient(given.patient)
-    truth = render_ct(
-        images, CtLook(noise_hu=given.noise, vessel_hu=given.vessel_hu, spacing_mm=given.spacing)
-    )
-    print(
-        f"{images.name}: {truth.ct.grid.describe()}, noise {given.noise:g} HU, vessels {given.vessel_hu:g} HU"
-    )
-    tree = tree_from_mask(images.lumen)
-    del images
-    lungs, wall, cpu = timed(lambda: segment_lungs(truth.ct))
-    both = lungs.left | lungs.right
-    dice = 2.0 * (both & truth.lung).sum() / (both.sum() + truth.lung.sum())
-    print(f"lungs: Dice {dice:.4f}; {wall:.1f} s wall, {cpu:.1f} s processor")
-    airways, wall, cpu = timed(lambda: segment_airway(truth.ct, lungs))
-    print(f"airways: {airway_scores(truth, tree, airways)}; {wall:.1f} s wall, {cpu:.1f} s processor")
-    vessels, wall, cpu = timed(lambda: segment_vessels(truth.ct, both, airways))
-    print(f"vessels: {wall:.1f} s wall, {cpu:.1f} s processor")
-    for sure, name in ((True, "points off the border"), (False, "all points")):
-        scores = point_scores(truth, vessels.vesselness, vessels.threshold, given.draws, sure=sure)
-        print(f"  F1 at {name}: {scores}")
-    print("\n".join(f"  {line}" for line in recall_by_radius(truth, vessels)))
-    if given.repeats:
-        compare_with_simpleitk(truth, given.repeats)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+    inside, outside = (g[rng.choice(len(g), min(AUC_SAMPLES, len(g)), replace=False)] for g in groups)
+    return inside, outside

@@ -32,7 +32,8 @@ NOISE_PERCENTILE = 97.0
 LEAST_DEPTH_HU = 20.0
 SAMPLE_STEP = 7
 """Every so many voxels of the lung are looked at to learn its noise."""
-GREATEST_HU = 3071
+GREATEST_HU = 16_383
+"""More, which metal may have, is cut off."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,10 +132,10 @@ def _box(mask: Mask, spacing_mm: Float) -> tuple[slice, slice, slice]:
 
 
 def _hounsfield(values: NDArray[np.generic]) -> Int16:
-    """Return the transposed values as int16, C-contiguous."""
+    """Return the transposed values as int16, C-contiguous: between any two lies less than 2^15."""
     if values.dtype != np.int16:
-        values = np.rint(np.clip(values.astype(np.float32), -1024, GREATEST_HU))
-    return np.ascontiguousarray(values.T, dtype=np.int16)
+        values = np.rint(values.astype(np.float32))
+    return np.ascontiguousarray(np.clip(values, -GREATEST_HU, GREATEST_HU).T, dtype=np.int16)
 
 
 def _smoothed(hu: Int16, spacing_mm: Float) -> Int16:

@@ -42,10 +42,8 @@ WALL_DIFFERENCE_HU = 10.0
 WALL_MM = 2.0
 """The wall reaches no farther than this beyond its first layer."""
 
-ROOM_FACTOR = 128
-"""Edge and wall have at most so many voxels for one that was grown."""
-
 _MARGIN = 3
+"""Border of the padded arrays: nothing grows into it, and no kernel looks farther than this from a voxel."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,9 +139,11 @@ def _edge_and_wall(
     """Bring the lumen in `state` to its edge and put the wall around it; all arrays padded and flat."""
     near, faces = kernel.box_offsets(shape, 1), kernel.face_offsets(shape)
     count = len(grown)
-    lumen = np.zeros(min(state.size, ROOM_FACTOR * count), dtype=np.int64)
+    # A voxel joins a list once, when its state changes: no list can be longer than the image.  Memory that
+    # is not written to is not taken.
+    lumen = np.zeros(state.size, dtype=np.int64)
     lumen[:count] = grown
-    core_hu = np.zeros(len(lumen), dtype=np.int16)
+    core_hu = np.zeros(state.size, dtype=np.int16)
     lumen_edge.darkest_beside(smooth, state, near, lumen, count, core_hu)
     for _ in range(max(round(EDGE_MM / float(ground.spacing_mm.mean())), 1)):
         count = lumen_edge.refine_edge(
@@ -151,7 +151,7 @@ def _edge_and_wall(
         )
     count = lumen_edge.join_corners(hu, state, shape, lumen, count)
     layers = int(np.ceil(WALL_MM / ground.spacing_mm.mean()))
-    wall = np.zeros(min(state.size, ROOM_FACTOR * count), dtype=np.int64)
+    wall = np.zeros(state.size, dtype=np.int64)
     lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, WALL_LEAST_HU, WALL_DIFFERENCE_HU, wall)
 
 

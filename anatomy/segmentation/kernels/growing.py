@@ -1,7 +1,8 @@
 """Growth of the airway from what is known of it, level by level; leaks are undone piece by piece.
 
-Volumes are `(nk, nj, ni)`, C-contiguous, with a border of `margin` voxels in which nothing can grow;
-voxels are named by their flat index.  `state` is uint8: FREE, LUMEN, BANNED, or the mark of a level.
+Volumes are `(nk, nj, ni)`, C-contiguous, and voxels are named by their flat index, int64.  Around the image
+lies a border, of two voxels or more, of depth 0: nothing grows there, and only neighbours of voxels that grew
+or might are looked at.  `state` is uint8: FREE, LUMEN, BANNED, or the mark of a level.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ BANNED = np.uint8(2)
 IN_LAYER = np.uint8(3)
 IN_SECTION = np.uint8(4)
 FIRST_MARK = 5
-"""Marks of level `n`: `FIRST_MARK + 2 n` for what may become lumen, one more for what may not."""
+"""Marks of level `n`: `FIRST_MARK + 2 n` for what may become lumen, one more for what may not.
+
+There is room for 125 levels in uint8.
+"""
 SETTLED_LAYERS = 3
 """The front of a piece is compared with the widest of its first layers."""
 DARK_SHARE = 0.1
@@ -66,7 +70,8 @@ def touches_lumen(state, near, at):
 def flood(depth, state, near, start, level, mark, front_factor, front_slack, queue, parent, layer_ends):
     """Grow one piece at a level from a voxel beside the lumen.
 
-    Returns its size, the number of its layers and whether it burst.
+    Returns its size, the number of its layers and whether it burst.  The size is at most `len(parent)`, and
+    there are no more layers than voxels: room in `queue`, `parent` and `layer_ends` for as many is enough.
 
     Behind its first layer a piece keeps one voxel away from the lumen, so that the skin of the airway
     does not join all its branches.  It bursts if it meets one that did, if its front grows beyond
@@ -119,7 +124,7 @@ def ban_pockets(hu, state, near, size, mark, wide, rim, dark_hu, queue, parent, 
     The piece lies in `queue` layer by layer; a cross-section is what hangs together of a layer.  One of
     `wide` voxels or more is lung between vessels, not an airway, if its darkest voxel is above `dark_hu`
     and little that is darker lies behind it; so are the voxels of the piece within `rim` steps of a banned
-    one.
+    one.  Sections and rims are listed in `queue` behind the piece, each voxel once: it holds `2 size`.
     A piece of which that is a large share is banned altogether.  Returns the number of voxels banned.
     """
     for q in range(size):
@@ -219,18 +224,27 @@ def grow_airway(
     ----------
     depth, hu, state : flat int16, int16, uint8
         `state` holds LUMEN where growth starts, and is changed.
+    shape : (3,) int64
+        nk, nj, ni, with the border.
     lumen : (R,) int64
         Its first `count` entries list the lumen; the others are filled in.  Growth ends where it is full.
     levels : (L,) int64
-        Falling; a voxel can join at a level if it is at least this deep.
+        Falling and positive, at most 125; a voxel can join at a level if it is at least this deep.
     least_layers : int
         Pieces of fewer layers are roughness of the wall.
-    reach : int
-        Half the side of the smallest box that counts as wide, voxels.
+    front_factor, front_slack : float
+        A piece bursts whose front is larger than the widest of its first layers by this factor and by so
+        many voxels more.
+    wide : float
+        Cross-sections of so many voxels or more are dark inside if they are an airway's.
+    rim : int
+        What lies within so many steps of one that is not dark is banned with it.
+    dark_hu : float
+        Below it is air, above it the tissue of the lung.
     skin_share : float
         Beside a voxel that joins, others join down to this share of its depth.
     queue, parent, behind, layer_ends : (2 R,), (R,), (2, R), (R,) int64
-        Room to work in.
+        Room to work in; a piece has at most R voxels.
 
     Returns
     -------

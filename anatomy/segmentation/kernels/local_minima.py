@@ -73,7 +73,9 @@ def reconstruct_slice(marker, mask, queue, waiting):
 
     `marker >= mask` everywhere.  The result is the limit of `max(erode(marker), mask)`.  One scan each
     way and a queue of what still changes [Vincent1993]; `queue` is `(rows * columns + 1,)` int32 and
-    `waiting` `(rows, columns)` bool, false, and false again afterwards.
+    `waiting` `(rows, columns)` bool, false, and false again afterwards.  No pixel waits twice, so the ring
+    of the queue, one longer than there are pixels, cannot run into its own head.  A slice has less than
+    2^31 pixels.
     """
     rows, columns = mask.shape
     for r in range(rows):

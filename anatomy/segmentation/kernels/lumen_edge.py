@@ -1,7 +1,9 @@
 """The edge of the airway lumen: refined towards the wall, made connected by faces, and the wall around it.
 
-Volumes are `(nk, nj, ni)`, C-contiguous, with a border of at least one voxel; voxels are named by their
-flat index.  Lists of voxels are filled up to the returned count.
+Volumes are `(nk, nj, ni)`, C-contiguous, and voxels are named by their flat index.  Around the image lies a
+border of three voxels of -1024 HU, in which there is no lumen: a voxel beside the lumen may lie in its first
+layer, and the closing there looks two farther.  Lists of voxels are filled up to the returned count.  A voxel
+is listed once, when its state changes, so a list as long as the image has room for all.
 """
 
 from __future__ import annotations
@@ -57,11 +59,30 @@ def darkest_beside(hu, state, near, lumen, count, core_hu):
 
 @numba.njit(cache=True)
 def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
-    """Add the voxels beside the lumen that are faceser to its HU than to those of the closing around them.
+    """Add the voxels beside the lumen that are nearer to its HU than to those of the closing around them.
 
     A voxel joins if the closing with painted lumen lies at least `least_depth` above it, and farther above
     it than it lies above the core of the lumen beside it, `core_hu`, which it then shares.  All voxels are
-    judged before the first one joins.
+    judged before the first one joins.  None of the border does if `least_depth` is positive: there the
+    closing is not above -1024 HU.
+
+    Parameters
+    ----------
+    hu, state : (V,) int16, uint8
+        `state` is 0 or LUMEN.
+    faces : (6,) int64
+        Flat steps to the neighbours that share a face.
+    row : int
+        Flat step from one row of a slice to the next.
+    least_depth : int
+        HU.
+    lumen, core_hu : (V,) int64, int16
+        Their first `count` entries list the lumen and the HU of its core; what joins follows.
+
+    Returns
+    -------
+    int
+        The new count.
     """
     known = count
     for s in range(known):
@@ -84,7 +105,8 @@ def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
 def join_corners(hu, state, shape, lumen, count):
     """Add the darkest voxels between voxels of the lumen that touch by an edge or corner alone.
 
-    Two voxels that differ by one along two or three axes get a way of faces between them.
+    Two voxels that differ by one along two or three axes get a way of faces between them, which lies in the
+    box of the two and so not in the border.  `lumen` is `(V,)` int64.  Returns the new count.
     """
     steps = np.zeros(3, dtype=np.int64)
     known = count
@@ -138,7 +160,8 @@ def grow_wall(hu, state, near, lumen, count, layers, least_hu, greatest_differen
     """Mark the wall: all neighbours of the lumen, then layers of voxels like those already in it.
 
     A voxel joins a further layer if it is above `least_hu` and differs from every neighbour in the wall so
-    far by less than `greatest_difference`.  Returns the number of voxels listed in `wall`.
+    far by less than `greatest_difference`.  Only the first layer reaches into the border, which is below
+    `least_hu`.  Returns the number of voxels listed in `wall`, `(V,)` int64.
     """
     size = 0
     for s in range(count):

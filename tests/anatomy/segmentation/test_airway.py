@@ -314,8 +314,9 @@ def test_phantom_airways_of_more_than_three_voxels_are_found(patient: Phantom, f
     near = ndimage.binary_dilation(found.lumen, FACES)[tuple(at[inside].T)]
     radius = lines.radius_mm[inside]
     assert (radius >= 1.25).sum() > 500
-    assert near[radius >= 1.25].mean() > 0.99
-    assert near.mean() > 0.7
+    assert near[radius >= 1.25].all()
+    assert near[radius >= 1.1].mean() > 0.94
+    assert near.mean() > 0.75
 
 
 def test_phantom_leakage(patient: Phantom, found: Airways) -> None:

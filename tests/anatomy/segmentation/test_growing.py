@@ -1,0 +1,61 @@
+"""The wall of the airway: many voxels of it for one of the lumen, and the end of the image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from anatomy.segmentation.growing import AIR_HU, WALL_MM, Ground, Grown, grow
+
+OLD_ROOM = 128
+"""So many voxels for one of the lumen once seemed enough."""
+TISSUE_HU = 0
+
+
+def ground(shape: tuple[int, int, int], spacing_mm: float, hu: int, hole: tuple[int, int, int]) -> Ground:
+    """Return a block of one HU with one voxel of air, and no minima to grow in."""
+    image = np.full(shape, hu, dtype=np.int16)
+    image[hole] = AIR_HU
+    return Ground(
+        hu=image,
+        smooth=image.copy(),
+        depth=np.zeros(shape, dtype=np.int16),
+        spacing_mm=np.full(3, spacing_mm),
+        dark_hu=-900.0,
+        least_depth=20.0,
+    )
+
+
+def grown_from(ground: Ground, hole: tuple[int, int, int]) -> Grown:
+    start = np.zeros(ground.hu.shape, dtype=np.bool_)
+    start[hole] = True
+    return grow(ground, start)
+
+
+def box(shape: tuple[int, int, int], middle: tuple[int, int, int], reach: int) -> NDArray[np.bool_]:
+    """Return the voxels within `reach` steps of one, without it."""
+    inside = np.zeros(shape, dtype=np.bool_)
+    inside[tuple(slice(max(m - reach, 0), m + reach + 1) for m in middle)] = True
+    inside[middle] = False
+    return inside
+
+
+@pytest.mark.parametrize("spacing_mm", [0.25, 0.4])
+def test_all_of_a_thick_wall_has_room(spacing_mm: float) -> None:
+    shape, middle = (41, 43, 45), (20, 21, 22)
+    grown = grown_from(ground(shape, spacing_mm, TISSUE_HU, middle), middle)
+    wall = box(shape, middle, 1 + int(np.ceil(WALL_MM / spacing_mm)))
+    assert wall.sum() > 2 * OLD_ROOM
+    assert grown.lumen.sum() == 1
+    np.testing.assert_array_equal(grown.wall, wall)
+
+
+@pytest.mark.parametrize("corner", [(0, 0, 0), (0, 24, 0), (22, 0, 26), (22, 24, 26)])
+def test_the_end_of_the_image_is_the_end_of_the_wall(corner: tuple[int, int, int]) -> None:
+    shape = (23, 25, 27)
+    grown = grown_from(ground(shape, 0.5, TISSUE_HU, corner), corner)
+    assert grown.lumen.sum() == 1
+    assert grown.wall[box(shape, corner, 1)].all()
+    assert box(shape, corner, 3).sum() <= grown.wall.sum()
+    assert not (grown.wall & ~box(shape, corner, 5)).any()

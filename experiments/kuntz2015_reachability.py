@@ -115,16 +115,21 @@ def add_case(result: Result, label: str, times: Float, refused: int, limit_s: fl
 
 def draw(found: Times, limit_s: float) -> Figure:
     """Draw the share solved over planning time, with the paper's three points."""
-    figure = style.new_figure(7.5, 4.2)
+    figure = style.new_figure(7.5, 5.2)
     axes = figure.subplots()
     grid = np.geomspace(0.005, limit_s, 300)
+    cases = list(dict.fromkeys(case for case, _planner in found))
     for (case, planner), (times, _refused) in found.items():
         share = [100.0 * float((times <= at).mean()) for at in grid]
-        axes.plot(grid, share, "-" if planner == OURS else ":", linewidth=1.2, label=f"{case}, {planner}")
+        axes.plot(
+            grid, share, "-" if planner == OURS else ":", color=f"C{cases.index(case)}", linewidth=1.4,
+            label=f"{case}, {planner}",
+        )  # fmt: skip
     paper = {at: share for at, share in PAPER_SHARES.items() if at <= limit_s}
     axes.plot(list(paper), list(paper.values()), "o", color=style.INK, label="paper, its own lung")
     axes.set(xscale="log", xlabel="planning time (s)", ylabel="targets with a plan (%)", ylim=(0, 100))
-    axes.legend(frameon=False, fontsize=6, loc="lower right")
+    figure.legend(*axes.get_legend_handles_labels(), frameon=False, fontsize=6, loc="lower center", ncols=2)
+    figure.subplots_adjust(bottom=0.16 + 0.012 * len(found), top=0.97)
     return figure
 
 

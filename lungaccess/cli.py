@@ -27,6 +27,7 @@ from lungaccess.commands_report import report
 from lungaccess.commands_risk import risk
 from lungaccess.commands_route import route
 from lungaccess.commands_segment import segment
+from lungaccess.commands_study import study
 from lungaccess.commands_tour import tour
 from lungaccess.commands_tubes import tubes
 from lungaccess.inputs import load_device, load_lung, require_one_target
@@ -89,6 +90,7 @@ app.command(tubes)
 app.command(risk)
 app.command(reach)
 app.command(segment)
+app.command(study)
 app.command(report)
 app.command(export)
 app.command(doctor)

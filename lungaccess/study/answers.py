@@ -1,0 +1,103 @@
+"""What a run ended with, as plain values that go from workers to the results file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+PLAN, PATH, NO_PLAN = "plan", "path", "no plan"
+"""Outcomes of runs; another one is the class of the error that ended the run."""
+
+STATUS = (
+    "Unknown status", "Invalid start", "Invalid goal", "Unrecognized goal type", "Timeout",
+    "Approximate solution", "Exact solution", "Crash",
+)  # fmt: skip
+"""OMPL's words for the end of a run, by number."""
+UNKNOWN, INVALID_GOAL, TIMEOUT, EXACT, CRASH = 0, 2, 4, 6, 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Improvement:
+    """A plan that is better than those before.
+
+    Parameters
+    ----------
+    time_s : float
+        Planning time.
+    iteration : int
+    cost : float
+        Under the run's objective.
+    """
+
+    time_s: float
+    iteration: int
+    cost: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """What a run ended with.
+
+    Parameters
+    ----------
+    key : str
+        That of the run.
+    outcome : str
+        `PLAN`, `PATH`, `NO_PLAN`, or the class of the error that ended the run.
+    status : int
+        Number of OMPL's word for it in `STATUS`.
+    failed : bool
+        Whether the run could not be made: a file was missing, the machine had no memory, a worker was lost.
+        Such a run is made again when the study is started the next time.
+    message, advice : str
+        Why there is no plan, and what would help.
+    time_s, cpu_s : float
+        Of the whole run, without opening the patient.
+    memory_mb : float
+        Resident memory of the process after the run, MiB.
+    iterations : int
+        At the best plan.
+    accepted : bool
+        Whether the independent check accepts the plan; for a needle path, whether nothing objects to it.
+    costs : mapping of str to float
+        "inverse_clearance", "cost_map", "voxel_sum", "length_mm".
+    improvements : tuple of Improvement
+    findings : tuple of mapping
+        What the check looked at; see `lungaccess.checking.findings.Finding.to_mapping`.
+    rejections : mapping of str to int
+        The reasons of `NoPlan`, counted.
+    plan : str
+        JSON of the plan or of the needle's path; "" if there is none.
+    digest : str
+        Hash of the plan without its times.
+    """
+
+    key: str
+    outcome: str
+    status: int
+    failed: bool = False
+    message: str = ""
+    advice: str = ""
+    time_s: float = 0.0
+    cpu_s: float = 0.0
+    memory_mb: float = 0.0
+    iterations: int = 0
+    accepted: bool = False
+    costs: Mapping[str, float] = field(default_factory=dict)
+    improvements: tuple[Improvement, ...] = ()
+    findings: tuple[Mapping[str, Any], ...] = ()
+    rejections: Mapping[str, int] = field(default_factory=dict)
+    plan: str = ""
+    digest: str = ""
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is a plan or path."""
+        return self.outcome in (PLAN, PATH)
+
+    @staticmethod
+    def from_mapping(values: Mapping[str, Any]) -> Answer:
+        """Return the answer that `dataclasses.asdict` made plain."""
+        made = tuple(Improvement(**each) for each in values["improvements"])
+        return Answer(**{**values, "improvements": made, "findings": tuple(values["findings"])})

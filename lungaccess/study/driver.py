@@ -1,0 +1,264 @@
+"""Run a study on a cluster of dask.distributed; only this process writes the results file."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lungaccess.study.answers import CRASH, UNKNOWN, Answer
+from lungaccess.study.results import ResultsFile
+from lungaccess.study.runs import Problem, Run, runs_of
+from lungaccess.study.settings import Study, StudyError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+RETRIES = 2
+"""How often a run that could not be made is tried again at once."""
+WAITING_A_WORKER = 3
+LEAST_WAITING = 4
+COUNT_WORKERS_EVERY_S = 5.0
+CONNECT_S = 20.0
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+
+Tell = Callable[[str, float | None], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyDone:
+    """What a start of a study did.
+
+    Parameters
+    ----------
+    runs : int
+        How many the study has.
+    stored_before : int
+        How many of them the file had.
+    added : int
+        How many were stored now; less than the rest if another process stored some meanwhile.
+    failed : int
+        How many of those could not be made; the next start makes them again.
+    wall_s : float
+    """
+
+    runs: int
+    stored_before: int
+    added: int
+    failed: int
+    wall_s: float
+
+
+def run_study(
+    study: Study,
+    path: Path,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    cache: Path | None = None,
+    tell: Tell | None = None,
+) -> StudyDone:
+    """Make the runs of a study that a results file does not have, and store them there one by one.
+
+    Parameters
+    ----------
+    study : Study
+    path : Path
+        Results file; made if it is not there.
+    scheduler : str, optional
+        Address of a running dask scheduler; processes on this machine if None.
+    workers : int, optional
+        How many processes on this machine; as many as there are cores if None.
+    cache : Path, optional
+        Folder of prepared anatomies and atlases, on every machine; the usual one if None.
+    tell : callable, optional
+        Told what is being done, and the share of the missing runs that is done.
+
+    Raises
+    ------
+    StudyError
+        If dask is not installed, or the scheduler does not answer.
+    FileError
+        If the results file cannot be read or written; what is stored by then stays.
+    LungaccessError
+        If a patient, a system or a target of the study cannot be read.
+    """
+    began = time.perf_counter()
+    say = tell or (lambda _words, _share: None)
+    require_dask()
+    with ResultsFile(path, create=True) as results:
+        runs = list(runs_of(study, cache=cache, tell=lambda words: say(words, None)))
+        stored = results.finished_keys()
+        missing = [run for run in runs if run.key not in stored]
+        added = failed = 0
+        if missing:
+            say("starting workers", None)
+            with _client(scheduler, workers) as client:
+                _prepare(client, missing, cache, say)
+                for done, (run, answer) in enumerate(_answers(client, missing, cache), start=1):
+                    new = results.add(run, answer)
+                    added += new
+                    failed += new and answer.failed
+                    say(f"{done} of {len(missing)} runs, {run.problem.case}", done / len(missing))
+    return StudyDone(
+        runs=len(runs),
+        stored_before=len(runs) - len(missing),
+        added=added,
+        failed=failed,
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def require_dask() -> None:
+    """Raise StudyError unless the libraries of studies are installed."""
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise StudyError(
+            f"Studies need a library that is not installed ({error})",
+            expected="dask.distributed",
+            remedy="pip install 'lungaccess[study]'",
+        ) from error
+
+
+@contextlib.contextmanager
+def _client(scheduler: str | None, workers: int | None) -> Iterator[Client]:
+    """Connect to a scheduler, or start processes on this machine and stop them afterwards."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    with contextlib.ExitStack() as stack:
+        # Dask would warn whenever this process is busy with a patient.
+        stack.enter_context(dask.config.set({"distributed.admin.tick.limit": "1h"}))
+        try:
+            if scheduler is None:
+                # Patients are mapped from files: dask would take that memory for a leak and stop a worker.
+                with _interruptions_ignored():
+                    cluster = LocalCluster(
+                        n_workers=workers or os.cpu_count() or 1,
+                        threads_per_worker=1,
+                        processes=True,
+                        memory_limit=0,
+                        dashboard_address="127.0.0.1:0",
+                        env=ONE_THREAD,
+                        silence_logs=50,
+                    )
+                stack.enter_context(cluster)
+                client = Client(cluster)
+            else:
+                client = Client(scheduler, timeout=CONNECT_S)
+        except (OSError, ValueError, TypeError) as error:
+            raise StudyError(
+                f"No dask scheduler answers at {scheduler or 'this machine'} ({error})",
+                expected="an address such as tcp://host:8786 where `dask scheduler` runs",
+                remedy="Start it, or leave --scheduler out",
+            ) from error
+        yield stack.enter_context(client)
+
+
+@contextlib.contextmanager
+def _interruptions_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C, as processes that are started meanwhile will for all their life: it is for this one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _prepare(client: Client, runs: list[Run], cache: Path | None, say: Tell) -> None:
+    """Let one worker for each patient and system make the atlas, before all of them need it."""
+    problems: dict[Any, Problem] = {}
+    for run in runs:
+        if run.planner.kind == "plan":
+            problems.setdefault((run.problem.patient, run.problem.system), run.problem)
+    from concurrent.futures import CancelledError
+
+    from distributed import KilledWorker
+
+    from lungaccess.study.one_run import prepare
+
+    for problem in problems.values():
+        if not client.nthreads():
+            say("waiting for a worker", None)
+            client.wait_for_workers(1)
+        say(f"enumerating what scope and tubes can do: {problem.case}", None)
+        try:
+            client.submit(prepare, problem, cache, pure=False, retries=RETRIES).result()
+        except (KilledWorker, CancelledError) as error:
+            raise StudyError(
+                f"The atlas of {problem.case} could not be made ({error})",
+                expected="workers with about 6 GiB of free memory",
+                remedy="Start fewer workers with --workers",
+            ) from error
+
+
+def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tuple[Run, Answer]]:
+    """Yield each run's answer as it comes; only a few runs wait at the scheduler at any time."""
+    from distributed import as_completed
+
+    from lungaccess.study.one_run import answer
+
+    waiting, under_way = iter(runs), dict[str, Run]()
+    finished = as_completed(with_results=True, raise_errors=False)
+    room = _Room(client)
+    while True:
+        for run in islice(waiting, max(0, room.count() - len(under_way))):
+            future = client.submit(answer, run, cache, key=run.key, pure=False, retries=RETRIES)
+            under_way[run.key] = run
+            finished.add(future)
+        if not under_way:
+            return
+        future, result = next(finished)
+        run = under_way.pop(future.key)
+        if future.status in ("cancelled", "lost"):
+            raise StudyError(
+                "The dask scheduler was lost",
+                remedy="Start the study again, it goes on from what is stored",
+            )
+        yield run, result if future.status == "finished" else _failed(run, result)
+        future.release()
+
+
+class _Room:
+    """How many runs may be under way, by the number of workers, which is asked for now and then."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._asked_s = -math.inf
+        self._count = LEAST_WAITING
+
+    def count(self) -> int:
+        """Return how many runs may be under way."""
+        if time.monotonic() - self._asked_s > COUNT_WORKERS_EVERY_S:
+            self._count = max(LEAST_WAITING, WAITING_A_WORKER * len(self._client.nthreads()))
+            self._asked_s = time.monotonic()
+        return self._count
+
+
+def _failed(run: Run, raised: Any) -> Answer:
+    """Return what is stored of a run that could not be made; dask hands over what `sys.exc_info` returns."""
+    from distributed import KilledWorker
+
+    error = raised[1] if isinstance(raised, tuple) else raised
+    crashed = isinstance(error, KilledWorker)
+    return Answer(
+        key=run.key,
+        outcome=type(error).__name__,
+        status=CRASH if crashed else UNKNOWN,
+        failed=True,
+        message=f"{error}",
+    )

@@ -1,0 +1,74 @@
+"""A run of the needle stage alone, from a start pose that came with the patient."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.lung import Lung
+from lungaccess.needle import plan_needle
+from lungaccess.records import needle_record
+from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
+from lungaccess.study.runs import Run
+from lungaccess.target import point_target
+from stages.needle.objections import objection
+from stages.needle.searches import Query
+
+OBJECTIVES = {
+    "inverse_clearance": "inverse-clearance",
+    "cost_map": "cost-map",
+    "voxel_sum": "voxel-sum",
+    "length_mm": "length",
+}
+"""The objective of a plan, as the needle stage calls it."""
+
+
+def needle_answer(run: Run, lung: Lung) -> Answer:
+    """Search for a needle path and let `stages.needle.objections.objection` look at it.
+
+    Raises
+    ------
+    SettingsError
+        If the patient came with no such start pose.
+    TargetError
+        If the target is not in free lung tissue.
+    """
+    problem = run.problem
+    if not 1 <= problem.start <= len(lung.starts):
+        raise SettingsError(f"There is no start pose {problem.start}", expected=f"1 to {len(lung.starts)}")
+    pose = lung.starts[problem.start - 1]
+    target = point_target(lung, np.array(problem.target_lps), origin=problem.origin)
+    found = plan_needle(
+        lung,
+        problem.system,
+        pose,
+        target,
+        planner=run.planner.method,
+        objective=OBJECTIVES[problem.objective],
+        seed=run.seed,
+        iterations=run.iterations,
+        time_s=problem.time_s,
+    )
+    if found.path is None:
+        return Answer(key=run.key, outcome=NO_PLAN, status=TIMEOUT, message=found.outcome)
+    record = needle_record(found)
+    first_s = record["path"].pop("first_path_s")
+    costs = dict(record["path"]["costs"])
+    costs["length_mm"] = costs.pop("length")
+    text = json.dumps(record, sort_keys=True)
+    query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
+    why = objection(found.space, query, found.path)
+    return Answer(
+        key=run.key,
+        outcome=PATH,
+        status=EXACT,
+        message=why,
+        accepted=not why,
+        costs=costs,
+        improvements=(Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
+        plan=text,
+        digest=hashlib.sha256(text.encode()).hexdigest(),
+    )

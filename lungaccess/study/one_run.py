@@ -1,0 +1,212 @@
+"""Make one run: in this process, or in one of its own with `python -m lungaccess.study.one_run`.
+
+That command reads a run as JSON on standard input and writes its answer as JSON on standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import psutil
+
+from anatomy.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
+from anatomy.lung import Lung
+from lungaccess.atlas import Atlas
+from lungaccess.atlas_store import open_atlas
+from lungaccess.checking.judge import Checker
+from lungaccess.noplan import NoPlan
+from lungaccess.planner import plan
+from lungaccess.study.answers import (
+    EXACT,
+    INVALID_GOAL,
+    NO_PLAN,
+    PLAN,
+    TIMEOUT,
+    UNKNOWN,
+    Answer,
+    Improvement,
+)
+from lungaccess.study.needle_run import needle_answer
+from lungaccess.study.patients import Patient, open_patient
+from lungaccess.study.runs import Problem, Run
+from lungaccess.study.settings import StudyError
+from lungaccess.system import System
+from lungaccess.target import point_target
+
+KEPT_PATIENTS = 2
+MIB = 2.0**20
+ANSWERS = (AnatomyError, PlanFileError, SettingsError, TargetError)
+"""Errors that the run would end with on any machine, at any time."""
+
+_one_at_a_time = threading.Lock()
+
+
+class Opened(NamedTuple):
+    """A patient and what is judged with."""
+
+    lung: Lung
+    checker: Checker
+
+
+def answer(run: Run, cache: Path | None = None) -> Answer:
+    """Make a run and return what it ended with.
+
+    Parameters
+    ----------
+    run : Run
+    cache : Path, optional
+        Folder of prepared anatomies and atlases; `anatomy.cache.default_cache()` if None.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or written here; whatever else is not the run's own answer is raised, too.
+    """
+    if run.planner.own_process:
+        return _in_own_process(run, cache)
+    with _one_at_a_time:
+        numba.set_num_threads(1)
+        return _measured(run, cache)
+
+
+def prepare(problem: Problem, cache: Path | None = None) -> None:
+    """Make sure that the cache has the patient and the atlas of a problem.
+
+    Raises
+    ------
+    LungaccessError
+        If the patient cannot be read or the cache cannot be written.
+    """
+    with _one_at_a_time:
+        numba.set_num_threads(1)
+        _atlas_of(problem, cache)
+
+
+def _measured(run: Run, cache: Path | None) -> Answer:
+    opened = _opened(run.problem.patient, cache)
+    atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
+    began, cpu_began = time.perf_counter(), time.process_time()
+    try:
+        made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
+    except NoPlan as failure:
+        made = _no_plan(run, failure)
+    except ANSWERS as error:
+        status = INVALID_GOAL if isinstance(error, TargetError) else UNKNOWN
+        made = Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
+    return replace(
+        made,
+        time_s=time.perf_counter() - began,
+        cpu_s=time.process_time() - cpu_began,
+        memory_mb=psutil.Process().memory_info().rss / MIB,
+    )
+
+
+def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
+    """Search for plans and let the best be checked."""
+    problem, best = run.problem, None
+    improvements = []
+    target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
+    for best in plan(
+        opened.lung,
+        problem.system,
+        target,
+        objective=problem.objective,
+        method=run.planner.method,
+        seed=run.seed,
+        iterations=run.iterations,
+        time_s=problem.time_s,
+        atlas=atlas,
+    ):
+        cost = best.costs[problem.objective]
+        improvements.append(
+            Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=cost)
+        )
+        if problem.first_plan:
+            break
+    if best is None:
+        raise NoPlan("The search ended without a plan", reasons={})
+    report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
+    return Answer(
+        key=run.key,
+        outcome=PLAN,
+        status=EXACT,
+        iterations=best.iterations,
+        accepted=report.accepted,
+        costs=dict(best.costs),
+        improvements=tuple(improvements),
+        findings=tuple(each.to_mapping() for each in report.findings),
+        plan=best.to_json(),
+        digest=best.digest,
+    )
+
+
+def _no_plan(run: Run, failure: NoPlan) -> Answer:
+    return Answer(
+        key=run.key,
+        outcome=NO_PLAN,
+        status=TIMEOUT,
+        message=failure.found,
+        advice=failure.advice,
+        rejections=dict(failure.reasons),
+    )
+
+
+@lru_cache(maxsize=KEPT_PATIENTS)
+def _opened(patient: Patient, cache: Path | None) -> Opened:
+    lung = open_patient(patient, cache)
+    return Opened(lung, Checker(lung))
+
+
+def _atlas_of(problem: Problem, cache: Path | None) -> Atlas:
+    spacing = (problem.rotations, problem.stop_spacing_mm, problem.site_spacing_mm)
+    return _atlas(problem.patient, problem.system, spacing, cache)
+
+
+@lru_cache(maxsize=KEPT_PATIENTS)
+def _atlas(patient: Patient, system: System, spacing: tuple[int, float, float], cache: Path | None) -> Atlas:
+    rotations, stop_mm, site_mm = spacing
+    return open_atlas(
+        _opened(patient, cache).lung,
+        system,
+        rotations=rotations,
+        stop_spacing_mm=stop_mm,
+        site_spacing_mm=site_mm,
+        cache=cache,
+    )
+
+
+def _in_own_process(run: Run, cache: Path | None) -> Answer:
+    """Make a run in a fresh process, as a library with one seed a process needs."""
+    own = replace(run, planner=replace(run.planner, own_process=False))
+    words = [sys.executable, "-m", "lungaccess.study.one_run", *([str(cache)] if cache else [])]
+    done = subprocess.run(words, input=own.to_json(), capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise StudyError(
+            f"The process of a run ended with code {done.returncode}: {done.stderr.strip()[-500:]}"
+        )
+    return replace(Answer.from_mapping(json.loads(done.stdout)), key=run.key)
+
+
+def main(words: list[str]) -> int:
+    """Make the run on standard input; an error goes to standard error."""
+    try:
+        made = answer(Run.from_json(sys.stdin.read()), Path(words[0]) if words else None)
+    except LungaccessError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    sys.stdout.write(json.dumps(asdict(made)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

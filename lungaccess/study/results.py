@@ -1,0 +1,309 @@
+"""The results file of a study: SQLite, one transaction a run, each run at most once."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import json
+import platform
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from anatomy.errors import FileError
+from anatomy.settings import to_mapping
+from lungaccess.assemble import software_version
+from lungaccess.study.answers import Answer
+from lungaccess.study.runs import Problem, Run
+from lungaccess.study.schema import APPLICATION_ID, FORMAT, statements
+
+BUSY_S = 60.0
+BATCH = 1000
+COSTS = ("inverse_clearance", "cost_map", "voxel_sum")
+
+
+class ResultsFile:
+    """A results file, open for reading and adding; for a `with` statement.
+
+    Several processes may have the same file open.
+
+    Parameters
+    ----------
+    path : Path
+    create : bool
+        Whether a file that is not there is made.
+
+    Raises
+    ------
+    FileError
+        If the file is not there, cannot be written, is damaged, or is not a results file of this format.
+    """
+
+    def __init__(self, path: Path, *, create: bool = False) -> None:
+        self.path = Path(path)
+        if not create and not self.path.is_file():
+            raise FileError(f"There is no file {path}", expected="a results file of `lungaccess study run`")
+        with _told(self.path):
+            self._connection = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
+            try:
+                self._begin()
+            except BaseException:
+                self._connection.close()
+                raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._connection.close()
+
+    def _begin(self) -> None:
+        """Make a new file's tables, or make sure that an old one is sound."""
+        if self._is_new():
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._make()
+        identity = (self._number("application_id"), self._number("user_version"))
+        if identity != (APPLICATION_ID, FORMAT):
+            raise FileError(
+                f"{self.path} is a database of another kind or format ({identity[0]}, {identity[1]})",
+                expected=f"results of lungaccess, format {FORMAT}",
+                remedy="Choose another file with --out",
+            )
+        self._connection.execute("PRAGMA foreign_keys = ON")
+        verdict = self._connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
+        if verdict != "ok":
+            raise _damaged(self.path, verdict)
+
+    def _is_new(self) -> bool:
+        """Tell whether there is nothing in the file, which another process may be about to change."""
+        return (
+            self._number("application_id") == 0
+            and not self._connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchall()
+        )
+
+    def _make(self) -> None:
+        try:
+            self._connection.executescript(statements())
+        except sqlite3.OperationalError:
+            # Another process may have made the tables in between.
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+            if self._is_new():
+                raise
+
+    def _number(self, pragma: str) -> int:
+        return int(self._connection.execute(f"PRAGMA {pragma}").fetchone()[0])
+
+    def rows(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of a query.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read.
+        """
+        with _told(self.path):
+            cursor = self._connection.execute(query, values)
+        while True:
+            with _told(self.path):
+                batch = cursor.fetchmany(BATCH)
+            if not batch:
+                return
+            yield from batch
+
+    def columns(self, query: str) -> tuple[str, ...]:
+        """Return the names of the columns of a query.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read.
+        """
+        with _told(self.path):
+            found = self._connection.execute(f"SELECT * FROM ({query}) LIMIT 0").description
+        return tuple(each[0] for each in found)
+
+    def finished_keys(self) -> set[str]:
+        """Return the keys of the runs that need not be made again: all but those that failed."""
+        query = "SELECT key FROM runs JOIN outcomes ON runid = id WHERE NOT failed"
+        return {key for (key,) in self.rows(query)}
+
+    def add(self, run: Run, answer: Answer) -> bool:
+        """Store what a run ended with, all of it or nothing; return whether it was new.
+
+        A run that is there already stays as it is, unless it failed.
+
+        Raises
+        ------
+        FileError
+            If the disk is full, another program holds the file for too long, or it is damaged.
+        """
+        with _told(self.path), self._transaction() as connection:
+            connection.execute(
+                "DELETE FROM runs WHERE key = ? AND id IN (SELECT runid FROM outcomes WHERE failed)",
+                (run.key,),
+            )
+            experiment, planner = self._experiment(run.problem), self._planner(run)
+            made = connection.execute(*_run_row(run, answer, experiment, planner))
+            if made.rowcount == 0:
+                return False
+            _add_rest(connection, int(made.lastrowid or 0), answer)
+            connection.execute(
+                "UPDATE experiments SET totaltime = totaltime + ?, runcount = (SELECT max(n) FROM "
+                "(SELECT count(*) AS n FROM runs WHERE experimentid = ? GROUP BY plannerid)) WHERE id = ?",
+                (answer.time_s, experiment, experiment),
+            )
+        return True
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        self._connection.execute("BEGIN IMMEDIATE")
+        try:
+            yield self._connection
+            self._connection.execute("COMMIT")
+        except BaseException:
+            # A full disk ends the transaction by itself.
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+            raise
+
+    def _experiment(self, problem: Problem) -> int:
+        """Return the number of the problem, which is stored if it is new."""
+        known = self._connection.execute(
+            "SELECT experimentid FROM problems WHERE key = ?", (problem.key,)
+        ).fetchone()
+        if known:
+            return int(known[0])
+        made = self._connection.execute(*_experiment_row(problem))
+        number = int(made.lastrowid or 0)
+        self._connection.execute(*_problem_row(problem, number))
+        return number
+
+    def _planner(self, run: Run) -> int:
+        settings = to_mapping(run.planner)
+        row = (settings.pop("name"), json.dumps(settings, sort_keys=True))
+        self._connection.execute("INSERT OR IGNORE INTO plannerConfigs (name, settings) VALUES (?, ?)", row)
+        found = self._connection.execute(
+            "SELECT id FROM plannerConfigs WHERE name = ? AND settings = ?", row
+        ).fetchone()
+        return int(found[0])
+
+
+def _insert(table: str, row: dict[str, Any], how: str = "INSERT") -> tuple[str, tuple[Any, ...]]:
+    places = ", ".join("?" * len(row))
+    return f"{how} INTO {table} ({', '.join(row)}) VALUES ({places})", tuple(row.values())
+
+
+def _experiment_row(problem: Problem) -> tuple[str, tuple[Any, ...]]:
+    row = {
+        "name": problem.case,
+        "totaltime": 0.0,
+        "timelimit": problem.time_s or 0.0,
+        "memorylimit": 0.0,
+        "version": f"lungaccess {software_version()}",
+        "hostname": platform.node(),
+        "date": datetime.datetime.now().isoformat(sep=" ", timespec="seconds"),
+        "setup": json.dumps(problem.to_mapping() | {"devices": to_mapping(problem.system)}, sort_keys=True),
+        "target": problem.target,
+        "start": problem.start,
+    }
+    return _insert("experiments", row)
+
+
+def _problem_row(problem: Problem, experiment: int) -> tuple[str, tuple[Any, ...]]:
+    x, y, z = problem.target_lps
+    row = {
+        "experimentid": experiment,
+        "key": problem.key,
+        "case_name": problem.case,
+        "patient": problem.patient_name,
+        "lung": problem.patient.key,
+        "system": problem.system.name,
+        "fissures_allowed": problem.system.fissures_allowed,
+        "objective": problem.objective,
+        "target": problem.target,
+        "origin": problem.origin,
+        "x_lps_mm": x,
+        "y_lps_mm": y,
+        "z_lps_mm": z,
+        "start": problem.start,
+        "iterations": problem.iterations,
+        "time_s": problem.time_s,
+    }
+    return _insert("problems", row)
+
+
+def _run_row(run: Run, answer: Answer, experiment: int, planner: int) -> tuple[str, tuple[Any, ...]]:
+    first = answer.improvements[0].time_s if answer.improvements else None
+    row = {
+        "experimentid": experiment,
+        "plannerid": planner,
+        "time": answer.time_s,
+        "memory": answer.memory_mb,
+        "iterations": answer.iterations,
+        "solved": answer.solved,
+        "correct_solution": answer.accepted,
+        "status": answer.status,
+        "solution_length": answer.costs.get("length_mm"),
+        "cpu_time": answer.cpu_s,
+        "first_solution_time": first,
+        "solutions": len(answer.improvements),
+        "seed": run.seed,
+        "cost": answer.costs.get(run.problem.objective),
+        **{name: answer.costs.get(name) for name in COSTS},
+        "key": run.key,
+    }
+    return _insert("runs", row, "INSERT OR IGNORE")
+
+
+def _add_rest(connection: sqlite3.Connection, run: int, answer: Answer) -> None:
+    outcome = (run, answer.outcome, answer.failed, answer.message, answer.advice)
+    connection.execute("INSERT INTO outcomes VALUES (?, ?, ?, ?, ?)", outcome)
+    if answer.plan:
+        connection.execute("INSERT INTO plans VALUES (?, ?, ?)", (run, answer.digest, answer.plan))
+    points = [(run, each.time_s, each.cost, each.iteration) for each in answer.improvements]
+    connection.executemany("INSERT INTO progress VALUES (?, ?, ?, ?)", points)
+    names = ("name", "ok", "value", "limit", "side", "tolerance", "unit", "detail")
+    findings = [(run, n, *(each[name] for name in names)) for n, each in enumerate(answer.findings, start=1)]
+    connection.executemany(f"INSERT INTO findings VALUES (?, ?{', ?' * len(names)})", findings)
+    counted = [(run, reason, count) for reason, count in answer.rejections.items()]
+    connection.executemany("INSERT INTO rejections VALUES (?, ?, ?)", counted)
+
+
+@contextlib.contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Turn what SQLite raises into a FileError that says what to do."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        if code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
+            raise FileError(
+                f"{path} cannot be written: {error}",
+                expected="room on the disk",
+                remedy="What is stored is sound: make room and start the study again, it goes on from there",
+            ) from error
+        if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+            raise FileError(
+                f"{path} has been locked by another program for {BUSY_S:g} s",
+                remedy="Close that program and start the study again, it goes on from there",
+            ) from error
+        if code in (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT):
+            raise _damaged(path, str(error)) from error
+        raise FileError(
+            f"{path} cannot be used: {error}",
+            expected="a folder that exists and may be written to",
+            remedy="Choose another file with --out",
+        ) from error
+
+
+def _damaged(path: Path, why: str) -> FileError:
+    return FileError(
+        f"{path} is damaged or is not a database: {why}",
+        expected="a results file of `lungaccess study run`",
+        remedy="Restore it from a copy, or choose another file with --out and run the study again",
+    )

@@ -1,0 +1,233 @@
+"""What a study is: cases, planners, seeds and a budget, read from a TOML file."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import Field
+
+from anatomy.errors import LungaccessError, SettingsError
+from anatomy.io.files import read_text
+from anatomy.settings import impossible, parse, quantity, settings, switch, text
+from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
+
+T = TypeVar("T")
+PHANTOM = "phantom"
+_REMEDY = "docs/studies.md explains every key"
+Objective = Literal["inverse_clearance", "cost_map", "voxel_sum", "length_mm"]
+Seed = Annotated[int, Field(strict=True, ge=0)]
+Iterations = Annotated[int, Field(strict=True, ge=0, description="iterations beyond the direct arcs")]
+
+
+class StudyError(LungaccessError):
+    """A study cannot go on: its library, its scheduler or its workers are not there."""
+
+
+@settings
+class PhantomPatient:
+    """Which synthetic patient a case is about; see `anatomy.phantom.phantom`."""
+
+    seed: Annotated[int, Field(strict=True, ge=0, description="seed of the synthetic patient")] = 0
+    size: Annotated[Literal["adult", "small"], Field(description="adult or small")] = "adult"
+    spacing_mm: Annotated[float | None, Field(strict=True, gt=0, description="edge of the voxels")] = None
+
+
+@settings
+class Peripheral:
+    """Random targets of a case; see `lungaccess.peripheral.peripheral_targets`."""
+
+    per_lung: Annotated[int, Field(strict=True, ge=0, description="targets on each side")] = 0
+    seed: Annotated[int, Field(strict=True, ge=0, description="seed of the points")] = 0
+
+
+@settings
+class Case:
+    """A patient, a system and targets.
+
+    Parameters
+    ----------
+    name : str
+    anatomy : str
+        "phantom", or a patient's folder; a relative one is relative to the study's file.
+    phantom : PhantomPatient
+        Which one, for the anatomy "phantom".
+    system : str
+        Preset, or TOML file relative to the study's file.
+    fissures_allowed : bool or None
+        Whether fissures may be crossed; None for what the system says.
+    objective : str
+        What is minimised.
+    targets : tuple of str
+        "ras:x,y,z", "lps:x,y,z", "nodule" or "nodule N".
+    peripheral : Peripheral
+        Random targets, after those that are stated.
+    starts : tuple of int
+        For needle planners: numbers of the start poses that came with the patient.
+    """
+
+    name: Annotated[str, text("name of the case")]
+    anatomy: Annotated[str, text("phantom, or a patient's folder")]
+    phantom: PhantomPatient = PhantomPatient()
+    system: Annotated[str, text("preset or TOML file")] = "lung-default"
+    fissures_allowed: Annotated[bool | None, switch("whether a fissure may be crossed")] = None
+    objective: Annotated[Objective, Field(description="what is minimised")] = "inverse_clearance"
+    targets: Annotated[tuple[str, ...], Field(description="points with their frame, or nodules")] = ()
+    peripheral: Peripheral = Peripheral()
+    starts: Annotated[tuple[Seed, ...], Field(description="start poses of the needle, from 1")] = ()
+
+    def __post_init__(self) -> None:
+        if not self.targets and not self.peripheral.per_lung:
+            raise impossible("targets", self.targets, "at least one target, or [case.peripheral]")
+
+
+@settings
+class PlannerChoice:
+    """A planner of the study.
+
+    Parameters
+    ----------
+    name : str
+        How tables call it.
+    kind : str
+        "plan" for all three stages, "needle" for the needle alone from the case's start poses.
+    method : str
+        One of `lungaccess.planner.METHODS`, or of `stages.needle.planners.PLANNERS`.
+    iterations : int or None
+        Instead of those of the budget.
+    own_process : bool
+        Whether each run has a fresh process.
+    """
+
+    name: Annotated[str, text("name of the planner in tables")]
+    kind: Annotated[Literal["plan", "needle"], Field(description="plan or needle")] = "plan"
+    method: Annotated[str, text("a method of plan, or a planner of the needle")] = "atlas"
+    iterations: Iterations | None = None
+    own_process: Annotated[bool, switch("whether each run has a fresh process")] = False
+
+    def __post_init__(self) -> None:
+        known = methods(self.kind)
+        if self.method not in known:
+            raise impossible("method", self.method, f"one of {', '.join(known)}")
+
+
+@settings
+class Budget:
+    """How long a run may search: by iterations, which can be repeated exactly, or by time, or both.
+
+    With `first_plan` it ends with its first plan, if that comes earlier.
+    """
+
+    iterations: Iterations | None = None
+    time_s: Annotated[float | None, Field(strict=True, gt=0, description="planning time of a run")] = None
+    first_plan: Annotated[bool, switch("whether a run ends with its first plan")] = False
+
+    def __post_init__(self) -> None:
+        if self.iterations is None and self.time_s is None:
+            raise impossible("iterations", None, "iterations, time_s or both")
+
+
+@settings
+class AtlasGrid:
+    """How densely deployments are enumerated; see `lungaccess.atlas.build_atlas`."""
+
+    rotations: Annotated[int, Field(strict=True, ge=1, description="rotations of the tubes")] = (
+        DEFAULT_ROTATIONS
+    )
+    stop_spacing_mm: Annotated[float, quantity("spacing of insertions", above=0)] = DEFAULT_STOP_MM
+    site_spacing_mm: Annotated[float, quantity("spacing of sites", above=0)] = 1.0
+
+
+@settings
+class Study:
+    """Every case with every planner and every seed.
+
+    Parameters
+    ----------
+    name : str
+    case : tuple of Case
+    planner : tuple of PlannerChoice
+    seeds : tuple of int
+    budget : Budget
+    atlas : AtlasGrid
+    folder : str
+        What relative paths are relative to; that of the file if it was read from one.
+    """
+
+    name: Annotated[str, text("name of the study")]
+    case: Annotated[tuple[Case, ...], Field(min_length=1, description="at least one [[case]]")]
+    planner: Annotated[tuple[PlannerChoice, ...], Field(min_length=1, description="at least one [[planner]]")]
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1, description="at least one seed")] = (0,)
+    budget: Budget
+    atlas: AtlasGrid = AtlasGrid()
+    folder: Annotated[str, text("what relative paths are relative to")] = "."
+
+    def __post_init__(self) -> None:
+        for key, names in (
+            ("case", [each.name for each in self.case]),
+            ("planner", [each.name for each in self.planner]),
+            ("seeds", list(self.seeds)),
+        ):
+            if len(set(names)) < len(names):
+                raise impossible(key, names, "each only once")
+        if any(each.kind == "needle" for each in self.planner) and not all(c.starts for c in self.case):
+            raise impossible("case", "starts = []", "start poses in every case, for planners of the needle")
+
+
+def methods(kind: str) -> tuple[str, ...]:
+    """Return the names of the planners of a kind, "plan" or "needle"."""
+    if kind == "needle":
+        from stages.needle.planners import PLANNERS
+
+        return tuple(PLANNERS)
+    from lungaccess.planner import METHODS
+
+    return tuple(METHODS)
+
+
+def read_study(path: str | os.PathLike[str]) -> Study:
+    """Read a study from a TOML file.
+
+    Raises
+    ------
+    SettingsError
+        If the file is not TOML, or a key is unknown, missing or wrong.
+    FileError
+        If the file cannot be read.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"{path} is not valid TOML ({error})", remedy=_REMEDY) from error
+    if "folder" in content:
+        raise SettingsError(f"{path}: folder is not a setting", remedy=_REMEDY)
+    return study_of(content, path.name, str(path.parent))
+
+
+def study_of(content: Mapping[str, Any], where: str = "study", folder: str = ".") -> Study:
+    """Return the study that plain values describe, as those of a TOML file.
+
+    Raises
+    ------
+    SettingsError
+        If a key is unknown, missing or wrong.
+    """
+    values = dict(content)
+    try:
+        for key, cls in (("case", Case), ("planner", PlannerChoice)):
+            if key in values:
+                values[key] = _listed(cls, values[key], f"{where}, {key}")
+        return parse(Study, {**values, "folder": folder}, where)
+    except SettingsError as error:
+        raise SettingsError(error.found, expected=error.expected, remedy=_REMEDY) from None
+
+
+def _listed(cls: type[T], tables: object, where: str) -> tuple[T, ...]:
+    """Read each table of an array of tables by itself, so that an error names the number of the table."""
+    if not isinstance(tables, list) or not all(isinstance(each, Mapping) for each in tables):
+        raise SettingsError(f"{where} is not an array of tables", expected="[[...]]")
+    return tuple(parse(cls, each, f"{where} {number}") for number, each in enumerate(tables, start=1))

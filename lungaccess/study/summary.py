@@ -1,0 +1,83 @@
+"""What a results file says, by case and planner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+from lungaccess.study.results import ResultsFile
+
+_QUERY = """
+SELECT p.case_name, p.objective, c.name,
+       o.failed, r.solved, r.correct_solution, r.first_solution_time, r.time, r.cost
+FROM runs r JOIN outcomes o ON o.runid = r.id JOIN plannerConfigs c ON c.id = r.plannerid
+     JOIN problems p ON p.experimentid = r.experimentid
+ORDER BY p.case_name, p.objective, c.name, r.key"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """The runs of one case with one planner.
+
+    Parameters
+    ----------
+    case, objective, planner : str
+    runs : int
+    failed : int
+        Of them, those that could not be made and will be made again; they count nowhere else.
+    solved_share : float
+        Share of the runs with a plan.
+    accepted_share : float
+        Share of the plans that the check accepts; 0 if there is none.
+    first_plan_s : tuple of float or None
+        Median and largest planning time of the first plan.
+    run_s : float
+        Median time of a run.
+    cost : float or None
+        Median cost of the best plans.
+    """
+
+    case: str
+    objective: str
+    planner: str
+    runs: int
+    failed: int
+    solved_share: float
+    accepted_share: float
+    first_plan_s: tuple[float, float] | None
+    run_s: float
+    cost: float | None
+
+
+def summary(path: Path) -> list[Group]:
+    """Summarise a results file by case, objective and planner.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    """
+    groups: dict[tuple[str, str, str], list[tuple[float, ...]]] = {}
+    with ResultsFile(path) as results:
+        for case, objective, planner, *values in results.rows(_QUERY):
+            groups.setdefault((case, objective, planner), []).append(tuple(values))
+    return [_group(*names, rows) for names, rows in groups.items()]
+
+
+def _group(case: str, objective: str, planner: str, rows: list[tuple[float, ...]]) -> Group:
+    made = [row[1:] for row in rows if not row[0]]
+    solved = [row for row in made if row[0]]
+    first = [row[2] for row in solved]
+    return Group(
+        case=case,
+        objective=objective,
+        planner=planner,
+        runs=len(rows),
+        failed=len(rows) - len(made),
+        solved_share=len(solved) / len(made) if made else 0.0,
+        accepted_share=sum(row[1] for row in solved) / len(solved) if solved else 0.0,
+        first_plan_s=(median(first), max(first)) if first else None,
+        run_s=median(row[3] for row in made) if made else 0.0,
+        cost=median(row[4] for row in solved) if solved else None,
+    )

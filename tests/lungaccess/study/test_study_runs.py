@@ -1,0 +1,157 @@
+"""Runs are named by all that their answer depends on, and answered in any process alike."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from anatomy.errors import FileError, SettingsError, TargetError
+from lungaccess import peripheral
+from lungaccess.plans import Plan
+from lungaccess.study import one_run
+from lungaccess.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
+from lungaccess.study.needle_run import needle_answer
+from lungaccess.study.one_run import answer
+from lungaccess.study.patients import open_patient
+from lungaccess.study.runs import Run, runs_of
+from lungaccess.study.settings import PlannerChoice, study_of
+from lungaccess.system import load_system
+from tests.lungaccess.study.toys import content
+
+
+def test_every_target_with_every_seed(runs: list[Run]) -> None:
+    assert [(run.problem.target, run.seed) for run in runs] == [(1, 0), (1, 1), (2, 0), (2, 1)]
+    assert len({run.key for run in runs}) == 4
+    assert len({run.problem.key for run in runs}) == 2
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"objective": "length_mm"},
+        {"target_lps": (0.0, 0.0, 1.0)},
+        {"origin": "elsewhere"},
+        {"iterations": 3},
+        {"time_s": 1.0},
+        {"first_plan": True},
+        {"rotations": 9},
+        {"stop_spacing_mm": 3.0},
+        {"site_spacing_mm": 3.0},
+        {"system": load_system("lung-default")},
+        {"case": "other"},
+        {"start": 1},
+    ],
+)
+def test_the_key_depends_on_the_problem(runs: list[Run], changes: dict[str, Any]) -> None:
+    run = runs[0]
+    assert replace(run, problem=replace(run.problem, **changes)).key != run.key
+
+
+def test_the_key_depends_on_planner_seed_and_patient_but_not_on_where_it_lies(runs: list[Run]) -> None:
+    run = runs[0]
+    patient = run.problem.patient
+    moved = replace(run.problem, patient=replace(patient, anatomy="/elsewhere"))
+    other = replace(run.problem, patient=replace(patient, sources=(("labels", "0" * 64),)))
+    assert replace(run, problem=moved).key == run.key
+    assert replace(run, problem=other).key != run.key
+    assert replace(run, seed=5).key != run.key
+    assert replace(run, planner=replace(run.planner, method="kuntz2015")).key != run.key
+
+
+def test_a_run_survives_json(runs: list[Run]) -> None:
+    for run in runs:
+        again = Run.from_json(run.to_json())
+        assert again == run
+        assert again.key == run.key
+
+
+def test_a_planner_may_have_iterations_of_its_own(cache: Path) -> None:
+    planners = [{"name": "a"}, {"name": "b", "iterations": 9}]
+    found = list(runs_of(study_of(content(planner=planners, seeds=[0])), cache=cache))
+    assert [run.iterations for run in found] == [2, 9, 2, 9]
+    assert found[0].problem.key == found[1].problem.key
+
+
+def test_a_plan_is_checked_and_a_bad_target_is_an_answer(runs: list[Run], cache: Path) -> None:
+    good, bad = answer(runs[0], cache), answer(runs[2], cache)
+    assert (good.outcome, good.status, good.solved, good.accepted) == (PLAN, EXACT, True, True)
+    plan = Plan.from_json(good.plan)
+    assert plan.digest == good.digest
+    assert plan.seed == runs[0].seed
+    costs = [each.cost for each in good.improvements]
+    assert costs == sorted(costs, reverse=True)
+    assert costs[-1] == good.costs["inverse_clearance"]
+    assert len(good.findings) > 50
+    assert all(each["ok"] for each in good.findings)
+    assert (bad.outcome, bad.status, bad.solved, bad.failed) == ("TargetError", INVALID_GOAL, False, False)
+    assert "outside the lung" in bad.message
+    assert answer(runs[0], cache).digest == good.digest
+
+
+def test_an_unknown_nodule_and_words_that_are_no_target(cache: Path) -> None:
+    for words in ("nodule 99", "nodule one", "1,2,3"):
+        with pytest.raises(Exception, match="nodule|frame") as caught:
+            list(runs_of(study_of(content(case={"targets": [words]})), cache=cache))
+        assert hasattr(caught.value, "remedy")
+
+
+def test_other_files_than_those_of_the_study_are_refused(runs: list[Run], tmp_path: Path) -> None:
+    patient = replace(runs[0].problem.patient, sources=(("labels", "0" * 64),))
+    with pytest.raises(FileError, match="differ from those the study began with"):
+        open_patient(patient, tmp_path)
+
+
+def test_few_patients_are_kept(runs: list[Run], cache: Path) -> None:
+    for spacing in (4.0, 5.0, 6.0, 7.0):
+        one_run.prepare(replace(runs[0].problem, site_spacing_mm=spacing, rotations=2), cache)
+    assert one_run._atlas.cache_info().currsize == one_run.KEPT_PATIENTS
+
+
+def test_drawing_targets_ends_where_there_is_no_room(
+    runs: list[Run], cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lung = open_patient(runs[0].problem.patient, cache)
+    points = peripheral.peripheral_targets(lung, 2, seed=4)
+    assert points.shape == (4, 3)
+    side = points[:, 0] - lung.tree.carina_lps[0]
+    assert (side[:2] > 0).all()
+    assert (side[2:] < 0).all()
+    assert (points == peripheral.peripheral_targets(lung, 2, seed=4)).all()
+    monkeypatch.setattr(peripheral, "CLEAR_MM", 1e6)
+    monkeypatch.setattr(peripheral, "DRAWS_A_POINT", 50)
+    with pytest.raises(TargetError, match="no peripheral target in its left lung"):
+        peripheral.peripheral_targets(lung, 1, seed=0)
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own_gives_the_same_plan(runs: list[Run], cache: Path) -> None:
+    alone = replace(runs[0], planner=replace(runs[0].planner, own_process=True))
+    found, here = answer(alone, cache), answer(runs[0], cache)
+    assert found.key == alone.key != here.key
+    assert found.digest == here.digest
+    assert found.findings == here.findings
+
+
+def test_a_run_of_the_needle_alone(runs: list[Run], cache: Path) -> None:
+    """From where the tube of a plan ends, to the plan's target."""
+    lung = open_patient(runs[0].problem.patient, cache)
+    tip = Plan.from_json(answer(runs[0], cache).plan).tube.lps_from_tip
+    choice = PlannerChoice(name="needle", kind="needle", method="optimal")
+    problem = replace(runs[0].problem, start=1, objective="length_mm", iterations=500)
+    run = Run(problem=problem, planner=choice, seed=3)
+    found = needle_answer(run, replace(lung, starts=(tip,)))
+    assert (found.outcome, found.status, found.accepted, found.message) == (PATH, EXACT, True, "")
+    straight_mm = float(np.linalg.norm(np.array(problem.target_lps) - tip[:3, 3]))
+    assert straight_mm <= found.costs["length_mm"] < 1.5 * straight_mm
+    assert json.loads(found.plan)["path"]["arcs"]
+    assert needle_answer(run, replace(lung, starts=(tip,))).digest == found.digest
+    aside = replace(runs[0].problem, start=1, iterations=500)
+    nothing = needle_answer(replace(run, problem=aside), replace(lung, starts=(np.eye(4),)))
+    assert (nothing.outcome, nothing.solved, nothing.plan) == (NO_PLAN, False, "")
+    with pytest.raises(SettingsError, match="no start pose 1"):
+        needle_answer(run, lung)

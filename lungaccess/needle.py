@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -19,6 +20,9 @@ from stages.needle.searches import Query, Search
 from stages.needle.space import NeedleSpace, needle_space
 
 SLICE = 500
+OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
+"""Planners of OMPL itself.  They steer by chance, and end within OMPL_TOLERANCE_MM of the target."""
+OMPL_TOLERANCE_MM = 1.0
 WALL_MM = 3.0
 """A start so near to an airway is taken to have pierced its wall."""
 
@@ -81,7 +85,8 @@ def plan_needle(
         +z is the direction of insertion.
     target : Target
     planner : str
-        One of `stages.needle.planners.PLANNERS`.
+        One of `stages.needle.planners.PLANNERS`, or of `OMPL_PLANNERS`: those look at no objective, end by
+        time alone, and can be seeded once in a process, so each call needs a process of its own.
     objective : str
         One of `OBJECTIVES`.
     seed : int
@@ -92,17 +97,22 @@ def plan_needle(
     Raises
     ------
     SettingsError
-        If there is no such planner or objective, no limit, or a cost map is missing.
+        If there is no such planner or objective, no limit, or a cost map is missing; if OMPL has been used
+        in this process.
     TargetError
         If the start lies outside the images.
     """
-    if planner not in PLANNERS or objective not in OBJECTIVES:
+    known = (*PLANNERS, *OMPL_PLANNERS)
+    if planner not in known or objective not in OBJECTIVES:
         raise SettingsError(
             f"There is no needle planner {planner!r} with objective {objective!r}",
-            expected=f"a planner of {', '.join(PLANNERS)}; an objective of {', '.join(OBJECTIVES)}",
+            expected=f"a planner of {', '.join(known)}; an objective of {', '.join(OBJECTIVES)}",
         )
-    if iterations is None and time_s is None:
-        raise SettingsError("A needle search has no limit", expected="iterations or a time in seconds")
+    if time_s is None and (iterations is None or planner in OMPL_PLANNERS):
+        raise SettingsError(
+            f"The needle search {planner} has no limit",
+            expected="a time in seconds" if planner in OMPL_PLANNERS else "iterations or a time in seconds",
+        )
     if not lung.grid.contains(lps_from_start[:3, 3]).all():
         raise TargetError(
             f"The start lies outside the images, at LPS {lps_from_start[:3, 3].round(1).tolist()}",
@@ -112,6 +122,8 @@ def plan_needle(
     space = needle_space(lung, system.needle, system.margins, with_fissures=not system.fissures_allowed)
     branch = pierced_branch(lung, lps_from_start[:3, 3])
     query = Query(lps_from_start=lps_from_start, target=target.lps_mm, branch=branch)
+    if planner in OMPL_PLANNERS:
+        return _by_ompl(space, query, planner, seed, time_s or 0.0)
     search = PLANNERS[planner](space, query, seed, OBJECTIVES[objective])
     first_path_s = None
     began = time.perf_counter()
@@ -131,6 +143,28 @@ def plan_needle(
         branch=branch,
         space=space,
         first_path_s=first_path_s,
+    )
+
+
+def _by_ompl(space: NeedleSpace, query: Query, planner: str, seed: int, time_s: float) -> NeedleAnswer:
+    """Let a planner of OMPL search; its cost is the length of the path."""
+    from stages.needle.ompl_planner import NeedleProblem, seed_ompl
+
+    seed_ompl(seed + 1)
+    problem = NeedleProblem(space)
+    problem.setup.setPlanner(problem.planners()[planner](problem.si))
+    problem.pose(query, goal_tolerance_mm=OMPL_TOLERANCE_MM)
+    began = time.perf_counter()
+    problem.setup.solve(time_s)
+    first_path_s = time.perf_counter() - began
+    path = problem.solution()
+    return NeedleAnswer(
+        outcome="nothing found" if path is None else "path",
+        path=path,
+        cost=math.inf if path is None else path.length_mm,
+        branch=query.branch,
+        space=space,
+        first_path_s=None if path is None else first_path_s,
     )
 
 

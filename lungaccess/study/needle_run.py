@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
-from lungaccess.needle import plan_needle
+from lungaccess.needle import OMPL_TOLERANCE_MM, plan_needle
 from lungaccess.records import needle_record
 from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
 from lungaccess.study.runs import Run
@@ -60,7 +60,8 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
     costs["length_mm"] = costs.pop("length")
     text = json.dumps(record, sort_keys=True)
     query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
-    why = objection(found.space, query, found.path)
+    tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.space.goal_tolerance_mm
+    why = objection(found.space, query, found.path, goal_tolerance_mm=tolerance_mm)
     return Answer(
         key=run.key,
         outcome=PATH,

@@ -72,11 +72,9 @@ def answer(run: Run, cache: Path | None = None) -> Answer:
     FileError
         If a file cannot be read or written here; whatever else is not the run's own answer is raised, too.
     """
-    if run.planner.own_process:
+    if run.planner.own_process or run.planner.is_of_ompl:
         return _in_own_process(run, cache)
-    with _one_at_a_time:
-        numba.set_num_threads(1)
-        return _measured(run, cache)
+    return _here(run, cache)
 
 
 def prepare(problem: Problem, cache: Path | None = None) -> None:
@@ -90,6 +88,12 @@ def prepare(problem: Problem, cache: Path | None = None) -> None:
     with _one_at_a_time:
         numba.set_num_threads(1)
         _atlas_of(problem, cache)
+
+
+def _here(run: Run, cache: Path | None) -> Answer:
+    with _one_at_a_time:
+        numba.set_num_threads(1)
+        return _measured(run, cache)
 
 
 def _measured(run: Run, cache: Path | None) -> Answer:
@@ -187,20 +191,19 @@ def _atlas(patient: Patient, system: System, spacing: tuple[int, float, float], 
 
 def _in_own_process(run: Run, cache: Path | None) -> Answer:
     """Make a run in a fresh process, as a library with one seed a process needs."""
-    own = replace(run, planner=replace(run.planner, own_process=False))
     words = [sys.executable, "-m", "lungaccess.study.one_run", *([str(cache)] if cache else [])]
-    done = subprocess.run(words, input=own.to_json(), capture_output=True, text=True, check=False)
+    done = subprocess.run(words, input=run.to_json(), capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise StudyError(
             f"The process of a run ended with code {done.returncode}: {done.stderr.strip()[-500:]}"
         )
-    return replace(Answer.from_mapping(json.loads(done.stdout)), key=run.key)
+    return Answer.from_mapping(json.loads(done.stdout))
 
 
 def main(words: list[str]) -> int:
     """Make the run on standard input; an error goes to standard error."""
     try:
-        made = answer(Run.from_json(sys.stdin.read()), Path(words[0]) if words else None)
+        made = _here(Run.from_json(sys.stdin.read()), Path(words[0]) if words else None)
     except LungaccessError as error:
         sys.stderr.write(f"{error}\n")
         return 2

@@ -95,11 +95,12 @@ class PlannerChoice:
     kind : str
         "plan" for all three stages, "needle" for the needle alone from the case's start poses.
     method : str
-        One of `lungaccess.planner.METHODS`, or of `stages.needle.planners.PLANNERS`.
+        One of `lungaccess.planner.METHODS`; for the needle, of `stages.needle.planners.PLANNERS` or of
+        `lungaccess.needle.OMPL_PLANNERS`.
     iterations : int or None
         Instead of those of the budget.
     own_process : bool
-        Whether each run has a fresh process.
+        Whether each run has a fresh process; OMPL's planners have one in any case.
     """
 
     name: Annotated[str, text("name of the planner in tables")]
@@ -112,6 +113,13 @@ class PlannerChoice:
         known = methods(self.kind)
         if self.method not in known:
             raise impossible("method", self.method, f"one of {', '.join(known)}")
+
+    @property
+    def is_of_ompl(self) -> bool:
+        """Whether it is a planner of OMPL, whose random numbers can be seeded once in a process."""
+        from lungaccess.needle import OMPL_PLANNERS
+
+        return self.kind == "needle" and self.method in OMPL_PLANNERS
 
 
 @settings
@@ -173,6 +181,8 @@ class Study:
         ):
             if len(set(names)) < len(names):
                 raise impossible(key, names, "each only once")
+        if self.budget.time_s is None and any(each.is_of_ompl for each in self.planner):
+            raise impossible("budget", "no time_s", "time_s, which planners of OMPL end by")
         if any(each.kind == "needle" for each in self.planner) and not all(c.starts for c in self.case):
             raise impossible("case", "starts = []", "start poses in every case, for planners of the needle")
 
@@ -180,9 +190,10 @@ class Study:
 def methods(kind: str) -> tuple[str, ...]:
     """Return the names of the planners of a kind, "plan" or "needle"."""
     if kind == "needle":
+        from lungaccess.needle import OMPL_PLANNERS
         from stages.needle.planners import PLANNERS
 
-        return tuple(PLANNERS)
+        return (*PLANNERS, *OMPL_PLANNERS)
     from lungaccess.planner import METHODS
 
     return tuple(METHODS)

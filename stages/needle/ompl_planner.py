@@ -470,19 +470,26 @@ class NeedleProblem:
         return state
 
 
+_seeds: list[int] = []
+"""What OMPL was seeded with in this process."""
+
+
 def seed_ompl(seed: int) -> None:
     """Make OMPL's own planners repeatable; call it before anything else is made with OMPL.
 
     Raises
     ------
     SettingsError
-        If OMPL has drawn random numbers in this process already, or the seed is less than 1.
+        If OMPL has been seeded or has drawn random numbers in this process already, or the seed is less
+        than 1.
     """
     level = util.getLogLevel()
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(seed)
     util.setLogLevel(level)
-    if seed < 1 or util.RNG.getSeed() != seed:
+    refused = _seeds or seed < 1 or util.RNG.getSeed() != seed
+    _seeds.append(seed)
+    if refused:
         raise SettingsError(
             f"OMPL cannot begin with the seed {seed}",
             expected="a number of 1 or more, before OMPL has drawn its first",

@@ -18,8 +18,10 @@ import pytest
 from anatomy.errors import AnatomyError, FrameError
 from lungaccess import cli, run, terminal
 from lungaccess.checking import CheckReport, Finding
+from lungaccess.commands.common import DEFAULT_BUDGET_S, DEFAULT_SYSTEM
 from lungaccess.noplan import NoPlan
 from lungaccess.plans import Plan
+from tests.lungaccess.loading import load_with
 
 WRITTEN = {"plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv"}
 
@@ -38,7 +40,7 @@ def never_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any, **__: Any) -> None:
         raise AssertionError("the patient was read")
 
-    monkeypatch.setattr(cli, "load_lung", fail)
+    load_with(monkeypatch, fail)
 
 
 @pytest.fixture
@@ -78,7 +80,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         )
         return CheckReport(accepted=seen["accepted"], findings=(bad,))
 
-    monkeypatch.setattr(cli, "load_lung", lambda *_, **__: toy_lung)
+    load_with(monkeypatch, lambda *_, **__: toy_lung)
     monkeypatch.setattr(run, "_atlas", lambda *_: None)
     monkeypatch.setattr(run, "_planner", lambda: search)
     monkeypatch.setattr(
@@ -139,7 +141,7 @@ def test_help_imports_nothing_heavy() -> None:
 def test_presets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["presets"]) == 0
     text = capsys.readouterr().out
-    assert cli.DEFAULT_SYSTEM in text and "121" in text
+    assert DEFAULT_SYSTEM in text and "121" in text
 
 
 # Plans -------------------------------------------------------------------------------------------
@@ -222,7 +224,7 @@ def test_targets_are_understood(
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(
     ("words", "time_s", "iterations"),
-    [([], cli.DEFAULT_BUDGET_S, None), (["--budget", "2"], 2.0, None), (["--iterations", "7"], None, 7)],
+    [([], DEFAULT_BUDGET_S, None), (["--budget", "2"], 2.0, None), (["--iterations", "7"], None, 7)],
 )
 def test_an_iteration_budget_leaves_the_time_open(
     words: list[str], time_s: Any, iterations: Any, toy_commands: dict[str, Any], tmp_path: Path
@@ -240,7 +242,7 @@ def test_the_user_decides_about_fissures(
     system = toy_commands["system"]
     assert system.fissures_allowed is allowed
     # A preset that was changed does not go by the name of the preset.
-    assert (system.name == cli.DEFAULT_SYSTEM) is not allowed
+    assert (system.name == DEFAULT_SYSTEM) is not allowed
 
 
 @pytest.mark.parametrize(("accepted", "code"), [(True, cli.OK), (False, cli.NO_PLAN)])
@@ -337,7 +339,7 @@ def test_a_typed_error_is_a_panel_and_exits_2(
     def fail(*_: Any, **__: Any) -> None:
         raise error("The mask [airway] is empty", expected="one voxel", remedy="Look at it")
 
-    monkeypatch.setattr(cli, "load_lung", fail)
+    load_with(monkeypatch, fail)
     assert cli.main(["info", "toy"]) == cli.BAD_INPUT
     text = capsys.readouterr().err
     for part in ("The mask [airway] is empty.", "one voxel", "Look at it"):
@@ -353,6 +355,6 @@ def test_lack_of_memory_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     def fail(*_: Any, **__: Any) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(cli, "load_lung", fail)
+    load_with(monkeypatch, fail)
     assert cli.main(["info", "toy"]) == cli.BAD_INPUT
     assert "not enough memory" in capsys.readouterr().err

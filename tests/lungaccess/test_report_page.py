@@ -487,7 +487,7 @@ def test_the_command_writes_page_and_movie(
     plans: tuple[Plan, ...], small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plans[0].save(tmp_path / "plan.json")
-    monkeypatch.setattr("lungaccess.commands_report.load_lung", lambda *_: small_lung)
+    monkeypatch.setattr("lungaccess.commands.report.load_lung", lambda *_: small_lung)
     monkeypatch.setattr(
         "lungaccess.report.html.bronchoscopy_webp", lambda _plan, _lung, path: Path(path).touch()
     )

@@ -62,7 +62,7 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the picture out where a test does not look at it."""
-    monkeypatch.setattr("lungaccess.commands_tubes._draw", lambda *_: None)
+    monkeypatch.setattr("lungaccess.commands.tubes._draw", lambda *_: None)
 
 
 def run(tmp_path: Path, *words: str) -> int:

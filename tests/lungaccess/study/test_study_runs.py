@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -155,3 +157,52 @@ def test_a_run_of_the_needle_alone(runs: list[Run], cache: Path) -> None:
     assert (nothing.outcome, nothing.solved, nothing.plan) == (NO_PLAN, False, "")
     with pytest.raises(SettingsError, match="no start pose 1"):
         needle_answer(run, lung)
+
+
+OMPL_SCRIPT = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from lungaccess.needle import plan_needle
+from lungaccess.study.patients import open_patient
+from lungaccess.study.runs import Run
+from lungaccess.target import point_target
+from anatomy.errors import SettingsError
+text, tip, cache = json.loads(sys.stdin.read())
+problem, tip = Run.from_json(text).problem, np.array(tip)
+lung = open_patient(problem.patient, Path(cache))
+target = point_target(lung, tip[:3, 3] + 12.0 * tip[:3, 2])
+asked = dict(planner="control.RRT", seed=4, time_s=60.0)
+found = plan_needle(lung, problem.system, tip, target, **asked)
+try:
+    plan_needle(lung, problem.system, tip, target, **asked)
+except SettingsError as error:
+    print(json.dumps([found.path.arcs.tolist(), found.cost, str(error)]))
+"""
+
+
+@pytest.mark.slow
+def test_planners_of_ompl_repeat_in_processes_of_their_own(runs: list[Run], cache: Path) -> None:
+    tip = Plan.from_json(answer(runs[0], cache).plan).tube.lps_from_tip
+    words = json.dumps([runs[0].to_json(), tip.tolist(), str(cache)])
+    first, again = (
+        json.loads(
+            subprocess.run(
+                [sys.executable, "-c", OMPL_SCRIPT], input=words, capture_output=True, text=True, check=True
+            ).stdout.splitlines()[-1]
+        )
+        for _ in range(2)
+    )
+    assert first == again
+    arcs, cost, refused = first
+    assert sum(arc[0] for arc in arcs) == pytest.approx(cost)
+    assert cost > 11.0 and "OMPL cannot begin" in refused
+
+
+def test_planners_of_ompl_end_by_time() -> None:
+    needle = {"name": "r", "kind": "needle", "method": "control.RRT"}
+    case = {"name": "c", "anatomy": "phantom", "targets": ["nodule"], "starts": [1]}
+    plain = {"name": "s", "case": [case], "planner": [needle], "budget": {"iterations": 5}}
+    with pytest.raises(SettingsError, match="time_s"):
+        study_of(plain)
+    assert study_of(plain | {"budget": {"time_s": 5.0}}).planner[0].is_of_ompl

@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 
 from anatomy.errors import SettingsError
 from lungaccess import terminal
+from lungaccess.commands.common import OK
 from lungaccess.progress import progress
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from lungaccess.study.summary import Group
 
-OK, NOT_ALL = 0, 1
+NOT_ALL = 1
 
 study = App(name="study", help="Run many plans from one file, into one file of results.")
 
@@ -100,7 +101,7 @@ def show(results: Path, *, json: bool = False) -> int:
 
 
 @study.command
-def export(results: Path, *, csv: Path | None = None, parquet: Path | None = None) -> int:
+def export(results: Path, *, csv: Path | None = None, parquet: Path | None = None, json: bool = False) -> int:
     """Write the tables of the results as CSV or Parquet.
 
     Parameters
@@ -111,6 +112,8 @@ def export(results: Path, *, csv: Path | None = None, parquet: Path | None = Non
         Folder for runs.csv, progress.csv, findings.csv, rejections.csv and plans.csv.
     parquet : Path
         Folder for the same as Parquet.
+    json : bool
+        Print JSON instead of text.
     """
     from lungaccess.study.export import export_csv, export_parquet
 
@@ -118,6 +121,9 @@ def export(results: Path, *, csv: Path | None = None, parquet: Path | None = Non
         raise SettingsError("Nothing to export to was given", expected="--csv FOLDER or --parquet FOLDER")
     written = [] if csv is None else export_csv(results, csv)
     written += [] if parquet is None else export_parquet(results, parquet)
+    if json:
+        terminal.show_json({"written": [str(path) for path in written]})
+        return OK
     for path in written:
         terminal.console.print(terminal.escaped(f"Written to {path}"))
     return OK

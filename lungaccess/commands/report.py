@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess import terminal
+from lungaccess.commands.common import OK
 from lungaccess.inputs import load_lung
 from lungaccess.progress import progress
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans import Plan
 
-OK = 0
 HISTORY_FILE = "cost_over_time.csv"
 
 

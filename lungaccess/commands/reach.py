@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from anatomy.io.files import atomic_write, require_writable_folder
 from lungaccess import terminal
+from lungaccess.commands.common import OK
 from lungaccess.inputs import load_device, load_lung
 from lungaccess.progress import progress
 
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lungaccess.reachability import ReachMap, RegionReach
-
-OK = 0
 
 
 def reach(

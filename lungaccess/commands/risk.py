@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lungaccess import terminal
+from lungaccess.commands.common import OK
 from lungaccess.inputs import load_lung
 from lungaccess.progress import progress
 
@@ -14,8 +15,6 @@ if TYPE_CHECKING:
 
     from lungaccess.risk import RiskReport, Share
     from lungaccess.tolerances import Tolerance
-
-OK = 0
 
 
 def risk(

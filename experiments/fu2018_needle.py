@@ -1,8 +1,8 @@
-"""Needle RRT on a cost map, by length and by raw voxel intensity, as in [Fu2018, fig. 7].
+"""Needle planner on a cost map, by length and by raw voxel intensity, as in [Fu2018, fig. 7].
 
     python -m experiments.fu2018_needle [--quick] [--seed 1] [--results FOLDER] [--ct NAME] [--work FOLDER]
 
-Three searches that differ in their objective alone, in three scenarios of rising difficulty: success and
+Three searches (`OptimalSearch`) that differ in their objective alone, in three scenarios of rising difficulty: success and
 cost over time.  Cost is judged by the cost map for all three: its sum over the set of voxels crossed [Fu2018,
 eq. 1], and its line integral, which does not depend on the voxel size.
 The cost map is that of `lungaccess segment`, of a CT or of the phantom's.

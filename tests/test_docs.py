@@ -19,10 +19,18 @@ ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/tutorial.md")
 LUNGACCESS = Path(sys.executable).with_name("lungaccess")
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
-ELSEWHERE = ("make ", ". .venv", "git ", "cd ", "lungaccess segment ")
+ELSEWHERE = ("pip ", "make ", ". .venv", "git ", "cd ", "lungaccess segment ")
 """Commands that other tests run, or that belong to a shell."""
 MAY_SAY_NO = ("advise", "needle", "tubes")
 """Commands that end with 1 where a device does not get there, which depends on the patient."""
+
+
+STUDY = """
+name = "nodules"
+budget = {iterations = 1}
+case = [{name = "nodule", anatomy = "PATIENT", targets = ["nodule"]}]
+planner = [{name = "atlas"}]
+"""
 
 
 def commands(text: str) -> list[list[str]]:
@@ -41,6 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     system = la.load_system("lung-default")
     found = next(la.plan(lung, system, la.resolve_target(lung), iterations=0))
     np.savetxt(here / "pose.txt", LPS_FROM_RAS @ found.tube.lps_from_tip)
+    (here / "study.toml").write_text(STUDY)
     lesions = [",".join(f"{x:.2f}" for x in nodule.centre_lps) for nodule in patient.nodules[:2]]
     (here / "lesions.txt").write_text("".join(f"lps:{lesion}\n" for lesion in lesions))
     return here

@@ -17,7 +17,7 @@ import json
 import sys
 import time
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from anatomy.grid import Float
 from anatomy.io.files import atomic_write
 from lungaccess.assemble import Candidate, Task, assemble
 from lungaccess.atlas import Atlas
+from lungaccess.inputs import load_device
 from lungaccess.peripheral import peripheral_targets
 from lungaccess.plans import Plan
 from lungaccess.reference import ReferenceSearch
@@ -146,7 +147,7 @@ def main() -> None:
     parser.add_argument("--cache", default=None)
     options = parser.parse_args()
     lung = la.load_patient(options.patient, cache=options.cache)
-    system = replace(la.load_system(options.system), fissures_allowed=options.allow_fissures)
+    system = load_device(options.system, options.allow_fissures)
     settings = {
         "lung": lung.key,
         "system": system_fingerprint(system),

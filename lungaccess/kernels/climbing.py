@@ -1,4 +1,4 @@
-"""Compiled kernel of the coupled search: random changes of a choice, of which what is cheaper is kept.
+"""Compiled kernels of the coupled search: random choices and changes, of which what is cheaper is kept.
 
 Arguments are those of `lungaccess.kernels.coupled`.
 """
@@ -137,3 +137,53 @@ def climb(tube, needle, stands, allowed, x, vias, count, target, tries, state):
             for m in range(count):
                 vias[m] = new_vias[m]
     return count, cost
+
+
+@numba.njit(cache=True, nogil=True)
+def scatter(
+    tube, needle, rows, row_of, rotations, outers, inners, spreads, target, tries, dearest, state, best
+):
+    """Vary random deployments a little, each with a single arc to the target, and keep the cheapest.
+
+    Parameters
+    ----------
+    rows : (K, 9) float64
+        Where the scope can stand.
+    row_of : (N,) int64
+        The place of each deployment among them.
+    rotations, outers, inners : (N,) float64
+        The deployments: rad, mm, mm.
+    spreads : (2,) float64
+        They are varied by up to so much, in rad and mm.
+    target : tuple of 3 floats
+    tries : int
+    dearest : float
+        What costs as much or more is of no interest.
+    state : (1,) uint64
+        Of the random numbers.
+    best : (4,) float64
+        Receives the cheapest choice.
+
+    Returns
+    -------
+    float
+        Its estimated cost, or `dearest` if there is none.
+    """
+    trace = np.zeros(N_TRACE)
+    tip = np.zeros(9)
+    x = np.zeros(N_CHOICE)
+    vias = np.zeros((MAX_VIAS, 3))
+    allowed = np.ones(rows.shape[0], dtype=np.bool_)
+    none = np.int64(0)
+    for _ in range(tries):
+        n = min(int(uniform(state) * row_of.shape[0]), row_of.shape[0] - 1)
+        x[STAND] = row_of[n]
+        x[ROTATION] = rotations[n] + spreads[0] * (2.0 * uniform(state) - 1.0)
+        x[OUTER] = max(outers[n] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
+        x[INNER] = max(inners[n] + spreads[1] * (2.0 * uniform(state) - 1.0), x[OUTER])
+        cost = judged_cost(tube, needle, rows, allowed, x, vias, none, target, dearest, trace, tip)
+        if cost < dearest:
+            dearest = cost
+            for m in range(N_CHOICE):
+                best[m] = x[m]
+    return dearest

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count, islice
+from itertools import chain, count, islice
 
 import numpy as np
 
+from anatomy.grid import Float
 from lungaccess.assemble import Candidate, Task
 from lungaccess.atlas import Atlas
 from lungaccess.kernels import pricing
 from lungaccess.searches.climbs import Climb, Climber, needle_of, objective_of
 from lungaccess.searches.desk import NeedleDesk, Step
 from lungaccess.searches.entries import Int, different, least_costs
+from lungaccess.searches.scatter import MOST, Scatter, nearly_reaching
 from stages.needle.optimal import OptimalSearch
 from stages.needle.path import direct_path
 from stages.tube.deployments import TubeJudge
@@ -28,7 +30,8 @@ KEPT_SLACK = 1.5
 FRONT = 8
 KICKED = 2
 PLANNED = 4
-SCATTERED = 20
+DRAWS = 6
+"""Iterations of a round in which deployments are drawn near those of the atlas."""
 SLICE = 50
 """Tries of an iteration, about a millisecond."""
 TRIES = 3 * SLICE
@@ -42,9 +45,9 @@ PLANNER_SLACK = 1.3
 """A needle planner may return what is so much dearer than the best: a climb will make it cheaper."""
 WORTH_PRICING = 0.999
 """A climb is priced exactly when its estimated cost has fallen by this factor."""
-HOPELESS_ITERATIONS = 2000
+HOPELESS_ITERATIONS = 1000
 """So many without a deployment that has the target in its needle's workspace, and the search is given up."""
-JOINT_EVERY = 2
+JOINT_EVERY = 4
 """Rounds after which what was found is refined by a nonlinear program."""
 
 
@@ -175,13 +178,14 @@ class AtlasSearch:
         climber = Climber(self.desk, self.judge, self.atlas.sites, self.rng)
         front = self._front(climber, different(self.atlas.deployments, self._clear)[number::parts])
         yield from self._race(climber, list(islice(front, FRONT)))
+        drawn = self._drawn(climber)
         planned = self._planned(climber)
         for turn in count(1):
             yield from self._polish(climber)
             if turn % JOINT_EVERY == 0 and number == 0:
                 yield from self._joint()
             newcomers = [*islice(front, 1), *self._kicked(climber)]
-            for step, climb in islice(planned, PLANNED):
+            for step, climb in chain(islice(drawn, DRAWS), islice(planned, PLANNED)):
                 newcomers += [] if climb is None else [climb]
                 yield step
             yield from self._race(climber, newcomers)
@@ -243,13 +247,10 @@ class AtlasSearch:
         """Run needle planners from deployments, the least lower bound first, longer in every pass."""
         nothing = Step(iteration=0, phase="needle planner")
         if not len(self.in_workspace):
-            yield from self._scattered(climber)
+            return
         entries, number, parts = self.atlas.deployments, *self._share
-        bounds = least_costs(self._needle, entries, self.in_workspace, self._lengths, self.task.target.lps_mm)
-        order = np.argsort(bounds, kind="stable")
-        least = np.zeros(entries.count)
-        least[self.in_workspace] = bounds
-        ordered = different(entries, self.in_workspace[order])[number::parts]
+        by_bound, least = self._by_bound()
+        ordered = different(entries, by_bound)[number::parts]
         for level in count():
             iterations = PLANNER_ITERATIONS * 2 ** min(level, PLANNER_DOUBLINGS)
             for entry in ordered.tolist():
@@ -263,6 +264,17 @@ class AtlasSearch:
                 yield step, next(self._begun(climber, found), None)
             yield nothing, None
 
+    def _by_bound(self) -> tuple[Int, Float]:
+        """Return the deployments with the target in their workspace, the least lower bound of the cost first.
+
+        And the bounds `(E,)` by deployment, 0 for all others.
+        """
+        target, entries = self.task.target.lps_mm, self.atlas.deployments
+        bounds = least_costs(self._needle, entries, self.in_workspace, self._lengths, target)
+        least = np.zeros(entries.count)
+        least[self.in_workspace] = bounds
+        return self.in_workspace[np.argsort(bounds, kind="stable")], least
+
     def _by_planner(self, candidate: Candidate | None, iterations: int) -> Candidate | None:
         """Return a deployment with a path of the needle planner that may become the best."""
         seed = int(self.rng.integers(2**63))
@@ -274,17 +286,19 @@ class AtlasSearch:
         search.advance(iterations)
         return None if search.path is None else replace(candidate, path=search.path)
 
-    def _scattered(self, climber: Climber) -> Iterator[tuple[Step, Climb | None]]:
-        """Vary deployments that do not have the target in their workspace until one has."""
-        nothing = Step(iteration=0, phase="climb")
+    def _drawn(self, climber: Climber) -> Iterator[tuple[Step, Climb | None]]:
+        """Draw deployments near those whose needle reaches the target, or nearly does, for ever."""
+        inside = different(self.atlas.deployments, self._by_bound()[0])[: MOST // 2]
+        most = MOST - len(inside)
+        outside = nearly_reaching(self.atlas, self.task.system.needle, self.task.target.lps_mm, most)
+        chosen = np.concatenate([inside, outside])
+        scatter = Scatter(climber, self.judge, self.atlas, chosen, self.rng)
         while True:
-            entry = int(self.rng.integers(self.atlas.deployments.count))
-            climb = next(self._begun(climber, self._entry(entry)), None)
-            for _ in range(SCATTERED):
-                if climb is not None and not math.isfinite(climb.cost):
-                    climber.advance(climb, SLICE)
-                found = climb is not None and math.isfinite(climb.cost)
-                yield nothing, climb if found else None
+            found = scatter.draw(KEPT_SLACK * self._best_cost)
+            step = Step(iteration=0, phase="climb")
+            if self.best is None:
+                step = self.desk.finished(0, "climb", found)
+            yield step, next(self._begun(climber, found), None)
 
     def _joint(self) -> Iterator[Step]:
         """Improve site, tubes and needle of the best together, by a nonlinear program."""

@@ -1,4 +1,4 @@
-"""The search over the deployment atlas: direct arcs, climbs from the best of them, needle planners."""
+"""The search over the deployment atlas: direct arcs, climbs from the best, draws between, needle planners."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ JOINT_EVERY = 4
 
 
 class AtlasSearch:
-    """Direct arcs from the whole atlas; then climbs, needle planners and joint refinement in turns.
+    """Direct arcs from the whole atlas; then climbs, draws, needle planners and joint refinement in turns.
 
     Parameters
     ----------
@@ -295,9 +295,9 @@ class AtlasSearch:
         scatter = Scatter(climber, self.judge, self.atlas, chosen, self.rng)
         while True:
             found = scatter.draw(KEPT_SLACK * self._best_cost)
-            step = Step(iteration=0, phase="climb")
+            step = Step(iteration=0, phase="draw")
             if self.best is None:
-                step = self.desk.finished(0, "climb", found)
+                step = self.desk.finished(0, "draw", found)
             yield step, next(self._begun(climber, found), None)
 
     def _joint(self) -> Iterator[Step]:

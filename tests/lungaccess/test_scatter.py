@@ -57,7 +57,7 @@ def test_what_is_drawn_is_proved_and_near_the_atlas(searches: list[AtlasSearch])
             if found is None:
                 continue
             seen += 1
-            step = search.desk.finished(1, "climb", found)
+            step = search.desk.finished(1, "draw", found)
             assert step.candidate is not None and step.cost < 1.03 * dearest
             own = found.deployment
             turn = np.abs(np.angle(np.exp(1j * (entries.rotation_rad[chosen] - own.rotation_rad))))

@@ -62,7 +62,6 @@ FULL = Size(
 QUICK = Size(per_lung=5, ours_s=5.0, papers_s=5.0, systems=(("ultrathin", True),))
 NOT_REPRODUCED = [
     "The lung of the paper and its nodules; it is a commercial model that cannot be had.",
-    "One hour a target: our own search was given two minutes.",
 ]
 
 
@@ -150,7 +149,9 @@ def main() -> None:
             "time": "wall, without the atlas; as many searches at once as there are workers",
             "searches": f"{OURS} up to {size.ours_s:g} s, {PAPERS} on our kernels up to {size.papers_s:g} s",
         },
-        not_reproduced=list(NOT_REPRODUCED),
+        not_reproduced=[
+            *NOT_REPRODUCED, f"One hour a target: our own search was given at most {size.ours_s:g} s.",
+        ],
     )  # fmt: skip
     file = options.runs.with_stem(f"{options.runs.stem}-{result.setting}")
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,7 @@
 
     python -m experiments.noplan_attack PATIENT RESULTS.json [--system lung-default] [--time 60]
 
-Random peripheral targets, as in kuntz2015_reachability.py.  Where the planner gives up, Algorithm 1 of
+Random peripheral targets, see `lungaccess.peripheral`.  Where the planner gives up, Algorithm 1 of
 [Kuntz2015] searches with FCL on meshes for `--time` s of processor time.  A plan of it that the check
 accepts is a defect of the planner: "missed" if the planner's proof accepts it too, "refused" if the proof
 alone stands against it.  Such plans are written beside the results.

@@ -73,9 +73,9 @@ def plan(
     objective : str
         "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1] or "length_mm".
     method : str
-        "atlas": direct arcs from every deployment of the atlas, then climbs from the best of them, the
-        optimal needle planner from others, and joint refinement.  "kuntz2015": Algorithm 1 of that paper;
-        "kuntz2015-without-rejection": the same without its workspace test.  "reference" and
+        "atlas": direct arcs from every deployment of the atlas, then climbs from the best of them, draws of
+        deployments between, the optimal needle planner from others, and joint refinement.
+        "kuntz2015": Algorithm 1 of that paper; "kuntz2015-without-rejection": the same without its workspace test.  "reference" and
         "reference-without-rejection": the same as printed, with FCL on meshes, slow; see
         `lungaccess.reference`.
     seed : int

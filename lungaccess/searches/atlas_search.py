@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from itertools import chain, count, islice
 
 import numpy as np
@@ -249,7 +250,7 @@ class AtlasSearch:
         if not len(self.in_workspace):
             return
         entries, number, parts = self.atlas.deployments, *self._share
-        by_bound, least = self._by_bound()
+        by_bound, least = self._by_bound
         ordered = different(entries, by_bound)[number::parts]
         for level in count():
             iterations = PLANNER_ITERATIONS * 2 ** min(level, PLANNER_DOUBLINGS)
@@ -264,8 +265,9 @@ class AtlasSearch:
                 yield step, next(self._begun(climber, found), None)
             yield nothing, None
 
+    @cached_property
     def _by_bound(self) -> tuple[Int, Float]:
-        """Return the deployments with the target in their workspace, the least lower bound of the cost first.
+        """The deployments with the target in their workspace, the least lower bound of the cost first.
 
         And the bounds `(E,)` by deployment, 0 for all others.
         """
@@ -288,7 +290,7 @@ class AtlasSearch:
 
     def _drawn(self, climber: Climber) -> Iterator[tuple[Step, Climb | None]]:
         """Draw deployments near those whose needle reaches the target, or nearly does, for ever."""
-        inside = different(self.atlas.deployments, self._by_bound()[0])[: MOST // 2]
+        inside = different(self.atlas.deployments, self._by_bound[0])[: MOST // 2]
         most = MOST - len(inside)
         outside = nearly_reaching(self.atlas, self.task.system.needle, self.task.target.lps_mm, most)
         chosen = np.concatenate([inside, outside])

@@ -76,8 +76,8 @@ def plan(
         "atlas": direct arcs from every deployment of the atlas, then climbs from the best of them, draws of
         deployments between, the optimal needle planner from others, and joint refinement.
         "kuntz2015": Algorithm 1 of that paper; "kuntz2015-without-rejection": the same without its workspace
-        test.  "reference" and "reference-without-rejection": the same as printed, with FCL on meshes, slow; see
-        `lungaccess.reference`.
+        test.  "reference" and "reference-without-rejection": the same as printed, with FCL on meshes, slow;
+        see `lungaccess.reference`.
     seed : int
         The same seed and `iterations` give the same plans.
     iterations : int, optional

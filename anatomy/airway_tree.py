@@ -13,6 +13,13 @@ from anatomy.grid import Float, read_only
 
 Int = NDArray[np.int64]
 
+LEAST_CONTINUED_RADIUS = 0.85
+MOST_SIDE_RADIUS = 0.6
+"""A bronchus goes on behind a fork with at least the one share of its radius if all else is below the other.
+
+Real forks divide: main bronchi have 0.6 to 0.85 of the trachea's radius, lobar bronchi less of theirs.
+"""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GapBridged:
@@ -227,6 +234,28 @@ class AirwayTree:
         """Position of the carina (the last point of branch 0), `(3,)` LPS mm."""
         carina: Float = self.points_lps[self.carina_point]
         return carina
+
+    @cached_property
+    def mediastinal(self) -> NDArray[np.bool_]:
+        """Which branches `(B,)` lie in the mediastinum: the trachea and the main bronchi.
+
+        Whoever leaves the airway there pierces the mediastinal pleura, whatever masks hold beside it.  The
+        children of the trachea are main bronchi.  Where a narrow side branch parts (a bronchus of the trachea
+        itself, a twig that is an error of the mask), the trachea or main bronchus goes on in the wide one.
+        In a tree of one branch nothing says what it is, and none is marked.
+        """
+        rank = np.zeros(self.n_branches, dtype=np.int64)
+        for branch in range(1, self.n_branches):
+            parent = int(self.branch_parent[branch])
+            rank[branch] = rank[parent] + (not self._continues(branch, parent))
+        mediastinal: NDArray[np.bool_] = (rank <= 1) & (self.n_branches > 1)
+        return read_only(mediastinal)
+
+    def _continues(self, branch: int, parent: int) -> bool:
+        """Tell whether a branch is the same bronchus as its parent, which only gave off narrow branches."""
+        radius = self.branch_mean_radius_mm / self.branch_mean_radius_mm[parent]
+        others = radius[np.setdiff1d(self.children(parent), branch)]
+        return bool(radius[branch] >= LEAST_CONTINUED_RADIUS and (others < MOST_SIDE_RADIUS).all())
 
     @cached_property
     def leaf_branches(self) -> Int:

@@ -6,8 +6,8 @@ import contextlib
 import json
 import os
 import shutil
-import tempfile
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
@@ -94,16 +94,10 @@ def _build_into(
 @contextlib.contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder beside `folder` and rename it on success."""
+    # The name is known before the folder is made: an interrupt between the two leaves nothing behind.
+    work = folder.parent / f"{BUILDING}{uuid.uuid4().hex}"
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(folder.parent)
-        work = Path(tempfile.mkdtemp(prefix=BUILDING, dir=folder.parent))
-    except OSError as error:
-        raise FileError(
-            f"The cache folder {folder.parent} cannot be written: {error}",
-            remedy="Choose another with --cache or LUNGACCESS_CACHE",
-        ) from error
-    try:
+        _make_folder(work)
         yield work
         _publish(work, folder)
     except OSError as error:
@@ -113,6 +107,18 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _make_folder(work: Path) -> None:
+    try:
+        work.parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(work.parent)
+        work.mkdir(mode=0o700)
+    except OSError as error:
+        raise FileError(
+            f"The cache folder {work.parent} cannot be written: {error}",
+            remedy="Choose another with --cache or LUNGACCESS_CACHE",
+        ) from error
 
 
 def _remove_abandoned(cache: Path) -> None:

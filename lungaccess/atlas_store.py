@@ -24,7 +24,7 @@ from stages.needle.bundles import StartIndex
 from stages.scope.sites import Sites
 from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
-FORMAT = 2
+FORMAT = 3
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 

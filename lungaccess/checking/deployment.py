@@ -33,6 +33,9 @@ NORMAL_RADIUS_MM = 2.5
 WALL_ZONE_MM = 1.0
 """Behind the exit the axis may cross corners of lumen voxels of the same branch for this length."""
 
+OUT_OF_LUMEN_MM = 0.02
+"""So far the axis stays from every lumen beyond the zone of the wall."""
+
 BRANCH_ZONE_MM = 0.25
 """The pierced branch is that of a lumen voxel which the axis meets in this last length before the exit."""
 
@@ -68,6 +71,7 @@ def check_deployment(plan: Plan, scene: Scene, found: Findings) -> Curve | None:
         way_out = replace(way_out, frame=int(np.abs(curve.arc_mm - way_out.arc_mm).argmin()))
         labels = labels_at(lung, curve.points)
         _check_containment(plan, curve, labels, way_out, found)
+        _check_out_of_lumen(scene, curve, way_out, found)
         _check_clearance(plan, scene, curve, way_out, sweep_mm, found)
     return curve
 
@@ -131,8 +135,9 @@ def _check_exit(
     near = (before >= 0.0) & (before <= BRANCH_ZONE_MM)
     branches = {int(b) for b in branch_of(labels[near & in_lumen])}
     found.true("tube.exit.branch", stated.branch in branches, f"{stated.branch} against {sorted(branches)}")
-    trachea = lung.tree.n_branches > 1 and stated.branch == 0
-    found.true("tube.exit.not_trachea", not trachea, "the trachea lies in the mediastinum")
+    outside_mediastinum = stated.branch in np.flatnonzero(~lung.tree.mediastinal)
+    detail = "trachea and main bronchi lie in the mediastinum"
+    found.true("tube.exit.not_mediastinal", outside_mediastinum, detail)
     detail = f"{exemption.branch} against {stated.branch}"
     found.true("exemption.branch", exemption.branch == stated.branch, detail)
     found.agrees("tube.exit.arc", stated.arc_length_mm, arc_mm, EXIT_TOLERANCE_MM, "mm")
@@ -217,6 +222,18 @@ def _check_containment(
     other = ((behind & structures.AIRWAY) != 0) & (branch_of(behind) != way_out.branch)
     hit = ((behind & forbidden) != 0) | other
     found.true("tube.containment", not hit.any(), f"{int(hit.sum())} samples behind the exit in an obstacle")
+
+
+def _check_out_of_lumen(scene: Scene, curve: Curve, way_out: Exit, found: Findings) -> None:
+    """Beyond the zone of the wall no segment of the axis comes near lumen: no corner is thin enough to hide."""
+    begin_mm = way_out.arc_mm + WALL_ZONE_MM
+    if curve.arc_mm[-1] <= begin_mm:
+        return
+    begin = [np.interp(begin_mm, curve.arc_mm, curve.points[:, axis]) for axis in range(3)]
+    points = np.concatenate([[begin], curve.points[curve.arc_mm > begin_mm]])
+    needed = np.full(len(points) - 1, OUT_OF_LUMEN_MM)
+    boxes = scene.boxes(has(structures.LUMEN), REACH_MM)
+    check_clear("tube.beyond_wall.lumen", boxes, points, needed, found, limited=True)
 
 
 def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:

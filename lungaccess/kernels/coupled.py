@@ -1,8 +1,8 @@
 """Compiled kernels of the coupled search: tubes and needle together, varied and judged as one.
 
-`tube` is the tuple (scene, constants, forbidden branch) of `stages.tube.kernels.deployment`; -1 forbids no
-branch.  `needle` is the tuple (space, limits, objective, whether voxels of infinite cost exist that the
-objective does not see, a cost map) of `stages.needle.kernels`.  A choice is `x`, the place of the scope's
+`tube` is the tuple (scene, constants) of `stages.tube.kernels.deployment`.  `needle` is the tuple (space,
+limits, objective, whether voxels of infinite cost exist that the objective does not see, a cost map) of
+`stages.needle.kernels`.  A choice is `x`, the place of the scope's
 tip as a row of `stands`, the rotation in rad, and the insertions of outer and inner tube in mm; and `vias`,
 points (LPS mm) through which single arcs lead from the tube to the target.  A row of `stands` is a scope tip:
 point, unit tangent, and a unit vector across from which the rotation counts.
@@ -125,7 +125,7 @@ def judged_cost(tube, needle, stands, allowed, x, vias, count, target, dearest, 
 
     What is fast comes first.
     """
-    scene, constants, forbidden = tube
+    scene, constants = tube
     row = int(x[STAND])
     outer, inner = x[OUTER], x[INNER]
     if row < 0 or row >= stands.shape[0] or not allowed[row]:
@@ -148,6 +148,6 @@ def judged_cost(tube, needle, stands, allowed, x, vias, count, target, dearest, 
     if deploy(scene, constants, base[:6], np.array(normal), outer, inner, trace, tip) != ACCEPTED:
         return math.inf
     branch = int(trace[BRANCH])
-    if branch == forbidden or not _needle_clear(needle, pose, vias, count, target, branch):
+    if not _needle_clear(needle, pose, vias, count, target, branch):
         return math.inf
     return cost

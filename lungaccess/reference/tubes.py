@@ -11,7 +11,7 @@ from anatomy.structures import AIRWAY, LUMEN
 from lungaccess.reference.obstacles import SAGITTA_MM, Labels, Obstacles, branch_of, chord_mm, labels_at
 from lungaccess.system import System
 from stages.needle.path import ArcPath, arc_transform
-from stages.tube.deployments import LEAVES_TRACHEA, REASONS, TRACHEA, Deployment, tube_constants
+from stages.tube.deployments import REASONS, Deployment, tube_constants
 from stages.tube.kernels import deployment as kernels
 
 NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
@@ -38,7 +38,7 @@ class TubeTrial:
             float(constants[kernels.OVERLAP_CURVATURE]),
             float(constants[kernels.INNER_CURVATURE]),
         )
-        self._has_trachea = obstacles.lung.tree.n_branches > 1
+        self._mediastinal = obstacles.lung.tree.mediastinal
 
     def shape(
         self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
@@ -60,8 +60,8 @@ class TubeTrial:
             return REASONS[kernels.NO_EXIT]
         first = int(outside[0])
         branch = int(branch_of(labels[first - 1 : first])[0])
-        if self._has_trachea and branch == TRACHEA:
-            return LEAVES_TRACHEA
+        if self._mediastinal[branch]:
+            return REASONS[kernels.LEAVES_MEDIASTINAL]
         exit_mm = self._leaving_mm(points[first - 1 : first + 1], at_mm[first - 1 : first + 1])
         refused = self._contained(labels[first:], at_mm[first:] - exit_mm, branch)
         if refused:

@@ -18,7 +18,7 @@ from stages.needle.objective import Arrays as ObjectiveArrays
 from stages.needle.path import ArcPath, direct_path
 from stages.needle.space import Arrays, NeedleSpace
 from stages.scope.sites import Sites
-from stages.tube.deployments import TRACHEA, Deployment, TubeJudge, scene_of, tube_constants
+from stages.tube.deployments import Deployment, TubeJudge, scene_of, tube_constants
 
 Needle = tuple[Arrays, Float, ObjectiveArrays, bool, NDArray[np.float32]]
 
@@ -92,10 +92,8 @@ class Climber:
         task, space = desk.task, desk.space
         tubes, margins = task.system.tubes, task.system.margins
         self._desk, self._judge, self._places, self._rng = desk, judge, places, rng
-        # In a tree of one branch nothing says that it is a trachea.
-        forbidden = TRACHEA if task.lung.tree.n_branches > 1 else -1
         scene = scene_of(task.lung, with_fissures=task.with_fissures)
-        self.tube = (scene, tube_constants(tubes, margins), forbidden)
+        self.tube = (scene, tube_constants(tubes, margins))
         self.needle = needle_of(space, task)
         x, y, z = task.target.lps_mm.tolist()
         self.target = (x, y, z)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,9 @@ from stages.tube.device import ConcentricTubes
 from stages.tube.kernels import deployment as kernels
 
 Int = NDArray[np.int64]
-Scene = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int, NDArray[np.uint16], Float]
+Scene = tuple[
+    NDArray[np.uint16], NDArray[np.uint16], Float, int, NDArray[np.uint16], Float, NDArray[np.bool_]
+]
 
 REASONS: dict[int, str] = {
     kernels.NO_EXIT: "the tube does not leave the airway",
@@ -34,12 +36,10 @@ REASONS: dict[int, str] = {
     kernels.SWEEPS: "the tube would sweep tissue sideways",
     kernels.TOO_LONG: "the tube would extend too far",
     kernels.PROTRUDES: "the inner tube is too short to protrude so far",
+    kernels.LEAVES_MEDIASTINAL: "the tube would leave the trachea or a main bronchus, in the mediastinum",
 }
 """Why a deployment is refused."""
 
-LEAVES_TRACHEA = "the tube would leave the trachea, which lies in the mediastinum"
-TRACHEA = 0
-"""The branch at the root of every airway tree."""
 
 DEFAULT_ROTATIONS = 24
 DEFAULT_STOP_MM = 2.0
@@ -120,7 +120,15 @@ def scene_of(lung: Lung, *, with_fissures: bool) -> Scene:
     field = lung.obstacle_field(with_fissures=with_fissures)
     bits = OBSTACLES | (FISSURE if with_fissures else 0)
     depth = lung.lumen_depth
-    return field.corners, lung.labels, field.geometry, bits, depth.corners, depth.geometry
+    return (
+        field.corners,
+        lung.labels,
+        field.geometry,
+        bits,
+        depth.corners,
+        depth.geometry,
+        lung.tree.mediastinal,
+    )
 
 
 def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
@@ -230,8 +238,7 @@ def deployments(
     refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
     for _, counts, _ in parts:
         refused += counts
-    found = _as_deployments(rows, angles, refused, sum(candidates for _, _, candidates in parts))
-    return _without_trachea(found) if _has_trachea(lung) else found
+    return _as_deployments(rows, angles, refused, sum(candidates for _, _, candidates in parts))
 
 
 def _between_unlike(rows: Float, rotations: int, stops: Float) -> Int:
@@ -257,23 +264,6 @@ def joined(one: Deployments, other: Deployments, first_site: int) -> Deployments
     return Deployments(**arrays, candidates=one.candidates + other.candidates, refused=refused)
 
 
-def _has_trachea(lung: Lung) -> bool:
-    """Tell whether branch 0 is a trachea: in a tree of one branch nothing says so."""
-    return lung.tree.n_branches > 1
-
-
-def _without_trachea(found: Deployments) -> Deployments:
-    """Refuse the exits through the wall of the trachea, whatever the masks hold there."""
-    kept = found.branch != TRACHEA
-    arrays: dict[str, Any] = {
-        f.name: read_only(getattr(found, f.name)[kept])
-        for f in fields(found)
-        if isinstance(getattr(found, f.name), np.ndarray)
-    }
-    count = int((~kept).sum())
-    return replace(found, **arrays, refused=found.refused | ({LEAVES_TRACHEA: count} if count else {}))
-
-
 def _as_deployments(rows: Float, angles: Float, refused: Int, candidates: int) -> Deployments:
     tip = kernels.ENTRY_TIP
     return Deployments(
@@ -297,7 +287,6 @@ class TubeJudge:
     def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
         self._scene = scene_of(lung, with_fissures=with_fissures)
         self._constants = tube_constants(tubes, margins)
-        self._forbidden_branch = TRACHEA if _has_trachea(lung) else -1
         self._trace = np.zeros(kernels.N_TRACE)
         self._tip = np.zeros(9)
 
@@ -332,8 +321,6 @@ class TubeJudge:
         )
         if reason != kernels.ACCEPTED:
             return REASONS[reason]
-        if int(trace[kernels.BRANCH]) == self._forbidden_branch:
-            return LEAVES_TRACHEA
         return Deployment(
             rotation_rad=float(rotation_rad),
             outer_mm=float(outer_mm),

@@ -52,6 +52,26 @@ def test_branches_generations_lengths(tree: AirwayTree):
     np.testing.assert_allclose(tree.tangents[4], (0, 0, -1), atol=1e-12)
 
 
+def test_trachea_and_main_bronchi_are_mediastinal(tree: AirwayTree):
+    assert tree.mediastinal.tolist() == (tree.generation <= 1).tolist()
+
+
+@pytest.mark.parametrize("at", [4, 11])
+@pytest.mark.parametrize("radius", [2.5, 3.5])
+def test_a_narrow_side_branch_does_not_end_trachea_or_main_bronchus(at: int, radius: float):
+    """A bronchus of the trachea itself, or a twig by error of the mask."""
+    points, radii, edges = _graph()
+    points = np.vstack((points, _line(tuple(points[at]), tuple(points[at] + (0, 40, 0)), 4)))
+    radii = np.append(radii, np.full(4, radius))
+    edges = np.vstack((edges, [(at, 24), (24, 25), (25, 26), (26, 27)]))
+    tree = tree_from_graph(points, radii, edges)
+    wide = tree.branch_mean_radius_mm > 5.0
+    assert wide.sum() >= 3
+    assert tree.mediastinal[wide].all()
+    lobar = np.isclose(tree.branch_mean_radius_mm, 3.0) | np.isclose(tree.branch_mean_radius_mm, 4.0)
+    assert lobar.sum() == 2 and not tree.mediastinal[lobar].any()
+
+
 def test_route_leads_from_the_root_over_neighbours(tree: AirwayTree):
     for point in range(tree.n_points):
         route = tree.route(point)

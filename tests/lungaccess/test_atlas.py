@@ -10,14 +10,8 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from stages.tube.deployments import (
-    DEFAULT_ROTATIONS,
-    LEAVES_TRACHEA,
-    TRACHEA,
-    _without_trachea,
-    deployments,
-    insertion_stops,
-)
+from stages.tube.deployments import DEFAULT_ROTATIONS, REASONS, deployments, insertion_stops
+from stages.tube.kernels import deployment as kernels
 from stages.tube.shape import centreline
 from tests.stages.scenes import brute_clearance
 
@@ -77,15 +71,25 @@ def test_tubes_are_clear_behind_the_exit(atlas: la.Atlas, small_lung: Lung) -> N
         assert not (labels[s > found.exit_mm[n] + 1.0] & LUMEN).any()
 
 
-def test_no_tube_leaves_the_trachea(atlas: la.Atlas) -> None:
-    """It lies in the mediastinum, whatever the masks hold beside it."""
-    entries = atlas.deployments
-    through = np.arange(entries.count) % 3 == 0
-    some = replace(entries, branch=np.where(through, TRACHEA, entries.branch))
-    kept = _without_trachea(some)
-    assert (atlas.deployments.branch != TRACHEA).all()
-    assert np.array_equal(kept.positions, entries.positions[~through])
-    assert kept.refused[LEAVES_TRACHEA] == through.sum()
+def test_no_tube_leaves_trachea_or_main_bronchi(atlas: la.Atlas, small_lung: Lung) -> None:
+    """They lie in the mediastinum, whatever the masks hold beside them; nothing else is lost by that."""
+    tree, free = small_lung.tree, replace(small_lung.tree)
+    assert tree.mediastinal.tolist() == (tree.generation <= 1).tolist()
+    vars(free)["mediastinal"] = np.zeros(tree.n_branches, dtype=bool)
+
+    def enumerated(lung: Lung) -> tuple[set[tuple[float, ...]], set[tuple[float, ...]]]:
+        """Return the deployments from the first sites at whole steps, those through the mediastinum apart."""
+        tips = atlas.sites.poses[:150]
+        found = deployments(lung, SYSTEM.tubes, SYSTEM.margins, tips, with_fissures=True, rotations=8)
+        columns = (found.branch, found.site, found.rotation_rad, found.outer_mm, found.inner_mm)
+        rows = np.stack(columns, axis=1)[np.isclose(found.rotation_rad % (np.pi / 4), 0.0)]
+        central = tree.mediastinal[rows[:, 0].astype(int)]
+        return {tuple(row) for row in rows[central]}, {tuple(row) for row in rows[~central]}
+
+    central, peripheral = enumerated(replace(small_lung, tree=free))
+    assert len(central) > 20 and len(peripheral) > 20
+    assert enumerated(small_lung) == (set(), peripheral)
+    assert atlas.deployments.refused[REASONS[kernels.LEAVES_MEDIASTINAL]] > 0
 
 
 def test_the_same_atlas_twice(atlas: la.Atlas, small_lung: Lung) -> None:

@@ -35,7 +35,7 @@ def searches() -> list[AtlasSearch]:
             ),
             atlas,
         )
-        for seed, point in enumerate(peripheral_targets(lung, 12, 3))
+        for seed, point in enumerate(peripheral_targets(lung, 16, 3))
     ]  # fmt: skip
 
 

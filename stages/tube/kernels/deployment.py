@@ -3,7 +3,8 @@
 A straight outer tube and an inner tube with a precurved distal part, rotated together, need no
 torsion: the centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `(10,)`
 float64 array indexed by the constants below.  `scene` is the tuple (obstacle field, labels, their
-geometry, obstacle bits, lumen depth, its geometry).  `trace` is a `(5,)` float64 array that follows
+geometry, obstacle bits, lumen depth, its geometry, which branches `(B,)` lie in the mediastinum and must not
+be left).  `trace` is a `(5,)` float64 array that follows
 one tube from the lumen through the wall into the tissue.
 """
 
@@ -54,7 +55,8 @@ FLAT_EXIT = 7
 SWEEPS = 8
 TOO_LONG = 9
 PROTRUDES = 10
-N_REASONS = 11
+LEAVES_MEDIASTINAL = 11
+N_REASONS = 12
 
 FINE_STEP_MM = 0.05
 WALL_ZONE_MM = 1.0
@@ -171,7 +173,10 @@ def wall_angle(labels, geometry, pose):
 @numba.njit(cache=True)
 def _leave_lumen(scene, tubes, trace, pose, bend, inside, outside, s0):
     """Find where the axis leaves the lumen between two arc lengths of a piece, and judge the exit."""
-    _field, labels, geometry, _bits, _lumen, _lumen_geometry = scene
+    _field, labels, geometry, _bits, _lumen, _lumen_geometry, mediastinal = scene
+    branch = int(trace[BRANCH])
+    if branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
+        return LEAVES_MEDIASTINAL
     for _ in range(BISECTIONS):
         middle = 0.5 * (inside + outside)
         x, y, z = point_on_arc(pose, bend, middle)
@@ -193,7 +198,7 @@ def _tissue_gap(scene, trace, x, y, z, required):
 
     Exempt is the wall of the pierced branch; its lumen must stay out of reach of the axis.
     """
-    field, labels, geometry, bits, _lumen, _lumen_geometry = scene
+    field, labels, geometry, bits, _lumen, _lumen_geometry, _mediastinal = scene
     gap = distance_bound(field, geometry, x, y, z) - required
     if gap >= MIN_GAP_MM:
         return gap, 0
@@ -214,7 +219,7 @@ def _lumen_step(scene, trace, x, y, z, radius, required):
     Where the tube touches the wall, what lies behind it must be as clear as in the tissue, unless the
     tube comes free again before it leaves.
     """
-    _field, labels, geometry, bits, lumen, lumen_geometry = scene
+    _field, labels, geometry, bits, lumen, lumen_geometry, _mediastinal = scene
     trace[BRANCH] = (label_at(labels, geometry, x, y, z) >> BRANCH_SHIFT) - 1
     depth = distance_bound(lumen, lumen_geometry, x, y, z)
     if depth >= radius:
@@ -375,7 +380,7 @@ def enumerate_site(scene, tubes, base, normals, site, stops, entries, reasons, w
         Insertions in mm, increasing from 0.
     entries : (rows, 13) float64
         Receives the accepted deployments; at least `T S (S + 1) / 2` rows.
-    reasons : (11,) int64
+    reasons : (12,) int64
         Counts the refused ones by reason.
     work : (2, 5) float64
         Scratch.

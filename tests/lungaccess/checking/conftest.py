@@ -20,25 +20,33 @@ SPACING_MM = (1.0, 0.9, 1.1)
 SHAPE = (150, 64, 104)
 BRANCH_END = np.array([40.0, 0.0, 12.0])
 CARINA = np.array([0.0, 0.0, 70.0])
-TRACHEA_RADIUS_MM, BRONCHUS_RADIUS_MM, WALL_MM = 6.0, 4.0, 1.0
-SITE_STEP = 48
+MAIN_END = CARINA + 0.2 * (BRANCH_END - CARINA)
+WALL_MM = 1.0
+BRANCHES = (
+    (np.array([0.0, 0.0, 88.0]), CARINA, 6.0, -1),
+    (CARINA, MAIN_END, 5.0, 0),
+    (CARINA, BRANCH_END * [-1, 1, 1], 4.0, 0),
+    (MAIN_END, BRANCH_END, 4.0, 1),
+)
+"""From, to, radius (mm) and parent of trachea, two main bronchi, and a lobar bronchus."""
+LOBAR = 3
+SITE_STEP = 20
 OUTER_MM, INNER_MM, ROTATION_RAD = 20.0, 38.0, 0.7
 ARCS = ((6.0, 0.4, 0.0), (10.0, 1.1, 0.008), (9.0, -2.0, 0.004))
 EXEMPT_MM = 5.0
 
 
 def toy_tree() -> AirwayTree:
-    """A trachea and two bronchi, points 0.5 mm apart."""
-    lines = [(np.array([0.0, 0.0, 88.0]), CARINA), (CARINA, BRANCH_END), (CARINA, BRANCH_END * [-1, 1, 1])]
+    """The branches as points 0.5 mm apart."""
     points, parents, branches, tangents, radii, start = [], [], [], [], [], [0]
-    for branch, (a, b) in enumerate(lines):
+    for branch, (a, b, radius, parent) in enumerate(BRANCHES):
         count = round(float(np.linalg.norm(b - a)) / 0.5)
         t = np.arange(0 if branch == 0 else 1, count + 1) / count
         points.append(a + t[:, None] * (b - a))
-        parents += [-1 if branch == 0 else start[1] - 1, *range(start[-1], start[-1] + len(t) - 1)]
+        parents += [-1 if branch == 0 else start[parent + 1] - 1, *range(start[-1], start[-1] + len(t) - 1)]
         branches += [branch] * len(t)
         tangents.append(np.tile((b - a) / np.linalg.norm(b - a), (len(t), 1)))
-        radii += [TRACHEA_RADIUS_MM if branch == 0 else BRONCHUS_RADIUS_MM] * len(t)
+        radii += [radius] * len(t)
         start.append(start[-1] + len(t))
     place = np.concatenate(points)
     way = np.zeros(len(place))
@@ -50,8 +58,8 @@ def toy_tree() -> AirwayTree:
         parent_point=np.array(parents),
         branch_of_point=np.array(branches),
         branch_start=np.array(start),
-        branch_parent=np.array([-1, 0, 0]),
-        generation=np.array([0, 1, 1]),
+        branch_parent=np.array([parent for *_, parent in BRANCHES]),
+        generation=np.array([0, 1, 1, 2]),
         distance_from_root_mm=way,
         tangents=np.concatenate(tangents),
     )
@@ -74,11 +82,7 @@ def toy_lung() -> Any:
         structures.OUTSIDE
     )
     lumen, wall = np.zeros((2, *SHAPE), dtype=bool)
-    for a, b, r in (
-        (np.array([0.0, 0, 96]), CARINA, TRACHEA_RADIUS_MM),
-        (CARINA, BRANCH_END, BRONCHUS_RADIUS_MM),
-        (CARINA, BRANCH_END * [-1, 1, 1], BRONCHUS_RADIUS_MM),
-    ):
+    for a, b, r in ((np.array([0.0, 0, 96]), CARINA, 6.0), *(branch[:3] for branch in BRANCHES)):
         lumen |= capsule(points, a, b, r)
         wall |= capsule(points, a, b, r + WALL_MM)
     vessel = capsule(points, np.array([30.0, 8.0, 60.0]), np.array([80.0, 9.0, 5.0]), 3.0) & ~wall
@@ -114,7 +118,7 @@ def turned(pose: np.ndarray, roll_rad: float) -> np.ndarray:
 def arc(length_mm: float, k: float) -> np.ndarray:
     """Closed form of an arc that bends towards +x."""
     a = k * length_mm
-    x, z = ((1 - np.cos(a)) / k, np.sin(a) / k) if k else (0.0, length_mm)
+    x, z = (2.0 * np.sin(0.5 * a) ** 2 / k, np.sin(a) / k) if k else (0.0, length_mm)
     return np.array(
         [[np.cos(a), 0, np.sin(a), x], [0, 1, 0, 0], [-np.sin(a), 0, np.cos(a), z], [0, 0, 0, 1.0]]
     )
@@ -220,9 +224,9 @@ def toy_plan(lung: Any, system: System, outer_mm: float, inner_mm: float, arcs: 
 
 
 def toy_route(lung: Any, system: System) -> ScopeRoute:
-    """Down the trachea and some way into the first bronchus."""
+    """Down the trachea and some way into the lobar bronchus."""
     tree: AirwayTree = lung.tree
-    site = int(tree.branch_start[1]) + SITE_STEP
+    site = int(tree.branch_start[LOBAR]) + SITE_STEP
     index = tree.route(site)
     points = tree.points_lps[index]
     radius = brute_distance(lung, (lung.labels & structures.LUMEN) == 0, points)
@@ -238,7 +242,7 @@ def toy_route(lung: Any, system: System) -> ScopeRoute:
         branches=tree.branch_of_point[index],
         lps_from_scope_tip=turned(frame, np.pi - ROTATION_RAD),
         site_point=site,
-        generation=1,
+        generation=2,
         length_mm=length,
         length_from_carina_mm=length - float(tree.distance_from_root_mm[tree.carina_point]),
         min_lumen_margin_mm=float(radius.min()) - system.scope.radius_mm,

@@ -27,7 +27,7 @@ ARC = st.tuples(st.floats(0.01, 20.0), st.floats(-6.3, 6.3), st.floats(0.0, 0.05
 def test_re_integration_against_closed_arcs(tools: Any, arcs: list[tuple[float, float, float]]) -> None:
     pieces = [shapes.Piece(length_mm=a, roll_rad=b, curvature_per_mm=c) for a, b, c in arcs]
     curve = shapes.integrate(np.eye(4), pieces)
-    frames, _ = tools.follow(np.eye(4), [(a, b, c if c > 1e-9 else 0.0) for a, b, c in arcs], 1.0)
+    frames, _ = tools.follow(np.eye(4), arcs, 1.0)
     np.testing.assert_allclose(curve.end, frames[-1], atol=1e-7)
     assert np.isclose(curve.arc_mm[-1], sum(a for a, _, _ in arcs))
     assert np.linalg.norm(np.diff(curve.points, axis=0), axis=1).max() <= shapes.STEP_MM + 1e-9

@@ -15,10 +15,10 @@ from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from stages.tube.deployments import Deployment, TubeJudge, scene_of, tube_constants
+from stages.tube.deployments import REASONS, Deployment, TubeJudge, scene_of, tube_constants
 from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.kernels import deployment as kernels
-from tests.stages.scenes import Canvas, brute_clearance
+from tests.stages.scenes import Canvas, brute_clearance, forked_tree
 
 KAPPA = 0.025
 CURVED = 40.0
@@ -129,6 +129,12 @@ def judged(
     return judge.judge(tip, rotation, outer, inner)
 
 
+CHAIN = forked_tree(
+    [([0, 0, 9], [0, 0, 6], 8.0, -1), ([0, 0, 6], [0, 0, 3], 5.0, 0), ([0, 0, 3], [0, 0, 0], 3.0, 1)]
+)
+"""Trachea, main bronchus, lobar bronchus: the last may be left."""
+
+
 def accepted(verdict: Deployment | str) -> Deployment:
     assert isinstance(verdict, Deployment), verdict
     return verdict
@@ -166,13 +172,24 @@ class TestExit:
             assert found.exit_mm == pytest.approx(4.0, abs=2e-3)
             assert math.degrees(found.wall_angle_rad) == pytest.approx(angle_deg, abs=5.0)
 
+    @pytest.mark.parametrize("branch", [-1, 0, 1, 2, 3])
+    def test_only_out_of_a_known_branch_beyond_the_main_bronchi(self, branch: int) -> None:
+        canvas = Canvas.empty(LOW, HIGH, 0.5)
+        x = canvas.points[..., 0]
+        canvas.airway(x < 0, x < 1, branch)
+        verdict = judged(canvas.lung(CHAIN))
+        if branch == 2:
+            assert accepted(verdict).branch == 2
+        else:
+            assert verdict == REASONS[kernels.LEAVES_MEDIASTINAL]
+
     @pytest.mark.parametrize("rotation", np.linspace(0.0, 2 * math.pi, 7, endpoint=False))
     def test_through_a_cylinder(self, rotation: float) -> None:
         """Against the voxels met by a dense walk along the same arc."""
         canvas = Canvas.empty([-15, -15, -20], [15, 15, 20], 0.6)
         radial = np.linalg.norm(canvas.points[..., :2], axis=-1)
         canvas.airway(radial < 3.0, radial < 4.0, 2)
-        lung = canvas.lung()
+        lung = canvas.lung(CHAIN)
         found = accepted(judged(lung, base=(0.0, 0.0, -15.0), rotation=rotation))
         s = np.arange(0.0, 30.0, 0.001)
         aside, ahead = (1 - np.cos(KAPPA * s)) / KAPPA, np.sin(KAPPA * s) / KAPPA

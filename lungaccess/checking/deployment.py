@@ -225,7 +225,7 @@ def _check_containment(
 
 
 def _check_out_of_lumen(scene: Scene, curve: Curve, way_out: Exit, found: Findings) -> None:
-    """Beyond the zone of the wall no segment of the axis comes near lumen: no corner is thin enough to hide."""
+    """Beyond the zone of the wall no segment of the axis comes near lumen, however thin the corner."""
     begin_mm = way_out.arc_mm + WALL_ZONE_MM
     if curve.arc_mm[-1] <= begin_mm:
         return

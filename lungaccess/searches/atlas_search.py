@@ -48,8 +48,10 @@ WORTH_PRICING = 0.999
 """A climb is priced exactly when its estimated cost has fallen by this factor."""
 HOPELESS_ITERATIONS = 1000
 """So many without a deployment that has the target in its needle's workspace, and the search is given up."""
-JOINT_EVERY = 4
+JOINT_EVERY = 16
 """Rounds after which what was found is refined by a nonlinear program."""
+WORTH_REFINING = 0.99
+"""It takes as long as several rounds, so the best must have become cheaper by this factor since the last time."""
 
 
 class AtlasSearch:
@@ -77,7 +79,7 @@ class AtlasSearch:
         self._needle = needle_of(self.desk.space, task)
         self._clear: Int = np.zeros(0, dtype=np.int64)
         self._share = (0, 1)
-        self._refined: Candidate | None = None
+        self._refined_cost = math.inf
 
     def steps(self) -> Iterator[Step]:
         """Search forever; the caller stops."""
@@ -307,11 +309,9 @@ class AtlasSearch:
         from lungaccess.refinement import refine
 
         best = self.best
-        if best is None or best.candidate is None or best.candidate is self._refined:
+        if best is None or best.candidate is None or best.cost >= WORTH_REFINING * self._refined_cost:
             return
-        self._refined = best.candidate
         found = refine(self.task, self.atlas.sites, best.candidate)
         step = self.desk.finished(0, "joint refinement", found)
-        if step.candidate is not None and step.cost < best.cost:
-            self._refined = step.candidate
+        self._refined_cost = min(best.cost, step.cost)
         yield step

@@ -23,6 +23,8 @@ TRIES = 2000
 """Of an iteration, a few milliseconds at most: nearly all of them end at the limits of the needle."""
 SPREADS = np.array([math.radians(15.0), 2.0])
 """How far rotation and insertions (mm) are varied: to the next entry of the atlas and beyond."""
+SWING_RAD = 0.15
+"""So far such a change turns the tip of the tubes, roughly."""
 
 
 class Scatter:
@@ -68,7 +70,10 @@ class Scatter:
 
 
 def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> Int:
-    """Return `most` entries that miss the needle's limits with a single arc, those that miss by least first.
+    """Return `most` entries whose single arc to the target exceeds the needle's limits, the nearest miss first.
+
+    A miss is how far the target lies from the needle's workspace, or less, against how far a small change of
+    the deployment moves that workspace: a few mm, and the farther from the tubes the more.
 
     Parameters
     ----------
@@ -78,14 +83,15 @@ def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> I
     most : int
     """
     entries = atlas.deployments
-    away = target - entries.positions
-    squared = np.maximum(np.einsum("ni,ni->n", away, away), 1e-12)
-    ahead = np.einsum("ni,ni->n", away, entries.tangents)
-    aside = np.sqrt(np.maximum(squared - ahead**2, 0.0))
-    curvature, turn = 2.0 * aside / squared, 2.0 * np.arctan2(aside, ahead)
+    offset = target - entries.positions
+    away = np.sqrt(np.maximum(np.einsum("ni,ni->n", offset, offset), 1e-12))
+    ahead = np.einsum("ni,ni->n", offset, entries.tangents)
+    aside = np.sqrt(np.maximum(away**2 - ahead**2, 0.0))
+    curvature, turn = 2.0 * aside / away**2, 2.0 * np.arctan2(aside, ahead)
     length = np.where(curvature > 1e-9, turn / np.maximum(curvature, 1e-9), np.abs(ahead))
     most_turn = math.radians(min(needle.max_angle_from_start_deg, needle.max_accumulated_turn_deg))
-    excess = np.maximum(curvature / needle.max_curvature_per_mm, 1.0)
-    excess *= np.maximum(length / needle.max_length_mm, 1.0) * np.maximum(turn / most_turn, 1.0)
-    excess[excess <= 1.0] = np.inf
-    return np.argsort(excess, kind="stable")[:most].astype(np.int64)
+    radius = 1.0 / needle.max_curvature_per_mm
+    miss = np.maximum(radius - np.hypot(ahead, aside - radius), (turn - most_turn) * away)
+    miss = np.maximum(miss, length - needle.max_length_mm)
+    miss[miss <= 0.0] = np.inf
+    return np.argsort(miss / (SPREADS[1] + SWING_RAD * away), kind="stable")[:most].astype(np.int64)

@@ -217,8 +217,9 @@ def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tu
     room = _Room(client)
     while True:
         for run in islice(waiting, max(0, room.count() - len(under_way))):
-            future = client.submit(answer, run, cache, key=run.key, pure=False, retries=RETRIES)
-            under_way[run.key] = run
+            key = task_key(run)
+            future = client.submit(answer, run, cache, key=key, pure=False, retries=RETRIES)
+            under_way[key] = run
             finished.add(future)
         if not under_way:
             return
@@ -231,6 +232,11 @@ def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tu
             )
         yield run, result if future.status == "finished" else _failed(run, result)
         future.release()
+
+
+def task_key(run: Run) -> str:
+    """Return what dask calls a run: its statistics, kept by the word before the dash, do not grow with the runs."""
+    return f"run-{run.key}"
 
 
 class _Room:

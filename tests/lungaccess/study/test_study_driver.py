@@ -105,17 +105,20 @@ def test_a_run_that_cannot_be_made_is_stored_and_made_again(
     assert (done.runs, done.stored_before, done.added, done.failed) == (4, 2, 2, 0)
 
 
-def test_only_a_few_runs_wait_at_the_scheduler(
+def test_only_a_few_runs_wait_at_the_scheduler_and_nothing_of_the_others_stays(
     tmp_path: Path, cache: Path, cluster: str, made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from distributed import Client
 
     waiting: list[int] = []
+    beginnings: list[int] = []
     add = ResultsFile.add
     with Client(cluster) as watcher:
 
         def added(results: ResultsFile, run: Run, answer: Answer) -> bool:
             waiting.append(watcher.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.tasks)))
+            kept = watcher.run_on_scheduler(lambda dask_scheduler: len(dask_scheduler.task_prefixes))
+            beginnings.append(kept)
             return add(results, run, answer)
 
         monkeypatch.setattr(ResultsFile, "add", added)
@@ -123,6 +126,7 @@ def test_only_a_few_runs_wait_at_the_scheduler(
         assert run_study(study, tmp_path / "r.db", scheduler=cluster, cache=cache).added == 60
     assert len(waiting) == 60
     assert max(waiting) <= driver.LEAST_WAITING + 1
+    assert beginnings[-1] == beginnings[0], "statistics that dask keeps for good"
 
 
 def test_a_full_disk_ends_the_study_and_keeps_what_is_stored(

@@ -31,6 +31,13 @@ CONNECT_S = 20.0
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
+DASK_CONFIG = {
+    # Dask would warn whenever this process is busy with a patient.
+    "distributed.admin.tick.limit": "1h",
+    # It keeps as many events, with the runs that they concern: memory grows until the logs are full.
+    "distributed.admin.low-level-log-length": 100,
+    "distributed.admin.log-length": 200,
+}
 
 Tell = Callable[[str, float | None], None]
 
@@ -138,8 +145,7 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Client]:
     from distributed import Client, LocalCluster
 
     with contextlib.ExitStack() as stack:
-        # Dask would warn whenever this process is busy with a patient.
-        stack.enter_context(dask.config.set({"distributed.admin.tick.limit": "1h"}))
+        stack.enter_context(dask.config.set(DASK_CONFIG))
         try:
             if scheduler is None:
                 # Patients are mapped from files: dask would take that memory for a leak and stop a worker.

@@ -51,7 +51,7 @@ HOPELESS_ITERATIONS = 1000
 JOINT_EVERY = 16
 """Rounds after which what was found is refined by a nonlinear program."""
 WORTH_REFINING = 0.99
-"""It takes as long as several rounds, so the best must have become cheaper by this factor since the last time."""
+"""It takes as long as several rounds; the best must have become cheaper by this factor since the last one."""
 
 
 class AtlasSearch:

@@ -70,7 +70,7 @@ class Scatter:
 
 
 def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> Int:
-    """Return `most` entries whose single arc to the target exceeds the needle's limits, the nearest miss first.
+    """Return `most` entries whose single arc to the target exceeds the needle's limits, nearest misses first.
 
     A miss is how far the target lies from the needle's workspace, or less, against how far a small change of
     the deployment moves that workspace: a few mm, and the farther from the tubes the more.

@@ -241,7 +241,7 @@ def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tu
 
 
 def task_key(run: Run) -> str:
-    """Return what dask calls a run: its statistics, kept by the word before the dash, do not grow with the runs."""
+    """Return what dask calls a run; it keeps statistics by the word before the dash, one for all runs."""
     return f"run-{run.key}"
 
 

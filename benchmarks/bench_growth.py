@@ -26,6 +26,12 @@ class _Growth:
     warmup_time = 0.0
     timer = time.process_time
     name = ""
+    params: tuple[int, ...]
+    param_names: tuple[str, ...]
+
+    def __init_subclass__(cls) -> None:
+        workload = WORKLOADS[cls.name]
+        cls.params, cls.param_names = workload.sizes, (workload.size_is,)
 
     def setup(self, size: int) -> None:
         """Prepare the work; the least size compiles the kernels."""
@@ -46,72 +52,54 @@ class DistanceField(_Growth):
     """Clearance field of cubes of 64^3 to 512^3 voxels."""
 
     name = "distance-field"
-    params = WORKLOADS[name].sizes
-    param_names = ("edge",)
 
 
 class Vesselness(_Growth):
     """Vesselness of a chest of 64^3 to 512^3 voxels."""
 
     name = "vesselness"
-    params = WORKLOADS[name].sizes
-    param_names = ("edge",)
 
 
 class CostMap(_Growth):
     """Cost map of a chest of 64^3 to 512^3 voxels."""
 
     name = "cost-map"
-    params = WORKLOADS[name].sizes
-    param_names = ("edge",)
 
 
 class BuildLung(_Growth):
     """Tree, labels and fields of a synthetic patient in finer and finer voxels."""
 
     name = "build-lung"
-    params = WORKLOADS[name].sizes
-    param_names = ("edge",)
 
 
 class DirectArcs(_Growth):
     """Direct arcs to 1 to 10^4 targets."""
 
     name = "direct-arcs"
-    params = WORKLOADS[name].sizes
-    param_names = ("targets",)
 
 
 class BuildIndex(_Growth):
     """Index of an atlas of 10^4 to 10^7 entries."""
 
     name = "build-index"
-    params = WORKLOADS[name].sizes
-    param_names = ("entries",)
 
 
 class QueryIndex(_Growth):
     """Queries of that index."""
 
     name = "query-index"
-    params = WORKLOADS[name].sizes
-    param_names = ("entries",)
 
 
 class TubeMechanicsGrowth(_Growth):
     """Solves of 1 to 5 tubes."""
 
     name = "tube-mechanics"
-    params = WORKLOADS[name].sizes
-    param_names = ("tubes",)
 
 
 class ShortestTour(_Growth):
     """The exact tour to 2 to 30 lesions."""
 
     name = "shortest-tour"
-    params = WORKLOADS[name].sizes
-    param_names = ("lesions",)
 
 
 class CostByIterations:

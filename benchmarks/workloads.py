@@ -52,6 +52,11 @@ class Workload:
     runs: int = 1
     fitted_from: int = 0
 
+    @property
+    def size_is(self) -> str:
+        """What a size counts."""
+        return "edge in voxels" if self.grows == "voxels" else self.grows
+
     def amount(self, size: int) -> int:
         """Return how much work a size is: the number of what grows."""
         return size**3 if self.grows == "voxels" else size

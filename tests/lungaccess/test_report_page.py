@@ -121,9 +121,11 @@ def test_every_control_has_a_name(page: Path) -> None:
 
 
 def test_scripts_find_only_elements_that_the_page_has() -> None:
-    for own, modules in (("plan.html", page_of_plan.MODULES), ("reach.html", ("reach.js",))):
+    scene = document.scene_figure(more_views=page_of_plan.TARGET_BUTTON)
+    plan, reach = document.asset("plan.html") + scene, document.asset("reach.html") + document.scene_figure()
+    for own, modules in ((plan, page_of_plan.MODULES), (reach, ("reach.js",))):
         script = document.bundle([*document.SHARED_MODULES, *modules])
-        present = set(re.findall(r'id="([\w-]+)"', document.asset(own) + document.asset("frame.html")))
+        present = set(re.findall(r'id="([\w-]+)"', own + document.asset("frame.html")))
         assert set(re.findall(r'(?:byId|find|getElementById)\("([\w-]+)"\)', script)) <= present
 
 

@@ -46,6 +46,11 @@ def filled(template: str, parts: Mapping[str, str]) -> str:
     return _HOLE.sub(lambda hole: parts[hole.group(1)], template)
 
 
+def scene_figure(*, more_views: str = "", more_notes: str = "") -> str:
+    """Return the figure of the 3-D view, with further buttons and words as HTML."""
+    return filled(asset("scene.html"), {"more_views": more_views, "more_notes": more_notes})
+
+
 def write_page(
     path: str | os.PathLike[str],
     template: str,

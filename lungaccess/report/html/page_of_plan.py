@@ -13,7 +13,7 @@ import numpy as np
 
 from lungaccess.report.html import tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
-from lungaccess.report.html.document import write_page
+from lungaccess.report.html.document import scene_figure, write_page
 from lungaccess.report.html.meshes import structure_meshes
 from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, ct_volumes, label_volumes
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from lungaccess.plans import Plan
 
 MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
+TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
+THICKER = "; seen from afar, devices are drawn thicker than they are"
 RISK_SAMPLES, RISK_SEED = 2000, 0
 
 
@@ -99,6 +101,7 @@ def plan_page(
             verdicts[0].accepted, "accepted by the independent check", "REFUSED by the independent check"
         ),
         "summary": _summary(plan, lung),
+        "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),
         "image_source": words.text(image_source(lung, chosen.ct_name if chosen.ct is not None else "")),
         "plans": tables.plans_section(plans, verdicts),
         "key_numbers": tables.key_section(plan),

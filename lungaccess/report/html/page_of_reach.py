@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.grid import Volume
 from lungaccess.report.html import words
-from lungaccess.report.html.document import write_page
+from lungaccess.report.html.document import scene_figure, write_page
 from lungaccess.report.html.meshes import Look, packed_surface, structure_meshes
 from lungaccess.report.html.pack import Packed, pack
 from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, label_volumes
@@ -50,6 +50,7 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
             f"Voxels of {first.kinds.grid.spacing_mm[0]:g} mm, each judged at its centre; "
             "not counted: outside the lung, in an obstacle"
         ),
+        "scene": scene_figure(),
         "volumes": volumes_section(maps),
         "systems": systems_section(maps),
     }

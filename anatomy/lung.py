@@ -158,3 +158,27 @@ class Lung:
         out = np.zeros(len(points))
         kernel.exact_at(self.labels, self.geometry, points, bits, exempt_branch, float(cap_mm), out)
         return out
+
+    def least_clearance_mm(
+        self, points_lps: Float, field: str, bits: int, *, cap_mm: float, exempt_branch: int = -1
+    ) -> float:
+        """Return the least of the distances of points to structures: exact below a cap, else a lower bound.
+
+        Parameters
+        ----------
+        points_lps : (N, 3) float64, LPS mm
+            At least one.
+        field : str
+            The distance field of the structures.
+        bits, cap_mm, exempt_branch
+            As in `exact_clearance_mm`.
+        """
+        points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
+        bounds = self.fields[field].lower_bound_mm(points)
+        order = np.argsort(bounds, kind="stable")
+        if bounds[order[0]] >= cap_mm:
+            return float(bounds[order[0]])
+        least = kernel.least_exact(
+            self.labels, self.geometry, points, order, bounds, bits, exempt_branch, float(cap_mm)
+        )
+        return float(least)

@@ -251,11 +251,8 @@ def _least_clearance(lung: Lung, points: Float, name: str, exempt_branch: int) -
     Exact distances below 5 mm, else the field's lower bound; between two samples the distance is at
     most half their spacing less.
     """
-    field = lung.fields["pleura" if name == "outside" else name]
-    bound = field.lower_bound_mm(points)
-    near = bound < CLEARANCE_CAP_MM
-    if near.any():
-        bound[near] = lung.exact_clearance_mm(
-            points[near], BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=exempt_branch
-        )
-    return max(float(bound.min()) - 0.5 * SAMPLE_MM, 0.0)
+    field = "pleura" if name == "outside" else name
+    least = lung.least_clearance_mm(
+        points, field, BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=exempt_branch
+    )
+    return max(least - 0.5 * SAMPLE_MM, 0.0)

@@ -37,6 +37,8 @@ UNITS_PER_MM = 256.0
 
 MIN_GAP_MM = 0.005
 """A proof that walks along a curve gives up where less clearance than this is to spare."""
+ROUNDING = 1e-9
+"""Searches go farther than what they may find by this share."""
 EXACT_REACH_MM = 0.5
 """How far beyond the required clearance such a proof searches voxels: its longest step near obstacles."""
 
@@ -171,3 +173,23 @@ def exact_at(labels, geometry, points, bits, exempt_branch, cap, out):
         out[n] = exact_distance(
             labels, geometry, points[n, 0], points[n, 1], points[n, 2], bits, exempt_branch, cap
         )[0]
+
+
+@numba.njit(cache=True)
+def least_exact(labels, geometry, points, order, bounds, bits, exempt_branch, cap):
+    """Return the least `exact_distance` of `points` (N, 3), at most `cap`.
+
+    `bounds` (N,) are never above the distances, and `order` (N,) is that of rising bounds: what cannot be
+    the least is not searched, and no search goes farther than the least that is known.
+    """
+    least = cap
+    for at in range(order.shape[0]):
+        n = order[at]
+        if bounds[n] >= least:
+            break
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        reach = min(least * (1.0 + ROUNDING), cap)
+        distance, label = exact_distance(labels, geometry, x, y, z, bits, exempt_branch, reach)
+        if label != 0 and distance < least:
+            least = distance
+    return least

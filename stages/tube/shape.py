@@ -33,12 +33,9 @@ def centreline(
         Insertions of the two tubes.
     """
     constants = tube_constants(tubes, Margins())
-    planar = np.array(
-        [
-            kernels.planar_point(constants, float(outer_mm), float(inner_mm), float(s))
-            for s in np.atleast_1d(np.asarray(arc_lengths_mm, dtype=np.float64))
-        ]
-    )
+    at_mm = np.array(arc_lengths_mm, dtype=np.float64, ndmin=1)
+    planar = np.zeros((len(at_mm), 2))
+    kernels.planar_points(constants, float(outer_mm), float(inner_mm), at_mm, planar)
     bend = bending_directions(lps_from_scope_tip, rotation_rad)[0]
     forward = lps_from_scope_tip[:3, 2]
     return np.asarray(lps_from_scope_tip[:3, 3] + planar[:, :1] * bend + planar[:, 1:] * forward)

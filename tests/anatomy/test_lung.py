@@ -65,6 +65,9 @@ def test_exact_clearance_is_the_distance_to_the_boxes(lung: Lung) -> None:
     assert not found[~outside].any()
     capped = lung.exact_clearance_mm(points, VESSEL, cap_mm=6.0)
     np.testing.assert_array_equal(capped, np.minimum(found, 6.0))
+    assert lung.least_clearance_mm(points, "vessel", VESSEL, cap_mm=100.0) == found.min()
+    bound = lung.fields["vessel"].lower_bound_mm(points).min()
+    assert lung.least_clearance_mm(points, "vessel", VESSEL, cap_mm=0.9 * bound) == bound
 
 
 def test_the_wall_of_an_exempt_branch_does_not_count(lung: Lung) -> None:

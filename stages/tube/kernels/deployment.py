@@ -99,6 +99,13 @@ def planar_point(tubes, outer, inner, s):
 
 
 @numba.njit(cache=True)
+def planar_points(tubes, outer, inner, arc_lengths, out):
+    """Fill `out` (N, 2) with `planar_point` at `arc_lengths` (N,)."""
+    for n in range(arc_lengths.shape[0]):
+        out[n, 0], out[n, 1] = planar_point(tubes, outer, inner, arc_lengths[n])
+
+
+@numba.njit(cache=True)
 def _off_track(tubes, outer, inner, tip):
     """Return how far the point at arc length `tip` ends up from where the tip first got there, in mm."""
     x0, z0 = planar_point(tubes, min(tip, outer), tip, tip)

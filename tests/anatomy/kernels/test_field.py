@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from anatomy.fields import corner_geometry, distance_field
 from anatomy.grid import Float, Grid
-from anatomy.kernels.field import distance_bound, exact_at, exact_distance, label_at
+from anatomy.kernels.field import distance_bound, exact_at, exact_distance, label_at, least_exact
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 from tests.anatomy.boxes import boxes_mm, edge_mm, in_grid_mm, rotated_grid
 
@@ -84,6 +84,25 @@ def test_exact_distance_is_that_of_trying_every_voxel(
     found = np.zeros(len(scene.points_lps))
     exact_at(scene.labels, corner_geometry(scene.grid), scene.points_lps, bits, exempt, cap, found)
     np.testing.assert_allclose(found, _expected(scene, bits, exempt, cap), atol=1e-7)
+
+
+@given(
+    scene=labelled(),
+    bits=st.sampled_from(BITS),
+    exempt=st.integers(-1, 2),
+    cap=st.floats(0.05, 8.0),
+    tight=st.floats(0.0, 1.0),
+)
+def test_the_least_is_that_of_all_to_the_last_bit(
+    scene: Labelled, bits: int, exempt: int, cap: float, tight: float
+) -> None:
+    geometry, points = corner_geometry(scene.grid), scene.points_lps
+    all_of_them = np.zeros(len(points))
+    exact_at(scene.labels, geometry, points, bits, exempt, cap, all_of_them)
+    bounds = all_of_them * np.random.default_rng(0).uniform(tight, 1.0, len(points))
+    order = np.argsort(bounds, kind="stable")
+    found = least_exact(scene.labels, geometry, points, order, bounds, bits, exempt, cap)
+    assert found == min(all_of_them.min(), cap)
 
 
 @given(scene=labelled(), bits=st.sampled_from(BITS), exempt=st.integers(-1, 2))

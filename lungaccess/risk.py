@@ -164,6 +164,7 @@ class RiskAssessor:
         field = lung.obstacle_field(with_fissures=True)
         self._scene = (field.corners, lung.labels, field.geometry, bits)
         self._depth = (lung.lumen_depth.corners, lung.lumen_depth.geometry)
+        self._mediastinal = lung.tree.mediastinal
         self.structures = {
             name: flag for name, flag in STRUCTURES.items() if flag != FISSURE or lung.has_fissures
         }
@@ -180,8 +181,8 @@ class RiskAssessor:
 
         def follow(part: slice) -> None:
             kernel.follow(
-                self._scene, self._depth, starts[part], pieces[part], TUBE_PIECES, exempt_mm,
-                touched[part], ends[part],
+                self._scene, self._depth, self._mediastinal, starts[part], pieces[part], TUBE_PIECES,
+                exempt_mm, touched[part], ends[part],
             )  # fmt: skip
 
         bounds = np.linspace(0, deviations.count, THREADS + 1).astype(int)

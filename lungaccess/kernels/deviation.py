@@ -16,7 +16,7 @@ import numpy as np
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
-from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, LUMEN
+from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
 
 LENGTH = 0
 ROLL = 1
@@ -84,7 +84,7 @@ def _in_lumen(scene, depth, x, y, z):
 
 
 @inner_kernel
-def _follow(scene, depth, start, pieces, n_tube, exempt_mm):
+def _follow(scene, depth, mediastinal, start, pieces, n_tube, exempt_mm):
     """Follow one chain; return what it touches and the point where it ends."""
     field, _labels, geometry, bits = scene
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
@@ -112,6 +112,8 @@ def _follow(scene, depth, start, pieces, n_tube, exempt_mm):
                 if here == NOT_IN_LUMEN:
                     if branch == IN_LUMEN:
                         touched |= STAYS_INSIDE
+                    elif branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
+                        touched |= bits & OUTSIDE
                     pierced = branch
                     left_at = done + at
                     continue
@@ -136,7 +138,7 @@ def _follow(scene, depth, start, pieces, n_tube, exempt_mm):
 
 
 @numba.njit(cache=True, nogil=True)
-def follow(scene, depth, starts, pieces, n_tube, exempt_mm, touched, ends):
+def follow(scene, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched, ends):
     """Follow N deviated plans, and note what each touches and where it ends.
 
     A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
@@ -151,6 +153,8 @@ def follow(scene, depth, starts, pieces, n_tube, exempt_mm, touched, ends):
         Clearance field of all structures in `bits`, labels, geometry, bits.
     depth : tuple
         Lumen depth and its geometry.
+    mediastinal : (B,) bool
+        The branches that lie in the mediastinum: what leaves one of them pierces the pleura.
     starts : (N, 9) float64
     pieces : (N, P, 4) float64
     n_tube : int
@@ -161,7 +165,7 @@ def follow(scene, depth, starts, pieces, n_tube, exempt_mm, touched, ends):
         Receives the last points.
     """
     for n in range(starts.shape[0]):
-        found, x, y, z = _follow(scene, depth, starts[n], pieces[n], n_tube, exempt_mm)
+        found, x, y, z = _follow(scene, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm)
         touched[n] = found
         ends[n, 0] = x
         ends[n, 1] = y

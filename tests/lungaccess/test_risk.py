@@ -170,6 +170,15 @@ def test_a_scope_outside_the_airway_deploys_nothing(assessor: RiskAssessor) -> N
     assert not assessor.succeeded(outcomes)[0]
 
 
+def test_leaving_a_main_bronchus_pierces_the_pleura(plan: Plan, small_lung: Lung) -> None:
+    tree = replace(small_lung.tree)
+    vars(tree)["mediastinal"] = np.arange(tree.n_branches) == plan.tube.exit.branch
+    there = RiskAssessor(plan, replace(small_lung, tree=tree))
+    outcomes = there.outcomes(Deviations(**no_deviations(1, there.n_arcs)))
+    assert outcomes.touched[0] == OUTSIDE
+    assert not there.succeeded(outcomes)[0]
+
+
 def test_tubes_that_stay_in_the_airway(assessor: RiskAssessor, plan: Plan) -> None:
     errors = no_deviations(1, assessor.n_arcs)
     errors["insertion_mm"] = np.array([[-100.0, -100.0]])

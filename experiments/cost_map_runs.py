@@ -15,8 +15,8 @@ from experiments.cost_map_problems import LEAST_COST, TRIES, TRY_ITERATIONS, Sce
 from stages.needle.costs import map_integral, obstacle_clearance_mm, voxel_sum
 from stages.needle.inflation import inflated_space, refuting_labels
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.optimal import OptimalSearch
 from stages.needle.path import ArcPath
+from stages.needle.racing import RacingSearch
 from stages.needle.searches import Query, RestartingRRT
 from stages.needle.space import NeedleSpace
 
@@ -48,7 +48,7 @@ def run(
     space: NeedleSpace, costs: Volume, query: Query, objective: Objective, seed: int, limit_s: float
 ) -> Run:
     """Search for `limit_s` seconds of processor time; judge the paths afterwards by `costs`."""
-    search = OptimalSearch(space, query, seed=seed, objective=objective)
+    search = RacingSearch(space, query, seed=seed, objective=objective)
     times, paths = [], []
     began = time.process_time()
     while time.process_time() - began < limit_s:

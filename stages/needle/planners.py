@@ -6,7 +6,7 @@ from typing import Protocol
 
 from stages.needle.decision import Decision
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.optimal import OptimalSearch
+from stages.needle.racing import RacingSearch
 from stages.needle.resolution import ResolutionSearch
 from stages.needle.searches import Query, RestartingRRT, Search
 from stages.needle.space import NeedleSpace
@@ -26,7 +26,7 @@ def _rrt(space: NeedleSpace, query: Query, seed: int, objective: Objective = SHO
 
 
 def _optimal(space: NeedleSpace, query: Query, seed: int, objective: Objective = SHORTEST) -> Search:
-    return OptimalSearch(space, query, seed=seed, objective=objective)
+    return RacingSearch(space, query, seed=seed, objective=objective)
 
 
 def _resolution(space: NeedleSpace, query: Query, seed: int, objective: Objective = SHORTEST) -> Search:

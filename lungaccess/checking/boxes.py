@@ -99,7 +99,8 @@ class Boxes:
         """Return the `(N - 1,)` distances from the segments between consecutive points to the boxes.
 
         Measured with FCL to the exact surface of the boxes nearer than `within_mm`, 0 where an end lies
-        inside them, and at most `within_mm`.
+        inside them, and at most `within_mm`.  FCL overlooks what is nearest to some segments that are
+        parallel to faces, so a segment is never farther away than either of its ends.
         """
         points = np.asarray(path_lps, dtype=np.float64)
         length = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -107,8 +108,12 @@ class Boxes:
         out = np.full(len(points) - 1, within_mm)
         near = np.flatnonzero(np.maximum(bounds[:-1], bounds[1:]) - length < within_mm)
         if len(near):
-            mesh = self._mesh_near(points[np.union1d(near, near + 1)], within_mm + float(length.max()))
+            ends = np.union1d(near, near + 1)
+            mesh = self._mesh_near(points[ends], within_mm + float(length.max()))
             out[near] = np.minimum(mesh.segment_distance_mm(points[near], points[near + 1]), within_mm)
+            exact = np.full(len(points), within_mm)
+            exact[ends] = self.distance_mm(points[ends])
+            out = np.minimum(out, np.minimum(exact[:-1], exact[1:]))
         inside = self.holds(points)
         out[inside[:-1] | inside[1:]] = 0.0
         return out

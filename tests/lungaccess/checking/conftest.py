@@ -118,7 +118,7 @@ def turned(pose: np.ndarray, roll_rad: float) -> np.ndarray:
 def arc(length_mm: float, k: float) -> np.ndarray:
     """Closed form of an arc that bends towards +x."""
     a = k * length_mm
-    x, z = (2.0 * np.sin(0.5 * a) ** 2 / k, np.sin(a) / k) if k else (0.0, length_mm)
+    x, z = length_mm * np.sin(0.5 * a) * np.sinc(0.5 * a / np.pi), length_mm * np.sinc(a / np.pi)
     return np.array(
         [[np.cos(a), 0, np.sin(a), x], [0, 1, 0, 0], [-np.sin(a), 0, np.cos(a), z], [0, 0, 0, 1.0]]
     )

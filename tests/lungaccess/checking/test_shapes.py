@@ -149,6 +149,16 @@ def test_segments_and_points_give_the_same_clearance(
     assert (segments >= np.minimum(ends - step / 2, within) - 1e-9).all()
 
 
+def test_a_segment_is_never_farther_than_its_ends(tiles: Tiles) -> None:
+    """FCL overlooks the nearest face beside some of these segments, which are parallel to it."""
+    path = np.linspace([47.625, -26.0, 5.0], [47.625, 26.0, 5.0], 200)
+    boxes = Boxes(tiles, has(structures.OBSTACLES | structures.FISSURE), 20.0)
+    exact = boxes.distance_mm(path)
+    segments = boxes.segments_mm(path, 1.0)
+    assert (segments <= np.minimum(exact[:-1], exact[1:])).all()
+    assert (exact > 0.0).sum() > 50
+
+
 def test_beyond_the_grid_is_outside(lung: Any) -> None:
     far = lung.grid.lps([[-3.0, 5.0, 5.0], [5.0, 5.0, 500.0]])
     assert (labels_at(lung, far) == structures.OUTSIDE).all()

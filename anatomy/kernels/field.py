@@ -37,10 +37,10 @@ UNITS_PER_MM = 256.0
 
 MIN_GAP_MM = 0.005
 """A proof that walks along a curve gives up where less clearance than this is to spare."""
-ROUNDING = 1e-9
-"""Searches go farther than what they may find by this share."""
 EXACT_REACH_MM = 0.5
 """How far beyond the required clearance such a proof searches voxels: its longest step near obstacles."""
+ROUNDING = 1e-9
+"""Searches go farther than what they may find by this share."""
 
 
 @numba.njit(cache=True, inline="never")

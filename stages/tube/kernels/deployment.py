@@ -3,9 +3,9 @@
 A straight outer tube and an inner tube with a precurved distal part, rotated together, need no
 torsion: the centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `(10,)`
 float64 array indexed by the constants below.  `scene` is the tuple (obstacle field, labels, their
-geometry, obstacle bits, lumen depth, its geometry, which branches `(B,)` lie in the mediastinum and must not
-be left).  `trace` is a `(5,)` float64 array that follows
-one tube from the lumen through the wall into the tissue.
+geometry, obstacle bits, lumen depth, its geometry, which branches `(B,)` lie in the mediastinum and
+must not be left).  `trace` is a `(5,)` float64 array that follows one tube from the lumen through the
+wall into the tissue.
 """
 
 from __future__ import annotations

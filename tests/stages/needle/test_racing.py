@@ -9,15 +9,15 @@ import pytest
 
 from anatomy.grid import Volume
 from anatomy.margins import Margins
-from anatomy.structures import OBSTACLES, VESSEL
+from anatomy.structures import VESSEL
 from stages.needle.device import Needle
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.optimal import OptimalSearch
-from stages.needle.path import blocker_on_path
 from stages.needle.racing import FIRST_HEAT, RacingSearch
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace, needle_space
-from tests.stages.scenes import Canvas, brute_clearance
+from tests.stages.needle.proved import assert_proved
+from tests.stages.scenes import Canvas
 
 INVERSE = Objective(inverse_clearance=1.0)
 MAP = Objective(cost_map=1.0)
@@ -75,12 +75,7 @@ def test_each_path_is_cheaper_clear_and_within_the_limits(objective: Objective) 
             continue
         assert search.path is not None
         costs.append(search.cost)
-        assert blocker_on_path(space, search.path, -1) == 0
-        points, _ = search.path.sample(0.02)
-        gap = brute_clearance(space.arrays[1], space.grid, points, OBSTACLES, 2.0)
-        assert gap.min() >= space.required_clearance_mm - 1e-9
-        assert search.path.arcs[:, 2].max() <= space.needle.max_curvature_per_mm * (1 + 1e-9)
-        assert np.linalg.norm(points[-1] - query().target) < 1e-6
+        assert_proved(space, search.path, query().target)
     assert len(costs) >= 2
     assert (np.diff(costs) < 0.0).all()
 

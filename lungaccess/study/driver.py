@@ -110,13 +110,14 @@ def run_study(
         added = failed = 0
         if missing:
             say("starting workers", None)
-            with _client(scheduler, workers) as client:
+            with _client(scheduler, workers) as client, _interruptions_noted() as stop_if_interrupted:
                 _prepare(client, missing, cache, say)
                 for done, (run, answer) in enumerate(_answers(client, missing, cache), start=1):
                     new = results.add(run, answer)
                     added += new
                     failed += new and answer.failed
                     say(f"{done} of {len(missing)} runs, {run.problem.case}", done / len(missing))
+                    stop_if_interrupted()
     return StudyDone(
         runs=len(runs),
         stored_before=len(runs) - len(missing),
@@ -181,6 +182,34 @@ def _interruptions_ignored() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _interruptions_noted() -> Iterator[Callable[[], None]]:
+    """Yield a function that raises KeyboardInterrupt if Ctrl-C was pressed in the meantime.
+
+    Python drops exceptions that are raised while an object is being deleted, as dask's futures are all the
+    time: such an interruption would be lost.
+    """
+    pressed = threading.Event()
+
+    def stop_if_interrupted() -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+
+    def note(*_signal: object) -> None:
+        pressed.set()
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
+        yield stop_if_interrupted
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield stop_if_interrupted
     finally:
         signal.signal(signal.SIGINT, before)
 

@@ -105,6 +105,31 @@ def test_a_run_that_cannot_be_made_is_stored_and_made_again(
     assert (done.runs, done.stored_before, done.added, done.failed) == (4, 2, 2, 0)
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interruption_ends_a_study_also_while_something_is_being_deleted(
+    tmp_path: Path, cache: Path, cluster: str, made: Path
+) -> None:
+    """Python prints an exception that is raised in `__del__`, and goes on."""
+    told: list[float] = []
+
+    class Interrupting:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    def tell(_words: str, share: float | None) -> None:
+        if share is not None:
+            told.append(share)
+            Interrupting()
+
+    path = tmp_path / "r.db"
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study_of(content()), path, scheduler=cluster, cache=cache, tell=tell)
+    assert told == [0.25]
+    with ResultsFile(path) as results:
+        assert len(results.finished_keys()) == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_only_a_few_runs_wait_at_the_scheduler_and_nothing_of_the_others_stays(
     tmp_path: Path, cache: Path, cluster: str, made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,7 +83,8 @@ def plan(
     iterations : int, optional
         Stop after so many iterations beyond the direct arcs.
     time_s : float, optional
-        Stop after so many seconds of planning.  With neither limit the caller stops the iterator.
+        Stop after so many seconds of planning, but not without a plan before the direct arcs have been tried.
+        With neither limit the caller stops the iterator.
     atlas : Atlas, optional
         Made with `build_atlas` beforehand; made here if None.
     processes : int
@@ -153,10 +154,11 @@ def _run(
     from lungaccess.explain import explain
 
     clock, task = Clock(), search.task
+    limit_s = math.inf if time_s is None else time_s
     best: float | None = None
     iteration = 0
     for step in steps:
-        if _spent(step, clock, iterations, time_s):
+        if iterations is not None and step.iteration > iterations:
             break
         iteration = step.iteration
         if step.candidate is not None:
@@ -164,6 +166,8 @@ def _run(
             timing = {"planning_s": clock.elapsed_s, "atlas_s": search.atlas.build_s}
             yield assemble(task, search.atlas.sites, step.candidate, iteration=iteration, timing=timing)
         if best is None and search.is_hopeless(step.iteration):
+            break
+        if (best is not None or iteration > 0) and clock.elapsed_s > limit_s:
             break
         if clock.due():
             tell(
@@ -173,12 +177,6 @@ def _run(
             )
     if best is None:
         raise explain(search, iteration)
-
-
-def _spent(step: Step, clock: Clock, iterations: int | None, time_s: float | None) -> bool:
-    if iterations is not None and step.iteration > iterations:
-        return True
-    return clock.elapsed_s > (math.inf if time_s is None else time_s)
 
 
 class Clock:

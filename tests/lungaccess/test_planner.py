@@ -170,11 +170,18 @@ class TestBudget:
         plans = plans_of(small_lung, target, atlas, iterations=0)
         assert plans and all(plan.iterations == 0 and len(plan.needle.arcs) == 1 for plan in plans)
 
+    def test_no_time_still_gives_the_first_direct_arc(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        (plan,) = la.plan(small_lung, SYSTEM, target, atlas=atlas, time_s=0.0)
+        assert plan.iterations == 0
+        assert plan.digest == plans_of(small_lung, target, atlas, iterations=0)[0].digest
+
     def test_time_that_is_over_ends_the_search(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
-        with pytest.raises(la.NoPlan, match="too short"):
-            list(la.plan(small_lung, SYSTEM, target, atlas=atlas, time_s=0.0))
+        with pytest.raises(la.NoPlan, match="after 1 iterations"):
+            list(la.plan(small_lung, SYSTEM, target, atlas=atlas, method="kuntz2015", time_s=0.0))
 
     def test_the_caller_may_stop_at_any_time(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
         plans = la.plan(small_lung, SYSTEM, target, atlas=atlas)

@@ -15,7 +15,7 @@ from anatomy.io.files import atomic_write, require_file, unreadable
 from anatomy.io.frames import LPS_FROM, Frame
 from anatomy.io.itk_headers import metaimage_payload, nrrd_labels, read_nrrd_header, stated_frame
 from anatomy.io.nifti import read_nifti, read_nifti_header, read_nifti_mask, require_numbers
-from anatomy.io.nifti_header import named_grid
+from anatomy.io.nifti_header import right_handed_grid
 
 if TYPE_CHECKING:
     import SimpleITK
@@ -51,21 +51,23 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
     Returns
     -------
     Volume
-        `array[i, j, k]` with the grid in LPS mm.
+        `array[i, j, k]` with the grid in LPS mm; the first index of a file with left-handed axes is
+        counted the other way.
 
     Raises
     ------
     FileError
         If the file is missing, damaged, truncated or no image of three dimensions.
     FrameError
-        If the file states no frame and none is given, or its axes are not orthonormal and right-handed.
+        If the file states no frame and none is given, or its axes are not perpendicular.
     """
     path = require_file(path)
     if _suffix(path) in NIFTI:
         return _guard(path, read_nifti, path, frame)
     image = _read_itk(path)
-    holder = _ImageBuffer(image)
-    return Volume(grid=_itk_grid(image, path, frame), array=np.asarray(holder).T)
+    array = np.asarray(_ImageBuffer(image)).T
+    grid, is_reversed = _itk_grid(image, path, frame)
+    return Volume(grid=grid, array=array[::-1] if is_reversed else array)
 
 
 def read_mask(path: str | Path, *, frame: Frame | None = None) -> Volume:
@@ -200,14 +202,14 @@ def _require_intact_payload(path: Path) -> None:
             require_intact(*payload)
 
 
-def _itk_grid(image: SimpleITK.Image, path: Path, frame: Frame | None) -> Grid:
+def _itk_grid(image: SimpleITK.Image, path: Path, frame: Frame | None) -> tuple[Grid, bool]:
     matrix = np.eye(4)
     matrix[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
     matrix[:3, 3] = image.GetOrigin()
     if image_suffix(path) in NRRD and not stated_frame(read_nrrd_header(path), path, frame):
         matrix = LPS_FROM[str(frame)] @ matrix
     ni, nj, nk = image.GetSize()
-    return named_grid((ni, nj, nk), matrix, path)
+    return right_handed_grid((ni, nj, nk), matrix, path)
 
 
 def _last_line(error: Exception) -> str:

@@ -31,7 +31,7 @@ def read_nifti(path: Path, frame: Frame | None = None) -> Volume:
     for at, chunk in _chunks(header, stream, path):
         flat[at : at + chunk.size] = chunk
     native = values.astype(values.dtype.newbyteorder("="), copy=False)
-    return Volume(grid=header.grid, array=native)
+    return Volume(grid=header.grid, array=native[::-1] if header.is_reversed else native)
 
 
 def read_nifti_mask(path: Path, frame: Frame | None = None) -> Volume:
@@ -48,7 +48,7 @@ def read_nifti_mask(path: Path, frame: Frame | None = None) -> Volume:
     for at, chunk in _chunks(header, stream, path):
         require_numbers(chunk, path)
         np.not_equal(chunk, 0, out=flat[at : at + chunk.size])
-    return Volume(grid=header.grid, array=mask)
+    return Volume(grid=header.grid, array=mask[::-1] if header.is_reversed else mask)
 
 
 def require_numbers(values: NDArray[Any], path: Path) -> None:

@@ -45,6 +45,8 @@ class NiftiHeader:
     Parameters
     ----------
     grid : Grid
+    is_reversed : bool
+        Whether the file counts the first index the other way; see `right_handed_grid`.
     dtype : dtype of the voxels on disk, with byte order
     data_offset : int
         Bytes before the first voxel.
@@ -55,6 +57,7 @@ class NiftiHeader:
     """
 
     grid: Grid
+    is_reversed: bool
     dtype: np.dtype[Any]
     data_offset: int
     slope: float
@@ -89,7 +92,7 @@ def parse_header(start: bytes, path: Path, frame: Frame | None = None) -> NiftiH
     FileError
         If it is no NIfTI image of three dimensions with plain numbers.
     FrameError
-        If no frame is stated and none given, or the grid is not rigid and right-handed.
+        If no frame is stated and none given, or the axes are not perpendicular.
     """
     fields = _fields(start, path)
     shape = _shape(fields["dim"], path)
@@ -100,8 +103,10 @@ def parse_header(start: bytes, path: Path, frame: Frame | None = None) -> NiftiH
     if slope == 0 or not np.isfinite([slope, intercept]).all():
         slope, intercept = 1.0, 0.0
     offset = int(fields["vox_offset"][0])
+    grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path, shape, frame), path)
     return NiftiHeader(
-        grid=named_grid(shape, _lps_from_ijk(fields, path, shape, frame), path),
+        grid=grid,
+        is_reversed=is_reversed,
         dtype=np.dtype(fields["order"][0] + _DTYPES[code]),
         data_offset=offset,
         slope=slope,
@@ -116,6 +121,23 @@ def named_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> 
         return Grid(shape=shape, lps_from_ijk=lps_from_ijk)
     except FrameError as error:
         raise FrameError(f"{path}: {error.found}", expected=error.expected, remedy=error.remedy) from error
+
+
+def right_handed_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> tuple[Grid, bool]:
+    """Make the grid of a file, with the first index counted the other way if its axes are left-handed.
+
+    Many programs store images so; nothing is mirrored as long as voxels and matrix agree.
+
+    Returns
+    -------
+    tuple of (Grid, bool)
+        The right-handed grid, and whether the voxels must be reversed along their first axis.
+    """
+    if not np.linalg.det(lps_from_ijk[:3, :3]) < 0.0:
+        return named_grid(shape, lps_from_ijk, path), False
+    reversed_from_stored = np.diag([-1.0, 1.0, 1.0, 1.0])
+    reversed_from_stored[0, 3] = shape[0] - 1
+    return named_grid(shape, lps_from_ijk @ reversed_from_stored, path), True
 
 
 def _fields(start: bytes, path: Path) -> dict[str, tuple[Any, ...]]:

@@ -32,7 +32,7 @@ def load_patient(path: str | Path) -> PatientImages:
     FileError
         If the path is of none of these kinds, or a file is damaged.
     FrameError
-        If a file states no frame, or one that is not rigid and right-handed.
+        If a file states no frame, or one whose axes are not perpendicular.
     GridMismatchError
         If the masks do not share one voxel grid.
     SettingsError

@@ -10,11 +10,11 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lungaccess.alternatives import different_candidates
 from lungaccess.assemble import Candidate, Task, assemble
 from lungaccess.atlas import Atlas, build_atlas
 from lungaccess.plans import Plan
 from lungaccess.searches import AtlasSearch
+from lungaccess.searches.menu import different_candidates
 from lungaccess.system import System
 from stages.needle.space import direct_arcs
 from stages.scope.device import Bronchoscope

@@ -15,8 +15,9 @@ import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess import cli
-from lungaccess.alternatives import Alternative, _branches_first, _lines, _samples, alternatives, judged
+from lungaccess.alternatives import Alternative, alternatives, judged
 from lungaccess.kernels.apart import choose_apart
+from lungaccess.searches.menu import _branches_first, _lines, _samples
 from stages.needle.path import direct_path
 from tests.lungaccess.resample import needle_walk
 

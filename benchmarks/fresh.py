@@ -6,6 +6,10 @@ import os
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+"""asv runs benchmarks somewhere else, and what a new process can import depends on where it starts."""
 
 
 class FreshProcess:
@@ -27,4 +31,4 @@ class FreshProcess:
 
     def run(self) -> None:
         """Run the code once."""
-        subprocess.run([sys.executable, "-c", self.code], check=True, env=self.environment)
+        subprocess.run([sys.executable, "-c", self.code], check=True, env=self.environment, cwd=ROOT)

@@ -28,15 +28,15 @@ WAITING_A_WORKER = 3
 LEAST_WAITING = 4
 COUNT_WORKERS_EVERY_S = 5.0
 CONNECT_S = 20.0
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 DASK_CONFIG = {
     # Dask would warn whenever this process is busy with a patient.
     "distributed.admin.tick.limit": "1h",
     # It keeps as many events, with the runs that they concern: memory grows until the logs are full.
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.log-length": 200,
+    # Set before a worker starts: numba refuses to compile if it finds another number later.
+    **{f"distributed.nanny.pre-spawn-environ.{name}": 1 for name in ONE_THREAD},
 }
 
 Tell = Callable[[str, float | None], None]
@@ -157,7 +157,6 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Client]:
                         processes=True,
                         memory_limit=0,
                         dashboard_address="127.0.0.1:0",
-                        env=ONE_THREAD,
                         silence_logs=50,
                     )
                 stack.enter_context(cluster)

@@ -105,6 +105,31 @@ def test_a_run_that_cannot_be_made_is_stored_and_made_again(
     assert (done.runs, done.stored_before, done.added, done.failed) == (4, 2, 2, 0)
 
 
+COUNT_THREADS = """
+import numba
+from lungaccess.study import driver
+
+def threads():
+    return numba.config.NUMBA_NUM_THREADS
+
+if __name__ == "__main__":
+    with driver._client(None, 1) as client:
+        print(client.submit(threads).result())
+"""
+
+
+def test_a_worker_has_one_thread_from_its_beginning(tmp_path: Path) -> None:
+    """It imports what the script imports, before dask can change anything."""
+    script = tmp_path / "script.py"
+    script.write_text(COUNT_THREADS)
+    environment = os.environ | {"PYTHONPATH": str(Path(driver.__file__).parents[2])}
+    environment.pop("NUMBA_NUM_THREADS", None)
+    done = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["1"]
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interruption_ends_a_study_also_while_something_is_being_deleted(
     tmp_path: Path, cache: Path, cluster: str, made: Path

@@ -61,6 +61,11 @@ class Objective:
         """Whether it needs a cost map."""
         return self.cost_map > 0.0 or self.voxel_sum > 0.0
 
+    @property
+    def is_length(self) -> bool:
+        """Whether it weighs nothing but length."""
+        return self.inverse_clearance == 0.0 and not self.weighs_map
+
     def arrays(self, cost_map: NDArray[np.float32] | None) -> Arrays:
         """Return the weights and the map for the kernels, see `stages.needle.kernels.cost`.
 

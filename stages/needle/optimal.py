@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.grid import Float
 from stages.needle.kernels import optimal, tree
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
@@ -53,12 +54,27 @@ class OptimalSearch(RestartingRRT):
 
     def adopt(self, path: ArcPath, cost: float) -> None:
         """Go on from a path that another search found for the same query and objective."""
-        points = path.frames()[1:, :3, 3]
         self.path, self.cost = path, cost
-        self._via_count = len(points)
-        if len(points) <= MAX_VIAS:
-            self._vias[: len(points), :3] = points
-            self._vias[: len(points), 3] = optimal.ARC
+        self._take_vias(path.frames()[1:, :3, 3])
+
+    def follow(self, points: Float) -> bool:
+        """Go on from a path through via points if there is one that is cheaper; return whether there is.
+
+        Parameters
+        ----------
+        points : (V, 3) float64, LPS mm
+            Ends of its arcs, the last one within the goal tolerance.
+        """
+        if len(points) > MAX_VIAS:
+            return False
+        vias = np.zeros_like(self._vias)
+        vias[: len(points), :3] = points
+        last = self._build(vias, len(points), self.cost)
+        if last == 0 or not self._scratch[last, tree.PATH_COST] < self.cost * (1.0 - IMPROVEMENT):
+            return False
+        self._keep(last)
+        self._take_vias(points)
+        return True
 
     def grow(self, iterations: int) -> tuple[int, int, bool]:
         """Grow by the RRT up to the first path, then in state and cost."""
@@ -76,26 +92,41 @@ class OptimalSearch(RestartingRRT):
         while last != 0:
             rows.append(last)
             last = int(self.parents[last])
-        self._via_count = len(rows)
-        self._vias[: len(rows), :3] = self.nodes[rows[::-1], :3]
-        self._vias[: len(rows), 3] = optimal.ARC
+        self._take_vias(self.nodes[rows[::-1], :3])
+
+    def _take_vias(self, points: Float) -> None:
+        """Take the ends of arcs as via points; too many are not varied."""
+        self._via_count = len(points)
+        if len(points) <= MAX_VIAS:
+            self._vias[: len(points), :3] = points
+            self._vias[: len(points), 3] = optimal.ARC
 
     def _refine(self, tries: int) -> bool:
         if not 0 < self._via_count <= MAX_VIAS:
             return False
         query = self.query
-        arguments = (
-            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
-            self._scratch, self._scratch_parents, self._vias,
-        )  # fmt: skip
         self._via_count, cost, improved = optimal.refine(
-            *arguments, self._via_count, tries, self.state, self.cost
-        )
+            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
+            self._scratch, self._scratch_parents, self._vias, self._via_count, tries, self.state, self.cost,
+        )  # fmt: skip
         self.iterations += tries
         if not improved:
             return False
-        last = optimal.build(*arguments, self._via_count, np.inf)
-        self.path = path_from_tree(query.lps_from_start, self._scratch, self._scratch_parents, last)
-        better = cost < self.cost * (1.0 - IMPROVEMENT)
-        self.cost = float(cost)
-        return bool(better)
+        before = self.cost
+        self._keep(self._build(self._vias, self._via_count, np.inf))
+        return bool(cost < before * (1.0 - IMPROVEMENT))
+
+    def _build(self, vias: Float, count: int, best: float) -> int:
+        """Lay the path through via points into the scratch rows; return the last one, 0 if there is none."""
+        query = self.query
+        return int(
+            optimal.build(
+                self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
+                self._scratch, self._scratch_parents, vias, count, best,
+            )
+        )  # fmt: skip
+
+    def _keep(self, last: int) -> None:
+        """Keep the path in the scratch rows as the best."""
+        self.path = path_from_tree(self.query.lps_from_start, self._scratch, self._scratch_parents, last)
+        self.cost = float(self._scratch[last, tree.PATH_COST])

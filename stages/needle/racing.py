@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Protocol
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from stages.needle.optimal import OptimalSearch
 from stages.needle.path import ArcPath
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace
+from stages.needle.ways import WayFinder, Work
 
 FIRST_RACE, LARGEST_RACE = 4, 64
 """Searches in the first race; each race has twice as many as the one before, up to the largest."""
@@ -19,6 +21,8 @@ FIRST_HEAT = 500
 """Iterations of a search in the first heat of a race; twice as many in each heat that follows."""
 LOOK = 100
 """A search without a path is looked at after so many iterations."""
+RANDOM_ONES = 4
+"""Every so many-th search begins at random though there are ways on lattices."""
 
 
 class RacingSearch:
@@ -27,6 +31,9 @@ class RacingSearch:
     A path is varied until it is the cheapest near it, and the tree seldom finds another way that is at once
     cheaper than a path made so cheap.  So further searches begin anew with numbers of their own, and are made
     cheaper too before they are compared.  The best path so far takes part in every race.
+
+    Where more than length counts, most of them begin with a way on a lattice, and each that goes on is led to
+    the cheapest way near its own first, see `stages.needle.ways`.
 
     Parameters
     ----------
@@ -48,6 +55,7 @@ class RacingSearch:
         self._space, self._query, self._seed, self._objective = space, query, seed, objective
         self._made = 0
         self._turns = self._races()
+        self._runner: _Runner
         self._runner, self._left = next(self._turns)
 
     def advance(self, iterations: int) -> bool:
@@ -77,25 +85,81 @@ class RacingSearch:
         self._made += 1
         return OptimalSearch(self._space, self._query, seed=seed, objective=self._objective)
 
-    def _races(self) -> Iterator[tuple[OptimalSearch, int]]:
+    def _races(self) -> Iterator[Turn]:
         """Yield whose turn it is and for how many iterations, for ever."""
         best, size = self._new(), FIRST_RACE
         while best.path is None:
             yield best, LOOK
         patience = best.iterations
+        finder = self._way_finder()
+        yield from self._improve(finder, [best])
         while True:
-            runners, heat = [best, *(self._new() for _ in range(size - 1))], FIRST_HEAT
+            runners, heat = [best], FIRST_HEAT
+            for n in range(1, size):
+                runners.append(self._new())
+                if finder is not None and finder.has_ways and n % RANDOM_ONES != 0:
+                    yield from _done(runners[-1], finder.begin(runners[-1], self.cost))
             while len(runners) > 1:
                 for runner in runners:
                     yield from _heat(runner, heat, patience)
                 arrived = sorted((each for each in runners if each.path is not None), key=lambda s: s.cost)
                 runners, heat = arrived[: len(runners) // 2], 2 * heat
+                yield from self._improve(finder, runners)
             best = runners[0]
             yield best, heat
             size = min(2 * size, LARGEST_RACE)
 
+    def _way_finder(self) -> WayFinder | None:
+        """Return what finds ways; of pure length, trees and refinement find the least as fast."""
+        if self._objective.is_length:
+            return None
+        return WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
 
-def _heat(runner: OptimalSearch, iterations: int, patience: int) -> Iterator[tuple[OptimalSearch, int]]:
+    def _improve(self, finder: WayFinder | None, runners: list[OptimalSearch]) -> Iterator[Turn]:
+        if finder is not None:
+            for runner in runners:
+                yield from _done(runner, finder.improve(runner, self.cost))
+
+
+class _Runner(Protocol):
+    """What takes turns: a search, or work that is done."""
+
+    iterations: int
+
+    @property
+    def path(self) -> ArcPath | None: ...
+
+    @property
+    def cost(self) -> float: ...
+
+    def advance(self, iterations: int) -> bool: ...
+
+
+Turn = tuple[_Runner, int]
+
+
+class _Done:
+    """Work that was done for a search, of which the iterations that it took are still to be counted."""
+
+    def __init__(self, runner: OptimalSearch, found: bool) -> None:
+        self.path, self.cost = runner.path, runner.cost
+        self.iterations = 0
+        self._found = found
+
+    def advance(self, iterations: int) -> bool:
+        """Count iterations; tell once whether a better path was found."""
+        self.iterations += iterations
+        found, self._found = self._found, False
+        return found
+
+
+def _done(runner: OptimalSearch, work: Iterator[Work]) -> Iterator[Turn]:
+    """Do work for a search piece by piece."""
+    for iterations, found in work:
+        yield _Done(runner, found), iterations
+
+
+def _heat(runner: OptimalSearch, iterations: int, patience: int) -> Iterator[Turn]:
     """Let a search find its first path, no longer than the first one took or a heat lasts, and refine it."""
     looked = 0
     while runner.path is None and looked < max(patience, iterations):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.grid import Float
+from stages.needle.kernels import limits as index
 from stages.needle.kernels import optimal, tree
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
@@ -63,9 +64,10 @@ class OptimalSearch(RestartingRRT):
         Parameters
         ----------
         points : (V, 3) float64, LPS mm
-            Ends of its arcs, the last one within the goal tolerance.
+            Ends of its arcs; nothing is followed whose last one lies beyond the goal tolerance.
         """
-        if len(points) > MAX_VIAS:
+        missing = float(np.linalg.norm(points[-1] - self.query.target))
+        if len(points) > MAX_VIAS or missing > self.space.limits[index.GOAL_TOLERANCE] + index.TINY:
             return False
         vias = np.zeros_like(self._vias)
         vias[: len(points), :3] = points

@@ -92,19 +92,17 @@ class RacingSearch:
             yield best, LOOK
         patience = best.iterations
         finder = self._way_finder()
-        yield from self._improve(finder, [best])
         while True:
-            runners, heat = [best], FIRST_HEAT
-            for n in range(1, size):
-                runners.append(self._new())
-                if finder is not None and finder.has_ways and n % RANDOM_ONES != 0:
-                    yield from _done(runners[-1], finder.begin(runners[-1], self.cost))
+            runners, heat = [best, *(self._new() for _ in range(size - 1))], FIRST_HEAT
             while len(runners) > 1:
-                for runner in runners:
+                for n, runner in enumerate(runners):
+                    if finder is not None and n % RANDOM_ONES != 0 and runner.path is None:
+                        yield from _done(runner, finder.begin(runner, self.cost))
                     yield from _heat(runner, heat, patience)
                 arrived = sorted((each for each in runners if each.path is not None), key=lambda s: s.cost)
                 runners, heat = arrived[: len(runners) // 2], 2 * heat
-                yield from self._improve(finder, runners)
+                for runner in runners if finder is not None else ():
+                    yield from _done(runner, finder.improve(runner, self.cost))
             best = runners[0]
             yield best, heat
             size = min(2 * size, LARGEST_RACE)
@@ -114,11 +112,6 @@ class RacingSearch:
         if self._objective.is_length:
             return None
         return WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
-
-    def _improve(self, finder: WayFinder | None, runners: list[OptimalSearch]) -> Iterator[Turn]:
-        if finder is not None:
-            for runner in runners:
-                yield from _done(runner, finder.improve(runner, self.cost))
 
 
 class _Runner(Protocol):

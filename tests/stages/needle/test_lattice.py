@@ -1,0 +1,252 @@
+"""Ways on lattices: against all sequences of moves, and against what a needle can follow."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from anatomy.grid import Float, Volume
+from anatomy.margins import Margins
+from anatomy.structures import VESSEL
+from stages.needle.costs import map_integral
+from stages.needle.device import Needle
+from stages.needle.kernels import limits as index
+from stages.needle.lattice import SLACK, Lattices, via_points
+from stages.needle.objective import SHORTEST, Objective
+from stages.needle.optimal import OptimalSearch
+from stages.needle.path import ArcPath
+from stages.needle.racing import RacingSearch
+from stages.needle.searches import Query
+from stages.needle.space import NeedleSpace, needle_space
+from stages.needle.ways import WayFinder
+from tests.stages.needle.proved import assert_proved
+from tests.stages.scenes import Canvas
+
+MAP = Objective(cost_map=1.0)
+RADIUS_MM = 60.0
+
+
+def space_with(costs: np.ndarray | None = None, *balls: tuple[list[float], float]) -> NeedleSpace:
+    """A box of tissue of 50 x 50 x 84 mm with vessel balls, and costs at its voxels."""
+    canvas = Canvas.empty([-25, -25, -42], [25, 25, 42], 1.0)
+    for centre, radius in balls:
+        canvas.add(canvas.ball(centre, radius), VESSEL)
+    needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / RADIUS_MM)
+    space = needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
+    if costs is None:
+        return space
+    return replace(space, cost_map=Volume(grid=space.grid, array=np.asfortranarray(costs, dtype=np.float32)))
+
+
+def random_costs(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.0, 1.0, (50, 50, 84))
+
+
+def wall_with_a_hole(aside_mm: float = 4.0, radius_mm: float = 0.8) -> np.ndarray:
+    """A thick wall of cost with a hole aside of the straight way; elsewhere tissue costs little."""
+    x, y = np.meshgrid(np.arange(50) - 24.5, np.arange(50) - 24.5, indexing="ij")
+    costs = np.full((50, 50, 84), 0.01)
+    costs[:, :, 30:54] = np.where(np.hypot(x - aside_mm, y) < radius_mm, 0.01, 10.0)[..., None]
+    return costs
+
+
+def query(tilt_deg: float = 0.0, goal: tuple[float, float, float] = (0.0, 0.0, 38.0)) -> Query:
+    """From the bottom of the box to its top; the start leans towards +x."""
+    c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
+    frame = np.eye(4)
+    frame[:3, :3] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+    frame[:3, 3] = 0.0, 0.0, -38.0
+    return Query(lps_from_start=frame, target=np.array(goal))
+
+
+def straight(p: Float, q: Float) -> ArcPath:
+    """Return the straight path from a point to another."""
+    z = (q - p) / np.linalg.norm(q - p)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    frame = np.eye(4)
+    frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3] = x, np.cross(z, x), z, p
+    return ArcPath(lps_from_start=frame, arcs=np.array([[np.linalg.norm(q - p), 0.0, 0.0]]))
+
+
+def bending(controls: Float) -> Float:
+    """Return the curvature of the circle that leaves the middle of each piece along it for that of the next."""
+    pieces = np.diff(controls, axis=0)
+    pieces[[0, -1]] *= 2.0
+    chords = 0.5 * (pieces[1:] + pieces[:-1])
+    across = np.linalg.norm(np.cross(pieces[:-1], chords), axis=1) / np.linalg.norm(pieces[:-1], axis=1)
+    return np.asarray(2.0 * across / (chords**2).sum(axis=1))
+
+
+def assert_followed(space: NeedleSpace, asked: Query, controls: Float, objective: Objective = MAP) -> float:
+    """Fail unless a needle can follow a way; return what that costs."""
+    search = OptimalSearch(space, asked, objective=objective)
+    assert search.follow(via_points(controls))
+    assert search.path is not None
+    assert_proved(space, search.path, asked.target)
+    return search.cost
+
+
+@pytest.mark.parametrize(("tilt_deg", "skew"), [(0.0, 0), (7.0, 0), (7.0, 1), (-10.0, 2)])
+def test_the_cheapest_way_is_that_of_all_sequences_of_moves(tilt_deg: float, skew: int) -> None:
+    """All 7^5 sequences of moves are tried; those that end at the target are rated piece by piece."""
+    layers, asked = 5, query(tilt_deg)
+    space = space_with(random_costs(1))
+    lattices = Lattices(space, asked, MAP)
+    base, axes, goal_cells = lattices._straight(layers, skew)
+    ways = lattices.everywhere(layers, skew=skew)
+    units = np.array([[0, 0], [1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
+    moves = units[np.array(list(product(range(7), repeat=layers)))]
+    steps = np.cumsum(moves, axis=1)
+    cells = np.concatenate([np.zeros((len(steps), 1, 2), int), np.cumsum(steps, axis=1)[:, :-1]], axis=1)
+    ends = 2 * cells[:, -1] + steps[:, -1]
+    cells = cells[(ends == goal_cells).all(axis=1)]
+    assert len(cells) > 20
+    costs = []
+    for each in cells:
+        inner = base[1:-1] + each @ axes
+        controls = np.concatenate([base[:1], inner, asked.target[None]])
+        if bending(controls).max() <= SLACK / RADIUS_MM:
+            pieces = zip(controls[:-1], controls[1:], strict=True)
+            costs.append(sum(map_integral(space.cost_map, straight(p, q)) for p, q in pieces))
+    assert len(costs) > 10
+    assert ways.is_whole
+    assert ways.costs[0] == pytest.approx(min(costs), rel=1e-6)
+    rated = [straight(p, q) for p, q in zip(ways.controls[0, :-1], ways.controls[0, 1:], strict=True)]
+    assert sum(map_integral(space.cost_map, each) for each in rated) == pytest.approx(min(costs), rel=1e-6)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 10.0, -15.0])
+def test_a_needle_can_follow_different_ways_around_a_ball(tilt_deg: float) -> None:
+    asked, objective = query(tilt_deg), Objective(length=1.0, inverse_clearance=1.0)
+    space = space_with(None, ([0.0, 0.0, 0.0], 3.0))
+    ways = Lattices(space, asked, objective).everywhere(12, most=6, apart_mm=2.0)
+    assert len(ways.controls) == 6
+    assert (np.diff(ways.costs) >= 0.0).all()
+    middles = ways.controls[:, 6]
+    apart = np.linalg.norm(middles[:, None] - middles, axis=-1) + 99.0 * np.eye(6)
+    assert apart.min() >= 2.0
+    for controls, cost in zip(ways.controls, ways.costs, strict=True):
+        assert bending(controls).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
+        assert controls[-1] == pytest.approx(asked.target, abs=1e-9)
+        assert assert_followed(space, asked, controls, objective) == pytest.approx(cost, rel=0.02)
+
+
+def test_ways_around_a_way_are_cheaper_and_meet_the_target() -> None:
+    space, asked = space_with(random_costs(2)), query(10.0)
+    lattices = Lattices(space, asked, MAP)
+    ways = lattices.everywhere(10)
+    costs = [ways.costs[0]]
+    for cells in (0.5, 0.25, 0.125):
+        ways = lattices.around(ways.controls[0], cells, 0.3, costs[-1] * (1 + 1e-9))
+        costs.append(ways.costs[0])
+        assert bending(ways.controls[0]).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
+        assert ways.controls[0, -1] == pytest.approx(asked.target, abs=1e-9)
+    assert (np.diff(costs) <= 1e-9).all()
+    assert costs[-1] < 0.97 * costs[0]
+    assert not len(lattices.around(ways.controls[0], 0.125, 0.3, 0.5 * costs[-1]).controls)
+
+
+def test_controls_of_a_path_lead_along_it() -> None:
+    space, asked = space_with(random_costs(3)), query(10.0)
+    lattices = Lattices(space, asked, MAP)
+    controls = lattices.everywhere(12).controls[0]
+    search = OptimalSearch(space, asked, objective=MAP)
+    assert search.follow(via_points(controls)) and search.path is not None
+    again = lattices.controls_of(search.path, 12)
+    assert again is not None
+    assert np.abs(again - controls).max() < 0.05
+
+
+def test_a_path_that_turns_back_has_no_controls() -> None:
+    frame = query().lps_from_start
+    back = ArcPath(lps_from_start=frame, arcs=np.array([[120.0, 0.0, 1 / RADIUS_MM]]))
+    assert Lattices(space_with(random_costs(1)), query(), MAP).controls_of(back, 12) is None
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        (query(80.0), "steep"),
+        (query(0.0, (0.0, 0.0, -38.0)), "at the start"),
+        (query(70.0, (-6.0, 0.0, -28.0)), "out of the workspace"),
+    ],
+)
+def test_there_are_no_ways_where_none_can_be(asked: Query, why: str) -> None:
+    space = space_with(random_costs(1))
+    assert not Lattices(space, asked, MAP).is_possible, why
+    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    search = OptimalSearch(space, asked, objective=MAP)
+    assert not finder.has_ways
+    assert not list(finder.begin(search, math.inf)) and search.path is None
+
+
+def test_a_lattice_without_room_has_no_ways() -> None:
+    ways = Lattices(space_with(random_costs(1)), query(10.0), MAP).everywhere(40)
+    assert not ways.is_whole and not len(ways.controls)
+
+
+def test_a_blocked_start_has_no_ways() -> None:
+    space = space_with(random_costs(1), ([0.0, 0.0, -36.0], 3.0))
+    assert not len(Lattices(space, query(), MAP).everywhere(10).controls)
+
+
+def test_searches_follow_only_what_is_cheaper_and_can_be_followed() -> None:
+    space, asked = space_with(random_costs(1)), query()
+    controls = Lattices(space, asked, MAP).everywhere(10).controls[0]
+    search = OptimalSearch(space, asked, objective=MAP)
+    assert not search.follow(np.array([[15.0, 0.0, -30.0], asked.target])), "bends too much"
+    assert not search.follow(np.array([[0.0, 0.0, 0.0]])), "does not reach the target"
+    assert not search.follow(np.repeat(asked.target[None], 99, axis=0)), "too many points"
+    assert search.path is None
+    assert search.follow(via_points(controls))
+    cost = search.cost
+    assert not search.follow(via_points(controls)), "is no cheaper"
+    while search.iterations < 3000:
+        search.advance(500)
+    assert search.cost < cost
+
+
+def test_races_go_through_holes_in_walls_of_cost() -> None:
+    """A search at random seldom meets both holes; a lattice holds the way through."""
+    space = space_with(wall_with_a_hole())
+    costs = {kind: [] for kind in (RacingSearch, OptimalSearch)}
+    for kind, seed in product(costs, range(1, 5)):
+        search = kind(space, query(), seed=seed, objective=MAP)
+        while search.iterations < 6_000:
+            search.advance(500)
+        costs[kind].append(search.cost)
+    assert max(costs[RacingSearch]) < 1.0
+    assert np.median(costs[OptimalSearch]) > 10.0, "the holes are hard to meet"
+
+
+def test_the_same_iterations_give_the_same_path() -> None:
+    def run(seed: int) -> np.ndarray:
+        search = RacingSearch(space_with(random_costs(1)), query(5.0), seed=seed, objective=MAP)
+        while search.iterations < 20_000:
+            before = search.iterations
+            assert search.advance(250) or search.iterations - before == 250
+        assert search.path is not None
+        return np.asarray(search.path.arcs)
+
+    assert np.array_equal(run(1), run(1))
+    assert run(1).shape != run(2).shape or not np.array_equal(run(1), run(2))
+
+
+def test_the_target_may_lie_straight_ahead() -> None:
+    lattices = Lattices(space_with(random_costs(4)), query(), MAP)
+    ways = lattices.everywhere(10)
+    assert len(ways.controls) == 1
+    assert ways.controls[0, -1] == pytest.approx(query().target, abs=1e-12)
+    assert_followed(space_with(random_costs(4)), query(), ways.controls[0])
+
+
+def test_pure_length_needs_no_ways() -> None:
+    assert SHORTEST.is_length and Objective(length=2.0).is_length
+    assert not MAP.is_length and not Objective(length=1.0, inverse_clearance=0.1).is_length
+    assert RacingSearch(space_with(), query())._way_finder() is None
+    assert space_with().limits[index.KAPPA] == pytest.approx(1 / RADIUS_MM)

@@ -21,8 +21,8 @@ FIRST_HEAT = 500
 """Iterations of a search in the first heat of a race; twice as many in each heat that follows."""
 LOOK = 100
 """A search without a path is looked at after so many iterations."""
-RANDOM_ONES = 4
-"""Every so many-th search begins at random though there are ways on lattices."""
+LED_SHARE = 2 / 3
+"""Share of the iterations, once there is a path, for races of searches that are led by ways on lattices."""
 
 
 class RacingSearch:
@@ -32,8 +32,8 @@ class RacingSearch:
     cheaper than a path made so cheap.  So further searches begin anew with numbers of their own, and are made
     cheaper too before they are compared.  The best path so far takes part in every race.
 
-    Where more than length counts, most of them begin with a way on a lattice, and each that goes on is led to
-    the cheapest way near its own first, see `stages.needle.ways`.
+    Where more than length counts, such races take turns with others, whose searches are led: they begin with
+    ways on lattices, and those that go on take the cheapest way near their own, see `stages.needle.ways`.
 
     Parameters
     ----------
@@ -53,23 +53,19 @@ class RacingSearch:
         self.iterations = 0
         """Iterations spent so far, by all searches."""
         self._space, self._query, self._seed, self._objective = space, query, seed, objective
-        self._made = 0
-        self._turns = self._races()
-        self._runner: _Runner
-        self._runner, self._left = next(self._turns)
+        self._made = [0, 0]
+        self._patience = 0
+        self._free = _Turns(self._races())
+        self._led: _Turns | None = None
 
     def advance(self, iterations: int) -> bool:
         """Go on with the search whose turn it is; see `stages.needle.searches.Search`."""
         left = iterations
         while left > 0:
-            if self._left <= 0:
-                self._runner, self._left = next(self._turns)
-            runner, before = self._runner, self._runner.iterations
-            found = runner.advance(min(left, self._left))
-            used = runner.iterations - before
+            turns = self._next()
+            runner, used, found = turns.advance(left)
             self.iterations += used
             left -= used
-            self._left -= used
             if found and runner.cost < self.cost:
                 self.path, self.cost = runner.path, runner.cost
                 return True
@@ -77,12 +73,25 @@ class RacingSearch:
                 return False
         return False
 
-    def _new(self) -> OptimalSearch:
-        """Return another search, with random numbers of its own."""
+    def _next(self) -> _Turns:
+        """Return the races that have had less than their share."""
+        if self._led is None:
+            # Of pure length, trees and refinement find the least as fast.
+            if self.path is None or self._objective.is_length:
+                return self._free
+            self._patience = self._free.spent
+            self._free.spent = 0
+            self._led = _Turns(self._led_races())
+        is_behind = (1.0 - LED_SHARE) * self._led.spent <= LED_SHARE * self._free.spent
+        return self._led if is_behind else self._free
+
+    def _new(self, kind: int = 0) -> OptimalSearch:
+        """Return another search, with random numbers of its own and of its kind: 0 free, 1 led."""
         seed = self._seed
-        if self._made:
-            seed = int(np.random.SeedSequence([self._seed, self._made]).generate_state(1, np.uint64)[0])
-        self._made += 1
+        if kind or self._made[kind]:
+            numbers = [self._seed, self._made[kind], kind][: 2 + kind]
+            seed = int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
+        self._made[kind] += 1
         return OptimalSearch(self._space, self._query, seed=seed, objective=self._objective)
 
     def _races(self) -> Iterator[Turn]:
@@ -91,27 +100,35 @@ class RacingSearch:
         while best.path is None:
             yield best, LOOK
         patience = best.iterations
-        finder = self._way_finder()
         while True:
             runners, heat = [best, *(self._new() for _ in range(size - 1))], FIRST_HEAT
             while len(runners) > 1:
-                for n, runner in enumerate(runners):
-                    if finder is not None and n % RANDOM_ONES != 0 and runner.path is None:
-                        yield from _done(runner, finder.begin(runner, self.cost))
+                for runner in runners:
                     yield from _heat(runner, heat, patience)
-                arrived = sorted((each for each in runners if each.path is not None), key=lambda s: s.cost)
-                runners, heat = arrived[: len(runners) // 2], 2 * heat
-                for runner in runners if finder is not None else ():
-                    yield from _done(runner, finder.improve(runner, self.cost))
+                runners, heat = _better_half(runners), 2 * heat
             best = runners[0]
             yield best, heat
             size = min(2 * size, LARGEST_RACE)
 
-    def _way_finder(self) -> WayFinder | None:
-        """Return what finds ways; of pure length, trees and refinement find the least as fast."""
-        if self._objective.is_length:
-            return None
-        return WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
+    def _led_races(self) -> Iterator[Turn]:
+        """Yield turns of searches that are led."""
+        finder = WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
+        best, size = self._new(1), FIRST_RACE
+        while True:
+            if self.path is not None and self.cost < best.cost:
+                best.adopt(self.path, self.cost)
+            runners, heat = [best, *(self._new(1) for _ in range(size - 1))], FIRST_HEAT
+            while len(runners) > 1:
+                for runner in runners:
+                    if runner.path is None:
+                        yield from _done(runner, finder.begin(runner, self.cost))
+                    yield from _heat(runner, heat, self._patience)
+                runners, heat = _better_half(runners), 2 * heat
+                for runner in runners:
+                    yield from _done(runner, finder.improve(runner, self.cost))
+            best = runners[0]
+            yield best, heat
+            size = min(2 * size, LARGEST_RACE)
 
 
 class _Runner(Protocol):
@@ -129,6 +146,27 @@ class _Runner(Protocol):
 
 
 Turn = tuple[_Runner, int]
+
+
+class _Turns:
+    """Turns that are taken one after the other, and the iterations spent."""
+
+    def __init__(self, turns: Iterator[Turn]) -> None:
+        self.spent = 0
+        self._turns = turns
+        self._runner: _Runner
+        self._runner, self._left = next(turns)
+
+    def advance(self, iterations: int) -> tuple[_Runner, int, bool]:
+        """Go on with a turn, not beyond it; return whose it is, iterations spent, and what it returned."""
+        if self._left <= 0:
+            self._runner, self._left = next(self._turns)
+        before = self._runner.iterations
+        found = self._runner.advance(min(iterations, self._left))
+        used = self._runner.iterations - before
+        self._left -= used
+        self.spent += used
+        return self._runner, used, found
 
 
 class _Done:
@@ -150,6 +188,11 @@ def _done(runner: OptimalSearch, work: Iterator[Work]) -> Iterator[Turn]:
     """Do work for a search piece by piece."""
     for iterations, found in work:
         yield _Done(runner, found), iterations
+
+
+def _better_half(runners: list[OptimalSearch]) -> list[OptimalSearch]:
+    arrived = sorted((each for each in runners if each.path is not None), key=lambda search: search.cost)
+    return arrived[: len(runners) // 2]
 
 
 def _heat(runner: OptimalSearch, iterations: int, patience: int) -> Iterator[Turn]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy.grid import Float
-from stages.needle.lattice import Lattices, via_points
+from stages.needle.lattice import Lattices, Ways, via_points
 from stages.needle.objective import Objective
 from stages.needle.optimal import OptimalSearch
 from stages.needle.searches import Query
@@ -22,12 +22,12 @@ CELLS = (1 / 3, 1 / 6, 1 / 3, 1 / 6)
 """Of lattices around a way, one after the other, as shares of what the greatest curvature allows."""
 SKEWS = 6
 """Lattices are turned in so many ways."""
-MOST_WAYS, APART_MM = 2, 1.0
-"""Ways taken from a lattice, and their least distance half-way."""
 MOST_COST = 2.0
 """A way that costs more than so many times the best path is left when it was made cheaper twice."""
 SPARE_COST = 1.5
 """By so much more than its path, a way near a path may cost first: straight pieces and arcs differ."""
+
+ROUNDING = 1e-9
 
 Work = tuple[int, bool]
 """What was done for a search: the iterations that it took, and whether it found a cheaper path."""
@@ -50,7 +50,6 @@ class WayFinder:
         self._random = np.random.default_rng(seed)
         self._layers = list(LAYERS) if self._lattices.is_possible else []
         self._tried = 0
-        self._waiting: list[tuple[Float, float]] = []
         self.has_ways = bool(self._layers)
         """Whether lattices over all of the space may have ways; no longer once none of them had any."""
         self._found_any = False
@@ -60,12 +59,13 @@ class WayFinder:
 
         `best` is the cost of the best path.
         """
-        if self.has_ways and not self._waiting:
-            yield self._look_everywhere(), False
-        if self._waiting:
-            controls, cost = self._waiting.pop(0)
-            search.follow(via_points(controls))
-            yield from self._climb(search, controls, cost * (1.0 + 1e-9), best)
+        if not self.has_ways:
+            return
+        ways = self._look_everywhere()
+        yield _iterations(ways.states), False
+        if len(ways.controls):
+            search.follow(via_points(ways.controls[0]))
+            yield from self._climb(search, ways.controls[0], float(ways.costs[0]) * (1.0 + ROUNDING), best)
 
     def improve(self, search: OptimalSearch, best: float) -> Iterator[Work]:
         """Lead a search to the cheapest way near its path; `best` is the cost of the best path."""
@@ -76,18 +76,16 @@ class WayFinder:
         if controls is not None:
             yield from self._climb(search, controls, SPARE_COST * search.cost, best)
 
-    def _look_everywhere(self) -> int:
-        """Put the ways of the next lattice on the waiting list; return the iterations that it took."""
+    def _look_everywhere(self) -> Ways:
+        """Return the cheapest way of the next lattice; the next time it is another one."""
         layers = self._layers[self._tried % len(self._layers)]
-        skew = int(self._random.integers(SKEWS))
-        ways = self._lattices.everywhere(layers, most=MOST_WAYS, apart_mm=APART_MM, skew=skew)
+        ways = self._lattices.everywhere(layers, skew=int(self._random.integers(SKEWS)))
         self._tried += 1
         if not ways.is_whole:
             self._layers = [each for each in self._layers if each < layers]
-        self._waiting = list(zip(ways.controls, ways.costs.tolist(), strict=True))
-        self._found_any = self._found_any or bool(self._waiting)
+        self._found_any = self._found_any or len(ways.controls) > 0
         self.has_ways = bool(self._layers) and (self._found_any or self._tried < len(LAYERS))
-        return _iterations(ways.states)
+        return ways
 
     def _climb(self, search: OptimalSearch, controls: Float, bound: float, best: float) -> Iterator[Work]:
         """Go to the cheapest way around the last one, again and again."""
@@ -98,7 +96,7 @@ class WayFinder:
             ways = self._lattices.around(controls, cells, turn, bound)
             found = False
             if len(ways.controls):
-                controls, bound = ways.controls[0], float(ways.costs[0]) * (1.0 + 1e-9)
+                controls, bound = ways.controls[0], float(ways.costs[0]) * (1.0 + ROUNDING)
                 found = search.follow(via_points(controls))
             yield _iterations(ways.states), found
 

@@ -59,7 +59,7 @@ def run(search: OptimalSearch | RacingSearch, iterations: int, slice_of: int = 5
 def test_races_find_ways_for_which_a_single_search_does_not_leave_its_own() -> None:
     space = two_valleys()
     single, races = (
-        np.array([run(kind(space, query(), seed=seed, objective=MAP), 60_000) for seed in range(6)])
+        np.array([run(kind(space, query(), seed=seed, objective=MAP), 60_000) for seed in range(3)])
         for kind in (OptimalSearch, RacingSearch)
     )
     assert races.max() < 1.001 * min(races.min(), single.min())

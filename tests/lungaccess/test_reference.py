@@ -354,12 +354,15 @@ class TestNeedle:
 
 
 def test_the_attack_reports_what_the_planner_missed(
-    atlas: la.Atlas, target: Target, obstacles: Obstacles
+    atlas: la.Atlas, target: Target, obstacles: Obstacles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A planner without time finds nothing, though there is a plan.
+    def gives_up(*_arguments: Any, **_options: Any) -> Any:
+        raise la.NoPlan("Nothing was tried", reasons={})
+
+    monkeypatch.setattr(noplan_attack.la, "plan", gives_up)
     attack = noplan_attack.Attack(atlas, 0.0, math.inf, 1, obstacles)
     record, plan = attack.result(target.lps_mm)
-    assert "too short" in record["planner"] and record["reference"] == noplan_attack.MISSED
+    assert "Nothing was tried" in record["planner"] and record["reference"] == noplan_attack.MISSED
     assert record["found"] >= 1 and la.check(plan, atlas.lung, SYSTEM).accepted
     targets = {"0": record | {"plan": "p.json"}, "1": {"planner": "plan"}}
     assert "missed by the planner: 1\n" in noplan_attack.summary(targets)

@@ -147,12 +147,17 @@ def test_an_interruption_ends_a_study_also_while_something_is_being_deleted(
             Interrupting()
 
     path = tmp_path / "r.db"
-    with pytest.raises(KeyboardInterrupt):
-        run_study(study_of(content()), path, scheduler=cluster, cache=cache, tell=tell)
+    # A shell lets jobs in the background ignore it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_study(study_of(content()), path, scheduler=cluster, cache=cache, tell=tell)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert told == [0.25]
     with ResultsFile(path) as results:
         assert len(results.finished_keys()) == 1
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_only_a_few_runs_wait_at_the_scheduler_and_nothing_of_the_others_stays(

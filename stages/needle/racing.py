@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +23,8 @@ LOOK = 100
 """A search without a path is looked at after so many iterations."""
 LED_SHARE = 2 / 3
 """Share of the iterations, once there is a path, for races of searches that are led by ways on lattices."""
+
+FREE, LED = 0, 1
 
 
 class RacingSearch:
@@ -85,50 +87,53 @@ class RacingSearch:
         is_behind = (1.0 - LED_SHARE) * self._led.spent <= LED_SHARE * self._free.spent
         return self._led if is_behind else self._free
 
-    def _new(self, kind: int = 0) -> OptimalSearch:
-        """Return another search, with random numbers of its own and of its kind: 0 free, 1 led."""
+    def _new(self, kind: int) -> OptimalSearch:
+        """Return another search, FREE or LED, with random numbers of its own."""
         seed = self._seed
-        if kind or self._made[kind]:
-            numbers = [self._seed, self._made[kind], kind][: 2 + kind]
+        if kind == LED or self._made[kind]:
+            numbers = [self._seed, self._made[kind], *([LED] if kind == LED else [])]
             seed = int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
         self._made[kind] += 1
         return OptimalSearch(self._space, self._query, seed=seed, objective=self._objective)
 
     def _races(self) -> Iterator[Turn]:
         """Yield whose turn it is and for how many iterations, for ever."""
-        best, size = self._new(), FIRST_RACE
+        best, size = self._new(FREE), FIRST_RACE
         while best.path is None:
             yield best, LOOK
         patience = best.iterations
         while True:
-            runners, heat = [best, *(self._new() for _ in range(size - 1))], FIRST_HEAT
-            while len(runners) > 1:
-                for runner in runners:
-                    yield from _heat(runner, heat, patience)
-                runners, heat = _better_half(runners), 2 * heat
-            best = runners[0]
-            yield best, heat
+            runners = [best, *(self._new(FREE) for _ in range(size - 1))]
+            best = yield from self._race(runners, patience)
             size = min(2 * size, LARGEST_RACE)
 
     def _led_races(self) -> Iterator[Turn]:
         """Yield turns of searches that are led."""
         finder = WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
-        best, size = self._new(1), FIRST_RACE
+        best, size = self._new(LED), FIRST_RACE
         while True:
             if self.path is not None and self.cost < best.cost:
                 best.adopt(self.path, self.cost)
-            runners, heat = [best, *(self._new(1) for _ in range(size - 1))], FIRST_HEAT
-            while len(runners) > 1:
-                for runner in runners:
-                    if runner.path is None:
-                        yield from _done(runner, finder.begin(runner, self.cost))
-                    yield from _heat(runner, heat, self._patience)
-                runners, heat = _better_half(runners), 2 * heat
+            runners = [best, *(self._new(LED) for _ in range(size - 1))]
+            best = yield from self._race(runners, self._patience, finder)
+            size = min(2 * size, LARGEST_RACE)
+
+    def _race(
+        self, runners: list[OptimalSearch], patience: int, finder: WayFinder | None = None
+    ) -> Generator[Turn, None, OptimalSearch]:
+        """Yield the turns of a race, whose searches a finder leads if there is one; return the winner."""
+        heat = FIRST_HEAT
+        while len(runners) > 1:
+            for runner in runners:
+                if finder is not None and runner.path is None:
+                    yield from _done(runner, finder.begin(runner, self.cost))
+                yield from _heat(runner, heat, patience)
+            runners, heat = _better_half(runners), 2 * heat
+            if finder is not None:
                 for runner in runners:
                     yield from _done(runner, finder.improve(runner, self.cost))
-            best = runners[0]
-            yield best, heat
-            size = min(2 * size, LARGEST_RACE)
+        yield runners[0], heat
+        return runners[0]
 
 
 class _Runner(Protocol):

@@ -15,12 +15,14 @@ from stages.needle.path import ArcPath
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace, workspace_lengths
 
-MOST_STATES = 1 << 17
-"""States of a lattice, in 13 MB; so many are looked at in 0.2 s."""
+MOST_STATES = 1 << 15
+"""States of a lattice, in 2 MB; so many are looked at in 0.1 s."""
 SLACK = 0.97
 """Share of the greatest curvature that ways take: the arcs laid along them bend a little more than they."""
 LEAST_COSINE = 0.3
 """Of the angle between a start and the line to the target; steeper ones get no ways."""
+SKEWS = 6
+"""Lattices are turned in so many ways."""
 REACH = 9
 """How many cells from a way those around it go."""
 ANYWHERE = 1 << 14
@@ -28,24 +30,24 @@ SAMPLE_MM = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ways:
-    """Ways through a lattice of L layers, the cheapest first.
+class Way:
+    """The cheapest way through a lattice of L layers, if there is one.
 
     Parameters
     ----------
-    controls : (W, L + 2, 3) float64, LPS mm
-        Start, control points of a quadratic spline, and target.
-    costs : (W,) float64
-        Of their straight pieces, not of the curves.
-    states : int
-        States that were looked at, a measure of the work.
+    controls : (L + 2, 3) float64, LPS mm
+        Start, control points of a quadratic spline, and target; None if there is no way.
+    cost : float
+        Of the arcs along it, infinite without a way.
+    arcs : int
+        Arcs that were tried, a measure of the work.
     is_whole : bool
-        False if the lattice had too many states: then there are no ways.
+        False if the lattice had too many states: then there is no way.
     """
 
-    controls: Float
-    costs: Float
-    states: int
+    controls: Float | None
+    cost: float
+    arcs: int
     is_whole: bool
 
 
@@ -74,38 +76,31 @@ class Lattices:
         )
         """Whether there may be ways: the target is in the workspace, and the start not too steep."""
         self._states = np.zeros((MOST_STATES, kernel.STATE_COLUMNS), dtype=np.int64)
-        self._links = np.zeros((MOST_STATES, kernel.LINK_COLUMNS), dtype=np.int32)
-        self._costs = np.zeros((MOST_STATES, kernel.COST_COLUMNS))
+        self._before = np.zeros(MOST_STATES, dtype=np.int32)
+        self._costs = np.zeros(MOST_STATES)
+        self._order = np.zeros(MOST_STATES, dtype=np.int32)
         self._table = np.zeros(2 * MOST_STATES, dtype=np.int32)
 
-    def everywhere(
-        self, layers: int, *, most: int = 1, apart_mm: float = 1.0, skew: int = 0, bound: float = math.inf
-    ) -> Ways:
-        """Return the cheapest ways of all that are apart half-way.
+    def everywhere(self, layers: int, *, skew: int = 0) -> Way:
+        """Return the cheapest way of all.
 
         Parameters
         ----------
         layers : int
             More are finer, and take time by about the 7th power.
-        most : int
-            Ways.
-        apart_mm : float
-            Least distance of two ways half-way.
         skew : int
-            Turns the lattice.
-        bound : float
-            Ways cost less.
+            Turns the lattice, less than SKEWS.
         """
         base, axes, goal_cells = self._straight(layers, skew)
-        return self._explore(base, axes, goal_cells, ANYWHERE, most, apart_mm, bound)
+        return self._explore(base, axes, goal_cells, ANYWHERE, math.inf)
 
-    def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> Ways:
+    def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> Way:
         """Return the cheapest way near another one, if it costs less than `bound`.
 
         Parameters
         ----------
         controls : (L + 2, 3) float64, LPS mm
-            As those of `Ways`.
+            As those of `Way`.
         cells : float
             Size of a cell, as a share of what the greatest curvature allows.
         turn_rad : float
@@ -113,7 +108,7 @@ class Lattices:
         bound : float
         """
         axes = self._axes(cells * self._largest_cell(len(controls) - 2), _beside(self._axis), turn_rad)
-        return self._explore(controls, axes, np.zeros(2, dtype=np.int64), REACH, 1, 0.0, bound)
+        return self._explore(controls, axes, np.zeros(2, dtype=np.int64), REACH, bound)
 
     def controls_of(self, path: ArcPath, layers: int) -> Float | None:
         """Return controls `(L + 2, 3)` of a spline near a path; None if that does not always lead ahead.
@@ -142,14 +137,16 @@ class Lattices:
     def _straight(self, layers: int, skew: int) -> tuple[Float, Float, Float]:
         """Return what goes straight on from the start, and a lattice around it that meets the target.
 
-        Steps of half a cell lead aside to the target, `skew` of them along the second axis.
+        Steps of half a cell lead aside to the target, `skew` of them along the second axis; where it lies
+        straight ahead, any turn will do.
         """
         pace = self._tangent * (self._distance / layers / self._cosine)
         end = self._start + layers * pace
         aside = self._query.target - end
         offset, largest = float(np.linalg.norm(aside)), self._largest_cell(layers)
         if offset < index.MIN_ARC_MM:
-            axes, goal_cells = self._axes(largest, _beside(self._axis), 0.0), (0, 0)
+            turn = skew * math.pi / (3.0 * SKEWS)
+            axes, goal_cells = self._axes(largest, _beside(self._axis), turn), (0, 0)
             end = self._query.target
         else:
             along = 0
@@ -168,28 +165,20 @@ class Lattices:
             [cell * (math.cos(a) * side + math.sin(a) * up) for a in (turn_rad, turn_rad + math.pi / 3)]
         )
 
-    def _explore(
-        self,
-        base: Float,
-        axes: Float,
-        goal_cells: Float,
-        reach: int,
-        most: int,
-        apart_mm: float,
-        bound: float,
-    ) -> Ways:
+    def _explore(self, base: Float, axes: Float, goal_cells: Float, reach: int, bound: float) -> Way:
         self._table.fill(kernel.NONE)
         begins = np.zeros(len(base), dtype=np.int64)
-        arrays = (begins, self._states, self._links, self._costs)
+        arrays = (begins, self._states, self._before, self._costs)
         query = self._query
-        count, is_whole = kernel.explore(
+        arcs, is_whole = kernel.explore(
             self._space.arrays, self._space.limits, self._objective, query.branch, base, axes, goal_cells,
-            self._kappa, reach, query.inserted_mm, bound, *arrays, self._table,
+            self._kappa, reach, query.inserted_mm, bound, *arrays, self._table, self._order,
         )  # fmt: skip
-        controls, costs, found = np.zeros((most, len(base), 3)), np.zeros(most), 0
+        controls, cost = np.zeros_like(base), math.inf
         if is_whole:
-            found = kernel.different_ways(base, axes, goal_cells, *arrays, bound, apart_mm, controls, costs)
-        return Ways(controls=controls[:found], costs=costs[:found], states=int(count), is_whole=is_whole)
+            cost = float(kernel.cheapest_way(base, axes, goal_cells, *arrays, controls))
+        found = controls if cost < math.inf else None
+        return Way(controls=found, cost=cost, arcs=int(arcs), is_whole=bool(is_whole))
 
 
 def via_points(controls: Float) -> Float:

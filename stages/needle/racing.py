@@ -22,7 +22,7 @@ FIRST_HEAT = 500
 LOOK = 100
 """A search without a path is looked at after so many iterations."""
 LED_SHARE = 2 / 3
-"""Share of the iterations, once there is a path, for races of searches that are led by ways on lattices."""
+"""Share of the iterations, once there is a path, for races of searches that are led, if there are ways."""
 
 FREE, LED = 0, 1
 
@@ -36,6 +36,7 @@ class RacingSearch:
 
     Where more than length counts, such races take turns with others, whose searches are led: they begin with
     ways on lattices, and those that go on take the cheapest way near their own, see `stages.needle.ways`.
+    Where no lattice has a way, the races without them have all the time.
 
     Parameters
     ----------
@@ -59,6 +60,7 @@ class RacingSearch:
         self._patience = 0
         self._free = _Turns(self._races())
         self._led: _Turns | None = None
+        self._finder: WayFinder
 
     def advance(self, iterations: int) -> bool:
         """Go on with the search whose turn it is; see `stages.needle.searches.Search`."""
@@ -76,16 +78,17 @@ class RacingSearch:
         return False
 
     def _next(self) -> _Turns:
-        """Return the races that have had less than their share."""
+        """Return the races that have had less than their share, those that are led only if there are ways."""
         if self._led is None:
             # Of pure length, trees and refinement find the least as fast.
             if self.path is None or self._objective.is_length:
                 return self._free
             self._patience = self._free.spent
             self._free.spent = 0
+            self._finder = WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
             self._led = _Turns(self._led_races())
         is_behind = (1.0 - LED_SHARE) * self._led.spent <= LED_SHARE * self._free.spent
-        return self._led if is_behind else self._free
+        return self._led if is_behind and self._finder.has_ways else self._free
 
     def _new(self, kind: int) -> OptimalSearch:
         """Return another search, FREE or LED, with random numbers of its own."""
@@ -109,13 +112,12 @@ class RacingSearch:
 
     def _led_races(self) -> Iterator[Turn]:
         """Yield turns of searches that are led."""
-        finder = WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
         best, size = self._new(LED), FIRST_RACE
         while True:
             if self.path is not None and self.cost < best.cost:
                 best.adopt(self.path, self.cost)
             runners = [best, *(self._new(LED) for _ in range(size - 1))]
-            best = yield from self._race(runners, self._patience, finder)
+            best = yield from self._race(runners, self._patience, self._finder)
             size = min(2 * size, LARGEST_RACE)
 
     def _race(

@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import product
+from operator import itemgetter
 
 import numpy as np
 
 from anatomy.grid import Float
-from stages.needle.lattice import Lattices, Ways, via_points
+from stages.needle.lattice import SKEWS, Lattices, via_points
 from stages.needle.objective import Objective
 from stages.needle.optimal import OptimalSearch
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace
 
-STATES_PER_ITERATION = 8
-"""States of a lattice take as long as one iteration of a search."""
+ARCS_PER_ITERATION = 8
+"""Arcs of a lattice take as long as one iteration of a search."""
 LAYERS = (12, 14, 16)
-"""Of lattices: over all of the space one after the other, around a path one of them drawn."""
-CELLS = (1 / 3, 1 / 6, 1 / 3, 1 / 6)
+"""Of lattices: over all of the space one after the other, around a path one of them drawn.
+
+No more of those are used of which there are too many states.
+"""
+CELLS = (1 / 3, 1 / 6)
 """Of lattices around a way, one after the other, as shares of what the greatest curvature allows."""
-SKEWS = 6
-"""Lattices are turned in so many ways."""
+LEAST_GAIN = 0.01
+"""A way is made cheaper again and again as long as it gains this share of its cost each time."""
+LOOK_ARCS = 1 << 15
+"""Once so many arcs were tried all over the space, a search begins before more lattices are looked at."""
 MOST_COST = 2.0
-"""A way that costs more than so many times the best path is left when it was made cheaper twice."""
+"""A way that costs more than so many times the best path is made cheaper only once."""
 SPARE_COST = 1.5
-"""By so much more than its path, a way near a path may cost first: straight pieces and arcs differ."""
+"""By so much more than its path, a way near a path may cost first: it is not quite that path."""
 
 ROUNDING = 1e-9
 
@@ -48,58 +55,73 @@ class WayFinder:
     def __init__(self, space: NeedleSpace, query: Query, *, seed: int, objective: Objective) -> None:
         self._lattices = Lattices(space, query, objective)
         self._random = np.random.default_rng(seed)
-        self._layers = list(LAYERS) if self._lattices.is_possible else []
-        self._tried = 0
-        self.has_ways = bool(self._layers)
-        """Whether lattices over all of the space may have ways; no longer once none of them had any."""
-        self._found_any = False
+        self._layers: tuple[int, ...] = LAYERS
+        self._unseen = list(product(range(SKEWS), LAYERS)) if self._lattices.is_possible else []
+        self._seen = 0
+        self._ways: list[tuple[float, Float]] = []
+        self._begun: list[tuple[float, Float]] = []
+        self.has_ways = bool(self._unseen)
+        """Whether lattices over all of the space may have ways; no longer once the first ones had none."""
 
     def begin(self, search: OptimalSearch, best: float) -> Iterator[Work]:
-        """Lead a search that has no path to the next way, if there is one, and make it cheaper.
+        """Lead a search that has no path to a way, if there is one, and make it cheaper.
 
-        `best` is the cost of the best path.
+        It is the cheapest of those found so far with which no search began, and the cheapest of all once
+        there is no other.  `best` is the cost of the best path.
         """
-        if not self.has_ways:
+        yield from self._look_everywhere()
+        if not self._ways:
+            self._ways, self._begun = self._begun, []
+        if not self._ways:
             return
-        ways = self._look_everywhere()
-        yield _iterations(ways.states), False
-        if len(ways.controls):
-            search.follow(via_points(ways.controls[0]))
-            yield from self._climb(search, ways.controls[0], float(ways.costs[0]) * (1.0 + ROUNDING), best)
+        self._ways.sort(key=itemgetter(0))
+        cost, controls = self._ways[0]
+        self._begun.append(self._ways.pop(0))
+        search.follow(via_points(controls))
+        yield from self._climb(search, controls, cost * (1.0 + ROUNDING), best)
 
     def improve(self, search: OptimalSearch, best: float) -> Iterator[Work]:
         """Lead a search to the cheapest way near its path; `best` is the cost of the best path."""
-        if search.path is None or not self._lattices.is_possible:
+        if search.path is None or not self.has_ways or not self._layers:
             return
-        layers = LAYERS[int(self._random.integers(len(LAYERS)))]
+        layers = self._layers[int(self._random.integers(len(self._layers)))]
         controls = self._lattices.controls_of(search.path, layers)
         if controls is not None:
             yield from self._climb(search, controls, SPARE_COST * search.cost, best)
 
-    def _look_everywhere(self) -> Ways:
-        """Return the cheapest way of the next lattice; the next time it is another one."""
-        layers = self._layers[self._tried % len(self._layers)]
-        ways = self._lattices.everywhere(layers, skew=int(self._random.integers(SKEWS)))
-        self._tried += 1
-        if not ways.is_whole:
-            self._layers = [each for each in self._layers if each < layers]
-        self._found_any = self._found_any or len(ways.controls) > 0
-        self.has_ways = bool(self._layers) and (self._found_any or self._tried < len(LAYERS))
-        return ways
+    def _look_everywhere(self) -> Iterator[Work]:
+        """Find the cheapest ways of some more lattices, as many as take the time for it."""
+        tried = 0
+        while self._unseen and tried < LOOK_ARCS:
+            skew, layers = self._unseen.pop(0)
+            way = self._lattices.everywhere(layers, skew=skew)
+            tried += way.arcs
+            if way.controls is not None:
+                self._ways.append((way.cost, way.controls))
+            if not way.is_whole:
+                self._layers = tuple(each for each in self._layers if each < layers)
+                self._unseen = [each for each in self._unseen if each[1] in self._layers]
+            self._seen += 1
+            if self._seen >= len(LAYERS) and not self._ways and not self._begun:
+                self._unseen.clear()
+            self.has_ways = bool(self._unseen or self._ways or self._begun)
+            yield _iterations(way.arcs), False
 
     def _climb(self, search: OptimalSearch, controls: Float, bound: float, best: float) -> Iterator[Work]:
-        """Go to the cheapest way around the last one, again and again."""
-        for n, cells in enumerate(CELLS):
-            if 2 * n >= len(CELLS) and bound > MOST_COST * best:
+        """Go to the cheapest way around the last one, as long as that makes it cheaper."""
+        while True:
+            before = bound
+            for cells in CELLS:
+                turn = float(self._random.uniform(0.0, math.pi / 3.0))
+                way = self._lattices.around(controls, cells, turn, bound)
+                found = False
+                if way.controls is not None:
+                    controls, bound = way.controls, way.cost * (1.0 + ROUNDING)
+                    found = search.follow(via_points(controls))
+                yield _iterations(way.arcs), found
+            if bound > (1.0 - LEAST_GAIN) * before or bound > MOST_COST * best:
                 return
-            turn = float(self._random.uniform(0.0, math.pi / 3.0))
-            ways = self._lattices.around(controls, cells, turn, bound)
-            found = False
-            if len(ways.controls):
-                controls, bound = ways.controls[0], float(ways.costs[0]) * (1.0 + ROUNDING)
-                found = search.follow(via_points(controls))
-            yield _iterations(ways.states), found
 
 
-def _iterations(states: int) -> int:
-    return 1 + states // STATES_PER_ITERATION
+def _iterations(arcs: int) -> int:
+    return 1 + arcs // ARCS_PER_ITERATION

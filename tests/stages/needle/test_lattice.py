@@ -12,16 +12,17 @@ import pytest
 from anatomy.grid import Float, Volume
 from anatomy.margins import Margins
 from anatomy.structures import VESSEL
+from stages.needle import ways
 from stages.needle.costs import map_integral
 from stages.needle.device import Needle
-from stages.needle.lattice import SLACK, Lattices, via_points
+from stages.needle.lattice import SKEWS, SLACK, Lattices, via_points
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.optimal import OptimalSearch
 from stages.needle.path import ArcPath
 from stages.needle.racing import RacingSearch
 from stages.needle.searches import Query
 from stages.needle.space import NeedleSpace, needle_space
-from stages.needle.ways import WayFinder
+from stages.needle.ways import ARCS_PER_ITERATION, CELLS, LAYERS, LEAST_GAIN, WayFinder
 from tests.stages.needle.proved import assert_proved
 from tests.stages.scenes import Canvas
 
@@ -72,13 +73,37 @@ def straight(p: Float, q: Float) -> ArcPath:
     return ArcPath(lps_from_start=frame, arcs=np.array([[np.linalg.norm(q - p), 0.0, 0.0]]))
 
 
+def arcs_along(controls: Float) -> list[ArcPath]:
+    """Return the arcs from the middle of each piece to that of the next; those at the ends are half ones."""
+    pieces = np.diff(controls, axis=0)
+    knots = np.concatenate([controls[:1], 0.5 * (controls[1:-2] + controls[2:-1]), controls[-1:]])
+    arcs = []
+    for p, along, q in zip(knots[:-1], pieces[:-1], knots[1:], strict=True):
+        t = along / np.linalg.norm(along)
+        chord = q - p
+        aside = chord - (chord @ t) * t
+        bend = 2.0 * float(np.linalg.norm(aside)) / float(chord @ chord)
+        x = aside if bend > 1e-9 else np.cross([0.0, 1.0, 0.0], t)
+        x = x / np.linalg.norm(x)
+        frame = np.eye(4)
+        frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3] = x, np.cross(t, x), t, p
+        turn = 2.0 * math.atan2(float(np.linalg.norm(aside)), float(chord @ t))
+        length = turn / bend if bend > 1e-9 else float(chord @ t)
+        arcs.append(
+            ArcPath(lps_from_start=frame, arcs=np.array([[length, 0.0, bend if bend > 1e-9 else 0.0]]))
+        )
+        assert np.allclose(arcs[-1].frames()[-1, :3, 3], q, atol=1e-6)
+    return arcs
+
+
+def map_cost(space: NeedleSpace, controls: Float) -> float:
+    """Return the line integral of the cost map along the arcs of a way."""
+    return sum(map_integral(space.cost_map, each) for each in arcs_along(controls))
+
+
 def bending(controls: Float) -> Float:
     """Return the curvature of the arcs from the middle of each piece to that of the next."""
-    pieces = np.diff(controls, axis=0)
-    pieces[[0, -1]] *= 2.0
-    chords = 0.5 * (pieces[1:] + pieces[:-1])
-    across = np.linalg.norm(np.cross(pieces[:-1], chords), axis=1) / np.linalg.norm(pieces[:-1], axis=1)
-    return np.asarray(2.0 * across / (chords**2).sum(axis=1))
+    return np.array([each.arcs[0, 2] for each in arcs_along(controls)])
 
 
 def assert_followed(space: NeedleSpace, asked: Query, controls: Float, objective: Objective = MAP) -> float:
@@ -97,7 +122,7 @@ def test_the_cheapest_way_is_that_of_all_sequences_of_moves(tilt_deg: float, ske
     space = space_with(random_costs(1))
     lattices = Lattices(space, asked, MAP)
     base, axes, goal_cells = lattices._straight(layers, skew)
-    ways = lattices.everywhere(layers, skew=skew)
+    way = lattices.everywhere(layers, skew=skew)
     units = np.array([[0, 0], [1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
     moves = units[np.array(list(product(range(7), repeat=layers)))]
     steps = np.cumsum(moves, axis=1)
@@ -110,50 +135,66 @@ def test_the_cheapest_way_is_that_of_all_sequences_of_moves(tilt_deg: float, ske
         inner = base[1:-1] + each @ axes
         controls = np.concatenate([base[:1], inner, asked.target[None]])
         if bending(controls).max() <= SLACK / RADIUS_MM:
-            pieces = zip(controls[:-1], controls[1:], strict=True)
-            costs.append(sum(map_integral(space.cost_map, straight(p, q)) for p, q in pieces))
+            costs.append(map_cost(space, controls))
     assert len(costs) > 10
-    assert ways.is_whole
-    assert ways.costs[0] == pytest.approx(min(costs), rel=1e-6)
-    rated = [straight(p, q) for p, q in zip(ways.controls[0, :-1], ways.controls[0, 1:], strict=True)]
-    assert sum(map_integral(space.cost_map, each) for each in rated) == pytest.approx(min(costs), rel=1e-6)
+    assert way.is_whole and way.controls is not None
+    assert way.cost == pytest.approx(min(costs), rel=1e-6)
+    assert map_cost(space, way.controls) == pytest.approx(min(costs), rel=1e-6)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 10.0, -15.0])
-def test_a_needle_can_follow_different_ways_around_a_ball(tilt_deg: float) -> None:
+def test_a_needle_can_follow_the_ways_around_a_ball(tilt_deg: float) -> None:
     asked, objective = query(tilt_deg), Objective(length=1.0, inverse_clearance=1.0)
     space = space_with(None, ([0.0, 0.0, 0.0], 3.0))
-    ways = Lattices(space, asked, objective).everywhere(12, most=6, apart_mm=2.0)
-    assert len(ways.controls) == 6
-    assert (np.diff(ways.costs) >= 0.0).all()
-    middles = ways.controls[:, 6]
-    apart = np.linalg.norm(middles[:, None] - middles, axis=-1) + 99.0 * np.eye(6)
-    assert apart.min() >= 2.0
-    for controls, cost in zip(ways.controls, ways.costs, strict=True):
-        assert bending(controls).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
-        assert controls[-1] == pytest.approx(asked.target, abs=1e-9)
-        assert assert_followed(space, asked, controls, objective) == pytest.approx(cost, rel=0.02)
+    lattices = Lattices(space, asked, objective)
+    middles = []
+    for skew in range(SKEWS):
+        way = lattices.everywhere(12, skew=skew)
+        assert way.controls is not None
+        assert bending(way.controls).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
+        assert way.controls[-1] == pytest.approx(asked.target, abs=1e-9)
+        assert assert_followed(space, asked, way.controls, objective) == pytest.approx(way.cost, rel=0.002)
+        middles.append(way.controls[6])
+    assert max(np.linalg.norm(each - middles[0]) for each in middles) > 0.05
+
+
+@pytest.mark.parametrize("tilt_deg", [4.0, 8.0, -6.0])
+def test_a_needle_can_follow_ways_that_touch_what_they_pass(tilt_deg: float) -> None:
+    """The shortest way bends around the ball: the arcs lie nearer to it than the vertices."""
+    asked = query(tilt_deg)
+    space = space_with(None, ([1.0, 0.0, 0.0], 5.0))
+    lattices = Lattices(space, asked, SHORTEST)
+    way = lattices.everywhere(10)
+    for cells, turn_rad in ((1 / 3, 0.1), (1 / 6, 0.4), (1 / 6, 0.8), (1 / 12, 0.2)):
+        assert way.controls is not None
+        assert assert_followed(space, asked, way.controls, SHORTEST) == pytest.approx(way.cost, rel=1e-4)
+        way = lattices.around(way.controls, cells, turn_rad, way.cost * (1 + 1e-9))
 
 
 def test_ways_around_a_way_are_cheaper_and_meet_the_target() -> None:
     space, asked = space_with(random_costs(2)), query(10.0)
     lattices = Lattices(space, asked, MAP)
-    ways = lattices.everywhere(10)
-    costs = [ways.costs[0]]
+    way = lattices.everywhere(10)
+    costs = [way.cost]
     for cells in (0.5, 0.25, 0.125):
-        ways = lattices.around(ways.controls[0], cells, 0.3, costs[-1] * (1 + 1e-9))
-        costs.append(ways.costs[0])
-        assert bending(ways.controls[0]).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
-        assert ways.controls[0, -1] == pytest.approx(asked.target, abs=1e-9)
+        assert way.controls is not None
+        way = lattices.around(way.controls, cells, 0.3, costs[-1] * (1 + 1e-9))
+        costs.append(way.cost)
+        assert way.controls is not None
+        assert bending(way.controls).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
+        assert way.controls[-1] == pytest.approx(asked.target, abs=1e-9)
+        assert map_cost(space, way.controls) == pytest.approx(way.cost, rel=1e-9)
     assert (np.diff(costs) <= 1e-9).all()
     assert costs[-1] < 0.97 * costs[0]
-    assert not len(lattices.around(ways.controls[0], 0.125, 0.3, 0.5 * costs[-1]).controls)
+    dearer = lattices.around(way.controls, 0.125, 0.3, 0.5 * costs[-1])
+    assert dearer.controls is None and dearer.cost == math.inf
 
 
 def test_controls_of_a_path_lead_along_it() -> None:
     space, asked = space_with(random_costs(3)), query(10.0)
     lattices = Lattices(space, asked, MAP)
-    controls = lattices.everywhere(12).controls[0]
+    controls = lattices.everywhere(12).controls
+    assert controls is not None
     search = OptimalSearch(space, asked, objective=MAP)
     assert search.follow(via_points(controls)) and search.path is not None
     again = lattices.controls_of(search.path, 12)
@@ -185,18 +226,19 @@ def test_there_are_no_ways_where_none_can_be(asked: Query, why: str) -> None:
 
 
 def test_a_lattice_without_room_has_no_ways() -> None:
-    ways = Lattices(space_with(random_costs(1)), query(10.0), MAP).everywhere(40)
-    assert not ways.is_whole and not len(ways.controls)
+    way = Lattices(space_with(random_costs(1)), query(10.0), MAP).everywhere(40)
+    assert not way.is_whole and way.controls is None
 
 
 def test_a_blocked_start_has_no_ways() -> None:
     space = space_with(random_costs(1), ([0.0, 0.0, -36.0], 3.0))
-    assert not len(Lattices(space, query(), MAP).everywhere(10).controls)
+    assert Lattices(space, query(), MAP).everywhere(10).controls is None
 
 
 def test_searches_follow_only_what_is_cheaper_and_can_be_followed() -> None:
     space, asked = space_with(random_costs(1)), query()
-    controls = Lattices(space, asked, MAP).everywhere(10).controls[0]
+    controls = Lattices(space, asked, MAP).everywhere(10).controls
+    assert controls is not None
     search = OptimalSearch(space, asked, objective=MAP)
     assert not search.follow(np.array([[15.0, 0.0, -30.0], asked.target])), "bends too much"
     assert not search.follow(np.array([[0.0, 0.0, 0.0]])), "does not reach the target"
@@ -213,7 +255,7 @@ def test_searches_follow_only_what_is_cheaper_and_can_be_followed() -> None:
 def test_a_lattice_holds_the_way_through_a_hole_in_a_wall_of_cost() -> None:
     """Searches that are led by ways alone go through the hole: they are not refined, and no tree grows."""
     space, asked = space_with(wall_with_a_hole()), query()
-    assert Lattices(space, asked, MAP).everywhere(10).costs[0] < 1.0
+    assert Lattices(space, asked, MAP).everywhere(10).cost < 1.0
     search = OptimalSearch(space, asked, objective=MAP)
     work = list(WayFinder(space, asked, seed=1, objective=MAP).begin(search, math.inf))
     assert search.cost < 1.0
@@ -223,6 +265,76 @@ def test_a_lattice_holds_the_way_through_a_hole_in_a_wall_of_cost() -> None:
     while races.iterations < 6_000:
         races.advance(500)
     assert races.cost < 1.0
+
+
+@pytest.mark.parametrize("look_arcs", [1, 1 << 30])
+def test_searches_begin_with_the_cheapest_ways(monkeypatch: pytest.MonkeyPatch, look_arcs: int) -> None:
+    """Of one more lattice each time, or of all that there are; no lattice is looked at twice."""
+    monkeypatch.setattr(ways, "LOOK_ARCS", look_arcs)
+    monkeypatch.setattr(ways, "LAYERS", (8, 10))
+    monkeypatch.setattr(ways, "CELLS", ())
+    space, asked = space_with(random_costs(5)), query(5.0)
+    lattices = Lattices(space, asked, MAP)
+    every = [lattices.everywhere(layers, skew=skew) for skew in range(SKEWS) for layers in (8, 10)]
+    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    unseen, seen, begun = list(every), [], []
+    for _ in range(len(every) + 2):
+        search = OptimalSearch(space, asked, objective=MAP)
+        work = list(finder.begin(search, math.inf))
+        looked, unseen = (unseen[:1], unseen[1:]) if look_arcs == 1 else (unseen, [])
+        assert [done for done, _ in work] == [1 + way.arcs // ARCS_PER_ITERATION for way in looked]
+        seen += looked
+        if not seen:
+            seen, begun = begun, []
+        seen.sort(key=lambda way: way.cost)
+        begun.append(seen.pop(0))
+        expected = OptimalSearch(space, asked, objective=MAP)
+        assert begun[-1].controls is not None and expected.follow(via_points(begun[-1].controls))
+        assert search.cost == expected.cost
+    assert len(begun) == 2 and finder.has_ways
+
+
+def test_layers_of_which_there_are_too_many_states_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ways, "LAYERS", (8, 40))
+    space, asked = space_with(random_costs(5)), query(5.0)
+    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    search = OptimalSearch(space, asked, objective=MAP)
+    list(finder.begin(search, math.inf))
+    assert search.path is not None and finder.has_ways
+    assert finder._layers == (8,)
+    cost = search.cost
+    for _ in range(3):
+        list(finder.improve(search, search.cost))
+    assert search.cost < cost
+
+
+def test_a_way_is_made_cheaper_as_long_as_that_gains() -> None:
+    space, asked = space_with(random_costs(2)), query(10.0)
+    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    search, costs = OptimalSearch(space, asked, objective=MAP), []
+    for _ in finder.begin(search, math.inf):
+        if search.path is not None:
+            costs.append(search.cost)
+    passes = costs[len(CELLS) - 1 :: len(CELLS)]
+    assert len(costs) == len(CELLS) * len(passes) > len(CELLS)
+    gains = -np.diff(np.log(passes))
+    assert (gains[:-1] > 0.9 * LEAST_GAIN).all() and gains[-1] < 1.1 * LEAST_GAIN
+
+
+def test_where_no_lattice_has_a_way_all_time_goes_to_searches_without() -> None:
+    """The target takes more than the share of the curvature that ways take."""
+    space, asked = space_with(random_costs(1)), query(0.0, (15.0, 0.0, 2.0))
+    lattices = Lattices(space, asked, MAP)
+    assert lattices.is_possible
+    assert all(lattices.everywhere(layers).controls is None for layers in LAYERS)
+    races = RacingSearch(space, asked, objective=MAP)
+    spent = []
+    for iterations in (3_000, 10_000):
+        while races.path is None or races.iterations < iterations:
+            races.advance(100)
+        assert races._led is not None
+        spent.append(races._led.spent)
+    assert spent[0] == spent[1] < 1000
 
 
 def test_the_same_iterations_give_the_same_path() -> None:
@@ -240,10 +352,10 @@ def test_the_same_iterations_give_the_same_path() -> None:
 
 def test_the_target_may_lie_straight_ahead() -> None:
     lattices = Lattices(space_with(random_costs(4)), query(), MAP)
-    ways = lattices.everywhere(10)
-    assert len(ways.controls) == 1
-    assert ways.controls[0, -1] == pytest.approx(query().target, abs=1e-12)
-    assert_followed(space_with(random_costs(4)), query(), ways.controls[0])
+    controls = lattices.everywhere(10).controls
+    assert controls is not None
+    assert controls[-1] == pytest.approx(query().target, abs=1e-12)
+    assert_followed(space_with(random_costs(4)), query(), controls)
 
 
 def test_pure_length_needs_no_ways() -> None:

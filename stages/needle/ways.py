@@ -27,8 +27,8 @@ CELLS = (1 / 3, 1 / 6)
 """Of lattices around a way, one after the other, as shares of what the greatest curvature allows."""
 LEAST_GAIN = 0.01
 """A way is made cheaper again and again as long as it gains this share of its cost each time."""
-LOOK_ARCS = 1 << 15
-"""Once so many arcs were tried all over the space, a search begins before more lattices are looked at."""
+LOOK_ARCS = 1 << 16
+"""Before each search but the first, lattices are looked at until so many arcs were tried."""
 MOST_COST = 2.0
 """A way that costs more than so many times the best path is made cheaper only once."""
 SPARE_COST = 1.5
@@ -90,9 +90,9 @@ class WayFinder:
             yield from self._climb(search, controls, SPARE_COST * search.cost, best)
 
     def _look_everywhere(self) -> Iterator[Work]:
-        """Find the cheapest ways of some more lattices, as many as take the time for it."""
+        """Find the cheapest ways of some more lattices; only a first one if no search has begun."""
         tried = 0
-        while self._unseen and tried < LOOK_ARCS:
+        while self._unseen and (tried < LOOK_ARCS if self._begun else not self._ways):
             skew, layers = self._unseen.pop(0)
             way = self._lattices.everywhere(layers, skew=skew)
             tried += way.arcs

@@ -106,6 +106,7 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
         hu=hu,
         smooth=smooth,
         depth=depth,
+        lung=lung,
         spacing_mm=spacing_mm,
         dark_hu=float(np.median(smooth[rough]) + tissue_hu) / 2,
         least_depth=max(noise, LEAST_DEPTH_HU),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from anatomy.grid import Float
 from anatomy.segmentation.kernels import growing as kernel
 from anatomy.segmentation.kernels import lumen_edge
+from anatomy.segmentation.thin_airways import follow_thin_airways
 
 Mask = NDArray[np.bool_]
 Int = NDArray[np.int64]
@@ -58,6 +59,8 @@ class Ground:
         The CT with less noise.
     depth : int16
         Its map of local minima.
+    lung : bool
+        Where thin airways may go on.
     spacing_mm : (3,) float64
         Voxel size along these axes.
     dark_hu : float
@@ -69,6 +72,7 @@ class Ground:
     hu: Int16
     smooth: Int16
     depth: Int16
+    lung: Mask
     spacing_mm: Float
     dark_hu: float
     least_depth: float
@@ -76,11 +80,12 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Grown:
-    """Lumen and wall, bool `(nk, nj, ni)`, and the number of voxels that were grown and undone."""
+    """Lumen and wall, bool `(nk, nj, ni)`, voxels that were grown and undone, and thin airways followed."""
 
     lumen: Mask
     wall: Mask
     undone: int
+    n_thin: int
 
 
 def grow(ground: Ground, start: Mask) -> Grown:
@@ -126,17 +131,32 @@ def grow(ground: Ground, start: Mask) -> Grown:
         behind,
         layer_ends,
     )
+    banned = np.flatnonzero(flat == kernel.BANNED)
     flat[flat != lumen_edge.LUMEN] = 0
-    _edge_and_wall(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, lumen[:count])
+    known = len(seeds)
+    edged, count = _to_its_edge(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, lumen[:count])
+    # Thin airways are as wide as a voxel: the edge of something so narrow is not to be seen.
+    flat[banned[flat[banned] == 0]] = kernel.BANNED
+    tubes = follow_thin_airways(
+        hu, smooth, state, _padded(ground.lung), ground.spacing_mm, edged, known, count
+    )
+    flat[flat != lumen_edge.LUMEN] = 0
+    _join_and_wall(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, edged, tubes.count)
     return Grown(
-        lumen=_inner(state == lumen_edge.LUMEN), wall=_inner(state == lumen_edge.WALL), undone=int(undone)
+        lumen=_inner(state == lumen_edge.LUMEN),
+        wall=_inner(state == lumen_edge.WALL),
+        undone=int(undone),
+        n_thin=tubes.n_tubes,
     )
 
 
-def _edge_and_wall(
+def _to_its_edge(
     ground: Ground, hu: Int16, smooth: Int16, state: NDArray[np.uint8], shape: Int, grown: Int
-) -> None:
-    """Bring the lumen in `state` to its edge and put the wall around it; all arrays padded and flat."""
+) -> tuple[Int, int]:
+    """Bring the lumen in `state` to its edge.
+
+    All arrays are padded and flat.  Returns its voxels and their count.
+    """
     near, faces = kernel.box_offsets(shape, 1), kernel.face_offsets(shape)
     count = len(grown)
     # A voxel joins a list once, when its state changes: no list can be longer than the image.  Memory that
@@ -149,9 +169,16 @@ def _edge_and_wall(
         count = lumen_edge.refine_edge(
             hu, state, faces, int(shape[2]), int(ground.least_depth), lumen, count, core_hu
         )
+    return lumen, int(count)
+
+
+def _join_and_wall(
+    ground: Ground, hu: Int16, smooth: Int16, state: NDArray[np.uint8], shape: Int, lumen: Int, count: int
+) -> None:
+    """Join the first `count` voxels of `lumen` by faces and put the wall around them; as above."""
     count = lumen_edge.join_corners(hu, state, shape, lumen, count)
     layers = int(np.ceil(WALL_MM / ground.spacing_mm.mean()))
-    wall = np.zeros(state.size, dtype=np.int64)
+    near, wall = kernel.box_offsets(shape, 1), np.zeros(state.size, dtype=np.int64)
     lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, WALL_LEAST_HU, WALL_DIFFERENCE_HU, wall)
 
 

@@ -21,6 +21,7 @@ def ground(shape: tuple[int, int, int], spacing_mm: float, hu: int, hole: tuple[
         hu=image,
         smooth=image.copy(),
         depth=np.zeros(shape, dtype=np.int16),
+        lung=np.zeros(shape, dtype=np.bool_),
         spacing_mm=np.full(3, spacing_mm),
         dark_hu=-900.0,
         least_depth=20.0,

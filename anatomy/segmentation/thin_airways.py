@@ -1,0 +1,146 @@
+"""Follow airways on from the ends of a grown lumen, where they are too thin for the map of minima."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float
+from anatomy.segmentation.kernels import thin_airways as kernel
+from anatomy.segmentation.kernels.growing import box_offsets
+
+Mask = NDArray[np.bool_]
+Int = NDArray[np.int64]
+Int16 = NDArray[np.int16]
+UInt8 = NDArray[np.uint8]
+
+N_DIRECTIONS = 260
+"""Over the sphere: 13 degrees apart, 1.1 mm at the end of a stretch."""
+RING_VOXELS = (1.4, 2.0)
+"""Radii of the ring about a line.  A wall thinner than a voxel appears so far from its middle."""
+N_PLACES = 400
+"""In so many places of the lung it is learnt how much of a tube appears where there is none."""
+LEAST_PLACES = 50
+LOOKED_AT = 100
+"""So many voxels are looked at for each place."""
+WAY_STEP = 7
+"""The direction at each place lies so far behind that of the last in the list of all."""
+SPREAD_OF_MEDIAN = 1.4826
+"""The standard deviation of normal values over their median distance from the median."""
+FAR_MM = 4.0
+"""They lie so far from the lumen."""
+BRIGHT_HU = 80.0
+"""It is learnt anywhere, and beside voxels this much above the lung, as airways lie; the greater counts."""
+DEVIATIONS = 3.0
+"""An airway has a contrast so many standard deviations above that of such places."""
+WALL_HU = 60.0
+"""The wall of an airway is this much brighter than the lung."""
+END_REACH_MM = 2.0
+"""No lumen so near to an end is farther from the trachea."""
+MOST_STARTS = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tubes:
+    """What was followed: voxels of the lumen now, tubes, and the contrast that a tube had to have, HU."""
+
+    count: int
+    n_tubes: int
+    least_contrast: float
+
+
+def follow_thin_airways(
+    hu: Int16,
+    smooth: Int16,
+    state: UInt8,
+    lung: Mask,
+    spacing_mm: Float,
+    lumen: Int,
+    known: int,
+    count: int,
+) -> Tubes:
+    """Add to the lumen the thin airways that go on from its ends.
+
+    Parameters
+    ----------
+    hu, smooth, state, lung : (nk, nj, ni) int16, int16, uint8, bool
+        The CT, the CT with less noise, what is lumen and what is banned (changed), and the lung; with a
+        border of two voxels or more that is not lung.
+    spacing_mm : (3,) float64
+    lumen : (V,) int64
+        Its first `count` entries are the flat indices of the lumen, the first `known` of them of trachea and
+        main bronchi; what is added follows.
+    """
+    per_mm = 1.0 / spacing_mm
+    voxel_mm = float(np.prod(spacing_mm) ** (1.0 / 3.0))
+    directions, radii_mm = _directions(), voxel_mm * np.array(RING_VOXELS)
+    starts = np.zeros((3, MOST_STARTS, 3))
+    n_starts = _find_starts(state, lung, spacing_mm, lumen[:count], known, starts)
+    if n_starts == 0:
+        return Tubes(count=count, n_tubes=0, least_contrast=np.inf)
+    tissue_hu = float(np.median(smooth[lung]))
+    noise = [
+        _false_contrast(hu, smooth, state, lung, spacing_mm, bright, directions, radii_mm)
+        for bright in (-np.inf, tissue_hu + BRIGHT_HU)
+    ]
+    least = max(noise)
+    if least <= 0.0:
+        return Tubes(count=count, n_tubes=0, least_contrast=np.inf)
+    count, n_tubes = kernel.follow_tubes(
+        hu, state, lung, per_mm, spacing_mm, directions, radii_mm, least, tissue_hu + WALL_HU,
+        starts[0], starts[1], starts[2], n_starts, lumen, count,
+    )  # fmt: skip
+    return Tubes(count=count, n_tubes=n_tubes, least_contrast=least)
+
+
+def _false_contrast(
+    hu: Int16,
+    smooth: Int16,
+    state: UInt8,
+    lung: Mask,
+    spacing_mm: Float,
+    bright_hu: float,
+    directions: Float,
+    radii_mm: Float,
+) -> float:
+    """Return the contrast that hardly any place beside something so bright has; 0 if there are none."""
+    apart = np.ceil(FAR_MM / spacing_mm).astype(np.int64)
+    stride = max(int(np.count_nonzero(lung)) // (LOOKED_AT * N_PLACES), 1)
+    places = np.zeros((LOOKED_AT * N_PLACES, 3), dtype=np.int64)
+    count = kernel.places_beside_bright(smooth, state, lung, stride, apart, bright_hu, places)
+    if count < LEAST_PLACES:
+        return 0.0
+    places = places[np.linspace(0, count - 1, min(count, N_PLACES)).astype(np.int64)]
+    contrast = np.zeros(len(places))
+    about = directions[(WAY_STEP * np.arange(len(places))) % len(directions)]
+    kernel.best_contrasts(
+        hu, state, lung, 1.0 / spacing_mm, places * spacing_mm, about, directions, radii_mm, contrast
+    )
+    np.maximum(contrast, 0.0, out=contrast)
+    middle = float(np.median(contrast))
+    return middle + DEVIATIONS * SPREAD_OF_MEDIAN * float(np.median(np.abs(contrast - middle)))
+
+
+def _directions() -> Float:
+    """Return unit vectors spread evenly over the sphere, `(N, 3)`."""
+    n = np.arange(N_DIRECTIONS) + 0.5
+    height, turn = 1.0 - 2.0 * n / N_DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * n
+    flat = np.sqrt(1.0 - height**2)
+    return np.column_stack([height, flat * np.sin(turn), flat * np.cos(turn)])
+
+
+def _find_starts(state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known: int, starts: Float) -> int:
+    """Fill `starts`, `(3, M, 3)`, with the ends of the lumen in the lung and places behind them."""
+    shape = np.array(state.shape, dtype=np.int64)
+    far = np.zeros(state.shape, dtype=np.int32)
+    queue, parent = lumen.copy(), np.zeros(len(lumen), dtype=np.int64)
+    near = box_offsets(shape, 1)
+    count = kernel.measure_way(state.reshape(-1), near, queue, known, parent, far.reshape(-1))
+    reach = np.ceil(END_REACH_MM / spacing_mm).astype(np.int64)
+    return int(
+        kernel.find_ends(
+            far, lung, queue, known, count, parent, reach, spacing_mm, starts[0], starts[1], starts[2]
+        )
+    )

@@ -16,6 +16,7 @@ from anatomy.errors import AnatomyError, LungaccessError
 from lungaccess import terminal
 from lungaccess.commands.advise import advise
 from lungaccess.commands.alternatives import alternatives
+from lungaccess.commands.certify import certify
 from lungaccess.commands.check import check
 from lungaccess.commands.common import BAD_INPUT, INTERRUPTED, NO_PLAN, OK
 from lungaccess.commands.demo import demo
@@ -59,8 +60,8 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 for _command in (
-    plan, needle, check, info, presets, demo, advise, alternatives, route, tour, tubes, risk, reach, segment,
-    study, report, export, doctor, completion,
+    plan, needle, certify, check, info, presets, demo, advise, alternatives, route, tour, tubes, risk, reach,
+    segment, study, report, export, doctor, completion,
 ):  # fmt: skip
     app.command(_command)
 

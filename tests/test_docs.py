@@ -21,7 +21,7 @@ LUNGACCESS = Path(sys.executable).with_name("lungaccess")
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 ELSEWHERE = ("pip ", "make ", ". .venv", "git ", "cd ", "lungaccess segment ")
 """Commands that other tests run, or that belong to a shell."""
-MAY_SAY_NO = ("advise", "needle", "tubes")
+MAY_SAY_NO = ("advise", "certify", "needle", "tubes")
 """Commands that end with 1 where a device does not get there, which depends on the patient."""
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
+from anatomy.kernels.labels import LUMEN
 from lungaccess.kernels.deployment_boxes import (
     BOX_COLUMNS,
     EAST,
@@ -68,7 +69,7 @@ FOLLOWED_MM = 8.0
 LOOSE_SWEEP_MM = 0.3
 """The sweep of a box is looked at where it is known so well."""
 EXACT_BELOW_MM = 1.0
-"""Where tubes of a box differ by less, the distance to hazards is taken exactly."""
+"""Where tubes of a box differ by less, distances to hazards and lumen are taken exactly."""
 LEAST_STEP_MM, GREATEST_STEP_MM = 0.05, 4.0
 """Of samples; the least is no less than the step of `deployment.march` where it leaves the lumen."""
 ROOM = 4000
@@ -165,13 +166,25 @@ def _lacking(scene, point, away, required):
 
 
 @inner_kernel
+def _is_out(scene, point, away):
+    """Tell whether all tubes that pass within `away` of a point are noticeably out of every lumen there."""
+    lumen, _allowed, _hazards, _depth, _freed, labels, geometry, _depth_geometry, _bits, loss = scene
+    required = away + UNNOTICED_MM
+    bound = distance_bound(lumen, geometry, point[0], point[1], point[2])
+    if bound > required or bound + loss < required or away >= EXACT_BELOW_MM:
+        return bound > required
+    _exact, label = exact_distance(labels, geometry, point[0], point[1], point[2], LUMEN, -1, required)
+    return label == 0
+
+
+@inner_kernel
 def _way_blocked(scene, tubes, family, box):
     """Tell whether all tubes of a box leave no airway, or one that they must not leave, or meet a hazard.
 
     A tube leaves between the last sample that is in the lumen for all of the box and the first that is
     outside for all; there and beyond it keeps clear of hazards, and out of every lumen.
     """
-    lumen, allowed, _hazards, depth, _freed, _labels, geometry, depth_geometry, _bits, _loss = scene
+    _lumen, allowed, _hazards, depth, _freed, _labels, geometry, depth_geometry, _bits, _loss = scene
     outer, inner = box[OUTER], box[INNER]
     half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]
     most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
@@ -200,7 +213,7 @@ def _way_blocked(scene, tubes, family, box):
                 may_leave, meets = may_here, meets_here
             else:
                 may_leave, meets = may_leave or may_here, meets and meets_here
-            out = distance_bound(lumen, geometry, point[0], point[1], point[2]) > away + UNNOTICED_MM
+            out = _is_out(scene, point, away)
             if out and (not may_leave or meets or (lacking > SPARE_MM and s <= shortest)):
                 return True
             if deep > step:

@@ -184,7 +184,7 @@ def _way_blocked(scene, tubes, family, box):
     A tube leaves between the last sample that is in the lumen for all of the box and the first that is
     outside for all; there and beyond it keeps clear of hazards, and out of every lumen.
     """
-    _lumen, allowed, _hazards, depth, _freed, _labels, geometry, depth_geometry, _bits, _loss = scene
+    lumen, allowed, _hazards, depth, _freed, _labels, geometry, depth_geometry, _bits, _loss = scene
     outer, inner = box[OUTER], box[INNER]
     half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]
     most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
@@ -204,7 +204,8 @@ def _way_blocked(scene, tubes, family, box):
         if out:
             if s <= shortest and (deep > 0.0 or lacking > SPARE_MM):
                 return True
-            step = max(step, min(-lacking, GREATEST_STEP_MM))
+            to_lumen = distance_bound(lumen, geometry, point[0], point[1], point[2])
+            step = max(step, min(-lacking, to_lumen))
         else:
             to_allowed = distance_bound(allowed, geometry, point[0], point[1], point[2])
             may_here = to_allowed <= away + step + UNNOTICED_MM

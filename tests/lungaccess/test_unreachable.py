@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -31,6 +32,7 @@ from stages.tube.kernels.deployment import (
     CURVED_LENGTH,
     MAX_SWEEP,
     N_TRACE,
+    NEAR_VESSEL,
     deploy,
     lateral_sweep,
     planar_point,
@@ -246,33 +248,51 @@ def deployment_of(frame: Float, plan: la.Plan) -> Float:
 def test_no_box_with_a_deployment_that_can_be_is_blocked(
     small_lung: Lung, tubes: Float, proof: UnreachableProof, plans: list[la.Plan]
 ) -> None:
-    """Deployments at random: some are hardly clear of vessels, some hardly out of the lumen."""
+    """Deployments as near to a limit as it gets, between one that can be and one that cannot."""
     rng = np.random.default_rng(6)
     deploying = scene_of(small_lung, with_fissures=False)
     scene = proof._scene(plans[0].target_lps)
     trace, tip = np.zeros(N_TRACE), np.zeros(9)
-    accepted = blocked = 0
-    for _ in range(60_000):
+    at_limits: Counter[int] = Counter()
+    blocked = 0
+
+    def judged(frame: Float, place: Float, values: Float) -> int:
+        turned = Rotation.from_rotvec(values[0] * frame[0] + values[1] * frame[1]).as_matrix()
+        normal = turned @ (math.cos(values[2]) * frame[0] + math.sin(values[2]) * frame[1])
+        base = np.concatenate([place, turned @ frame[2]])
+        return int(deploy(deploying, tubes, base, normal, values[3], values[4], trace, tip))
+
+    def box_around(values: Float, m: int) -> Float:
+        scale = 10.0 ** rng.uniform(-5.0, -1.0)
+        halves = scale * np.array([0.7, 0.7, 3.0, 20.0, 20.0]) * rng.uniform(0.1, 1.0, 5)
+        return np.array([*(values + rng.uniform(-1.0, 1.0, 5) * halves), *halves, m, m + 1])
+
+    for _ in range(20_000):
         piece = proof._pieces[int(rng.integers(len(proof._pieces)))]
         m = int(rng.integers(len(piece.cones)))
         share = rng.uniform()
         place = (1.0 - share) * piece.knots[m] + share * piece.knots[m + 1]
         inner = rng.uniform(2.0, 46.0)
-        middles = np.array([*rng.normal(0.0, 0.4, 2), rng.uniform(-3.1, 3.1), rng.uniform(0.0, inner), inner])
-        turned = Rotation.from_rotvec(middles[0] * piece.frame[0] + middles[1] * piece.frame[1]).as_matrix()
-        normal = turned @ (math.cos(middles[2]) * piece.frame[0] + math.sin(middles[2]) * piece.frame[1])
-        base = np.concatenate([place, turned @ piece.frame[2]])
-        possible = deploy(deploying, tubes, base, normal, middles[3], middles[4], trace, tip) == ACCEPTED
-        halves = (
-            10.0 ** rng.uniform(-4.0, -1.0) * np.array([0.7, 0.7, 3.0, 20.0, 20.0]) * rng.uniform(0.1, 1.0, 5)
-        )
-        box = np.array([*(middles + rng.uniform(-1.0, 1.0, 5) * halves), *halves, m, m + 1])
-        wrong = way_blocked(scene, tubes, piece.frame, piece.knots, box)
-        assert not (possible and wrong), (middles, box)
-        accepted += possible
-        blocked += wrong
-    assert accepted > 300
-    assert blocked > 10_000
+        values = np.array([*rng.normal(0.0, 0.4, 2), rng.uniform(-3.1, 3.1), rng.uniform(0.0, inner), inner])
+        if judged(piece.frame, place, values) != ACCEPTED:
+            blocked += way_blocked(scene, tubes, piece.frame, piece.knots, box_around(values, m))
+            continue
+        other = values + rng.normal(0.0, 1.0, 5) * [0.3, 0.3, 1.0, 5.0, 5.0]
+        why = judged(piece.frame, place, other)
+        for _ in range(25 if why != ACCEPTED else 0):
+            middle = 0.5 * (values + other)
+            reason = judged(piece.frame, place, middle)
+            if reason == ACCEPTED:
+                values = middle
+            else:
+                other, why = middle, reason
+        at_limits[why] += 1
+        for _ in range(8):
+            box = box_around(values, m)
+            assert not way_blocked(scene, tubes, piece.frame, piece.knots, box), (values, box, why)
+    assert blocked > 3000
+    assert sum(at_limits.values()) > 100
+    assert at_limits[NEAR_VESSEL] > 30
 
 
 def test_what_a_plan_reaches_is_never_ruled_out(proof: UnreachableProof, plans: list[la.Plan]) -> None:

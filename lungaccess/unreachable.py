@@ -14,6 +14,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.errors import TargetError
 from anatomy.fields import distance_corners
 from anatomy.grid import Float
+from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.kernels.deployment_boxes import BOX_COLUMNS, FIRST_KNOT, LAST_KNOT
@@ -107,7 +108,7 @@ class UnreachableProof:
             for mask in ((lung.labels & LUMEN) != 0, leaving, (lung.labels & hazards) != 0)
         )
         # Corners are rounded down, and between them a bound lacks at most half a diagonal of a voxel.
-        self._loss_mm = 0.5 * float(np.linalg.norm(spacing_mm)) + 1.0 / 256.0
+        self._loss_mm = 0.5 * float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
         self._free = _free_regions(lung, float(self._limits[REQUIRED]), self._loss_mm, with_fissures)
         reach_mm = float(self._insertions.max())
         self._pieces = list(_pieces(lung, system, leaving, reach_mm))
@@ -203,7 +204,7 @@ def _free_regions(lung: Lung, required_mm: float, loss_mm: float, with_fissures:
     corners = lung.obstacle_field(with_fissures=with_fissures).corners
     greatest = ndimage.maximum_filter(corners, size=2, origin=-1)[:-1, :-1, :-1]
     bits = OBSTACLES | (FISSURE if with_fissures else 0)
-    free = (greatest / 256.0 + loss_mm >= required_mm) & ((lung.labels & bits) == 0)
+    free = (greatest / UNITS_PER_MM + loss_mm >= required_mm) & ((lung.labels & bits) == 0)
     labels, _ = ndimage.label(free, structure=np.ones((3, 3, 3)))
     return np.asarray(labels, dtype=np.int32)
 

@@ -80,12 +80,11 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Grown:
-    """Lumen and wall, bool `(nk, nj, ni)`, voxels that were grown and undone, and thin airways followed."""
+    """Lumen and wall, bool `(nk, nj, ni)`, and the number of voxels that were grown and undone."""
 
     lumen: Mask
     wall: Mask
     undone: int
-    n_thin: int
 
 
 def grow(ground: Ground, start: Mask) -> Grown:
@@ -146,7 +145,6 @@ def grow(ground: Ground, start: Mask) -> Grown:
         lumen=_inner(state == lumen_edge.LUMEN),
         wall=_inner(state == lumen_edge.WALL),
         undone=int(undone),
-        n_thin=tubes.n_tubes,
     )
 
 

@@ -44,11 +44,10 @@ MOST_STARTS = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class Tubes:
-    """What was followed: voxels of the lumen now, tubes, and the contrast that a tube had to have, HU."""
+    """What was followed: the number of voxels of the lumen now, and of tubes."""
 
     count: int
     n_tubes: int
-    least_contrast: float
 
 
 def follow_thin_airways(
@@ -79,7 +78,7 @@ def follow_thin_airways(
     starts = np.zeros((3, MOST_STARTS, 3))
     n_starts = _find_starts(state, lung, spacing_mm, lumen[:count], known, starts)
     if n_starts == 0:
-        return Tubes(count=count, n_tubes=0, least_contrast=np.inf)
+        return Tubes(count=count, n_tubes=0)
     tissue_hu = float(np.median(smooth[lung]))
     noise = [
         _false_contrast(hu, smooth, state, lung, spacing_mm, bright, directions, radii_mm)
@@ -87,12 +86,12 @@ def follow_thin_airways(
     ]
     least = max(noise)
     if least <= 0.0:
-        return Tubes(count=count, n_tubes=0, least_contrast=np.inf)
+        return Tubes(count=count, n_tubes=0)
     count, n_tubes = kernel.follow_tubes(
         hu, state, lung, per_mm, spacing_mm, directions, radii_mm, least, tissue_hu + WALL_HU,
         starts[0], starts[1], starts[2], n_starts, lumen, count,
     )  # fmt: skip
-    return Tubes(count=count, n_tubes=n_tubes, least_contrast=least)
+    return Tubes(count=count, n_tubes=n_tubes)
 
 
 def _false_contrast(

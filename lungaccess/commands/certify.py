@@ -20,7 +20,7 @@ def certify(
     nodule: int | None = None,
     system: str = "lung-default",
     allow_fissures: bool | None = None,
-    most_boxes: int = 3_000_000,
+    most_boxes: int | None = None,
     json: bool = False,
     cache: Path | None = None,
 ) -> int:
@@ -41,17 +41,18 @@ def certify(
     allow_fissures : bool
         Whether fissures may be crossed; as the system says if not given.
     most_boxes : int
-        Ranges of deployments to look at for every 8 mm of airway before the proof is given up.
+        Ranges of deployments to look at for every 8 mm of airway before the proof is given up; 3 million if
+        not given.
     json : bool
         Print JSON instead of a table.
     cache : Path
         Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.target import nodule_target
-    from lungaccess.unreachable import UnreachableProof
+    from lungaccess.unreachable import MOST_BOXES, UnreachableProof
 
     require_one_target(target, nodule)
-    if most_boxes < 1:
+    if most_boxes is not None and most_boxes < 1:
         raise SettingsError(f"--most-boxes is {most_boxes}", expected="at least 1")
     device = load_device(system, allow_fissures)
     lung = load_lung(patient, cache)
@@ -59,7 +60,7 @@ def certify(
     with progress("proving") as shown:
         proof = UnreachableProof(lung, device, with_fissures=not device.fissures_allowed)
         verdict = proof.prove(
-            point, most_boxes=most_boxes, progress=lambda share: shown.step("proving", share)
+            point, most_boxes=most_boxes or MOST_BOXES, progress=lambda share: shown.step("proving", share)
         )
     open_lps = None if verdict.open_lps is None else verdict.open_lps.tolist()
     if json:

@@ -287,8 +287,8 @@ def tubes_of(tubes, knots, frame, box):
     """Return what the samples of a box's tubes need: the middle one, and how the others differ.
 
     Place, direction and bending direction; and how much the place, the direction, the rotation, the share of
-    the outer tube and that of the straight part may differ: see
-    `sample_of`.
+    the outer tube and that of the straight part may
+    differ: see `sample_of`.
     """
     middle, chord, astray = place_of(knots, int(box[FIRST_KNOT]), int(box[LAST_KNOT]))
     forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)

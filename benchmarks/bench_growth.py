@@ -12,8 +12,8 @@ import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.phantom import phantom
 from benchmarks.workloads import WORKLOADS
-from lungaccess.peripheral import peripheral_targets
-from lungaccess.target import point_target
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.target import point_target
 
 
 class _Growth:

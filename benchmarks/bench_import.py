@@ -12,7 +12,7 @@ def timeraw_import_lungaccess() -> str:
 
 def timeraw_import_system() -> str:
     """Return the statement that asv times in a new process."""
-    return "import lungaccess.system"
+    return "import lungaccess.problem.system"
 
 
 class Presets:
@@ -20,7 +20,7 @@ class Presets:
 
     def setup(self) -> None:
         """Import outside the timed part."""
-        from lungaccess.system import load_system
+        from lungaccess.problem.system import load_system
 
         self.load: Callable[[str], object] = load_system
 

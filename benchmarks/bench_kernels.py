@@ -14,7 +14,7 @@ COLD_RUN = """
 import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.phantom import phantom
-from lungaccess.target import nodule_target
+from lungaccess.problem.target import nodule_target
 lung = build_lung(phantom(seed=3, size="small").images)
 next(la.plan(lung, la.load_system("ultrathin"), nodule_target(lung, 1)))
 """

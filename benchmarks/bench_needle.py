@@ -7,11 +7,11 @@ import numpy as np
 from anatomy.grid import Grid
 from anatomy.structures import VESSEL
 from benchmarks.fresh import FreshProcess
-from stages.needle.certificate import NoPathProof
 from stages.needle.device import Needle
-from stages.needle.optimal import OptimalSearch
-from stages.needle.resolution import ResolutionSearch
-from stages.needle.searches import Query, RestartingRRT
+from stages.needle.infeasibility.certificate import NoPathProof
+from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.search.optimal import OptimalSearch
+from stages.needle.search.resolution import ResolutionSearch
 from stages.needle.space import NeedleSpace, space_of_labels
 
 RADIUS_MM = 60.0
@@ -19,10 +19,10 @@ SIDE = 96
 BALLS = 160
 COLD_RUN = """
 from benchmarks.bench_needle import query, scene
-from stages.needle.certificate import NoPathProof
-from stages.needle.optimal import OptimalSearch
-from stages.needle.resolution import ResolutionSearch
-from stages.needle.searches import RestartingRRT
+from stages.needle.infeasibility.certificate import NoPathProof
+from stages.needle.search.optimal import OptimalSearch
+from stages.needle.search.resolution import ResolutionSearch
+from stages.needle.search.base import RestartingRRT
 space = scene(0)
 for kind in (RestartingRRT, OptimalSearch, ResolutionSearch):
     kind(space, query()).advance(500)

@@ -13,7 +13,7 @@ import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.phantom import phantom
 from anatomy.store import open_lung
-from lungaccess.target import point_target
+from lungaccess.problem.target import point_target
 from stages.needle.space import needle_space, workspace_lengths
 
 SYSTEM = "ultrathin"

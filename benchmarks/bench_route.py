@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.fresh import FreshProcess
+from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.route.centreline import Centreline, from_tree
 from stages.scope.route.planner import Replanner, plan_route, try_route
 from stages.scope.route.proof import prove
@@ -12,9 +13,8 @@ from stages.scope.route.search import nearest_links
 from stages.scope.route.settings import RouteLimits
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
-from stages.scope.tour.models import random_airway, random_lesions
 from stages.scope.tour.shortest import shortest_tour
-from stages.scope.tour.ways import ways_to
+from stages.scope.tour.subtree import ways_to
 
 COLD_RUN = """
 from benchmarks.bench_route import Routes, Tours

@@ -7,14 +7,14 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume
 from benchmarks.fresh import FreshProcess
-from stages.scope.advisor import Advisor, start_state
-from stages.scope.best_motion import Weights, best_motion
-from stages.scope.collision import Scene
-from stages.scope.kinematics import ScopeModel
-from stages.scope.lumen import Lumen, lumen_of_mask
-from stages.scope.navigation import goal_at, navigation_field
-from stages.scope.orientability import orientability
-from stages.scope.retreat import PathSettings
+from stages.scope.advisor.advisor import Advisor, start_state
+from stages.scope.advisor.best_motion import Weights, best_motion
+from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.kinematics import ScopeModel
+from stages.scope.advisor.lumen import Lumen, lumen_of_mask
+from stages.scope.advisor.navigation import goal_at, navigation_field
+from stages.scope.advisor.orientability import orientability
+from stages.scope.advisor.path_search import PathSettings
 
 SPACING_MM = (0.7, 0.7, 0.6)
 LINES = (

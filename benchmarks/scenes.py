@@ -16,10 +16,10 @@ from anatomy.grid import Float, Grid
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.patient import PatientImages
-    from lungaccess.atlas import Atlas
-    from lungaccess.searches import AtlasSearch
+    from lungaccess.coupled.atlas import Atlas
+    from lungaccess.coupled.search import AtlasSearch
     from stages.needle.space import NeedleSpace
-    from stages.scope.tour.ways import Ways
+    from stages.scope.tour.subtree import Ways
     from stages.tube.mechanics import TubeMechanics
 
 Mask = NDArray[np.bool_]
@@ -90,10 +90,10 @@ def images(edge: int) -> PatientImages:
 
 def direct_search(targets: int) -> tuple[Callable[[Float], AtlasSearch], Float]:
     """Return what makes a search for a point of a synthetic lung, and peripheral points."""
-    from lungaccess.assemble import Task
-    from lungaccess.peripheral import peripheral_targets
-    from lungaccess.searches import AtlasSearch
-    from lungaccess.target import point_target
+    from lungaccess.coupled.search import AtlasSearch
+    from lungaccess.plans.assemble import Task
+    from lungaccess.problem.peripheral import peripheral_targets
+    from lungaccess.problem.target import point_target
 
     lung, atlas = _small_atlas()
 
@@ -134,7 +134,7 @@ def starts(entries: int) -> tuple[Float, Float]:
 
 def index_targets() -> Float:
     """Return `(INDEX_TARGETS, 3)` peripheral points of the same lung."""
-    from lungaccess.peripheral import peripheral_targets
+    from lungaccess.problem.peripheral import peripheral_targets
 
     return peripheral_targets(_small_atlas()[0], INDEX_TARGETS // 2, 0)
 
@@ -176,9 +176,9 @@ def configurations(made: TubeMechanics, count: int, seed: int = 0) -> tuple[Floa
 
 def tours(lesions: int) -> list[Ways]:
     """Return the ways to random lesions in `TOUR_MODELS` random airways."""
+    from experiments.support.tour_models import random_airway, random_lesions
     from stages.scope.tour.exits import find_exits
-    from stages.scope.tour.models import random_airway, random_lesions
-    from stages.scope.tour.ways import ways_to
+    from stages.scope.tour.subtree import ways_to
 
     made = []
     for seed in range(TOUR_MODELS):

@@ -107,14 +107,14 @@ def _direct_arcs(targets: int) -> Work:
 
 
 def _build_index(entries: int) -> Work:
-    from stages.needle.bundles import StartIndex
+    from stages.needle.start_index import StartIndex
 
     positions, tangents = scenes.starts(entries)
     return lambda: StartIndex(positions, tangents)
 
 
 def _query_index(entries: int) -> Work:
-    from stages.needle.bundles import StartIndex
+    from stages.needle.start_index import StartIndex
 
     space, targets = scenes.free_space(), scenes.index_targets()
     index = StartIndex(*scenes.starts(entries))

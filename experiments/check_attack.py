@@ -30,13 +30,13 @@ from anatomy.build import build_lung
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.phantom import phantom
-from experiments.mutants import Case, Mutant
-from experiments.plan_mutations import mutate
-from experiments.random_plans import plans_of_batch
-from lungaccess import explain
+from experiments.support.mutants import Case, Mutant
+from experiments.support.plan_mutations import mutate
+from experiments.support.random_plans import plans_of_batch
 from lungaccess.checking import Checker, CheckReport
-from lungaccess.plans import Plan
-from lungaccess.system import System
+from lungaccess.coupled import explain
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
 
 PHANTOM_SEED = 1
 

@@ -20,8 +20,11 @@ import lungaccess as la
 from anatomy.errors import TargetError
 from anatomy.grid import Float
 from anatomy.lung import Lung
-from experiments.insertion_figure import draw_insertions
-from experiments.results import (
+from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
+from experiments.support.insertion.repeated import Study, Summary, study, summary
+from experiments.support.insertion.truth import Errors, tilt
+from experiments.support.insertion_figure import draw_insertions
+from experiments.support.results import (
     PHANTOM,
     Result,
     anatomy,
@@ -30,15 +33,12 @@ from experiments.results import (
     study_parser,
     write_result,
 )
-from lungaccess.peripheral import peripheral_targets
-from lungaccess.target import point_target
-from stages.needle.insertion.closed_loop import TOLERANCE_MM, Outcome
-from stages.needle.insertion.replanning import ITERATIONS, Replanner, ReplanSettings, with_reserve
-from stages.needle.insertion.study import Study, Summary, study, summary
-from stages.needle.insertion.truth import Errors, tilt
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.target import point_target
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform
-from stages.needle.searches import Query, RestartingRRT
+from stages.needle.replanning.replanner import ITERATIONS, Replanner, ReplanSettings, with_reserve
+from stages.needle.search.base import Query, RestartingRRT
 from stages.needle.space import NeedleSpace, needle_space
 
 OBJECTIVE = Objective(inverse_clearance=1.0)

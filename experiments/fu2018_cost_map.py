@@ -31,10 +31,9 @@ from anatomy.segmentation.lungs import segment_lungs
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
 from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, vesselness
 from anatomy.segmentation.vessels import Vessels, segment_vessels
-from anatomy.synthetic_ct import CtLook, SyntheticCt, render_ct
 from anatomy.tree import tree_from_mask
-from experiments import segmentation_scores as scores
-from experiments.results import (
+from experiments.support import segmentation_scores as scores
+from experiments.support.results import (
     PHANTOM,
     Result,
     default_anatomies,
@@ -43,6 +42,7 @@ from experiments.results import (
     study_parser,
     write_result,
 )
+from experiments.support.synthetic_ct import CtLook, SyntheticCt, render_ct
 from lungaccess.report import style
 
 PAPER_F1 = 0.9709

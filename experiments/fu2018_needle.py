@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from anatomy.grid import Float
-from experiments.cost_map_case import NEEDLE, SAFETY_MM, Case, case_of
-from experiments.cost_map_figure import draw
-from experiments.cost_map_problems import Scenario, choose_scenarios
-from experiments.cost_map_runs import (
+from experiments.support.cost_map_case import NEEDLE, SAFETY_MM, Case, case_of
+from experiments.support.cost_map_figure import draw
+from experiments.support.cost_map_problems import Scenario, choose_scenarios
+from experiments.support.cost_map_runs import (
     COST_MAP,
     INTENSITY,
     PAPER_MODE_ITERATIONS,
@@ -32,8 +32,8 @@ from experiments.cost_map_runs import (
     run_all,
     success_and_means,
 )
-from experiments.results import PHANTOM, Result, data_folder, setting_of, study_parser, write_result
-from stages.needle.inflation import largest_step_mm
+from experiments.support.inflation import largest_step_mm
+from experiments.support.results import PHANTOM, Result, data_folder, setting_of, study_parser, write_result
 
 SHARES_OF_TIME = (0.01, 0.1, 1.0)
 PAPER_CHANGE = -50.0

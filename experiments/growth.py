@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.workloads import WORKLOADS, Workload
-from experiments.results import Result, setting_of, study_parser, write_result
+from experiments.support.results import Result, setting_of, study_parser, write_result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

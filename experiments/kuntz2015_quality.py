@@ -19,18 +19,25 @@ from matplotlib.axes import Axes
 
 import lungaccess as la
 from anatomy.grid import Float
-from experiments import cost_over_time, workspace_rejection
-from experiments.results import Result, anatomy, default_anatomies, setting_of, study_parser, write_result
-from experiments.rrt_time import LONG_S, PAPER_S, PAPER_SHARE, TimedRRT, success_times
-from experiments.workspace_rejection import PAPER_PATHS
-from experiments.workspace_rejection import PAPER_S as PAPER_PATHS_S
-from lungaccess.alternatives import Alternative, alternatives
-from lungaccess.assemble import Task
-from lungaccess.atlas import Atlas
-from lungaccess.peripheral import peripheral_targets
+from experiments.support import cost_over_time, workspace_rejection
+from experiments.support.results import (
+    Result,
+    anatomy,
+    default_anatomies,
+    setting_of,
+    study_parser,
+    write_result,
+)
+from experiments.support.rrt_time import LONG_S, PAPER_S, PAPER_SHARE, TimedRRT, success_times
+from experiments.support.workspace_rejection import PAPER_PATHS
+from experiments.support.workspace_rejection import PAPER_S as PAPER_PATHS_S
+from lungaccess.coupled.alternatives import Alternative, alternatives
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.plans.assemble import Task
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.target import point_target
 from lungaccess.report import style
 from lungaccess.report.geometry import needle_polyline
-from lungaccess.target import point_target
 
 NOT_REPRODUCED = [
     "The goals and the costs of fig. 9: the paper prints no numbers for them, and its lung cannot be had.",

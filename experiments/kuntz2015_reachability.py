@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from anatomy.grid import Float
-from experiments.results import (
+from experiments.support.results import (
     PHANTOM,
     Result,
     default_anatomies,

@@ -2,10 +2,10 @@
 
     python -m experiments.li2021_route [--quick] [--seed 1] [--results FOLDER] [--groups G1 G2 G3 G4]
 
-The groups: experiments/route_groups.py.  Ends have Gaussian noise.  A trial succeeds if the final curve is
-proved on its whole length: curvature, and inside the lumen; beside it is what the method's own test at path
-points says, which for RRT and RRT* is that there is a way.  These go on sampling until a curve is proved or
-4048 samples are taken; "first" is their first way, whatever its curve.
+The groups: see `experiments.support.route_groups`.  Ends have Gaussian noise.  A trial succeeds if the final
+curve is proved on its whole length: curvature, and inside the lumen; beside it is what the method's own test
+at path points says, which for RRT and RRT* is that there is a way.  These go on sampling until a curve is
+proved or 4048 samples are taken; "first" is their first way, whatever its curve.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import kruskal
 
-from experiments.results import Result, default_anatomies, setting_of, study_parser, write_result
-from experiments.route_groups import LIMITS_PER_MM, NOISE_MM, TRIALS, Trial, load_group, trials
-from experiments.route_speed import replanning, side_by_side
+from experiments.support.results import Result, default_anatomies, setting_of, study_parser, write_result
+from experiments.support.route_baselines import sampled_route
+from experiments.support.route_groups import LIMITS_PER_MM, NOISE_MM, TRIALS, Trial, load_group, trials
+from experiments.support.route_speed import replanning, side_by_side
 from lungaccess.report import style
-from stages.scope.route.baselines import sampled_route
 from stages.scope.route.curve import Curve
 from stages.scope.route.metrics import measure
 from stages.scope.route.planner import Repair, try_route

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from anatomy.build import build_lung
 from anatomy.phantom import phantom
-from experiments.needle_queries import (
+from experiments.support.needle_queries import (
     Judge,
     Obstacles,
     Query,
@@ -30,7 +30,7 @@ from experiments.needle_queries import (
     load_obstacles,
     obstacles_of,
 )
-from experiments.needle_runs import (
+from experiments.support.needle_runs import (
     MARKS_S,
     SLICE,
     Problem,
@@ -41,9 +41,16 @@ from experiments.needle_runs import (
     run,
     solved_by_other,
 )
-from experiments.results import Result, data_folder, require_data, setting_of, study_parser, write_result
+from experiments.support.results import (
+    Result,
+    data_folder,
+    require_data,
+    setting_of,
+    study_parser,
+    write_result,
+)
 from lungaccess.report import style
-from stages.needle.planners import PLANNERS
+from stages.needle.search.planners import PLANNERS
 
 NAMES = ("rrt", "optimal", "resolution", "decide")
 COLOURS = (style.SCOPE, style.TUBE, style.NODULE, style.FISSURE)

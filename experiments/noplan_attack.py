@@ -2,7 +2,7 @@
 
     python -m experiments.noplan_attack PATIENT RESULTS.json [--system lung-default] [--time 60]
 
-Random peripheral targets, see `lungaccess.peripheral`.  Where the planner gives up, Algorithm 1 of
+Random peripheral targets, see `lungaccess.problem.peripheral`.  Where the planner gives up, Algorithm 1 of
 [Kuntz2015] searches with FCL on meshes for `--time` s of processor time.  A plan of it that the check
 accepts is a defect of the planner: "missed" if the planner's proof accepts it too, "refused" if the proof
 alone stands against it.  Such plans are written beside the results.
@@ -25,16 +25,16 @@ import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.io.files import atomic_write
-from lungaccess.assemble import Candidate, Task, assemble
-from lungaccess.atlas import Atlas
-from lungaccess.inputs import load_device
-from lungaccess.peripheral import peripheral_targets
-from lungaccess.plans import Plan
-from lungaccess.reference import ReferenceSearch
-from lungaccess.reference.obstacles import Obstacles
-from lungaccess.reference.search import FOUND, obstacles_for
-from lungaccess.system import system_fingerprint
-from lungaccess.target import point_target
+from lungaccess.cli.inputs import load_device
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch
+from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
+from lungaccess.coupled.kuntz2015_fcl.search import FOUND, obstacles_for
+from lungaccess.plans.assemble import Candidate, Task, assemble
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.system import system_fingerprint
+from lungaccess.problem.target import point_target
 
 RRT_TIME_S = 0.05
 MISSED, REFUSED = "missed", "refused"

@@ -18,14 +18,21 @@ from matplotlib.figure import Figure
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Float
 from anatomy.lung import Lung
-from experiments.results import Result, anatomy, default_anatomies, setting_of, study_parser, write_result
+from experiments.support.results import (
+    Result,
+    anatomy,
+    default_anatomies,
+    setting_of,
+    study_parser,
+    write_result,
+)
+from experiments.support.tour_models import random_airway, random_lesions
 from lungaccess.report import style
 from stages.scope.tour.circuit import SAME_RESISTANCE, circuits
 from stages.scope.tour.exits import Exit, find_exits
 from stages.scope.tour.itinerary import itinerary, one_by_one_mm
-from stages.scope.tour.models import random_airway, random_lesions
 from stages.scope.tour.shortest import shortest_tour
-from stages.scope.tour.ways import Ways, ways_to
+from stages.scope.tour.subtree import Ways, ways_to
 
 LESIONS = (3, 4, 5, 6, 7, 8, 9)
 MODELS, DRAWS = 100, 20

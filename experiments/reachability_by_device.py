@@ -18,10 +18,17 @@ from matplotlib.figure import Figure
 import lungaccess as la
 from anatomy.grid import Float
 from anatomy.lung import Lung
-from experiments.results import Result, anatomy, default_anatomies, setting_of, study_parser, write_result
-from lungaccess.reachability import reachability
+from experiments.support.results import (
+    Result,
+    anatomy,
+    default_anatomies,
+    setting_of,
+    study_parser,
+    write_result,
+)
+from lungaccess.problem.system import System
+from lungaccess.reachability.reach_map import reachability
 from lungaccess.report import style
-from lungaccess.system import System
 
 
 @dataclass(frozen=True, kw_only=True)

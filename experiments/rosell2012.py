@@ -15,18 +15,25 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from anatomy.lung import Lung
-from experiments.results import Result, anatomy, default_anatomies, setting_of, study_parser, write_result
-from experiments.scope_ends import NEAR_MM, success, touching
-from experiments.scope_goals import PAPER_SPACING_MM, ends, goal_with_room
-from experiments.scope_speed import ARRIVED_MM, ROOM_VOXELS, measure_speed
+from experiments.support.results import (
+    Result,
+    anatomy,
+    default_anatomies,
+    setting_of,
+    study_parser,
+    write_result,
+)
+from experiments.support.scope_ends import NEAR_MM, success, touching
+from experiments.support.scope_goals import PAPER_SPACING_MM, ends, goal_with_room
+from experiments.support.scope_speed import ARRIVED_MM, ROOM_VOXELS, measure_speed
 from lungaccess.report import style
-from stages.scope.advisor import Advisor, start_state
-from stages.scope.best_motion import Weights
-from stages.scope.collision import Scene
-from stages.scope.kinematics import ScopeModel
-from stages.scope.lumen import lumen_of_lung
-from stages.scope.path import ScopePath
-from stages.scope.retreat import PathSettings
+from stages.scope.advisor.advisor import Advisor, start_state
+from stages.scope.advisor.best_motion import Weights
+from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.kinematics import ScopeModel
+from stages.scope.advisor.lumen import lumen_of_lung
+from stages.scope.advisor.path import ScopePath
+from stages.scope.advisor.path_search import PathSettings
 
 WEIGHTS = {
     "(1, 0, 0)": Weights(nf1=1.0, clearance=0.0, twist=0.0),

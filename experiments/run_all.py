@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.results import setting_of, study_parser
+from experiments.support.results import setting_of, study_parser
 from experiments.write_results import OUR_OWN, PAPERS, write_page
 
 STUDIES = (*(name for names in PAPERS.values() for name in names), *OUR_OWN)

@@ -17,7 +17,7 @@ from typing import Any
 
 from anatomy.errors import FileError
 from anatomy.io.files import atomic_write, read_text
-from experiments.results import Row, cells, number
+from experiments.support.results import Row, cells, number
 
 PAPERS = {
     "Rosell et al. 2012": ("rosell2012",),
@@ -63,7 +63,7 @@ def _read(file: Path) -> dict[str, Any]:
     except (ValueError, TypeError, KeyError) as error:
         raise FileError(
             f"{file} is damaged: {error!r}",
-            expected="a result as experiments.results.write_result stores it",
+            expected="a result as experiments.support.results.write_result stores it",
             remedy=f"Run `python -m experiments.{file.stem}` again",
         ) from error
     return stored

@@ -22,35 +22,35 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree as AirwayTree
     from anatomy.errors import LungaccessError as LungaccessError
     from anatomy.lung import Lung as Lung
-    from lungaccess.atlas import Atlas as Atlas
-    from lungaccess.atlas import build_atlas as build_atlas
     from lungaccess.checking import check as check
-    from lungaccess.noplan import NoPlan as NoPlan
-    from lungaccess.patients import load_patient as load_patient
-    from lungaccess.planner import plan as plan
-    from lungaccess.plans import Plan as Plan
-    from lungaccess.system import System as System
-    from lungaccess.system import load_system as load_system
-    from lungaccess.system import preset_names as preset_names
-    from lungaccess.target import Target as Target
-    from lungaccess.target import resolve_target as resolve_target
+    from lungaccess.coupled.atlas import Atlas as Atlas
+    from lungaccess.coupled.atlas import build_atlas as build_atlas
+    from lungaccess.coupled.planner import plan as plan
+    from lungaccess.plans.no_plan import NoPlan as NoPlan
+    from lungaccess.plans.plan import Plan as Plan
+    from lungaccess.problem.patients import load_patient as load_patient
+    from lungaccess.problem.system import System as System
+    from lungaccess.problem.system import load_system as load_system
+    from lungaccess.problem.system import preset_names as preset_names
+    from lungaccess.problem.target import Target as Target
+    from lungaccess.problem.target import resolve_target as resolve_target
 
 _HOME = {
     "AirwayTree": "anatomy.airway_tree",
-    "Atlas": "lungaccess.atlas",
+    "Atlas": "lungaccess.coupled.atlas",
     "Lung": "anatomy.lung",
     "LungaccessError": "anatomy.errors",
-    "NoPlan": "lungaccess.noplan",
-    "Plan": "lungaccess.plans",
-    "System": "lungaccess.system",
-    "Target": "lungaccess.target",
-    "build_atlas": "lungaccess.atlas",
+    "NoPlan": "lungaccess.plans.no_plan",
+    "Plan": "lungaccess.plans.plan",
+    "System": "lungaccess.problem.system",
+    "Target": "lungaccess.problem.target",
+    "build_atlas": "lungaccess.coupled.atlas",
     "check": "lungaccess.checking",
-    "load_patient": "lungaccess.patients",
-    "load_system": "lungaccess.system",
-    "plan": "lungaccess.planner",
-    "preset_names": "lungaccess.system",
-    "resolve_target": "lungaccess.target",
+    "load_patient": "lungaccess.problem.patients",
+    "load_system": "lungaccess.problem.system",
+    "plan": "lungaccess.coupled.planner",
+    "preset_names": "lungaccess.problem.system",
+    "resolve_target": "lungaccess.problem.target",
 }
 
 __all__ = [

@@ -6,7 +6,7 @@ from anatomy.grid import Float
 from lungaccess.checking.boxes import Boxes
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.shapes import STEP_MM
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 
 CLEARANCE_TOLERANCE_MM = 1e-3
 BEYOND_MM = 1.0

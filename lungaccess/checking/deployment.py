@@ -17,7 +17,7 @@ from lungaccess.checking.poses import POSITION_TOLERANCE_MM, check_rigid, check_
 from lungaccess.checking.scene import Scene
 from lungaccess.checking.shapes import Curve
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at, region_around
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

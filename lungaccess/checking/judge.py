@@ -13,8 +13,8 @@ from lungaccess.checking.record import check_record
 from lungaccess.checking.route import check_route
 from lungaccess.checking.scene import Scene
 from lungaccess.checking.steering import check_needle
-from lungaccess.plans import Plan
-from lungaccess.system import System
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

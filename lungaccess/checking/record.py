@@ -13,8 +13,8 @@ from anatomy.errors import LungaccessError
 from anatomy.grid import Float
 from anatomy.settings import to_mapping
 from lungaccess.checking.findings import Findings
-from lungaccess.plans import SCHEMA, Plan
-from lungaccess.system import System, load_system, preset_names, system_fingerprint
+from lungaccess.plans.plan import SCHEMA, Plan
+from lungaccess.problem.system import System, load_system, preset_names, system_fingerprint
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

@@ -12,7 +12,7 @@ from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
 from lungaccess.checking.scene import AirwayAxis, Scene
 from lungaccess.checking.space import labels_at, not_lumen
-from lungaccess.plans import Plan, ScopeRoute
+from lungaccess.plans.plan import Plan, ScopeRoute
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree

@@ -21,7 +21,7 @@ from lungaccess.checking.poses import (
 from lungaccess.checking.scene import Scene
 from lungaccess.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lungaccess.assemble import Candidate, Task
+from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.refinement.problem import ARC_COUNTS, WEIGHTS, Court, Problem
 from stages.scope.sites import Sites
 

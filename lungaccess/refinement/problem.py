@@ -12,16 +12,16 @@ from scipy import ndimage
 from anatomy import poses
 from anatomy.grid import Float
 from anatomy.structures import FISSURE, OBSTACLES
-from lungaccess.assemble import Candidate, Task
-from lungaccess.costs import path_cost
+from lungaccess.plans.assemble import Candidate, Task
+from lungaccess.plans.costs import path_cost
 from lungaccess.refinement import boxes as fields
 from lungaccess.refinement.axis import axis_of, standing_still
 from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_WAY_MM, Layout, Numbers
-from stages.needle.objections import objection
 from stages.needle.path import CURVATURE
-from stages.needle.searches import Query
+from stages.needle.search.base import Query
 from stages.needle.space import needle_space
+from stages.needle.violations import objection
 from stages.scope.sites import Sites
 from stages.scope.tips import ScopeTip
 from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm, tube_constants

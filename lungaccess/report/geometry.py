@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from lungaccess.plans import NeedlePath, Plan, TubeDeployment
+    from lungaccess.plans.plan import NeedlePath, Plan, TubeDeployment
     from stages.tube.device import ConcentricTubes
 
 Float = NDArray[np.float64]

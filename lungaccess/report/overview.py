@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from anatomy.lung import Lung
-    from lungaccess.plans import Plan
+    from lungaccess.plans.plan import Plan
 
 Float = NDArray[np.float64]
 

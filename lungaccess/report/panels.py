@@ -13,7 +13,7 @@ from lungaccess.report.geometry import needle_polyline, tube_centreline
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.plans import Plan
+    from lungaccess.plans.plan import Plan
 
 Float = NDArray[np.float64]
 

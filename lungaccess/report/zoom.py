@@ -15,7 +15,7 @@ from lungaccess.report.layers import Layers
 from lungaccess.report.views import View, plane_view
 
 if TYPE_CHECKING:
-    from lungaccess.plans import Plan
+    from lungaccess.plans.plan import Plan
 
 Float = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lungaccess.courses import Course
-from lungaccess.plans import Plan
+from lungaccess.plans.curves import Course
+from lungaccess.plans.plan import Plan
 
 ROUTE, BRANCHING, BEYOND = 0, 1, 2
 _HEADING = (

@@ -13,8 +13,8 @@ from anatomy.io.centerlines import write_centerlines
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from lungaccess.checking import CheckReport, check
-from lungaccess.courses import Course, courses
-from lungaccess.plans import Plan
+from lungaccess.plans.curves import Course, courses
+from lungaccess.plans.plan import Plan
 from lungaccess.slicer.custusx import route_text
 from lungaccess.slicer.markups import TARGET_COLOUR, curve, points_of_interest
 from lungaccess.slicer.models import device_surface, structure_surface, write_ply

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from lungaccess.courses import Course
-from lungaccess.plans import Plan
-from stages.scope.fly_through import MARKUPS_SCHEMA
+from lungaccess.plans.curves import Course
+from lungaccess.plans.plan import Plan
+from stages.scope.advisor.fly_through import MARKUPS_SCHEMA
 
 TARGET_COLOUR = (0.17, 0.63, 0.17)
 

@@ -11,7 +11,7 @@ from anatomy.grid import Float, Volume
 from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, smooth_surface
-from lungaccess.courses import Course
+from lungaccess.plans.curves import Course
 
 MOST_TRIANGLES = 150_000
 SIDES = 16

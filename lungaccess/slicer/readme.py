@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lungaccess.checking import CheckReport
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 
 _MEANING = {
     "scene.mrml": "drag this into 3D Slicer (5.0 or later): it loads everything below it",

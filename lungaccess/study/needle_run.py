@@ -9,13 +9,13 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
-from lungaccess.needle import OMPL_TOLERANCE_MM, plan_needle
-from lungaccess.records import needle_record
+from lungaccess.cli.records import needle_record
+from lungaccess.one_stage.needle import OMPL_TOLERANCE_MM, plan_needle
+from lungaccess.problem.target import point_target
 from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
 from lungaccess.study.runs import Run
-from lungaccess.target import point_target
-from stages.needle.objections import objection
-from stages.needle.searches import Query
+from stages.needle.search.base import Query
+from stages.needle.violations import objection
 
 OBJECTIVES = {
     "inverse_clearance": "inverse-clearance",
@@ -27,7 +27,7 @@ OBJECTIVES = {
 
 
 def needle_answer(run: Run, lung: Lung) -> Answer:
-    """Search for a needle path and let `stages.needle.objections.objection` look at it.
+    """Search for a needle path and let `stages.needle.violations.objection` look at it.
 
     Raises
     ------

@@ -21,11 +21,13 @@ import psutil
 
 from anatomy.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
-from lungaccess.atlas import Atlas
-from lungaccess.atlas_store import open_atlas
 from lungaccess.checking.judge import Checker
-from lungaccess.noplan import NoPlan
-from lungaccess.planner import plan
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.atlas_store import open_atlas
+from lungaccess.coupled.planner import plan
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.problem.system import System
+from lungaccess.problem.target import point_target
 from lungaccess.study.answers import (
     EXACT,
     INVALID_GOAL,
@@ -40,8 +42,6 @@ from lungaccess.study.needle_run import needle_answer
 from lungaccess.study.patients import Patient, open_patient
 from lungaccess.study.runs import Problem, Run
 from lungaccess.study.settings import StudyError
-from lungaccess.system import System
-from lungaccess.target import point_target
 
 KEPT_PATIENTS = 2
 MIB = 2.0**20

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from anatomy.errors import FileError
 from anatomy.settings import to_mapping
-from lungaccess.assemble import software_version
+from lungaccess.plans.assemble import software_version
 from lungaccess.study.answers import Answer
 from lungaccess.study.runs import Problem, Run
 from lungaccess.study.schema import APPLICATION_ID, FORMAT, statements

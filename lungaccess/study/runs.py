@@ -14,13 +14,13 @@ from anatomy.errors import LungaccessError
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
 from anatomy.settings import to_mapping
-from lungaccess.assemble import software_version
-from lungaccess.inputs import load_device
-from lungaccess.peripheral import peripheral_targets
+from lungaccess.cli.inputs import load_device
+from lungaccess.plans.assemble import software_version
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.system import System, system_fingerprint
+from lungaccess.problem.target import nodule_target
 from lungaccess.study.patients import Patient, open_patient, patient_of
 from lungaccess.study.settings import Case, PlannerChoice, Study
-from lungaccess.system import System, system_fingerprint
-from lungaccess.target import nodule_target
 
 RUN_FORMAT = 1
 """Raise it when what a run does changes: stored runs of another format are run anew."""

@@ -38,7 +38,7 @@ class PhantomPatient:
 
 @settings
 class Peripheral:
-    """Random targets of a case; see `lungaccess.peripheral.peripheral_targets`."""
+    """Random targets of a case; see `lungaccess.problem.peripheral.peripheral_targets`."""
 
     per_lung: Annotated[int, Field(strict=True, ge=0, description="targets on each side")] = 0
     seed: Annotated[int, Field(strict=True, ge=0, description="seed of the points")] = 0
@@ -95,8 +95,8 @@ class PlannerChoice:
     kind : str
         "plan" for all three stages, "needle" for the needle alone from the case's start poses.
     method : str
-        One of `lungaccess.planner.METHODS`; for the needle, of `stages.needle.planners.PLANNERS` or of
-        `lungaccess.needle.OMPL_PLANNERS`.
+        One of `lungaccess.coupled.planner.METHODS`; for the needle, of
+        `stages.needle.search.planners.PLANNERS` or of `lungaccess.one_stage.needle.OMPL_PLANNERS`.
     iterations : int or None
         Instead of those of the budget.
     own_process : bool
@@ -117,7 +117,7 @@ class PlannerChoice:
     @property
     def is_of_ompl(self) -> bool:
         """Whether it is a planner of OMPL, whose random numbers can be seeded once in a process."""
-        from lungaccess.needle import OMPL_PLANNERS
+        from lungaccess.one_stage.needle import OMPL_PLANNERS
 
         return self.kind == "needle" and self.method in OMPL_PLANNERS
 
@@ -140,7 +140,7 @@ class Budget:
 
 @settings
 class AtlasGrid:
-    """How densely deployments are enumerated; see `lungaccess.atlas.build_atlas`."""
+    """How densely deployments are enumerated; see `lungaccess.coupled.atlas.build_atlas`."""
 
     rotations: Annotated[int, Field(strict=True, ge=1, description="rotations of the tubes")] = (
         DEFAULT_ROTATIONS
@@ -190,11 +190,11 @@ class Study:
 def methods(kind: str) -> tuple[str, ...]:
     """Return the names of the planners of a kind, "plan" or "needle"."""
     if kind == "needle":
-        from lungaccess.needle import OMPL_PLANNERS
-        from stages.needle.planners import PLANNERS
+        from lungaccess.one_stage.needle import OMPL_PLANNERS
+        from stages.needle.search.planners import PLANNERS
 
         return (*PLANNERS, *OMPL_PLANNERS)
-    from lungaccess.planner import METHODS
+    from lungaccess.coupled.planner import METHODS
 
     return tuple(METHODS)
 

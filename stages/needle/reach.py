@@ -12,7 +12,7 @@ from anatomy.grid import Float
 from stages.needle.kernels import reach as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
-from stages.needle.searches import RANDOM_SHARE
+from stages.needle.search.base import RANDOM_SHARE
 from stages.needle.space import NeedleSpace
 
 DIRECT, SEARCHED, UNREACHED, NO_ROOM = kernel.DIRECT, kernel.SEARCHED, kernel.UNREACHED, kernel.NO_ROOM

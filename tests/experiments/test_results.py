@@ -16,8 +16,9 @@ from PIL import Image
 
 from anatomy.errors import FileError
 from anatomy.lung import Lung
-from experiments import pan2025_tour, results, run_all, write_results
-from experiments.results import PNG_BYTES, Result, Row, cells, number, write_result
+from experiments import pan2025_tour, run_all, write_results
+from experiments.support import results
+from experiments.support.results import PNG_BYTES, Result, Row, cells, number, write_result
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 

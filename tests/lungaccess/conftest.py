@@ -13,7 +13,7 @@ import pytest
 from scipy import ndimage
 
 from anatomy.grid import Grid, Volume
-from lungaccess.plans import (
+from lungaccess.plans.plan import (
     Exemption,
     NeedleArc,
     NeedlePath,
@@ -22,8 +22,8 @@ from lungaccess.plans import (
     TubeDeployment,
     WallExit,
 )
+from lungaccess.problem.system import load_system, system_fingerprint
 from lungaccess.report.geometry import arc_step
-from lungaccess.system import load_system, system_fingerprint
 
 LEFT_LUNG_LPS = np.array([60.0, 0.0, 0.0])
 RIGHT_LUNG_LPS = np.array([-60.0, 0.0, 0.0])

@@ -11,4 +11,4 @@ import pytest
 def load_with(monkeypatch: pytest.MonkeyPatch, load: Callable[..., Any]) -> None:
     """Replace `load_lung` in the commands that plan, check or show a patient."""
     for name in ("check", "info", "needle", "plan"):
-        monkeypatch.setattr(f"lungaccess.commands.{name}.load_lung", load)
+        monkeypatch.setattr(f"lungaccess.cli.commands.{name}.load_lung", load)

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 from tests.stages.scenes import brute_clearance
 
 STEP_MM = 0.02

@@ -48,7 +48,7 @@ def test_type_checkers_see_the_same_names_as_users() -> None:
 def test_modules_do_not_hide_functions() -> None:
     """`la.plan` and `la.check` stay functions whatever has been imported before."""
     code = (
-        "import lungaccess.planner, lungaccess.plans, lungaccess.checking, lungaccess.cli\n"
+        "import lungaccess.coupled.planner, lungaccess.plans.plan, lungaccess.checking, lungaccess.cli.app\n"
         "import lungaccess as la\n"
         "print(callable(la.plan) and callable(la.check))"
     )

@@ -19,7 +19,7 @@ import pytest
 from anatomy.display import AXIAL, CORONAL, Drawing
 from anatomy.lung import Lung
 from lungaccess.checking import CheckReport, Finding
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 
 TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "tutorial.ipynb"
 EVIL = "<script>alert('x')</script>&\""
@@ -134,7 +134,7 @@ def test_showing_needs_no_plotting_library() -> None:
     code = (
         "import sys, lungaccess as la; from lungaccess.checking import CheckReport;"
         "CheckReport(accepted=True, findings=())._repr_html_(); la.Plan._repr_html_; la.Lung; la.AirwayTree;"
-        "import anatomy.display, lungaccess.plan_display;"
+        "import anatomy.display, lungaccess.plans.display;"
         "sys.exit(int(bool({'matplotlib', 'IPython'} & set(sys.modules))))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lungaccess.peripheral import peripheral_targets
+from lungaccess.problem.peripheral import peripheral_targets
 from stages.needle.space import direct_arcs, needle_space, workspace_lengths
 from tests.scenarios import expected as expectations
 from tests.scenarios.cases import (

@@ -10,10 +10,10 @@ import numpy as np
 
 import lungaccess as la
 from anatomy.poses import pose
-from lungaccess.needle import plan_needle
-from lungaccess.target import point_target
-from stages.needle.objections import objection
-from stages.needle.searches import Query
+from lungaccess.one_stage.needle import plan_needle
+from lungaccess.problem.target import point_target
+from stages.needle.search.base import Query
+from stages.needle.violations import objection
 from tests.scenarios.cases import (
     NEEDLE_DEVICE,
     NEEDLE_ITERATIONS,

@@ -14,7 +14,7 @@ from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import phantom
 from lungaccess.checking import Checker
-from lungaccess.system import System
+from lungaccess.problem.system import System
 from tests.scenarios.cases import Anatomy, Case
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.needle_queries import Judge, Obstacles, hard_queries, load_obstacles
-from stages.needle import searches
-from stages.needle.planners import PLANNERS
+from experiments.support.needle_queries import Judge, Obstacles, hard_queries, load_obstacles
+from stages.needle.search import base as searches
+from stages.needle.search.planners import PLANNERS
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES
 from tests.scenarios.runs import Answer
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from lungaccess.searches import desk
+from lungaccess.coupled.search import evaluator as desk
 from stages.needle.kernels.limits import REQUIRED
 from stages.needle.space import NeedleSpace, needle_space
 from tests.scenarios import runs

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.checking import shapes
-from lungaccess.costs import obstacle_clearance_mm
+from lungaccess.cli.terminal import objective_words
+from lungaccess.plans.costs import obstacle_clearance_mm
 from lungaccess.report.geometry import needle_polyline, tube_centreline
 from lungaccess.report.html.pack import Packed, pack
-from lungaccess.terminal import objective_words
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.plans import Plan
+    from lungaccess.plans.plan import Plan
 
 Float = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from lungaccess.report.html.deployment import arc_lengths, camera_axes
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.plans import Plan
+    from lungaccess.plans.plan import Plan
 
 Picture = NDArray[np.uint8]
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from anatomy.grid import Volume
     from anatomy.lung import Lung
     from lungaccess.checking import CheckReport
-    from lungaccess.plans import Plan
+    from lungaccess.plans.plan import Plan
 
 MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
 TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
@@ -44,7 +44,7 @@ class PageOptions:
     cost_over_time : path or None
         CSV that `lungaccess plan` wrote beside the plan.
     risk_samples, risk_seed : int
-        See `lungaccess.risk.assess`; 0 samples for none.
+        See `lungaccess.risk.assessment.assess`; 0 samples for none.
     instructions : bool
         Whether the scope's way is searched and told turn by turn.
     """
@@ -84,7 +84,7 @@ def plan_page(
         If the CT does not hold the plan.
     """
     from lungaccess.checking.judge import Checker
-    from lungaccess.risk import assess
+    from lungaccess.risk.assessment import assess
 
     chosen = options or PageOptions()
     plans = (plan, *chosen.alternatives)

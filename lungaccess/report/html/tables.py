@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.checking import CheckReport
     from lungaccess.checking.findings import Finding
-    from lungaccess.plans import Plan
-    from lungaccess.risk import RiskReport, Share
+    from lungaccess.plans.plan import Plan
+    from lungaccess.risk.assessment import RiskReport, Share
 
 GOAL_RADIUS_MM = 2.0
 AXES_AGREE = "largest angle between the axes"
@@ -97,7 +97,7 @@ def _value(finding: Finding) -> str:
 
 def plans_section(plans: Sequence[Plan], verdicts: Sequence[CheckReport]) -> str:
     """Return a table that compares plans."""
-    from lungaccess.alternatives import criteria
+    from lungaccess.coupled.alternatives import criteria
 
     rows = []
     for number, (plan, verdict) in enumerate(zip(plans, verdicts, strict=True)):
@@ -133,7 +133,7 @@ def key_section(plan: Plan) -> str:
 
 def instructions_section(plan: Plan, lung: Lung) -> str:
     """Return turn by turn how the scope gets to where the plan has its tip, or why that is not known."""
-    from lungaccess.advise import advise_scope
+    from lungaccess.one_stage.scope import advise_scope
 
     tip = np.array(plan.scope.lps_from_scope_tip[:3, 3])
     try:

@@ -12,11 +12,11 @@ import numpy as np
 from anatomy.grid import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
+from stages.scope.route.guide_path import Way
 from stages.scope.route.kernels.repair import repair
 from stages.scope.route.kernels.spline import take_samples
 from stages.scope.route.proof import Proof, prove
 from stages.scope.route.settings import RouteLimits
-from stages.scope.route.way import Way
 
 CENTRING = 0.02
 """Weight of the squared distance from the way, in radii; small against the limits."""

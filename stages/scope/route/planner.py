@@ -15,10 +15,10 @@ from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.exact import Problem, repair_exact
 from stages.scope.route.genetic import GeneticSettings, repair_genetic
+from stages.scope.route.guide_path import WAYPOINT_SPACING_MM, Way, way_along
 from stages.scope.route.proof import Proof
 from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.settings import RouteLimits
-from stages.scope.route.way import WAYPOINT_SPACING_MM, Way, way_along
 
 Int = NDArray[np.int64]
 Repair = Literal["exact", "ga", "none"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from anatomy.errors import SettingsError
 from anatomy.grid import Float, read_only
 from stages.scope.tour.kernels.circuit import all_resistances
-from stages.scope.tour.ways import Ways
+from stages.scope.tour.subtree import Ways
 
 Int = NDArray[np.int64]
 Reading = Literal["printed", "reduced"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from stages.scope.tour.exits import Exit
-from stages.scope.tour.ways import Ways
+from stages.scope.tour.subtree import Ways
 
 Int = NDArray[np.int64]
 

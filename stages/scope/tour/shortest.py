@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stages.scope.tour.itinerary import Itinerary, itinerary
 from stages.scope.tour.kernels.steiner import solve
-from stages.scope.tour.ways import Ways
+from stages.scope.tour.subtree import Ways
 
 Int = NDArray[np.int64]
 

@@ -13,8 +13,8 @@ import pytest
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume, transform_points
-from lungaccess.plans import Exemption, NeedleArc, NeedlePath, Plan, ScopeRoute, TubeDeployment, WallExit
-from lungaccess.system import System, load_system, system_fingerprint
+from lungaccess.plans.plan import Exemption, NeedleArc, NeedlePath, Plan, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.problem.system import System, load_system, system_fingerprint
 
 SPACING_MM = (1.0, 0.9, 1.1)
 SHAPE = (150, 64, 104)

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.settings import override
-from experiments import check_attack, random_plans
-from experiments.mutants import Case
-from experiments.plan_mutations import MUTATIONS
+from experiments import check_attack
+from experiments.support import random_plans
+from experiments.support.mutants import Case
+from experiments.support.plan_mutations import MUTATIONS
 from lungaccess.checking import Checker, check
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 
 PLANS_A_SYSTEM = 8
 MUTANTS_OF_A_KIND = 4
@@ -122,7 +123,7 @@ def test_a_run_that_was_interrupted_goes_on(
     small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(random_plans, "PLANS_A_BATCH", 2)
-    monkeypatch.setattr("lungaccess.explain.explain", lambda *_: la.NoPlan("No plan", reasons={}))
+    monkeypatch.setattr("lungaccess.coupled.explain.explain", lambda *_: la.NoPlan("No plan", reasons={}))
     monkeypatch.setattr(random_plans, "random_system", lambda _rng: la.load_system("ultrathin"))
     files = [tmp_path / name for name in ("at-once.jsonl", "in-parts.jsonl")]
     for file, parts in zip(files, [(4,), (2, 4)], strict=True):

@@ -15,7 +15,7 @@ from anatomy import structures
 from anatomy.settings import override
 from lungaccess.checking import Finding, check
 from lungaccess.checking.findings import Findings
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 
 LIMITS = {
     "tube.sweep.limit": "at most",

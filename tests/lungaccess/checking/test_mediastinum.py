@@ -10,11 +10,11 @@ import numpy as np
 import lungaccess as la
 from anatomy.errors import LungaccessError
 from anatomy.lung import Lung
-from lungaccess.assemble import Task, assemble
 from lungaccess.checking import Checker
-from lungaccess.plans import Plan
-from lungaccess.searches import AtlasSearch
-from lungaccess.target import point_target
+from lungaccess.coupled.search import AtlasSearch
+from lungaccess.plans.assemble import Task, assemble
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.target import point_target
 
 AHEAD_MM = 15.0
 WANTED = 3

@@ -15,8 +15,8 @@ from anatomy import structures
 from anatomy.grid import Volume
 from anatomy.settings import override
 from lungaccess.checking import check
-from lungaccess.plans import Plan
-from lungaccess.system import load_system, system_fingerprint
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import load_system, system_fingerprint
 from stages.needle.path import ArcPath
 
 

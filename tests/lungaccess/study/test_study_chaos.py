@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
 from lungaccess.study.compare import differences
 from lungaccess.study.driver import run_study
 from lungaccess.study.results import ResultsFile

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from lungaccess import cli, terminal
+from lungaccess.cli import app as cli
+from lungaccess.cli import terminal
 from lungaccess.study.answers import NO_PLAN, TIMEOUT
 from lungaccess.study.export import export_csv, export_parquet
 from lungaccess.study.results import ResultsFile
@@ -158,7 +159,7 @@ def test_bad_input_is_explained(
 
 def command(study: Path, out: Path, cache: Path) -> list[str]:
     words = ["study", "run", str(study), "--out", str(out), "--cache", str(cache), "--workers", "1", "--json"]
-    return [sys.executable, "-c", "import sys; from lungaccess.cli import main; sys.exit(main())", *words]
+    return [sys.executable, "-c", "import sys; from lungaccess.cli.app import main; sys.exit(main())", *words]
 
 
 @pytest.mark.slow

@@ -220,7 +220,7 @@ def test_no_scheduler(tmp_path: Path, study: Study, cache: Path, monkeypatch: py
 
 
 def test_importing_the_commands_does_not_import_dask() -> None:
-    script = "import lungaccess.cli, sys; print({'dask', 'distributed', 'pyarrow'} & set(sys.modules))"
+    script = "import lungaccess.cli.app, sys; print({'dask', 'distributed', 'pyarrow'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

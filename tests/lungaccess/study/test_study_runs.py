@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from anatomy.errors import FileError, SettingsError, TargetError
-from lungaccess import peripheral
-from lungaccess.plans import Plan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem import peripheral
+from lungaccess.problem.system import load_system
 from lungaccess.study import one_run
 from lungaccess.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
 from lungaccess.study.needle_run import needle_answer
@@ -22,7 +23,6 @@ from lungaccess.study.one_run import answer
 from lungaccess.study.patients import open_patient
 from lungaccess.study.runs import Run, runs_of
 from lungaccess.study.settings import PlannerChoice, study_of
-from lungaccess.system import load_system
 from tests.lungaccess.study.toys import content
 
 
@@ -163,10 +163,10 @@ OMPL_SCRIPT = """
 import json, sys
 from pathlib import Path
 import numpy as np
-from lungaccess.needle import plan_needle
+from lungaccess.one_stage.needle import plan_needle
 from lungaccess.study.patients import open_patient
 from lungaccess.study.runs import Run
-from lungaccess.target import point_target
+from lungaccess.problem.target import point_target
 from anatomy.errors import SettingsError
 text, tip, cache = json.loads(sys.stdin.read())
 problem, tip = Run.from_json(text).problem, np.array(tip)

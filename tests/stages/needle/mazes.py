@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from anatomy.grid import Float
 from anatomy.structures import VESSEL
 from stages.needle.device import Needle
-from stages.needle.searches import Query
+from stages.needle.search.base import Query
 from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 

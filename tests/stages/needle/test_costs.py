@@ -29,7 +29,7 @@ from stages.needle.kernels import cost as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath
-from stages.needle.searches import Query, RestartingRRT
+from stages.needle.search.base import Query, RestartingRRT
 from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 

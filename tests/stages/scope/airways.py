@@ -10,7 +10,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN
-from stages.scope.lumen import Lumen, lumen_of_lung, lumen_of_mask
+from stages.scope.advisor.lumen import Lumen, lumen_of_lung, lumen_of_mask
 from tests.stages.scenes import Canvas, brute_clearance, forked_tree
 
 WALL = 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from anatomy.lung import Lung
-from stages.scope.lumen import Lumen
+from stages.scope.advisor.lumen import Lumen
 from tests.stages.scope import airways
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from anatomy.lung import Lung
-from lungaccess.patients import load_patient
-from stages.scope.advisor import Advisor, start_state, why_stopped
-from stages.scope.kinematics import ScopeModel
-from stages.scope.lumen import Lumen, lumen_of_lung
-from stages.scope.navigation import entering_costs, goal_at, navigation_field
+from lungaccess.problem.patients import load_patient
+from stages.scope.advisor.advisor import Advisor, start_state, why_stopped
+from stages.scope.advisor.kinematics import ScopeModel
+from stages.scope.advisor.lumen import Lumen, lumen_of_lung
+from stages.scope.advisor.navigation import entering_costs, goal_at, navigation_field
+from tests.stages.scope.advisor.test_navigation import dijkstra_of
 from tests.stages.scope.airways import wall_mm
-from tests.stages.scope.test_navigation import dijkstra_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.data]
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from anatomy.errors import SettingsError, TargetError
+from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.tour.exits import ExitRule, find_exits
-from stages.scope.tour.models import random_airway, random_lesions
 from tests.stages.scope.tour.trees import figure_1, straight_branches
 
 

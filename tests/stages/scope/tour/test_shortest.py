@@ -9,13 +9,13 @@ import pytest
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import SettingsError
+from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.tour import shortest
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
 from stages.scope.tour.itinerary import itinerary, one_by_one_mm
-from stages.scope.tour.models import random_airway, random_lesions
 from stages.scope.tour.shortest import shortest_tour
-from stages.scope.tour.ways import Ways, ways_to
+from stages.scope.tour.subtree import Ways, ways_to
 from tests.stages.scope.tour.trees import (
     by_trying_everything,
     ends_of,

@@ -10,7 +10,7 @@ from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.tree.branches import Strand, assemble
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.itinerary import itinerary
-from stages.scope.tour.ways import Ways
+from stages.scope.tour.subtree import Ways
 
 
 def straight_branches(ends: list[tuple[int, tuple[float, float, float]]], radius: float = 2.0) -> AirwayTree:

@@ -1,0 +1,132 @@
+"""Needle problems of rising difficulty beside the airways of a segmented CT, as for [Fu2018, fig. 7]."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import edt
+import numpy as np
+
+from anatomy.grid import Float
+from anatomy.structures import OUTSIDE
+from experiments.support.cost_map_case import Case
+from experiments.support.inflation import refuting_labels
+from stages.needle.costs import voxel_sum
+from stages.needle.objective import SHORTEST
+from stages.needle.path import ArcPath
+from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.space import NeedleSpace, direct_arcs, workspace_lengths
+
+EXIT_MM = (5.0, 9.0)
+MAX_EXIT_ANGLE_DEG = 60.0
+TARGET_MM = (50.0, 90.0)
+PLEURA_MM = 5.0
+TRIES, TRY_ITERATIONS = 40, 300
+MOST_CANDIDATES = 3000
+SCENARIOS = {"easy": (0.9, 1.0), "medium": (0.4, 0.6), "hard": (0.02, 0.12)}
+"""Share of `TRIES` short searches that find a path: what makes a scenario easy or hard."""
+LEAST_COST = 1.0
+"""Where the shortest path costs less there is nothing to be saved."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scenario:
+    """A start pose and a goal, and the share of short searches that solve it."""
+
+    name: str
+    query: Query
+    solved_share: float
+
+    def describe(self) -> str:
+        """Say where it is and how hard."""
+        start, goal = self.query.lps_from_start[:3, 3], self.query.target
+        return (
+            f"start LPS {np.round(start, 1).tolist()}, goal {np.round(goal, 1).tolist()}, "
+            f"{np.linalg.norm(goal - start):.0f} mm apart; {100 * self.solved_share:.0f} % of "
+            f"{TRIES} searches of {TRY_ITERATIONS} iterations succeed"
+        )
+
+
+def candidates(case: Case, rng: np.random.Generator) -> Iterator[Query]:
+    """Draw start poses beside airways, as a tube would hold the needle there, and goals ahead of them.
+
+    Both are as clear of obstacles as the needle must be, the goal lies in the needle's workspace and
+    5 mm or more below the pleura, and no single arc leads to it.
+    """
+    space, inner = case.space, case.inner_lps
+    lung = np.asfortranarray((space.arrays[1] & OUTSIDE) == 0)
+    depth = edt.edt(lung, anisotropy=tuple(space.grid.spacing_mm), order="F")
+    tissue = np.argwhere(depth > PLEURA_MM)
+    while True:
+        way = unit(rng.normal(size=3))
+        start = inner[rng.integers(len(inner))] + rng.uniform(*EXIT_MM) * way
+        goal = space.grid.lps(tissue[rng.integers(len(tissue))] + rng.uniform(-0.5, 0.5, 3))
+        ahead = goal - start
+        distance = float(np.linalg.norm(ahead))
+        tangent = unit(way + rng.normal(scale=0.3, size=3))
+        if (
+            not TARGET_MM[0] <= distance <= TARGET_MM[1]
+            or ahead @ way < math.cos(math.radians(MAX_EXIT_ANGLE_DEG)) * distance
+        ):
+            continue
+        query = Query(lps_from_start=_pose(start, tangent), target=goal)
+        if _is_problem(space, query):
+            yield query
+
+
+def unit(vector: Float) -> Float:
+    """Return the vector over its length."""
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _pose(position: Float, tangent: Float) -> Float:
+    """Return a pose (4, 4) whose +z is the tangent."""
+    x = unit(np.cross(np.eye(3)[int(np.argmin(np.abs(tangent)))], tangent))
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = x, np.cross(tangent, x), tangent, position
+    return pose
+
+
+def _is_problem(space: NeedleSpace, query: Query) -> bool:
+    """Tell whether both ends are clear, the goal is in the workspace and no single arc leads there."""
+    place, tangent = query.lps_from_start[None, :3, 3], query.lps_from_start[None, :3, 2]
+    if not np.isfinite(workspace_lengths(space, place, tangent, query.target)[0]):
+        return False
+    here = [
+        ArcPath(lps_from_start=_pose(p, tangent[0]), arcs=np.zeros((1, 3))) for p in (place[0], query.target)
+    ]
+    if refuting_labels(space, here).any():
+        return False
+    return bool(direct_arcs(space, place, tangent, np.array([-1]), query.target)[0][0] != 0)
+
+
+def choose_scenarios(case: Case, seed: int) -> list[Scenario]:
+    """Return the first candidate of each difficulty, in the order of `SCENARIOS`; those that were found.
+
+    Difficulty is the share of short searches for any path that succeed: it counts iterations, so that
+    the choice is the same on every machine.  Left out is where the shortest path of these searches costs
+    less than `LEAST_COST` [Fu2018, eq. 1].
+    """
+    found: dict[str, Scenario] = {}
+    for query in islice(candidates(case, np.random.default_rng(seed)), MOST_CANDIDATES):
+        paths = []
+        for n in range(TRIES):
+            search = RestartingRRT(case.space, query, seed=n + 1, objective=SHORTEST)
+            if search.advance(TRY_ITERATIONS) and search.path is not None:
+                paths.append(search.path)
+        share = len(paths) / TRIES
+        if not paths or voxel_sum(case.costs, min(paths, key=_length)) < LEAST_COST:
+            continue
+        for name, (low, high) in SCENARIOS.items():
+            if name not in found and low <= share <= high:
+                found[name] = Scenario(name=name, query=query, solved_share=share)
+        if len(found) == len(SCENARIOS):
+            break
+    return [found[name] for name in SCENARIOS if name in found]
+
+
+def _length(path: ArcPath) -> float:
+    return path.length_mm

@@ -1,0 +1,1 @@
+"""Simulated insertion of needles that do not follow their plans."""

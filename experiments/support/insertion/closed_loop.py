@@ -1,0 +1,335 @@
+"""Insertion of a needle that does not follow its plan exactly, with and without replanning on the way.
+
+Every few millimetres a tracker tells where the tip and the target seem to be.  In closed loop the planner
+then makes a new path from there; in open loop the first plan is carried out blindly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from anatomy.kernels.field import bounds_at, exact_at
+from experiments.support.insertion.truth import Errors, Truth, tilt
+from stages.needle.kernels import limits as index
+from stages.needle.kernels.proof import blocker_on_arc
+from stages.needle.objective import SHORTEST, Objective
+from stages.needle.path import LENGTH, ROLL, ArcPath, arc_transform, bend_direction
+from stages.needle.replanning.escaping import structure_name, with_limit
+from stages.needle.replanning.reaiming import pose_at
+from stages.needle.replanning.replanner import (
+    DEFAULT_SETTINGS,
+    ITERATIONS,
+    Failure,
+    Replan,
+    Replanner,
+    ReplanSettings,
+)
+from stages.needle.search.base import Query
+from stages.needle.space import NeedleSpace
+
+STEP_MM = 0.25
+TOLERANCE_MM = 2.0
+GAIN = 0.3
+"""Share of a measurement that is believed: over the few millimetres between two of them, dead reckoning
+is more exact than a tracker."""
+
+WIDEST_CLEARANCE_MM = 200.0
+
+
+class Outcome(StrEnum):
+    """How an insertion ended."""
+
+    REACHED = "reached"
+    MISSED = "missed"
+    HIT = "hit an obstacle"
+    NO_PATH = "no path left"
+    OUT_OF_LENGTH = "out of length"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Insertion:
+    """What happened to one needle.
+
+    Parameters
+    ----------
+    lps_from_tip : (N, 4, 4) float64
+        Where the tip really was, the start first.
+    inserted_mm : (N,) float64
+        Length of needle at each of these poses, counted from its first start.
+    outcome : Outcome
+    label : int
+        Label of the voxel that was hit, 0 if none.
+    target_lps : (3,) float64, LPS mm
+        Where the target really is in the end.
+    tip_error_mm : float
+        Distance from the tip to it, wherever the insertion ended.
+    clearance_mm : float
+        Smallest distance from the needle's surface to an obstacle at these poses; after a hit about 0 or
+        negative.  The wall of the pierced branch does not count as long as it is exempt.
+    replans : tuple of Replan
+    """
+
+    lps_from_tip: Float
+    inserted_mm: Float
+    outcome: Outcome
+    label: int
+    target_lps: Float
+    tip_error_mm: float
+    clearance_mm: float
+    replans: tuple[Replan, ...]
+
+    @property
+    def structure(self) -> str:
+        """Name of what was hit, '' if nothing was."""
+        return structure_name(self.label) if self.label else ""
+
+
+class _Needle:
+    """The true needle: where its tip is, and whether it has hit something."""
+
+    def __init__(self, space: NeedleSpace, query: Query, truth: Truth) -> None:
+        self._space = with_limit(space, index.REQUIRED, space.needle.radius_mm)
+        self._branch = query.branch
+        self._truth = truth
+        self.frame = np.array(query.lps_from_start)
+        self.inserted_mm = query.inserted_mm
+        self.frames, self.lengths = [self.frame], [self.inserted_mm]
+        self.label = 0
+
+    def roll(self, angle: float) -> None:
+        """Roll at the base."""
+        if angle != 0.0:
+            self.frame = self.frame @ arc_transform(0.0, angle, 0.0)
+            self._truth.roll()
+
+    def insert(self, length: float, curvature: float) -> None:
+        """Insert by a small step; the needle's surface is judged along it, exactly."""
+        middle = self.inserted_mm + 0.5 * length
+        towards, bent = self._truth.bend(self.frame, curvature, middle)
+        normal = bend_direction(self.frame, towards)
+        bend = (bent, *(float(v) for v in normal))
+        self.label = int(
+            blocker_on_arc(
+                self._space.arrays, self._space.limits, pose_at(self.frame), bend, length,
+                self.inserted_mm, self._branch,
+            )
+        )  # fmt: skip
+        self.frame = self.frame @ arc_transform(length, towards, bent) @ arc_transform(0.0, -towards, 0.0)
+        self.inserted_mm += length
+        self.frames.append(self.frame)
+        self.lengths.append(self.inserted_mm)
+
+
+class _Belief:
+    """Where the planner takes tip and target to be: dead reckoning, corrected by each measurement."""
+
+    def __init__(self, query: Query, gain: float) -> None:
+        self._gain = gain
+        self.frame = np.array(query.lps_from_start)
+        self.target = query.target
+
+    def roll(self, angle: float) -> None:
+        """Roll as commanded."""
+        self.frame = self.frame @ arc_transform(0.0, angle, 0.0)
+
+    def insert(self, length: float, curvature: float) -> None:
+        """Insert as commanded."""
+        self.frame = self.frame @ arc_transform(length, 0.0, curvature)
+
+    def correct(self, seen: Float, target: Float) -> None:
+        """Take a measurement into account; it says nothing about the roll."""
+        x, y, z = (float(v) for v in self.frame[:3, :3].T @ seen[:3, 2])
+        moved = self.frame[:3, 3] + self._gain * (seen[:3, 3] - self.frame[:3, 3])
+        self.frame = self.frame @ tilt(self._gain * math.atan2(math.hypot(x, y), z), math.atan2(y, x))
+        self.frame[:3, 3] = moved
+        self.target = self.target + self._gain * (target - self.target)
+
+
+class _Commands:
+    """What the needle is told to do: the arcs of a plan, in small pieces."""
+
+    def __init__(self, plan: ArcPath) -> None:
+        self._arcs = plan.arcs
+        self._arc = 0
+        self._done_mm = 0.0
+
+    @property
+    def finished(self) -> bool:
+        return self._arc >= len(self._arcs)
+
+    @property
+    def left_mm(self) -> float:
+        """What is left of the arc."""
+        return float(self._arcs[self._arc, LENGTH]) - self._done_mm
+
+    def give(self, needle: _Needle, belief: _Belief, longest_mm: float) -> None:
+        """Let the needle do a piece of the arc, and roll before a new one."""
+        length = min(longest_mm, self.left_mm)
+        if self.left_mm - length < index.MIN_ARC_MM:
+            length = self.left_mm
+        _length, roll, curvature = (float(v) for v in self._arcs[self._arc])
+        for body in (needle, belief):
+            if self._done_mm == 0.0:
+                body.roll(roll)
+            body.insert(length, curvature)
+        self._done_mm += length
+        if self.left_mm <= 0.0:
+            self._arc += 1
+            self._done_mm = 0.0
+
+    def rest(self, frame: Float) -> ArcPath:
+        """Return what is left, from another pose."""
+        arcs = np.array(self._arcs[self._arc :])
+        if self._done_mm > 0.0:
+            arcs[0, LENGTH], arcs[0, ROLL] = self.left_mm, 0.0
+        return ArcPath(lps_from_start=frame, arcs=arcs)
+
+
+def simulate(
+    space: NeedleSpace,
+    query: Query,
+    plan: ArcPath,
+    errors: Errors,
+    *,
+    closed_loop: bool,
+    seed: int,
+    step_mm: float = STEP_MM,
+    tolerance_mm: float = TOLERANCE_MM,
+    gain: float = GAIN,
+    objective: Objective = SHORTEST,
+    replanning: ReplanSettings = DEFAULT_SETTINGS,
+    iterations: int = ITERATIONS,
+) -> Insertion:
+    """Insert a needle by a plan that it does not follow exactly.
+
+    In closed loop every measurement is followed by a replan.  If that finds no path, the needle goes on by
+    the old one as long as this, moved to where the tip is taken to be, is proved clear; otherwise it stops.
+    An obstacle is hit where the needle's surface comes nearer than 0.005 mm to it on its true path; there
+    the insertion ends.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+        With all of the needle's curvature.  The planner keeps the required clearance, the judge the radius.
+    query : Query
+        What the plan was made for.
+    plan : ArcPath
+    errors : Errors
+    closed_loop : bool
+        Whether to measure and replan on the way.
+    seed : int
+        The same seed is the same needle and the same motion of the target, open loop or closed.
+    step_mm : float
+        Piece of needle within which the errors are constant.
+    tolerance_mm : float
+        A tip that ends no farther from the target has reached it.
+    gain : float
+        Share of a measurement by which dead reckoning is corrected; 1 trusts the tracker alone.
+    objective, replanning, iterations
+        See `Replanner`.
+
+    Raises
+    ------
+    SettingsError
+        If the step is not above 0, the tolerance negative, or the gain not above 0 or above 1.
+    """
+    if not (0.0 < step_mm < math.inf and 0.0 <= tolerance_mm < math.inf and 0.0 < gain <= 1.0):
+        raise SettingsError(
+            f"A simulation has a step of {step_mm} mm, a tolerance of {tolerance_mm} mm and a gain of {gain}",
+            expected="a finite step above 0, a finite tolerance of at least 0, a gain above 0 and at most 1",
+        )
+    longest_mm = float(space.limits[index.MAX_LENGTH])
+    truth = Truth(errors, query, longest_mm - query.inserted_mm, seed)
+    needle, belief, commands = _Needle(space, query, truth), _Belief(query, gain), _Commands(plan)
+    replanner = Replanner(
+        space, query, plan, objective=objective, settings=replanning, iterations=iterations, seed=seed
+    )
+    replans: list[Replan] = []
+    stopped: Failure | None = None
+    measure_mm = query.inserted_mm + errors.measure_every_mm if closed_loop else math.inf
+    while not (commands.finished or needle.label):
+        if needle.inserted_mm >= measure_mm - index.TINY:
+            measure_mm += errors.measure_every_mm
+            belief.correct(*truth.measure(needle.frame, needle.inserted_mm))
+            replans.append(replanner.replan(belief.frame, belief.target, needle.inserted_mm))
+            path = replans[-1].path
+            if path is not None:
+                commands = _Commands(path)
+                continue
+            if not _is_clear(space, commands.rest(belief.frame), needle.inserted_mm, query.branch):
+                stopped = replans[-1].failure
+                break
+        if needle.inserted_mm >= longest_mm - index.MIN_ARC_MM:
+            stopped = Failure.OUT_OF_LENGTH
+            break
+        left_mm = min(measure_mm, longest_mm) - needle.inserted_mm
+        commands.give(needle, belief, min(step_mm, left_mm))
+    return _insertion(space, query, needle, truth, stopped, tolerance_mm, replans)
+
+
+def _is_clear(space: NeedleSpace, path: ArcPath, inserted_mm: float, branch: int) -> bool:
+    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
+        bend = (float(curvature), *(float(v) for v in bend_direction(frame, roll)))
+        pose = pose_at(frame)
+        if blocker_on_arc(space.arrays, space.limits, pose, bend, float(length), inserted_mm, branch):
+            return False
+        inserted_mm += float(length)
+    return True
+
+
+def _insertion(
+    space: NeedleSpace,
+    query: Query,
+    needle: _Needle,
+    truth: Truth,
+    stopped: Failure | None,
+    tolerance_mm: float,
+    replans: list[Replan],
+) -> Insertion:
+    target = truth.target(needle.inserted_mm)
+    error = float(np.linalg.norm(needle.frame[:3, 3] - target))
+    if needle.label:
+        outcome = Outcome.HIT
+    elif error <= tolerance_mm:
+        outcome = Outcome.REACHED
+    elif stopped is Failure.OUT_OF_LENGTH:
+        outcome = Outcome.OUT_OF_LENGTH
+    else:
+        outcome = Outcome.MISSED if stopped is None else Outcome.NO_PATH
+    frames, lengths = np.stack(needle.frames), np.array(needle.lengths)
+    return Insertion(
+        lps_from_tip=read_only(frames),
+        inserted_mm=read_only(lengths),
+        outcome=outcome,
+        label=needle.label,
+        target_lps=read_only(target),
+        tip_error_mm=error,
+        clearance_mm=_smallest_clearance(space, query.branch, frames[:, :3, 3], lengths),
+        replans=tuple(replans),
+    )
+
+
+def _smallest_clearance(space: NeedleSpace, branch: int, points: Float, lengths: Float) -> float:
+    """Return the exact smallest distance from the needle's surface to an obstacle at points `(N, 3)`."""
+    field, labels, geometry, bits = space.arrays
+    bounds = np.zeros(len(points))
+    bounds_at(field, geometry, np.ascontiguousarray(points), bounds)
+    in_exit = (lengths < space.limits[index.EXEMPT_LENGTH]) if branch >= 0 else np.zeros(len(points), bool)
+    cap = float(bounds.min()) + 1.0
+    while True:
+        least = cap
+        for spared, chosen in ((branch, in_exit), (-1, ~in_exit)):
+            # The bound is never above the distance, so the points left out are farther away than the cap.
+            near = np.ascontiguousarray(points[chosen & (bounds < cap)])
+            distances = np.full(len(near), cap)
+            exact_at(labels, geometry, near, bits, spared, cap, distances)
+            least = min(least, float(distances.min(initial=cap)))
+        if least < cap or cap > WIDEST_CLEARANCE_MM:
+            return least - space.needle.radius_mm
+        cap *= 2.0

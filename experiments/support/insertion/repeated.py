@@ -1,0 +1,139 @@
+"""Insertions of one needle many times, in open and in closed loop: how often they reach the target."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from experiments.support.insertion.closed_loop import (
+    GAIN,
+    STEP_MM,
+    TOLERANCE_MM,
+    Insertion,
+    Outcome,
+    simulate,
+)
+from experiments.support.insertion.truth import Errors
+from stages.needle.objective import SHORTEST, Objective
+from stages.needle.path import ArcPath
+from stages.needle.replanning.replanner import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
+from stages.needle.search.base import Query
+from stages.needle.space import NeedleSpace
+
+Z_95 = 1.959963984540054
+"""Two-sided 95 % quantile of the normal distribution."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Summary:
+    """What became of many insertions.
+
+    Parameters
+    ----------
+    insertions : tuple of Insertion
+    outcomes : dict
+        How often each outcome came.
+    reached_share, reached_low, reached_high : float
+        Share that reached the target, and its 95 % interval [Wilson1927].
+    median_error_mm, error_95_mm : float
+        Median and 95 % quantile of the tip error, over all insertions wherever they ended.
+    clearance_mm : float
+        Smallest of all.
+    """
+
+    insertions: tuple[Insertion, ...]
+    outcomes: dict[Outcome, int]
+    reached_share: float
+    reached_low: float
+    reached_high: float
+    median_error_mm: float
+    error_95_mm: float
+    clearance_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Study:
+    """The same needles in open and in closed loop."""
+
+    open_loop: Summary
+    closed_loop: Summary
+
+
+def study(
+    space: NeedleSpace,
+    query: Query,
+    plan: ArcPath,
+    errors: Errors,
+    *,
+    seeds: Iterable[int],
+    step_mm: float = STEP_MM,
+    tolerance_mm: float = TOLERANCE_MM,
+    gain: float = GAIN,
+    objective: Objective = SHORTEST,
+    replanning: ReplanSettings = DEFAULT_SETTINGS,
+    iterations: int = ITERATIONS,
+) -> Study:
+    """Insert one needle for each seed, in open and in closed loop.
+
+    Parameters are those of `simulate`.
+
+    Raises
+    ------
+    SettingsError
+        If there is no seed, and as `simulate`.
+    """
+    chosen = tuple(seeds)
+
+    def insertions(closed_loop: bool) -> Iterator[Insertion]:
+        for seed in chosen:
+            yield simulate(
+                space, query, plan, errors, closed_loop=closed_loop, seed=seed, step_mm=step_mm,
+                tolerance_mm=tolerance_mm, gain=gain, objective=objective, replanning=replanning,
+                iterations=iterations,
+            )  # fmt: skip
+
+    return Study(open_loop=summary(insertions(False)), closed_loop=summary(insertions(True)))
+
+
+def summary(insertions: Iterable[Insertion]) -> Summary:
+    """Count outcomes and errors.
+
+    Raises
+    ------
+    SettingsError
+        If there is no insertion.
+    """
+    runs = tuple(insertions)
+    if not runs:
+        raise SettingsError("A study has no insertions", expected="at least one seed")
+    outcomes = {outcome: sum(run.outcome is outcome for run in runs) for outcome in Outcome}
+    errors = np.array([run.tip_error_mm for run in runs])
+    low, high = wilson_interval(outcomes[Outcome.REACHED], len(runs))
+    return Summary(
+        insertions=runs,
+        outcomes=outcomes,
+        reached_share=outcomes[Outcome.REACHED] / len(runs),
+        reached_low=low,
+        reached_high=high,
+        median_error_mm=float(np.median(errors)),
+        error_95_mm=float(np.quantile(errors, 0.95)),
+        clearance_mm=min(run.clearance_mm for run in runs),
+    )
+
+
+def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share [Wilson1927].
+
+    Parameters
+    ----------
+    successes, runs : int
+        At least one run.
+    """
+    share, z2 = successes / runs, Z_95 * Z_95
+    middle = (share + 0.5 * z2 / runs) / (1.0 + z2 / runs)
+    half = Z_95 * math.sqrt(share * (1.0 - share) / runs + 0.25 * z2 / runs**2) / (1.0 + z2 / runs)
+    return max(middle - half, 0.0), min(middle + half, 1.0)

@@ -1,0 +1,187 @@
+"""Routes, deployments and needles that are not what is stated about them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from anatomy.grid import Float
+from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way
+from lungaccess.plans.plan import Plan
+from stages.needle.path import ArcPath
+
+
+def route_cut(case: Case, rng: Rng) -> Mutant | None:
+    """The first or the last points of the route are missing, or some between."""
+    scope = case.plan.scope
+    count = len(scope.points_lps)
+    many = int(rng.integers(1, max(count // 2, 2)))
+    kind = int(rng.integers(3))
+    kept = np.arange(many, count) if kind == 0 else np.arange(count - many)
+    if kind == 2:
+        before_tip = np.linalg.norm(scope.points_lps - scope.points_lps[-1], axis=1)
+        kept = np.append(np.flatnonzero(before_tip > rng.uniform(6.0, 40.0)), count - 1)
+    if not 2 <= len(kept) < count:
+        return None
+    return Mutant(
+        plan=changed(
+            case.plan,
+            scope__points_lps=scope.points_lps[kept],
+            scope__lumen_radius_mm=scope.lumen_radius_mm[kept],
+            scope__branches=scope.branches[kept],
+        )
+    )
+
+
+def route_moved(case: Case, rng: Rng) -> Mutant | None:
+    """The route, or one point of it, lies beside the axis."""
+    points = case.plan.scope.points_lps.copy()
+    if rng.integers(2):
+        points += signed(rng, 0.03, 20.0) * way(rng)
+    else:
+        n = int(rng.integers(1, len(points) - 1))
+        along = points[n + 1] - points[n - 1]
+        aside = np.cross(along, way(rng))
+        points[n] += far(rng, 0.4, 10.0) * aside / np.linalg.norm(aside)
+    return Mutant(plan=changed(case.plan, scope__points_lps=points))
+
+
+def route_statement_edited(case: Case, rng: Rng) -> Mutant | None:
+    """A number about the route that is not so."""
+    scope, tree = case.plan.scope, case.lung.tree
+    radii, branches = scope.lumen_radius_mm.copy(), scope.branches.copy()
+    n = int(rng.integers(len(radii)))
+    radii[n] = 0.0 if rng.integers(2) and radii[n] > 2.5 else min(radii[n] + far(rng, 1.5, 5.0), 14.9)
+    at = int(np.linalg.norm(tree.points_lps - scope.points_lps[n], axis=1).argmin())
+    strangers = np.setdiff1d(np.arange(tree.n_branches), branch_and_kin(tree, int(tree.branch_of_point[at])))
+    if not len(strangers) or radii[n] == scope.lumen_radius_mm[n]:
+        return None
+    branches[n] = rng.choice(strangers)
+    over = next(each.value for each in case.report.findings if each.name == "scope.margin") or 0.0
+    distant = np.flatnonzero(np.linalg.norm(tree.points_lps - scope.points_lps[-1], axis=1) > 0.01)
+    edits: dict[str, Any] = {
+        "scope__lumen_radius_mm": radii,
+        "scope__branches": branches,
+        "scope__min_lumen_margin_mm": scope.min_lumen_margin_mm - over + far(rng, 0.1, 10.0),
+        "scope__generation": scope.generation + int(rng.choice([-1, 1, 2])),
+        "scope__length_mm": scope.length_mm + signed(rng, 0.01, 50.0),
+        "scope__length_from_carina_mm": scope.length_from_carina_mm + far(rng, 0.05, 50.0),
+        "scope__site_point": int(rng.choice(distant)),
+    }
+    key = str(rng.choice(list(edits)))
+    return Mutant(plan=changed(case.plan, **{key: edits[key]}))
+
+
+def branch_and_kin(tree: Any, branch: int) -> list[int]:
+    """Return a branch, its parent, its children and its siblings."""
+    parent = int(tree.branch_parent[branch])
+    kin = [n for n, p in enumerate(tree.branch_parent) if p in (branch, parent)]
+    return [branch, parent, *kin]
+
+
+def tube_edited(case: Case, rng: Rng) -> Mutant | None:
+    """Another rotation or insertion than leads to the stated tip."""
+    tube, inner = case.plan.tube, case.plan.system.tubes.inner
+    kind = int(rng.integers(3))
+    if kind == 0:
+        return Mutant(
+            plan=changed(case.plan, tube__rotation_rad=tube.rotation_rad + signed(rng, 1e-3, np.pi))
+        )
+    if kind == 1:
+        inserted = tube.inner_insertion_mm + signed(rng, 0.01, 10.0)
+        return Mutant(plan=changed(case.plan, tube__inner_insertion_mm=inserted))
+    inserted = tube.outer_insertion_mm + signed(rng, 0.1, 10.0)
+    # Where the tubes are straight the outer tube's end changes no shape.
+    if min(inserted, tube.outer_insertion_mm) < tube.inner_insertion_mm - inner.curved_length_mm:
+        return None
+    return Mutant(plan=changed(case.plan, tube__outer_insertion_mm=inserted))
+
+
+def exit_edited(case: Case, rng: Rng) -> Mutant | None:
+    """Another place, angle or branch of the exit."""
+    way_out = case.plan.tube.exit
+    point = way_out.point_lps + far(rng, 0.1, 20.0) * way(rng)
+    branch = int(rng.choice(np.setdiff1d(np.arange(-1, case.lung.tree.n_branches + 1), [way_out.branch])))
+    edits: list[dict[str, Any]] = [
+        {"tube__exit__point_lps": point},
+        {"exemption__exit_point_lps": point},
+        {"tube__exit__point_lps": point, "exemption__exit_point_lps": point},
+        {"tube__exit__arc_length_mm": way_out.arc_length_mm + signed(rng, 0.05, 20.0)},
+        {"tube__exit__wall_angle_rad": way_out.wall_angle_rad + signed(rng, 0.12, 1.5)},
+        {"tube__exit__branch": branch},
+        {"exemption__branch": branch},
+        {"tube__exit__branch": branch, "exemption__branch": branch},
+    ]
+    return Mutant(plan=changed(case.plan, **edits[int(rng.integers(len(edits)))]))
+
+
+def exemption_longer(case: Case, rng: Rng) -> Mutant | None:
+    """More needle is exempt than the device allows, or less than none."""
+    limit = case.plan.system.needle.exit_exemption_mm
+    length = -far(rng, 0.01, 5.0) if rng.integers(4) == 0 else limit + far(rng, 1e-4, 30.0)
+    return Mutant(plan=changed(case.plan, exemption__needle_length_mm=length))
+
+
+def arcs_edited(case: Case, rng: Rng) -> Mutant | None:
+    """Length, roll or curvature of arcs, or arcs lost or swapped: the needle ends elsewhere."""
+    arcs = list(case.plan.needle.arcs)
+    n = int(rng.integers(len(arcs)))
+    arc = arcs[n]
+    kind = int(rng.integers(6))
+    if kind == 0:
+        arcs[n] = replace(arc, length_mm=arc.length_mm + signed(rng, 0.01, 10.0))
+    elif kind == 1:
+        arcs[n] = replace(arc, roll_rad=arc.roll_rad + signed(rng, 0.01, np.pi))
+    elif kind == 2:
+        arcs[n] = replace(arc, curvature_per_mm=-arc.curvature_per_mm)
+    elif kind == 3:
+        arcs[n] = replace(arc, curvature_per_mm=arc.curvature_per_mm * far(rng, 1.1, 3.0))
+    elif kind == 4 and len(arcs) > 1:
+        del arcs[n]
+    elif kind == 5 and len(arcs) > 1:
+        arcs[n], arcs[n - 1] = arcs[n - 1], arcs[n]
+    ends = [end_of(case.plan, each) for each in (arcs, case.plan.needle.arcs)]
+    moved = float(np.linalg.norm(ends[0] - ends[1]))
+    if moved < 0.01:
+        return None
+    edits: dict[str, Any] = {"needle__arcs": tuple(arcs)}
+    if rng.integers(2):
+        length = float(sum(each.length_mm for each in arcs))
+        edits |= {"needle__length_mm": length, "costs": {**case.plan.costs, "length_mm": length}}
+    if rng.integers(2) and not case.plan.target_origin.startswith("nodule"):
+        edits |= {"needle__end_lps": ends[0]}
+    return Mutant(plan=changed(case.plan, **edits))
+
+
+def end_of(plan: Plan, arcs: Any) -> Float:
+    """Return where the needle ends with these arcs."""
+    rows = np.array([[a.length_mm, a.roll_rad, a.curvature_per_mm] for a in arcs])
+    return np.asarray(ArcPath(lps_from_start=plan.needle.lps_from_start, arcs=rows).frames()[-1][:3, 3])
+
+
+def needle_statement_edited(case: Case, rng: Rng) -> Mutant | None:
+    """A number about the needle that is not so."""
+    needle = case.plan.needle
+    edits: dict[str, Any] = {
+        "needle__length_mm": needle.length_mm + signed(rng, 1e-5, 20.0),
+        "needle__accumulated_turn_rad": needle.accumulated_turn_rad + signed(rng, 2e-3, 1.0),
+        "needle__max_angle_from_start_rad": needle.max_angle_from_start_rad + signed(rng, 2e-3, 1.0),
+        "needle__end_lps": needle.end_lps + far(rng, 0.01, 20.0) * way(rng),
+        "needle__arcs": (),
+    }
+    key = str(rng.choice(list(edits)))
+    return Mutant(plan=changed(case.plan, **{key: edits[key]}))
+
+
+MUTATIONS: tuple[Mutation, ...] = (
+    route_cut,
+    route_moved,
+    route_statement_edited,
+    tube_edited,
+    exit_edited,
+    exemption_longer,
+    arcs_edited,
+    needle_statement_edited,
+)

@@ -1,0 +1,21 @@
+"""All mutations by name, and a random one that applies to a plan."""
+
+from __future__ import annotations
+
+from experiments.support import mutants_of_motion, mutants_of_place, mutants_of_record, mutants_of_tissue
+from experiments.support.mutants import Case, Mutant, Mutation, Rng
+
+MUTATIONS: dict[str, Mutation] = {
+    mutation.__name__: mutation
+    for family in (mutants_of_record, mutants_of_motion, mutants_of_place, mutants_of_tissue)
+    for mutation in family.MUTATIONS
+}
+
+
+def mutate(case: Case, rng: Rng) -> tuple[str, Mutant]:
+    """Return the name of a random mutation that applies, and its mutant."""
+    while True:
+        name = str(rng.choice(list(MUTATIONS)))
+        mutant = MUTATIONS[name](case, rng)
+        if mutant is not None:
+            return name, mutant

@@ -1,0 +1,126 @@
+"""RRT and RRT* on centreline samples, the baselines of [Li2021]."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.grid import Float
+from anatomy.settings import quantity, settings
+from experiments.support.route_sampling import grow
+from stages.scope.route.centreline import Centreline
+from stages.scope.route.curve import Curve, interpolate
+from stages.scope.route.proof import prove
+from stages.scope.route.search import NoRouteError
+from stages.scope.route.settings import RouteLimits
+
+
+@settings
+class SamplingSettings:
+    """How the baselines are set up; the first three numbers are the paper's.
+
+    Parameters
+    ----------
+    samples : int
+        Most samples to take.
+    goal_probability : float
+        How often a sample is followed by an attempt to connect the goal.
+    neighbours : int
+        How many near vertices RRT* looks at.
+    step_mm : float
+        Longest edge; the paper states none.
+    look_mm : float
+        Spacing of the points at which an edge is tested.
+
+    Raises
+    ------
+    SettingsError
+        If a value is out of its range.
+    """
+
+    samples: Annotated[int, quantity("most samples", at_least=1, at_most=10_000_000)] = 4048
+    goal_probability: Annotated[float, quantity("chance to try the goal", at_least=0.0, at_most=1.0)] = 0.1
+    neighbours: Annotated[int, quantity("near vertices to rewire", at_least=1, at_most=10_000)] = 32
+    step_mm: Annotated[float, quantity("longest edge", above=0.0, at_most=1000.0)] = 3.0
+    look_mm: Annotated[float, quantity("spacing of the tests of an edge", above=0.0, at_most=10.0)] = 0.25
+
+
+def sampled_route(
+    centreline: Centreline,
+    start_mm: Float,
+    goal_mm: Float,
+    limits: RouteLimits,
+    *,
+    star: bool,
+    seed: int,
+    settings: SamplingSettings | None = None,
+    any_curve: bool = False,
+) -> tuple[Curve, bool]:
+    """Return the first curve found by RRT, or by RRT* if `star`, that is proved to keep the limits.
+
+    The trees know nothing of curvature: each way to the goal becomes a cubic spline through its vertices,
+    which keeps the limits more often than one through points every 3 mm; if it breaks one, sampling goes on.
+
+    Parameters
+    ----------
+    centreline : Centreline
+    start_mm, goal_mm : (3,) float64
+    limits : RouteLimits
+    star : bool
+    seed : int
+    settings : SamplingSettings, optional
+    any_curve : bool
+        Take the first way that is found, whether its curve keeps the limits or not.
+
+    Returns
+    -------
+    (Curve, bool)
+        The curve and whether it is proved; the last one found if none is.
+
+    Raises
+    ------
+    NoRouteError
+        If the goal was never connected within the samples.
+
+    References
+    ----------
+    .. [Li2021] docs/bibliography.md
+    """
+    chosen = settings or SamplingSettings()
+    points, parent = np.zeros((chosen.samples + 1, 3)), np.full(chosen.samples + 1, -1, dtype=np.int64)
+    cost, counts = np.zeros(chosen.samples + 1), np.array((1, 0, -1))
+    points[0] = start_mm
+    goal = np.ascontiguousarray(goal_mm, dtype=np.float64)
+    numbers = (limits.needed_mm, chosen.step_mm, chosen.look_mm, chosen.goal_probability)
+    state = np.array([seed], dtype=np.uint64)
+    found: Curve | None = None
+    proved = False
+    while not proved and grow(
+        centreline.nodes_mm, goal, centreline.cones, *centreline.cells, np.array(numbers),
+        chosen.neighbours if star else 0, points, parent, cost, counts, state,
+    ):  # fmt: skip
+        found = interpolate(_way_to_root(points, parent, int(counts[2]), goal))
+        proved = prove(
+            found,
+            centreline,
+            max_curvature_per_mm=limits.max_curvature_per_mm,
+            needed_mm=limits.needed_mm,
+        ).holds
+        if any_curve:
+            break
+    if found is None:
+        raise NoRouteError(
+            f"The goal was not connected within {chosen.samples} samples", remedy="Allow more samples"
+        )
+    return found, proved
+
+
+def _way_to_root(points: Float, parent: NDArray[np.int64], vertex: int, goal: Float) -> Float:
+    """Return the vertices from the root to the goal, `(V, 3)`."""
+    way = [goal]
+    while vertex >= 0:
+        way.append(points[vertex])
+        vertex = int(parent[vertex])
+    return np.array(way[::-1])

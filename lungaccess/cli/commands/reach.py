@@ -1,0 +1,178 @@
+"""The command `lungaccess reach`: what a system, or several, can reach of a patient's lung."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from anatomy.io.files import atomic_write, require_writable_folder
+from lungaccess.cli import terminal
+from lungaccess.cli.commands.common import OK
+from lungaccess.cli.inputs import load_device, load_lung
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from lungaccess.reachability.reach_map import ReachMap, RegionReach
+
+
+def reach(
+    patient: Path,
+    *,
+    system: str = "lung-default",
+    spacing: float = 3.0,
+    search: int = 0,
+    compare: str | None = None,
+    allow_fissures: bool | None = None,
+    out: Path = Path("lungaccess-reach"),
+    page: Path | None = None,
+    json: bool = False,
+    cache: Path | None = None,
+) -> int:
+    """Map what a system reaches of the lung, and write the map as volumes for 3D Slicer and as a picture.
+
+    A run that was stopped goes on where it was if it is started again with the same options.
+
+    Parameters
+    ----------
+    patient : Path
+        Folder of masks.
+    system : str
+        Name of a preset, or path of a TOML file.
+    spacing : float
+        Side of the map's voxels, mm.
+    search : int
+        Random trees for each point that no single arc reaches; 0 for single arcs only.
+    compare : str
+        Further presets or TOML files to compare with, separated by commas.
+    allow_fissures : bool
+        Whether fissures may be crossed; as each system says if not given.
+    out : Path
+        Folder for the volumes, the pictures and reach.json.
+    page : Path
+        HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
+    json : bool
+        Print JSON instead of tables.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.reachability.reach_map import compare as compare_systems
+    from lungaccess.report import reach_png
+
+    names = [system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
+    systems = [load_device(name, allow_fissures) for name in dict.fromkeys(names)]
+    folder = require_writable_folder(out)
+    if page is not None:
+        require_writable_folder(page.parent)
+    lung = load_lung(patient, cache)
+    with progress("scanning") as shown:
+        maps = compare_systems(
+            lung,
+            systems,
+            spacing_mm=spacing,
+            trees=search,
+            work=folder,
+            progress=shown.step,
+        )
+    stems = _stems(maps)
+    for stem, each in zip(stems, maps, strict=True):
+        each.save(folder, stem)
+        reach_png(each, lung, folder / f"{stem}.png")
+    written = [record(each) for each in maps]
+    with atomic_write(folder / "reach.json") as temporary:
+        temporary.write_text(json_format.dumps(written, indent=2) + "\n", encoding="utf-8")
+    if page is not None:
+        from lungaccess.report.html import reach_page
+
+        reach_page(maps, lung, page)
+    if json:
+        terminal.show_json(written)
+        return OK
+    terminal.show([_region_table(each) for each in maps])
+    if len(maps) > 1:
+        terminal.show([_comparison_table(maps)])
+    files = ", ".join(f"{stem}.nrrd, {stem}-cost.nrrd, {stem}-clearance.nrrd, {stem}.png" for stem in stems)
+    also = "" if page is None else f"; {page}"
+    terminal.console.print(terminal.escaped(f"Written to {out}: {files}, reach.json{also}"))
+    return OK
+
+
+def _stems(maps: tuple[ReachMap, ...]) -> list[str]:
+    """Return a file name for each map, without what a file name may not hold."""
+    if len(maps) == 1:
+        return ["reach"]
+    plain = ["".join(c if c.isalnum() or c in "-_" else "-" for c in each.system.name) for each in maps]
+    return [f"reach-{n}-{name}" for n, name in enumerate(plain, start=1)]
+
+
+def record(reach: ReachMap) -> dict[str, object]:
+    """Return the figures of a map as plain values."""
+    system = reach.system
+    return {
+        "patient": reach.patient_name,
+        "system": system.name,
+        "scope_diameter_mm": system.scope.outer_diameter_mm,
+        "needle_diameter_mm": system.needle.diameter_mm,
+        "needle_radius_of_curvature_mm": system.needle.min_radius_of_curvature_mm,
+        "fissures_are_obstacles": reach.with_fissures,
+        "spacing_mm": float(reach.kinds.grid.spacing_mm[0]),
+        "deployments": reach.entries,
+        "sides_told_apart": reach.regions.told_apart,
+        "regions": [_plain(row) for row in reach.by_region()],
+        "resumed_layers": reach.resumed_layers,
+        "timing": {"scan_s": reach.scan_s, "atlas_s": reach.atlas_s},
+    }
+
+
+def _plain(row: RegionReach) -> dict[str, object]:
+    from lungaccess.reachability.reach_map import KINDS
+
+    return {
+        "name": row.name,
+        "volume_ml": row.volume_ml,
+        "shares": dict(zip(KINDS, row.shares, strict=True)),
+        "median_cost": row.median_cost if row.reached else None,
+        "median_clearance_mm": row.median_clearance_mm if row.reached else None,
+    }
+
+
+def _region_table(reach: ReachMap) -> Table:
+    from lungaccess.reachability.reach_map import KINDS
+
+    rows = [
+        (
+            row.name,
+            f"{row.volume_ml:.0f}",
+            *(f"{100.0 * share:.1f}" for share in row.shares),
+            f"{row.median_cost:.2f}",
+            f"{row.median_clearance_mm:.2f}",
+        )
+        for row in reach.by_region()
+    ]
+    headings = ("", "mL", *(f"{name}, %" for name in KINDS), "median cost", "median clearance, mm")
+    return terminal.table(f"{reach.system.name} in {reach.patient_name}", headings, rows)
+
+
+def _comparison_table(maps: tuple[ReachMap, ...]) -> Table:
+    first = maps[0]
+    rows = [
+        (
+            each.system.name,
+            f"{each.system.scope.outer_diameter_mm:g}",
+            f"{each.system.needle.diameter_mm:g}",
+            f"{each.system.needle.min_radius_of_curvature_mm:.0f}",
+            *(f"{100.0 * row.reached:.1f}" for row in each.by_region()),
+            f"{gained:.0f}",
+            f"{lost:.0f}",
+        )
+        for each in maps
+        for gained, lost in [each.gained_and_lost_ml(first)]
+    ]
+    names = [row.name for row in first.by_region()]
+    headings = (
+        "system", "scope, mm", "needle, mm", "radius, mm", *(f"{name}, %" for name in names), "gained, mL",
+        "lost, mL",
+    )  # fmt: skip
+    return terminal.table("Share reached; volume gained and lost beside the first", headings, rows)

@@ -1,0 +1,114 @@
+"""The command `lungaccess report`: everything about a plan on one page that opens offline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from anatomy.errors import SettingsError
+from anatomy.io.files import require_writable_folder
+from lungaccess.cli import terminal
+from lungaccess.cli.commands.common import OK
+from lungaccess.cli.inputs import load_lung
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.plans.plan import Plan
+
+HISTORY_FILE = "cost_over_time.csv"
+
+
+def report(
+    plan: Path,
+    patient: Path,
+    *,
+    out: Path | None = None,
+    alternatives: int = 0,
+    ct: Path | None = None,
+    movie: Path | None = None,
+    samples: int = 2000,
+    seed: int = 0,
+    instructions: bool = True,
+    json: bool = False,
+    cache: Path | None = None,
+) -> int:
+    """Write a page about a stored plan: it plays in 3-D, with slices, charts, limits and risk; one HTML file.
+
+    Parameters
+    ----------
+    plan : Path
+        The plan.json; cost_over_time.csv beside it is shown, too.
+    patient : Path
+        Folder of the patient it was made for.
+    out : Path
+        The HTML file; report.html beside the plan if not given.
+    alternatives : int
+        So many other plans to the same target are searched and shown on demand.
+    ct : Path
+        CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, if there is
+        one, else the structures of the masks.
+    movie : Path
+        WebP file for the flight through the airway to the scope's place.
+    samples : int
+        Deviated plans of the estimate of risk; 0 leaves it out.
+    seed : int
+        Seed of that estimate.
+    instructions : bool
+        Whether the scope's way is searched and told turn by turn.
+    json : bool
+        Print JSON instead of text.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.plans.plan import Plan
+    from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page
+    from lungaccess.report.html.volumes import find_ct, read_ct
+
+    if alternatives < 0 or samples < 0:
+        raise SettingsError(
+            f"{alternatives} alternatives and {samples} samples are asked for", expected="no negative number"
+        )
+    page = plan.with_name("report.html") if out is None else out
+    for file in (page, *([movie] if movie is not None else [])):
+        require_writable_folder(file.parent)
+    stored = Plan.load(plan)
+    lung = load_lung(patient, cache)
+    image = ct if ct is not None else find_ct(patient)
+    with progress("making the page"):
+        options = PageOptions(
+            alternatives=_others(stored, lung, alternatives, cache) if alternatives else (),
+            ct=None if image is None else read_ct(image),
+            ct_name="" if image is None else image.name,
+            cost_over_time=plan.with_name(HISTORY_FILE),
+            risk_samples=samples,
+            risk_seed=seed,
+            instructions=instructions,
+        )
+        plan_page(stored, lung, page, options)
+        if movie is not None:
+            bronchoscopy_webp(stored, lung, movie)
+    files = [str(file) for file in (page, movie) if file is not None]
+    if json:
+        terminal.show_json({"files": files, "page_bytes": page.stat().st_size})
+        return OK
+    written = ", ".join(files)
+    size = page.stat().st_size / 1e6
+    terminal.console.print(terminal.escaped(f"Written: {written} (the page has {size:.1f} MB)"))
+    return OK
+
+
+def _others(plan: Plan, lung: Lung, count: int, cache: Path | None) -> tuple[Plan, ...]:
+    """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it."""
+    from lungaccess.coupled.alternatives import alternatives as find
+    from lungaccess.coupled.atlas_store import open_atlas
+    from lungaccess.plans.no_plan import NoPlan
+    from lungaccess.problem.target import Target
+
+    target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
+    atlas = open_atlas(lung, plan.system, cache=cache)
+    try:
+        menu = find(lung, plan.system, target, objective=plan.objective, count=count, atlas=atlas)
+    except NoPlan:
+        return ()
+    return tuple(each.plan for each in menu)

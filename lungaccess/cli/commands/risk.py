@@ -1,0 +1,153 @@
+"""The command `lungaccess risk`: how likely a stored plan succeeds if the devices deviate from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lungaccess.cli import terminal
+from lungaccess.cli.commands.common import OK
+from lungaccess.cli.inputs import load_lung
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from lungaccess.risk.assessment import RiskReport, Share
+    from lungaccess.risk.tolerances import Tolerance
+
+
+def risk(
+    plan: Path,
+    patient: Path,
+    *,
+    errors: Path | None = None,
+    samples: int = 10_000,
+    radius: float | None = None,
+    probability: float = 0.95,
+    seed: int = 0,
+    json: bool = False,
+    cache: Path | None = None,
+) -> int:
+    """Estimate how likely a stored plan succeeds if the devices deviate from it, open loop.
+
+    Parameters
+    ----------
+    plan : Path
+        The plan.json.
+    patient : Path
+        Folder of the patient it was made for.
+    errors : Path
+        TOML file of the error model; the default one, all of it assumed, if not given.
+    samples : int
+        Number of deviated plans.
+    radius : float
+        Radius of the goal in mm; by default that of the nodule, or 5 if the target lies in none.
+    probability : float
+        Probability of success that the tolerances keep.
+    seed : int
+        Seed of the random numbers.
+    json : bool
+        Print JSON instead of tables.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.plans.plan import Plan
+    from lungaccess.risk.assessment import assess
+    from lungaccess.risk.errors import ErrorModel, load_errors
+    from lungaccess.risk.tolerances import tolerances
+
+    model = ErrorModel() if errors is None else load_errors(errors)
+    stored = Plan.load(plan)
+    lung = load_lung(patient, cache)
+    with progress("deviating the plan"):
+        report = assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
+    with progress("looking for the largest errors"):
+        kept = tolerances(stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius)
+    if json:
+        terminal.show_json(record(report, kept))
+    else:
+        terminal.show([_outcome_table(report), _tolerance_table(kept)])
+    return OK
+
+
+def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]:
+    """Return a report and tolerances as plain values."""
+    from anatomy.settings import to_mapping
+
+    return {
+        "errors": to_mapping(report.model),
+        "samples": report.samples,
+        "seed": report.seed,
+        "radius_mm": report.radius_mm,
+        "radius_origin": report.radius_origin,
+        "succeeds": _plain(report.succeeds),
+        "reaches": _plain(report.reaches),
+        "touches": {name: _plain(share) for name, share in report.touches.items()},
+        "forbidden": list(report.forbidden),
+        "miss_mm": {f"{share:g}": miss for share, miss in report.miss_mm.items()},
+        "tolerances": [
+            {
+                "kind": each.kind,
+                "unit": each.unit,
+                "stated": each.stated,
+                "probability": each.probability,
+                "largest": each.largest,
+                "margin": list(each.margin),
+                "succeeds_with_it_alone": _plain(report.alone[each.kind]),
+            }
+            for each in kept
+        ],
+    }
+
+
+def _plain(share: Share) -> dict[str, object]:
+    return {"probability": share.value, "interval_95": list(share.interval)}
+
+
+def _outcome_table(report: RiskReport) -> Table:
+    def row(name: str, share: Share) -> terminal.Row:
+        low, high = share.interval
+        return name, f"{100.0 * share.value:.2f}", f"{100.0 * low:.2f} to {100.0 * high:.2f}"
+
+    rows = [
+        row("succeeds", report.succeeds),
+        row(f"ends within {report.radius_mm:.2f} mm", report.reaches),
+    ]
+    for name, share in report.touches.items():
+        words = name if name.startswith("stays") else f"touches {name}"
+        rows.append(row(words if name in report.forbidden else f"{words} (allowed)", share))
+    rows += [
+        (f"{100.0 * share:.0f} % end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()
+    ]
+    title = f"{report.samples} deviated plans; radius: {report.radius_origin}"
+    return terminal.table(title, ("", "%", "95 % interval"), rows)
+
+
+def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:
+    rows = [
+        (
+            each.kind.replace("_", " "),
+            each.unit,
+            f"{each.stated:g}" if isinstance(each.stated, float) else "{:g} to {:g}".format(*each.stated),
+            f"{100.0 * each.alone.value:.1f}",
+            _largest(each),
+            "{:.2f}, {:.2f}".format(*each.margin),
+        )
+        for each in kept
+    ]
+    headings = (
+        "one kind alone", "unit", "stated", "succeeds, %",
+        f"largest for {100.0 * kept[0].probability:g} %", "never fails within",
+    )  # fmt: skip
+    return terminal.table("Tolerance", headings, rows)
+
+
+def _largest(tolerance: Tolerance) -> str:
+    from lungaccess.risk.tolerances import LARGEST
+
+    size = tolerance.largest
+    more = "at least " if size >= LARGEST[tolerance.unit] else ""
+    if tolerance.kind == "needle_curvature":
+        return f"{more}{1.0 / size:.2f} to {size:.2f}"
+    return f"{more}{size:.2f}"

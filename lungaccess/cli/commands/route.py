@@ -1,0 +1,127 @@
+"""The command `lungaccess route`: a way along airways or vessels for a device of limited curvature."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from anatomy.errors import SettingsError
+from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.frames import Frame, parse_point
+from lungaccess.cli import terminal
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from stages.scope.route.planner import Route
+
+PROVED, NO_ROUTE = 0, 1
+
+
+def route(
+    source: Path,
+    *,
+    goal: str,
+    start: str | None = None,
+    curvature: float,
+    radius: float = 0.0,
+    margin: float = 0.0,
+    tolerance: float = 0.0,
+    repair: Literal["exact", "ga"] = "exact",
+    seed: int = 0,
+    frame: Frame | None = None,
+    pixel: float | None = None,
+    out: Path = Path("lungaccess-route"),
+    json: bool = False,
+    cache: Path | None = None,
+) -> int:
+    """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, and draw it.
+
+    Parameters
+    ----------
+    source : Path
+        Folder of a patient, a centreline with radii (.vtp, .vtu), a mask of vessels, or a drawing (.png).
+    goal : str
+        Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the right, y down.
+    start : str
+        Start; the widest end of the tubes if not given.
+    curvature : float
+        Largest curvature of the device, 1/mm.
+    radius : float
+        Outer radius of the device, mm.
+    margin : float
+        Gap that must remain between device and wall, mm.
+    tolerance : float
+        How far the ends of the route may lie from start and goal, mm.
+    repair : str
+        exact: a nonlinear program; ga: the genetic search of Li et al. 2021.
+    seed : int
+        Seed of the genetic search.
+    frame : str
+        Frame of a centreline file or mask that states none.
+    pixel : float
+        Size of a pixel of a drawing, mm.
+    out : Path
+        Folder for route.json and route.png.
+    json : bool
+        Print JSON instead of a table.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.one_stage.route import open_source, record, widest_end
+    from lungaccess.report.route import route_png
+    from stages.scope.route.planner import try_route
+    from stages.scope.route.settings import RouteLimits
+
+    limits = RouteLimits(
+        max_curvature_per_mm=curvature,
+        device_radius_mm=radius,
+        wall_margin_mm=margin,
+        end_tolerance_mm=tolerance,
+    )
+    end = parse_point(goal)
+    begin = None if start is None else parse_point(start)
+    if seed < 0:
+        raise SettingsError(f"--seed is {seed}", expected="at least 0")
+    require_writable_folder(out)
+    with progress("route") as shown:
+        shown.step("reading the tubes")
+        opened = open_source(source, frame=frame, pixel_mm=pixel, cache=cache)
+        shown.step("planning")
+        first = widest_end(opened.centreline) if begin is None else begin
+        found = try_route(opened.centreline, first, end, limits, repair=repair, seed=seed)
+    written = record(opened, found)
+    with atomic_write(out / "route.json") as temporary:
+        temporary.write_text(json_format.dumps(written, indent=2) + "\n", encoding="utf-8")
+    route_png(opened.name, opened.centreline, found, out / "route.png")
+    if json:
+        terminal.show_json(written)
+        return PROVED if found.proved else NO_ROUTE
+    terminal.show([terminal.table(f"Route along {opened.name}", ("", "", "limit"), _rows(found, written))])
+    terminal.console.print(terminal.escaped(f"Written to {out}: route.json, route.png"))
+    return _verdict(found)
+
+
+def _rows(found: Route, written: dict[str, object]) -> list[terminal.Row]:
+    limits = found.limits
+    return [
+        ("length", f"{written['length_mm']:.1f} mm", ""),
+        ("largest curvature", f"{written['largest_curvature_per_mm']:.4f} per mm",
+         f"at most {limits.max_curvature_per_mm:g}"),
+        ("least distance to wall", f"{written['least_wall_mm']:.2f} mm", f"at least {limits.needed_mm:g}"),
+        ("mean distance to wall", f"{written['mean_wall_mm']:.2f} mm", ""),
+        ("ends off by", f"{found.end_error_mm:.2f} mm", f"at most {limits.end_tolerance_mm:g}"),
+        ("proved on the whole curve", "yes" if found.proved else "NO", ""),
+    ]  # fmt: skip
+
+
+def _verdict(found: Route) -> int:
+    from stages.scope.route.planner import require_proved
+    from stages.scope.route.search import NoRouteError
+
+    try:
+        require_proved(found)
+    except NoRouteError as error:
+        terminal.show_error(error)
+        return NO_ROUTE
+    return PROVED

@@ -1,0 +1,178 @@
+"""The command `lungaccess segment`: from a CT to a patient folder for planning."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.panel import Panel
+
+from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.frames import parse_point
+from lungaccess.cli import terminal
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from anatomy.segmentation.pipeline import Segmentation
+    from anatomy.segmentation.quality import Quality
+
+STEP_SHARES = {
+    "reading the CT": 0.02,
+    "checking the CT": 0.06,
+    "lungs: coarse image": 0.08,
+    "lungs: boundary": 0.14,
+    "airway tree": 0.85,
+    "pictures": 0.95,
+}
+"""Share of the work that is done when a step begins, as measured on a CT of 512 x 512 x 275 voxels."""
+
+
+def segment(
+    ct: Path,
+    *,
+    out: Path,
+    nodule_contours: Path | None = None,
+    nodule_mask: Path | None = None,
+    target: str | None = None,
+    series: str | None = None,
+    ex_vivo: bool = False,
+    thick_slices: bool = False,
+    seed: str | None = None,
+    lungs: Path | None = None,
+    airway: Path | None = None,
+    airway_wall: Path | None = None,
+    vessels: Path | None = None,
+    totalsegmentator: Path | None = None,
+    name: str = "",
+    pictures: bool = True,
+    json: bool = False,
+) -> int:
+    """Segment a chest CT into lungs, airway, vessels and cost map: a folder that the other commands take.
+
+    Run it again after correcting a mask in the folder: only what depends on the mask is done again.
+
+    Parameters
+    ----------
+    ct : Path
+        CT as NIfTI, NRRD or MetaImage file, or a folder of DICOM files.
+    out : Path
+        Patient folder to write or to bring up to date.
+    nodule_contours : Path
+        Contours of radiologists (JSON, see docs/segmentation.md); the nodule becomes the target.
+    nodule_mask : Path
+        Mask of the nodule, which becomes the target.
+    target : str
+        Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
+    series : str
+        UID of the DICOM series, where the folder holds several.
+    ex_vivo : bool
+        The image shows an inflated lung in air, not a patient.
+    thick_slices : bool
+        Accept slices of more than 3 mm; planning on the result must then be allowed as well.
+    seed : str
+        A point in the trachea, ras:x,y,z or lps:x,y,z, if it is not found by itself.
+    lungs : Path
+        Lungs from elsewhere: label map (1 right, 2 left; or lobes 1 to 5) or one mask.
+    airway : Path
+        Mask of the airway lumen from elsewhere.
+    airway_wall : Path
+        Mask of the airway wall from elsewhere.
+    vessels : Path
+        Mask of the vessels to avoid from elsewhere.
+    totalsegmentator : Path
+        Folder with output of TotalSegmentator's tasks lung_vessels or total, used in place of these steps.
+    name : str
+        How reports call the patient.
+    pictures : bool
+        Draw the pictures of the quality report.
+    json : bool
+        Print JSON, the content of quality.json, instead of tables.
+    """
+    from anatomy.segmentation.pipeline import memory_estimate_gib, read_ct
+    from anatomy.segmentation.pipeline import segment as run
+    from anatomy.segmentation.quality import quality_of
+    from anatomy.segmentation.request import Given, SegmentationRequest
+
+    for point in (target, seed):
+        if point is not None:
+            parse_point(point)
+    require_writable_folder(out)
+    with progress(f"reading {ct}") as shown:
+        volume, sources = read_ct(ct, series)
+        estimate = f"{memory_estimate_gib(volume.grid):.1f} GiB"
+        terminal.progress_console.print(
+            f"{volume.grid.describe()}; up to about {estimate} of memory", highlight=False
+        )
+        request = SegmentationRequest(
+            ct=volume,
+            out=out,
+            name=name,
+            sources=sources,
+            ex_vivo=ex_vivo,
+            thick_slices=thick_slices,
+            seed_lps=None if seed is None else parse_point(seed),
+            given=Given(
+                lungs=lungs,
+                airway=airway,
+                airway_wall=airway_wall,
+                vessels=vessels,
+                totalsegmentator=totalsegmentator,
+                nodule_contours=nodule_contours,
+                nodule_mask=nodule_mask,
+                target=target,
+            ),
+        )
+        result = run(request, lambda step: shown.step(step, STEP_SHARES.get(step)))
+        shown.step("airway tree", STEP_SHARES["airway tree"])
+        quality = quality_of(result.parts, result.grid)
+        if pictures:
+            from lungaccess.report.segmentation import segmentation_png
+
+            shown.step("pictures", STEP_SHARES["pictures"])
+            segmentation_png(volume, result.parts, out / "segmentation.png")
+    warnings = [*result.warnings, *quality.warnings]
+    with atomic_write(out / "quality.json") as temporary:
+        record = quality.to_mapping() | {"warnings": warnings}
+        temporary.write_text(json_format.dumps(record, indent=2) + "\n", encoding="utf-8")
+    if json:
+        terminal.show_json(record)
+        return 0
+    terminal.show(_tables(result, quality))
+    if warnings:
+        text = terminal.escaped("\n".join(f"- {warning}" for warning in warnings))
+        terminal.console.print(Panel(text, title="warnings", title_align="left", border_style="yellow"))
+    terminal.console.print(terminal.escaped(_written(result)))
+    return 0
+
+
+def _tables(result: Segmentation, quality: Quality) -> list[Table]:
+    volumes = [(name, f"{volume:.3f}") for name, volume in quality.volumes_l.items() if volume]
+    tree = quality.tree
+    airway = [("ends", f"{quality.ends}")]
+    if tree is not None:
+        airway += [
+            ("branches", f"{tree.n_branches}"),
+            ("deepest generation (trachea 0)", f"{int(tree.generation.max())}"),
+            ("length of the centreline, mm", f"{float(tree.branch_length_mm.sum()):.0f}"),
+            ("gaps bridged", f"{len(tree.report.gaps_bridged)}"),
+        ]
+    done = [
+        ("done now", ", ".join(result.recomputed) or "nothing: all was up to date"),
+        ("corrected by hand", ", ".join(result.corrected) or "nothing"),
+    ]
+    return [
+        terminal.table("Volumes", ("structure", "litres"), volumes),
+        terminal.table("Airway", ("", ""), airway),
+        terminal.table("Steps", ("", ""), done),
+    ]
+
+
+def _written(result: Segmentation) -> str:
+    words = f"Written to {result.folder}: patient.toml, its masks, quality.json, segmentation.json."
+    if result.kept_description:
+        words += " patient.toml was edited by hand and is kept as it was."
+    goal = "--nodule" if result.parts.nodule.any() else "--target ras:x,y,z"
+    return f"{words}\nPlan with: lungaccess plan {result.folder} {goal}"

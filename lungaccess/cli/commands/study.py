@@ -1,0 +1,171 @@
+"""The commands `lungaccess study ...`: sweeps of patients, targets, devices, planners and seeds."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from anatomy.errors import SettingsError
+from lungaccess.cli import terminal
+from lungaccess.cli.commands.common import OK
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from lungaccess.study.summary import Group
+
+NOT_ALL = 1
+
+study = App(name="study", help="Run many plans from one file, into one file of results.")
+
+
+@study.command
+def run(
+    study: Path,
+    *,
+    out: Path = Path("results.db"),
+    scheduler: str | None = None,
+    workers: Annotated[int | None, Parameter(name="--workers")] = None,
+    json: bool = False,
+    cache: Path | None = None,
+) -> int:
+    """Make the runs of a study that the results do not have yet; exit code 1 if one could not be made.
+
+    Stop it at any time and start it again: it goes on from what is stored.
+
+    Parameters
+    ----------
+    study : Path
+        TOML file of the study.
+    out : Path
+        Results file (SQLite); made if it is not there.
+    scheduler : str
+        Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
+    workers : int
+        How many processes on this machine; as many as it has cores if not given.
+    json : bool
+        Print JSON instead of tables.
+    cache : Path
+        Folder where prepared anatomies and atlases are kept, on every machine.
+    """
+    from lungaccess.study.driver import run_study
+    from lungaccess.study.settings import read_study
+    from lungaccess.study.summary import summary
+
+    if workers is not None and (workers < 1 or scheduler is not None):
+        raise SettingsError(
+            f"--workers is {workers}" + (" and a scheduler is given" if scheduler else ""),
+            expected="at least 1, and no --scheduler, which has workers of its own",
+        )
+    asked = read_study(study)
+    with progress(asked.name) as shown:
+        done = run_study(asked, out, scheduler=scheduler, workers=workers, cache=cache, tell=shown.step)
+    if json:
+        terminal.show_json(asdict(done) | {"results": str(out), "groups": [asdict(g) for g in summary(out)]})
+        return NOT_ALL if done.failed else OK
+    terminal.show([_table(asked.name, summary(out))])
+    terminal.console.print(
+        terminal.escaped(
+            f"{done.runs} runs: {done.stored_before} were stored, {done.added} added in {done.wall_s:.1f} s. "
+            f"Written to {out}"
+        )
+    )
+    if done.failed:
+        terminal.console.print(f"[bold red]{done.failed} could not be made; start the study again.[/]")
+    return NOT_ALL if done.failed else OK
+
+
+@study.command
+def show(results: Path, *, json: bool = False) -> int:
+    """Show what is stored, by case and planner.
+
+    Parameters
+    ----------
+    results : Path
+        Results file.
+    json : bool
+        Print JSON instead of a table.
+    """
+    from lungaccess.study.summary import summary
+
+    groups = summary(results)
+    if json:
+        terminal.show_json([asdict(group) for group in groups])
+    else:
+        terminal.show([_table(str(results), groups)])
+    return OK
+
+
+@study.command
+def export(results: Path, *, csv: Path | None = None, parquet: Path | None = None, json: bool = False) -> int:
+    """Write the tables of the results as CSV or Parquet.
+
+    Parameters
+    ----------
+    results : Path
+        Results file.
+    csv : Path
+        Folder for runs.csv, progress.csv, findings.csv, rejections.csv and plans.csv.
+    parquet : Path
+        Folder for the same as Parquet.
+    json : bool
+        Print JSON instead of text.
+    """
+    from lungaccess.study.export import export_csv, export_parquet
+
+    if csv is None and parquet is None:
+        raise SettingsError("Nothing to export to was given", expected="--csv FOLDER or --parquet FOLDER")
+    written = [] if csv is None else export_csv(results, csv)
+    written += [] if parquet is None else export_parquet(results, parquet)
+    if json:
+        terminal.show_json({"written": [str(path) for path in written]})
+        return OK
+    for path in written:
+        terminal.console.print(terminal.escaped(f"Written to {path}"))
+    return OK
+
+
+@study.command
+def compare(first: Path, second: Path, *, json: bool = False) -> int:
+    """Compare two results files, but for times and memory; exit code 1 if they differ.
+
+    Parameters
+    ----------
+    first, second : Path
+        Results files.
+    json : bool
+        Print JSON instead of text.
+    """
+    from lungaccess.study.compare import differences
+
+    found = differences(first, second)
+    if json:
+        terminal.show_json(found)
+        return NOT_ALL if found else OK
+    for each in found:
+        terminal.console.print(terminal.escaped(each))
+    terminal.console.print("They differ." if found else "They hold the same runs with the same answers.")
+    return NOT_ALL if found else OK
+
+
+def _table(title: str, groups: list[Group]) -> Table:
+    headings = ("case", "planner", "runs", "failed", "solved, %", "accepted, %", "first, s", "run, s", "cost")
+    return terminal.table(title, headings, [_row(group) for group in groups])
+
+
+def _row(group: Group) -> tuple[str, ...]:
+    return (
+        group.case,
+        group.planner,
+        str(group.runs),
+        str(group.failed),
+        f"{100.0 * group.solved_share:.1f}",
+        f"{100.0 * group.accepted_share:.1f}" if group.first_plan_s else "",
+        "" if group.first_plan_s is None else f"{group.first_plan_s[0]:.3f}",
+        f"{group.run_s:.2f}",
+        "" if group.cost is None else f"{group.cost:.4g}",
+    )

@@ -1,0 +1,163 @@
+"""The command `lungaccess tour`: several lesions in one procedure."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from anatomy.errors import SettingsError
+from anatomy.io.files import atomic_write, require_writable_folder
+from lungaccess.cli import terminal
+from lungaccess.cli.inputs import load_lung
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from lungaccess.one_stage.tour import TourAnswer
+    from stages.scope.tour.itinerary import Itinerary
+
+ALL_REACHED, SOME_LEFT_OUT = 0, 1
+
+
+def tour(
+    patient: Path,
+    *,
+    targets: Path,
+    system: str = "lung-default",
+    vet: bool = True,
+    closed: bool = False,
+    reading: Literal["printed", "reduced"] = "printed",
+    beta: float = 0.2,
+    tissue_weight: float = 0.0,
+    speed: float = 10.0,
+    per_lesion: float = 300.0,
+    out: Path = Path("lungaccess-tour"),
+    json: bool = False,
+    cache: Path | None = None,
+) -> int:
+    """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out.
+
+    Parameters
+    ----------
+    patient : Path
+        Folder of masks.
+    targets : Path
+        Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm.
+    system : str
+        Preset or TOML file whose devices reach the lesions from the airway.
+    vet : bool
+        Count an exit only if a coupled plan of scope, tubes and needle from there exists.
+    closed : bool
+        Return to the root of the airway after the last lesion.
+    reading : str
+        How the resistances of Pan et al. 2025 are merged: as printed, or by true reduction of the tree.
+    beta : float
+        Weight of the angle in the resistance; the paper's worked example needs 2.5.
+    tissue_weight : float
+        How many mm of the scope's way a mm between exit and lesion is worth, for the shortest tour.
+    speed : float
+        Speed of the scope, mm/s, for the times.
+    per_lesion : float
+        Time that each lesion takes besides, s.
+    out : Path
+        Folder for tour.json and tour.png.
+    json : bool
+        Print JSON instead of tables.
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+    from lungaccess.coupled.atlas_store import open_atlas
+    from lungaccess.one_stage.tour import plan_tour, read_lesions, record
+    from lungaccess.problem.system import load_system
+    from lungaccess.report.tour import tour_png
+    from stages.scope.tour.resistance import Resistances
+
+    if not tissue_weight >= 0.0:
+        raise SettingsError(f"--tissue-weight is {tissue_weight:g}", expected="at least 0")
+    if not speed > 0.0 or not per_lesion >= 0.0:
+        raise SettingsError(
+            f"--speed is {speed:g}, --per-lesion {per_lesion:g}", expected="above 0; at least 0"
+        )
+    lesions = read_lesions(targets)
+    require_writable_folder(out)
+    device = load_system(system)
+    lung, atlas = load_lung(patient, cache), None
+    if vet:
+        with progress("enumerating what scope and tubes can do") as shown:
+            atlas = open_atlas(lung, device, cache=cache, progress=shown.share)
+    with progress("planning the tour"):
+        answer = plan_tour(
+            lung,
+            lesions,
+            weights=Resistances(beta=beta),
+            reading=reading,
+            closed=closed,
+            tissue_weight=tissue_weight,
+            atlas=atlas,
+        )
+    with atomic_write(out / "tour.json") as temporary:
+        temporary.write_text(json_format.dumps(record(answer), indent=2) + "\n", encoding="utf-8")
+    tour_png(answer, lung, out / "tour.png")
+    if json:
+        terminal.show_json(record(answer))
+        return SOME_LEFT_OUT if answer.left_out else ALL_REACHED
+    _show(answer, speed, per_lesion)
+    terminal.console.print(terminal.escaped(f"Written to {out}: tour.json, tour.png"))
+    for number, why in answer.left_out.items():
+        terminal.console.print(terminal.escaped(f"Left out, lesion {number}: {why}."))
+    return SOME_LEFT_OUT if answer.left_out else ALL_REACHED
+
+
+def _show(answer: TourAnswer, speed: float, per_lesion: float) -> None:
+    rows = [_summary("shortest", answer.shortest, answer, speed, per_lesion)]
+    if answer.least_resistance is not None:
+        rows.append(_summary("least resistance", answer.least_resistance, answer, speed, per_lesion))
+    count = len(answer.lesions_lps)
+    habit_s = answer.one_by_one_mm / speed + per_lesion * count
+    rows.append(
+        (
+            "one by one, back to the root",
+            f"{answer.one_by_one_mm:.0f}",
+            f"{habit_s:.0f}",
+            f"{habit_s / count:.0f}",
+            "",
+            "",
+        )
+    )
+    headings = ("tour", "length, mm", "time, s", "s a lesion", "saved, %", "order of lesions")
+    visits = [
+        (
+            str(number),
+            str(answer.numbers[visit.lesion]),
+            ", ".join(visit.roles),
+            f"{visit.distance_mm:.1f}",
+            f"{visit.angle_rad * 57.29578:.0f}",
+        )
+        for number, visit in enumerate(answer.shortest.visits, 1)
+    ]
+    vetted = "each exit has a coupled plan" if answer.vetted else "exits not vetted"
+    terminal.show(
+        [
+            terminal.table(f"Tours to {count} lesions ({vetted})", headings, rows),
+            terminal.table(
+                "Visits of the shortest tour",
+                ("visit", "lesion", "exit", "from the lesion, mm", "angle, deg"),
+                visits,
+            ),
+        ]
+    )
+
+
+def _summary(
+    name: str, tour: Itinerary, answer: TourAnswer, speed: float, per_lesion: float
+) -> tuple[str, ...]:
+    seconds = tour.seconds(speed, per_lesion)
+    saved = 100.0 * (1.0 - tour.length_mm / answer.one_by_one_mm)
+    return (
+        name,
+        f"{tour.length_mm:.0f}",
+        f"{seconds:.0f}",
+        f"{seconds / len(tour.order):.0f}",
+        f"{saved:.0f}",
+        " ".join(str(answer.numbers[lesion]) for lesion in tour.order),
+    )

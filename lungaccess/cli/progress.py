@@ -1,0 +1,130 @@
+"""Progress on standard error: what is being done, how much of it is done, and about how long it takes."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
+from rich.text import Text
+
+from lungaccess.cli.terminal import escaped, progress_console
+
+BAR_WIDTH = 24
+HONEST_SHARE = 0.02
+"""From less than this share no time is extrapolated."""
+
+
+class _Times(ProgressColumn):
+    """Time that has passed, and the time left as far as it can be told."""
+
+    def render(self, task: Task) -> Text:
+        """Return the text of the column."""
+        passed = task.finished_time if task.finished else task.elapsed
+        words = f"{passed or 0.0:.0f} s"
+        left = remaining_s(passed or 0.0, task.completed, task.total)
+        if left is not None and not task.finished:
+            words += f", about {left:.0f} s left"
+        return Text(words)
+
+
+def remaining_s(passed_s: float, completed: float, total: float | None) -> float | None:
+    """Return the time left if all goes on as before; None if too little is done to tell.
+
+    Examples
+    --------
+    >>> remaining_s(10.0, 0.25, 1.0)
+    30.0
+    >>> remaining_s(10.0, 0.0, 1.0) is None
+    True
+    """
+    if not total or completed < HONEST_SHARE * total:
+        return None
+    return max(passed_s * (total - completed) / completed, 0.0)
+
+
+def _bar(*more: ProgressColumn) -> Progress:
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=BAR_WIDTH),
+        _Times(),
+        *more,
+        console=progress_console,
+        transient=True,
+    )
+
+
+class StepDisplay:
+    """Shows work that is done in steps.
+
+    The bar moves back and forth as long as nobody knows which share is done.
+
+    Parameters
+    ----------
+    description : str
+    """
+
+    def __init__(self, description: str) -> None:
+        self._description = description
+        self._progress = _bar()
+        self._task = self._progress.add_task(escaped(description), total=None)
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def step(self, words: str, share: float | None = None) -> None:
+        """Say what is being done now, and the share of all that is done; None if it is not known."""
+        description = escaped(f"{self._description}: {words}" if words else self._description)
+        if share is None:
+            self._progress.update(self._task, description=description, total=None)
+        else:
+            self._progress.update(self._task, description=description, total=1.0, completed=share)
+
+    def share(self, share: float) -> None:
+        """Say which share is done."""
+        self.step("", share)
+
+
+def progress(description: str) -> StepDisplay:
+    """Return a display of work in steps, for a `with` statement."""
+    return StepDisplay(description)
+
+
+class SearchDisplay:
+    """Shows a search while it runs: what it does, how much of the budget is used, the best cost."""
+
+    def __init__(self, time_s: float | None, iterations: int | None) -> None:
+        self._time_s, self._iterations = time_s, iterations
+        self._progress = _bar(TextColumn("{task.fields[best]}"))
+        total = float(iterations) if iterations is not None else time_s
+        self._task = self._progress.add_task("searching", total=total, best="no plan yet")
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
+        """Show the state of the search."""
+        done = float(iteration) if self._iterations is not None else elapsed_s
+        best = "no plan yet" if best_cost is None else f"best cost {best_cost:.4g}"
+        self._progress.update(self._task, description=description, completed=done, best=best)
+
+    def better(self, elapsed_s: float, cost: float) -> None:
+        """Leave a line about a better plan above the bar."""
+        self._progress.console.print(f"  {elapsed_s:8.2f} s   cost {cost:.5g}", highlight=False)
+
+    def interrupted(self) -> None:
+        """Leave a line that says that the user ended the search."""
+        self._progress.console.print("  interrupted: the best plan so far is kept")

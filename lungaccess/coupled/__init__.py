@@ -1,0 +1,1 @@
+"""The coupled planner: searches for plans of all three stages."""

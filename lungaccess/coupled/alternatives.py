@@ -1,0 +1,131 @@
+"""A menu of plans to one target that are really different, and which of them no other beats."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.lung import Lung
+from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
+from lungaccess.coupled.explain import explain
+from lungaccess.coupled.search import AtlasSearch
+from lungaccess.coupled.search.diverse import different_candidates
+from lungaccess.plans.assemble import Task, assemble
+from lungaccess.plans.costs import require_objective
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target, require_free
+
+COUNT = 15
+APART_MM = 5.0
+
+SMALL_IS_GOOD = ("inverse_clearance", "cost_map", "length_in_tissue_mm")
+LARGE_IS_GOOD = ("clearance_mm", "pleura_mm")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Alternative:
+    """One way to a target.
+
+    Parameters
+    ----------
+    plan : Plan
+    criteria : dict of str to float
+        "clearance_mm" and "pleura_mm", least distance of tube and needle from any obstacle and from the
+        pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" of the needle.
+    on_front : bool
+        Whether no other one of the menu is at least as good in all criteria and better in one.
+    """
+
+    plan: Plan
+    criteria: dict[str, float]
+    on_front: bool
+
+
+def alternatives(
+    lung: Lung,
+    system: System,
+    target: Target,
+    *,
+    objective: str = "inverse_clearance",
+    count: int = COUNT,
+    apart_mm: float = APART_MM,
+    atlas: Atlas | None = None,
+) -> tuple[Alternative, ...]:
+    """Return up to `count` plans of which the needles of every two lie at least `apart_mm` apart somewhere.
+
+    Direct arcs from the atlas are taken, the cheapest first, the cheapest through each airway branch before
+    others; each is proved and complete as any plan.
+
+    Parameters
+    ----------
+    lung : Lung
+    system : System
+    target : Target
+    objective : str
+        What "cheap" means; see `lungaccess.coupled.planner.plan`.
+    count : int
+    apart_mm : float
+        Somewhere a point of the needle of one plan is so far from all of the other's.
+    atlas : Atlas, optional
+        Made with `build_atlas` beforehand.
+
+    Raises
+    ------
+    NoPlan
+        If no direct arc reaches the target.
+    SettingsError
+        If a number is not above 0, the objective is unknown, or the atlas belongs to another lung or system.
+    TargetError
+        If the target lies outside the lung or inside an obstacle.
+    """
+    require_objective(objective)
+    if count < 1 or not apart_mm > 0.0:
+        raise SettingsError(f"{count} plans {apart_mm:g} mm apart are asked for", expected="both above 0")
+    require_free(lung, target.lps_mm)
+    if atlas is not None:
+        require_same(atlas, lung, system)
+    atlas = atlas or build_atlas(lung, system)
+    task = Task(
+        lung=lung, system=system, target=target, objective=objective, with_fissures=atlas.with_fissures,
+        method="alternatives", seed=0,
+    )  # fmt: skip
+    began = time.perf_counter()
+    search = AtlasSearch(task, atlas)
+    chosen = list(different_candidates(search, count, apart_mm))
+    if not chosen:
+        raise explain(search, 0)
+    timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
+    plans = [assemble(task, atlas.sites, each, iteration=0, timing=timing) for each in chosen]
+    return judged(plans)
+
+
+def criteria(plan: Plan) -> dict[str, float]:
+    """Return what plans are compared by; see `Alternative`."""
+    clearances = [values for stage in ("tube", "needle") for values in (plan.clearance_mm[stage],)]
+    judged_structures = [name for name in clearances[0] if name != "fissure" or plan.fissures_are_obstacles]
+    return {
+        "clearance_mm": min(values[name] for values in clearances for name in judged_structures),
+        "pleura_mm": min(values["outside"] for values in clearances),
+        "length_in_tissue_mm": plan.needle.length_mm
+        + plan.tube.inner_insertion_mm
+        - plan.tube.exit.arc_length_mm,
+        "inverse_clearance": plan.costs["inverse_clearance"],
+        "cost_map": plan.costs["cost_map"],
+    }
+
+
+def judged(plans: list[Plan]) -> tuple[Alternative, ...]:
+    """Return plans with their criteria, and which of them are on the Pareto front."""
+    values = [criteria(plan) for plan in plans]
+    signed = np.array(
+        [[v[name] for name in SMALL_IS_GOOD] + [-v[name] for name in LARGE_IS_GOOD] for v in values]
+    )
+    beaten = [bool(((signed <= row).all(axis=1) & (signed < row).any(axis=1)).any()) for row in signed]
+    return tuple(
+        Alternative(plan=plan, criteria=value, on_front=not worse)
+        for plan, value, worse in zip(plans, values, beaten, strict=True)
+    )

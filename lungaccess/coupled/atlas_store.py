@@ -1,0 +1,131 @@
+"""Deployment atlases on disk: one file per lung, scope, tubes and margins, whatever the needle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anatomy.cache import default_cache
+from anatomy.errors import FileError
+from anatomy.grid import read_only
+from anatomy.io.files import atomic_write
+from anatomy.lung import Lung
+from anatomy.settings import to_mapping
+from lungaccess.coupled.atlas import SITE_SPACING_MM, Atlas, build_atlas
+from lungaccess.problem.system import System
+from stages.needle.start_index import StartIndex
+from stages.scope.sites import Sites
+from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
+
+FORMAT = 3
+"""Raise it when the enumeration changes: stored atlases of another format are made anew."""
+DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
+
+
+def open_atlas(
+    lung: Lung,
+    system: System,
+    *,
+    rotations: int = DEFAULT_ROTATIONS,
+    stop_spacing_mm: float = DEFAULT_STOP_MM,
+    site_spacing_mm: float = SITE_SPACING_MM,
+    cache: Path | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Atlas:
+    """Return the atlas from the cache, or make and keep it.
+
+    A system that differs in its needle alone finds the same file.  Parameters as those of
+    `lungaccess.coupled.atlas.build_atlas`.
+
+    Parameters
+    ----------
+    cache : Path, optional
+        Folder of the cache; `anatomy.cache.default_cache()` if None.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    resolution = {"rotations": rotations, "stop_mm": stop_spacing_mm, "site_mm": site_spacing_mm}
+    path = (cache or default_cache()) / f"atlas-{_key(lung, system, resolution)}.npz"
+    stored = _load(path, lung, system)
+    if stored is not None:
+        return stored
+    atlas = build_atlas(
+        lung,
+        system,
+        rotations=rotations,
+        stop_spacing_mm=stop_spacing_mm,
+        site_spacing_mm=site_spacing_mm,
+        progress=progress,
+    )
+    _save(atlas, path)
+    return atlas
+
+
+def _key(lung: Lung, system: System, resolution: dict[str, float]) -> str:
+    """Return a hash of all that an atlas depends on."""
+    parts = {
+        "format": FORMAT,
+        "lung": lung.key,
+        "scope": to_mapping(system.scope),
+        "tubes": to_mapping(system.tubes),
+        "margins": to_mapping(system.margins),
+        "with_fissures": lung.has_fissures and not system.fissures_allowed,
+        **resolution,
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=list).encode()).hexdigest()
+
+
+def _save(atlas: Atlas, path: Path) -> None:
+    arrays: dict[str, Any] = {}
+    rest: dict[str, Any] = {"with_fissures": atlas.with_fissures, "build_s": atlas.build_s}
+    for name, part in (("sites", atlas.sites), ("deployments", atlas.deployments)):
+        for field in fields(part):
+            value = getattr(part, field.name)
+            key = f"{name}.{field.name}"
+            if isinstance(value, np.ndarray):
+                arrays[key] = value
+            else:
+                rest[key] = value
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as temporary, open(temporary, "wb") as stream:
+            np.savez(stream, rest=np.array(json.dumps(rest)), **arrays)
+    except OSError as error:
+        raise FileError(
+            f"The atlas cannot be stored in {path.parent}: {error}",
+            remedy="Choose another folder with --cache or LUNGACCESS_CACHE",
+        ) from error
+
+
+def _load(path: Path, lung: Lung, system: System) -> Atlas | None:
+    """Read an atlas; None if there is none or it is damaged."""
+    try:
+        with np.load(path) as stored:
+            arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
+            rest = json.loads(str(stored["rest"]))
+        values = arrays | rest
+        sites: Any = {field.name: values[f"sites.{field.name}"] for field in fields(Sites)}
+        sites["narrowest"] = tuple(sites["narrowest"])
+        found: Any = {field.name: values[f"deployments.{field.name}"] for field in fields(Deployments)}
+        deployments = Deployments(**found)
+        return Atlas(
+            lung=lung,
+            system=system,
+            with_fissures=rest["with_fissures"],
+            sites=Sites(**sites),
+            deployments=deployments,
+            index=StartIndex(deployments.positions, deployments.tangents),
+            build_s=rest["build_s"],
+        )
+    except DAMAGE:
+        return None

@@ -1,0 +1,114 @@
+"""Compiled kernels of the coupled search: lower bounds of the cost, and the price of many direct arcs.
+
+`needle` is that of `lungaccess.coupled.kernels.candidate`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from anatomy.kernels.arcs import arc_to_point
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.field import distance_estimate
+from stages.needle.kernels.cost import (
+    CLEARANCE_FLOOR_MM,
+    INVERSE_CLEARANCE,
+    LEAST_RATE,
+    LENGTH,
+    cost_of_arc,
+)
+from stages.needle.kernels.limits import COST_STEP, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN
+from stages.needle.kernels.proof import blocker_on_arc
+
+TOO_DEAR = -2
+"""Stands for the label of what blocks an arc that was not looked at because of its cost."""
+
+
+@inner_kernel
+def _room(needle, x, y, z):
+    """Return a distance in mm that the clearance at a point does not exceed."""
+    space, _limits, _objective, _sees_walls, _walls = needle
+    geometry = space[2]
+    diagonal = math.sqrt(geometry[0, 4] + geometry[1, 4] + geometry[2, 4])
+    return max(distance_estimate(space[0], geometry, x, y, z) + diagonal, CLEARANCE_FLOOR_MM)
+
+
+@inner_kernel
+def _least_cost(needle, begin_mm, end_mm, length):
+    """Return what any path of `length` mm or more costs at least.
+
+    Clearance is 1-Lipschitz: `s` mm from an end of the path it is at most that at the end and `s` more.
+
+    Parameters
+    ----------
+    begin_mm, end_mm : float
+        Clearance at the two ends, or more.
+    """
+    weights = needle[2][0]
+    cost = weights[LENGTH] * length
+    if weights[INVERSE_CLEARANCE] > 0.0:
+        middle = min(max(0.5 * (length + end_mm - begin_mm), 0.0), length)
+        total = math.log(1.0 + middle / begin_mm) + math.log(1.0 + (length - middle) / end_mm)
+        cost += weights[INVERSE_CLEARANCE] * total
+    return max(cost, weights[LEAST_RATE] * length)
+
+
+@numba.njit(cache=True, nogil=True)
+def least_costs(needle, positions, lengths, target, bounds):
+    """Fill `bounds` (N,) with what any path of `lengths` (N,) mm or more from `positions` (N, 3) costs."""
+    end = _room(needle, target[0], target[1], target[2])
+    for n in range(positions.shape[0]):
+        begin = _room(needle, positions[n, 0], positions[n, 1], positions[n, 2])
+        bounds[n] = _least_cost(needle, begin, end, lengths[n])
+
+
+@numba.njit(cache=True, nogil=True)
+def priced_arcs(needle, positions, tangents, branches, target, slack, best, blockers, costs):
+    """Price the single arc from each pose to the target, and prove those that may be worth it.
+
+    Parameters
+    ----------
+    positions, tangents : (N, 3) float64
+    branches : (N,) int64
+    target : tuple of 3 floats
+    slack, best : float
+        Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not looked at.
+    blockers : (N,) int64
+        Receives 0 for arcs that are proved clear, the label that blocks, -1 where no arc keeps the
+        needle's limits, or TOO_DEAR.
+    costs : (N,) float64
+        Receives estimated costs, infinite where a lower bound was enough.
+
+    Returns
+    -------
+    float
+        The cheapest clear one.
+    """
+    space, limits, objective, _sees_walls, _walls = needle
+    end = _room(needle, target[0], target[1], target[2])
+    for n in range(positions.shape[0]):
+        x, y, z = positions[n]
+        tx, ty, tz = tangents[n]
+        pose = (x, y, z, tx, ty, tz)
+        length, bend, turn = arc_to_point(pose, target)
+        costs[n] = math.inf
+        if (
+            bend[0] > limits[KAPPA]
+            or length > limits[MAX_LENGTH]
+            or turn > min(limits[MAX_ANGLE], limits[MAX_TURN])
+        ):
+            blockers[n] = -1
+            continue
+        if _least_cost(needle, _room(needle, x, y, z), end, length) > slack * best:
+            blockers[n] = TOO_DEAR
+            continue
+        costs[n] = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, True)
+        if costs[n] > slack * best:
+            blockers[n] = TOO_DEAR
+            continue
+        blockers[n] = blocker_on_arc(space, limits, pose, bend, length, 0.0, branches[n])
+        if blockers[n] == 0 and costs[n] < best:
+            best = costs[n]
+    return best

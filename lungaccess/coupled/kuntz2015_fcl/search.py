@@ -1,0 +1,189 @@
+"""Algorithm 1 of [Kuntz2015] as printed, with FCL on surface meshes instead of clearance fields."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT
+from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
+from lungaccess.coupled.kuntz2015_fcl.tubes import TubeTrial
+from lungaccess.coupled.search import AtlasSearch, Step
+from lungaccess.plans.assemble import Candidate, Task
+from stages.needle.path import ArcPath
+from stages.scope.tips import MedialAxis, looks_ahead
+from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
+
+PHASE = "reference"
+FOUND = "found"
+LOOKS_BACK = "the scope's tip looks sideways behind a fork"
+OUT_OF_WORKSPACE = "the target lies outside the needle's workspace"
+NO_PATH = "the RRT found no path"
+RRT_ITERATIONS = 50
+"""About what 0.05 s of [Kuntz2015] hold here."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Refusal:
+    """A plan of the reference that the planner's proof refuses: whether its tubes or its needle."""
+
+    stage: str
+    candidate: Candidate
+
+
+class ReferenceSearch(AtlasSearch):
+    """Random placements, FCL, a needle RRT each, keep the best: the yardstick of the planner.
+
+    As printed, but for what the paper leaves open or safety asks for: the scope stands where it fits and an
+    airway in lung tissue lies ahead, as in `KuntzSearch`; after line 8 the tubes are judged too.  A path
+    that is found is yielded only if the planner's proof accepts it.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+        Only its sites are used, to know where the scope fits.
+    rrt_iterations : int
+        Samples of each RRT: the same seed then gives the same plans.
+    rrt_time_s : float, optional
+        Processor time of each RRT instead, 0.05 in the paper.  Such a run cannot be repeated exactly.
+    obstacles : Obstacles, optional
+        Those of another search in the same lung; its meshes, which take long to make, are then shared.
+
+    Attributes
+    ----------
+    counts : Counter
+        What became of the placements: `FOUND`, or why none was.
+    spent_s : dict of str to float
+        Processor time by part: "placement", "tubes", "needle", "proof".
+    refused_by_proof : list of Refusal
+        Paths that were found and are not yielded.
+
+    Raises
+    ------
+    SettingsError
+        If an RRT has no budget.
+    """
+
+    rejects = True
+    """Whether line 8 is carried out."""
+    from_atlas = False
+
+    def __init__(
+        self,
+        task: Task,
+        atlas: Atlas,
+        *,
+        rrt_iterations: int = RRT_ITERATIONS,
+        rrt_time_s: float | None = None,
+        obstacles: Obstacles | None = None,
+    ) -> None:
+        super().__init__(task, atlas)
+        if not (rrt_iterations if rrt_time_s is None else rrt_time_s) > 0:
+            raise SettingsError("The RRT has no budget", expected="rrt_iterations or rrt_time_s above 0")
+        system = task.system
+        self.obstacles = obstacles or obstacles_for(task)
+        self._budget = (rrt_iterations, None) if rrt_time_s is None else (None, rrt_time_s)
+        self._trial = TubeTrial(system, self.obstacles)
+        required_mm = system.needle.radius_mm + system.margins.total_mm
+        self._needle_rrt = NeedleRRT(system.needle, required_mm, self.obstacles)
+        self._proof = TubeJudge(task.lung, system.tubes, system.margins, with_fissures=task.with_fissures)
+        self._random = np.random.Generator(np.random.PCG64(task.seed))
+        self.counts: Counter[str] = Counter()
+        self.spent_s: defaultdict[str, float] = defaultdict(float)
+        self.refused_by_proof: list[Refusal] = []
+
+    def steps(self) -> Iterator[Step]:
+        """Search forever; the caller stops."""
+        best = math.inf
+        axis = MedialAxis(self.task.lung.tree, self.atlas.sites.passable & self.atlas.sites.exits_ahead)
+        iteration = 0
+        while axis.length_mm > 0.0:
+            iteration += 1
+            found = self._attempt(axis)
+            proved = None if found is None else self._proved(found)
+            cost = math.inf if proved is None else self.desk.cost(proved.path)
+            if cost < best:
+                best = cost
+                yield Step(iteration=iteration, phase=PHASE, candidate=proved, cost=cost)
+            else:
+                yield Step(iteration=iteration, phase=PHASE)
+
+    def _attempt(self, axis: MedialAxis) -> Candidate | None:
+        """Carry out lines 3 to 9 once."""
+        random, began = self._random, time.thread_time()
+        tip = axis.sample(random)
+        rotation = float(random.uniform(0.0, 2.0 * math.pi))
+        outer, inner = np.sort(random.uniform(0.0, tracking_length_mm(self.task.system.tubes), 2))
+        seed = int(random.integers(2**63))
+        shape = self._trial.shape(tip.lps_from_scope_tip, rotation, float(outer), float(inner))
+        looks = looks_ahead(self.task.lung.tree, tip)
+        reached = looks and (not self.rejects or self.desk.reaches(shape.frames()[-1]))
+        began = self._spend("placement", began)
+        if not reached:
+            self.counts[OUT_OF_WORKSPACE if looks else LOOKS_BACK] += 1
+            return None
+        deployment = self._trial.judge(shape)
+        began = self._spend("tubes", began)
+        if isinstance(deployment, str):
+            self.counts[deployment] += 1
+            return None
+        path = self._path(deployment, seed)
+        self._spend("needle", began)
+        self.counts[NO_PATH if path is None else FOUND] += 1
+        return None if path is None else Candidate(tip=tip, deployment=deployment, path=path)
+
+    def _path(self, deployment: Deployment, seed: int) -> ArcPath | None:
+        """Carry out line 9."""
+        iterations, time_s = self._budget
+        return self._needle_rrt.plan(
+            deployment.lps_from_tip,
+            self.task.target.lps_mm,
+            deployment.branch,
+            np.random.Generator(np.random.PCG64(seed)),
+            iterations=iterations,
+            time_s=time_s,
+        )
+
+    def _proved(self, found: Candidate) -> Candidate | None:
+        """Return what was found with the tubes and the needle as the planner proves them."""
+        began, own = time.thread_time(), found.deployment
+        judged = self._proof.judge(found.tip.lps_from_scope_tip, own.rotation_rad, own.outer_mm, own.inner_mm)
+        stage = "tubes" if isinstance(judged, str) else ""
+        if not isinstance(judged, str):
+            path = replace(found.path, lps_from_start=judged.lps_from_tip)
+            if self.desk.proved(judged, path):
+                self._spend("proof", began)
+                return Candidate(tip=found.tip, deployment=judged, path=path)
+            stage = "needle"
+        self._spend("proof", began)
+        self.refused_by_proof.append(Refusal(stage=stage, candidate=found))
+        return None
+
+    def _spend(self, part: str, began: float) -> float:
+        now = time.thread_time()
+        self.spent_s[part] += now - began
+        return now
+
+
+class ReferenceSearchWithoutRejection(ReferenceSearch):
+    """The same without line 8: what [Kuntz2015, sec. V] compares with."""
+
+    rejects = False
+
+
+def obstacles_for(task: Task) -> Obstacles:
+    """Return the solids that a task's tubes and needle may touch."""
+    system = task.system
+    reach = system.tubes.max_extension_mm + system.needle.exit_exemption_mm
+    widest = max(system.tubes.outer.radius_mm, system.needle.radius_mm)
+    return Obstacles(
+        task.lung, with_fissures=task.with_fissures, reach_mm=reach + widest + system.margins.total_mm
+    )

@@ -1,0 +1,163 @@
+"""Deployments of the tubes judged with FCL: leave the airway once, and touch nothing beyond it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.grid import Float
+from anatomy.structures import AIRWAY, LUMEN
+from lungaccess.coupled.kuntz2015_fcl.obstacles import (
+    SAGITTA_MM,
+    Labels,
+    Obstacles,
+    branch_of,
+    chord_mm,
+    labels_at,
+)
+from lungaccess.problem.system import System
+from stages.needle.path import ArcPath, arc_transform
+from stages.tube.deployments import REASONS, Deployment, tube_constants
+from stages.tube.kernels import deployment as kernels
+
+NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
+LABEL_STEP_MM = 0.05
+SAMPLES_PER_CONTACT = 5
+"""Every so many samples it is asked whether the tube touches the wall from inside."""
+EXIT_SAMPLES = 51
+
+
+class TubeTrial:
+    """Judges deployments without sideways sweep, with the rules of `stages.tube` but none of its fields.
+
+    Parameters
+    ----------
+    system : System
+    obstacles : Obstacles
+    """
+
+    def __init__(self, system: System, obstacles: Obstacles) -> None:
+        self._system = system
+        self._obstacles = obstacles
+        constants = tube_constants(system.tubes, system.margins)
+        self._curvatures = (
+            float(constants[kernels.OVERLAP_CURVATURE]),
+            float(constants[kernels.INNER_CURVATURE]),
+        )
+        self._mediastinal = obstacles.lung.tree.mediastinal
+
+    def shape(
+        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
+    ) -> ArcPath:
+        """Return the centreline: one arc inside the outer tube, one beyond it, in one plane."""
+        overlap, free = self._curvatures
+        arcs = np.array([[outer_mm, rotation_rad, overlap], [inner_mm - outer_mm, 0.0, free]])
+        return ArcPath(lps_from_start=lps_from_scope_tip, arcs=arcs)
+
+    def judge(self, shape: ArcPath) -> Deployment | str:
+        """Return the deployment of a centreline, or the reason why it is refused."""
+        (outer_mm, rotation, _), (protrusion, _, _) = shape.arcs
+        if protrusion > self._system.tubes.max_inner_protrusion_mm:
+            return REASONS[kernels.PROTRUDES]
+        points, at_mm = shape.sample(LABEL_STEP_MM)
+        labels = labels_at(self._obstacles.lung, points)
+        outside = np.flatnonzero((labels & LUMEN) == 0)
+        if not len(outside) or outside[0] == 0:
+            return REASONS[kernels.NO_EXIT]
+        first = int(outside[0])
+        branch = int(branch_of(labels[first - 1 : first])[0])
+        if self._mediastinal[branch]:
+            return REASONS[kernels.LEAVES_MEDIASTINAL]
+        exit_mm = self._leaving_mm(points[first - 1 : first + 1], at_mm[first - 1 : first + 1])
+        refused = self._contained(labels[first:], at_mm[first:] - exit_mm, branch)
+        if refused:
+            return refused
+        angle = self._wall_angle_rad(shape, exit_mm)
+        if angle < math.radians(self._system.tubes.min_wall_angle_deg):
+            return REASONS[kernels.FLAT_EXIT]
+        contact_mm = self._contact_mm(points[:first], at_mm[:first], float(outer_mm))
+        refused = self._clear(shape, contact_mm, exit_mm, branch)
+        if refused:
+            return refused
+        return Deployment(
+            rotation_rad=float(rotation),
+            outer_mm=float(outer_mm),
+            inner_mm=float(outer_mm + protrusion),
+            lps_from_tip=shape.frames()[-1],
+            branch=branch,
+            exit_mm=exit_mm,
+            wall_angle_rad=angle,
+            lateral_sweep_mm=0.0,
+        )
+
+    def _leaving_mm(self, ends: Float, at_mm: Float) -> float:
+        """Return the arc length at which the axis leaves the lumen, between two samples."""
+        share = np.linspace(0.0, 1.0, EXIT_SAMPLES)
+        labels = labels_at(self._obstacles.lung, ends[0] + share[:, None] * (ends[1] - ends[0]))
+        last = int(np.argmin((labels & LUMEN) != 0)) - 1
+        return float(at_mm[0] + share[last] * (at_mm[1] - at_mm[0]))
+
+    def _wall_angle_rad(self, shape: ArcPath, exit_mm: float) -> float:
+        lung, frame = self._obstacles.lung, frame_at(shape, exit_mm)
+        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+        return float(kernels.wall_angle(lung.labels, lung.geometry, pose))
+
+    def _contained(self, labels: Labels, beyond_mm: Float, branch: int) -> str:
+        """Return why the axis beyond the exit lies in something, or an empty text."""
+        lumen = (labels & LUMEN) != 0
+        own = branch_of(labels) == branch
+        in_tissue = beyond_mm >= kernels.WALL_ZONE_MM
+        if not in_tissue.any():
+            return REASONS[kernels.NO_EXIT]
+        if (lumen & (in_tissue | ~own)).any():
+            return REASONS[kernels.REENTERS_LUMEN]
+        if (labels & self._obstacles.forbidden).any():
+            return NEAR_TISSUE
+        if (((labels & AIRWAY) != 0) & ~own).any():
+            return REASONS[kernels.NEAR_OTHER_BRANCH]
+        return ""
+
+    def _contact_mm(self, points: Float, at_mm: Float, outer_mm: float) -> float:
+        """Return the arc length from which on the tube is never clear of the wall, up to its exit."""
+        tubes = self._system.tubes
+        for n in range(len(points) - 1, 0, -SAMPLES_PER_CONTACT):
+            radius = tubes.outer.radius_mm if at_mm[n] <= outer_mm else tubes.inner.radius_mm
+            if self._obstacles.lumen.depth_mm(points[n]) >= radius:
+                return float(at_mm[n])
+        return 0.0
+
+    def _clear(self, shape: ArcPath, contact_mm: float, exit_mm: float, branch: int) -> str:
+        """Return what the tubes touch from their contact with the wall on, or an empty text."""
+        tubes, margin = self._system.tubes, self._system.margins.total_mm
+        outer_mm, end_mm = float(shape.arcs[0, 0]), shape.length_mm
+        pieces = ((0.0, outer_mm, tubes.outer.radius_mm), (outer_mm, end_mm, tubes.inner.radius_mm))
+        for begin, end, radius in pieces:
+            distance = radius + margin + SAGITTA_MM
+            if max(begin, contact_mm) < end:
+                line = line_between(shape, max(begin, contact_mm), end)
+                if self._obstacles.tissue.is_near(line, distance):
+                    return NEAR_TISSUE
+            if max(begin, exit_mm) < end:
+                line = line_between(shape, max(begin, exit_mm), end)
+                if self._obstacles.other_airways(branch).is_near(line, distance):
+                    return REASONS[kernels.NEAR_OTHER_BRANCH]
+        return ""
+
+
+def frame_at(path: ArcPath, at_mm: float) -> Float:
+    """Return the frame `(4, 4)` of a path at an arc length."""
+    frame = np.asarray(path.lps_from_start)
+    for length, roll, curvature in path.arcs:
+        here = min(float(length), at_mm)
+        frame = frame @ arc_transform(here, roll, curvature)
+        at_mm -= here
+    return frame
+
+
+def line_between(path: ArcPath, begin_mm: float, end_mm: float) -> Float:
+    """Return points `(N, 3)` of a path between two arc lengths, within SAGITTA_MM of it."""
+    points, at_mm = path.sample(chord_mm(float(path.arcs[:, 2].max())))
+    between = points[(at_mm > begin_mm) & (at_mm < end_mm)]
+    ends = [frame_at(path, at)[None, :3, 3] for at in (begin_mm, end_mm)]
+    return np.concatenate([ends[0], between, ends[1]])

@@ -1,0 +1,200 @@
+"""The anytime coupled planner: an iterator of better and better plans."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from anatomy.errors import SettingsError
+from anatomy.lung import Lung
+from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
+from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch, ReferenceSearchWithoutRejection
+from lungaccess.coupled.search import AtlasSearch, KuntzSearch, KuntzSearchWithoutRejection, Step
+from lungaccess.plans.assemble import Task, assemble
+from lungaccess.plans.costs import require_objective
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target, require_free
+
+METHODS = {
+    "atlas": AtlasSearch,
+    "kuntz2015": KuntzSearch,
+    "kuntz2015-without-rejection": KuntzSearchWithoutRejection,
+    "reference": ReferenceSearch,
+    "reference-without-rejection": ReferenceSearchWithoutRejection,
+}
+PROGRESS_EVERY_S = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressEvent:
+    """Where a search stands.
+
+    Parameters
+    ----------
+    iteration : int
+    elapsed_s : float
+        Planning time, without that of the atlas.
+    best_cost : float or None
+        None as long as there is no plan.
+    phase, message : str
+    """
+
+    iteration: int
+    elapsed_s: float
+    best_cost: float | None
+    phase: str
+    message: str = ""
+
+
+def plan(
+    lung: Lung,
+    system: System,
+    target: Target,
+    *,
+    objective: str = "inverse_clearance",
+    method: str = "atlas",
+    seed: int = 0,
+    iterations: int | None = None,
+    time_s: float | None = None,
+    atlas: Atlas | None = None,
+    processes: int = 1,
+    on_progress: Callable[[ProgressEvent], None] | None = None,
+) -> Iterator[Plan]:
+    """Plan all three stages; yield each plan that is better than the one before.
+
+    Parameters
+    ----------
+    lung : Lung
+    system : System
+    target : Target
+    objective : str
+        "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1] or "length_mm".
+    method : str
+        "atlas": direct arcs from every deployment of the atlas, then climbs from the best of them, draws of
+        deployments between, the optimal needle planner from others, and joint refinement.
+        "kuntz2015": Algorithm 1 of that paper; "kuntz2015-without-rejection": the same without its workspace
+        test.  "reference" and "reference-without-rejection": the same as printed, with FCL on meshes, slow;
+        see `lungaccess.coupled.kuntz2015_fcl`.
+    seed : int
+        The same seed and `iterations` give the same plans.
+    iterations : int, optional
+        Stop after so many iterations beyond the direct arcs.
+    time_s : float, optional
+        Stop after so many seconds of planning, but not without a plan before the direct arcs have been tried.
+        With neither limit the caller stops the iterator.
+    atlas : Atlas, optional
+        Made with `build_atlas` beforehand; made here if None.
+    processes : int
+        How many processes vary the best candidate at the same time.  The same seed, number of processes and
+        `iterations` give the same plans.
+    on_progress : callable, optional
+        Told about ten times a second.
+
+    Raises
+    ------
+    NoPlan
+        If the search ends without a plan; counts the reasons.
+    SettingsError
+        If objective or method is unknown, the atlas belongs to another lung or system, or there cannot be so
+        many processes.
+    TargetError
+        If the target lies outside the lung or inside an obstacle.
+    """
+    require_objective(objective)
+    if method not in METHODS:
+        raise SettingsError(f"There is no method {method!r}", expected=f"one of {', '.join(METHODS)}")
+    tell = on_progress or (lambda _event: None)
+    require_free(lung, target.lps_mm)
+    if atlas is not None:
+        require_same(atlas, lung, system)
+    atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(atlas_event(share)))
+    task = Task(
+        lung=lung,
+        system=system,
+        target=target,
+        objective=objective,
+        with_fissures=atlas.with_fissures,
+        method=method,
+        seed=seed,
+    )
+    search = METHODS[method](task, atlas)
+    if processes == 1:
+        return _run(search, search.steps(), iterations, time_s, tell)
+    if method != "atlas":
+        raise SettingsError(
+            f"{processes} processes are asked for with {method}", expected="one process, or method atlas"
+        )
+    from lungaccess.coupled.parallel import parallel_steps
+
+    return _run(search, parallel_steps(search, processes), iterations, time_s, tell)
+
+
+def atlas_event(share: float) -> ProgressEvent:
+    """Return what is told while the atlas is made."""
+    return ProgressEvent(
+        iteration=0,
+        elapsed_s=0.0,
+        best_cost=None,
+        phase="atlas",
+        message=f"deployment atlas, {share:.0%} of the sites",
+    )
+
+
+def _run(
+    search: AtlasSearch,
+    steps: Iterator[Step],
+    iterations: int | None,
+    time_s: float | None,
+    tell: Callable[[ProgressEvent], None],
+) -> Iterator[Plan]:
+    """Drive a search within its budget."""
+    from lungaccess.coupled.explain import explain
+
+    clock, task = Clock(), search.task
+    limit_s = math.inf if time_s is None else time_s
+    best: float | None = None
+    iteration = 0
+    for step in steps:
+        if iterations is not None and step.iteration > iterations:
+            break
+        iteration = step.iteration
+        if step.candidate is not None:
+            best = step.cost
+            timing = {"planning_s": clock.elapsed_s, "atlas_s": search.atlas.build_s}
+            yield assemble(task, search.atlas.sites, step.candidate, iteration=iteration, timing=timing)
+        if best is None and search.is_hopeless(step.iteration):
+            break
+        if (best is not None or iteration > 0) and clock.elapsed_s > limit_s:
+            break
+        if clock.due():
+            tell(
+                ProgressEvent(
+                    iteration=iteration, elapsed_s=clock.elapsed_s, best_cost=best, phase=step.phase
+                )
+            )
+    if best is None:
+        raise explain(search, iteration)
+
+
+class Clock:
+    """Measures planning time; time in which the caller holds a yielded plan counts too."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._told = self._began
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began
+
+    def due(self) -> bool:
+        """Tell whether the next progress report is due, and start counting anew if so."""
+        now = time.perf_counter()
+        if now - self._told < PROGRESS_EVERY_S:
+            return False
+        self._told = now
+        return True

@@ -1,0 +1,117 @@
+"""Direct arcs from the atlas that differ from each other: the menu of alternatives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from anatomy.grid import Float
+from lungaccess.coupled.kernels.separation import choose_apart
+from lungaccess.coupled.search.atlas_search import AtlasSearch
+from lungaccess.coupled.search.entries import Int
+from lungaccess.plans.assemble import Candidate
+from stages.needle.space import direct_arcs
+
+SAMPLES = 17
+"""Points of each path that are compared; between two of them a path strays less than 1 mm from a line."""
+NEAREST, SAMPLED, LEAST_OF_BRANCH = 1000, 2000, 100
+"""Deployments that are looked at: the nearest ones, and about so many of all, evenly spaced; at least so many
+of every branch."""
+
+
+def different_candidates(search: AtlasSearch, count: int, apart_mm: float) -> Iterator[Candidate]:
+    """Yield proved direct arcs that differ, the cheapest of each branch first, then the others.
+
+    The nearest deployments are looked at, and an even sample of the others; of these all, sample by sample,
+    only as long as there are not enough plans.
+    """
+    near, target = search.in_workspace, search.task.target.lps_mm
+    entries = search.atlas.deployments
+    pool, prices = np.zeros(0, dtype=np.int64), np.zeros(0)
+    proved: dict[int, Candidate | None] = {}
+    chosen: list[int] = []
+    for sample in _samples(entries.branch[near]):
+        looked = near[sample]
+        blockers, lengths, inverse = direct_arcs(
+            search.desk.space,
+            entries.positions[looked],
+            entries.tangents[looked],
+            entries.branch[looked],
+            target,
+        )
+        search.desk.count_blockers(blockers)
+        clear = np.flatnonzero(blockers == 0)
+        price = {"length_mm": lengths, "inverse_clearance": inverse}.get(search.task.objective, lengths)
+        pool, prices = np.append(pool, looked[clear]), np.append(prices, price[clear])
+        chosen = _chosen(search, pool[np.argsort(prices, kind="stable")], count, apart_mm, proved)
+        if len(chosen) == count:
+            break
+    for entry in chosen:
+        candidate = proved[entry]
+        if candidate is not None:
+            yield candidate
+
+
+def _samples(branch: Int) -> Iterator[Int]:
+    """Yield parts of deployments, given by their branches (N,), that together are all of them.
+
+    The first part holds the first deployments, and evenly spaced ones of every branch.
+    """
+    everyone = np.arange(len(branch))
+    grouped = np.argsort(branch, kind="stable")
+    _names, first, group, sizes = np.unique(
+        branch[grouped], return_index=True, return_inverse=True, return_counts=True
+    )
+    strides = np.maximum(np.minimum(len(branch) // SAMPLED, sizes // LEAST_OF_BRANCH), 1)
+    part = np.zeros(len(branch), dtype=np.int64)
+    part[grouped] = (everyone - first[group]) % strides[group]
+    part[:NEAREST] = 0
+    for number in range(int(part.max(initial=0)) + 1):
+        yield np.flatnonzero(part == number)
+
+
+def _chosen(
+    search: AtlasSearch, ordered: Int, count: int, apart_mm: float, proved: dict[int, Candidate | None]
+) -> list[int]:
+    """Return the deployments of a menu, chosen from clear ones by rising cost; `proved` keeps the proofs."""
+    lines = _lines(search, ordered)
+    order = _branches_first(search.atlas.deployments.branch[ordered])
+    while True:
+        refused = [n for n, entry in enumerate(ordered.tolist()) if proved.get(entry, True) is None]
+        places = np.zeros(count, dtype=np.int64)
+        found = choose_apart(lines, order[~np.isin(order, refused)], float(apart_mm), places)
+        chosen: list[int] = ordered[places[:found]].tolist()
+        unproved = [entry for entry in chosen if entry not in proved]
+        for entry in unproved:
+            proved[entry] = search.finished(entry)
+        if all(proved[entry] is not None for entry in chosen):
+            return chosen
+
+
+def _branches_first(branch: Int) -> Int:
+    """Return the order in which the first of every branch comes before all others."""
+    _names, first = np.unique(branch, return_index=True)
+    first = np.sort(first)
+    rest = np.setdiff1d(np.arange(len(branch)), first)
+    return np.concatenate([first, rest])
+
+
+def _lines(search: AtlasSearch, chosen: Int) -> Float:
+    """Return points (E, SAMPLES, 3) of the direct arcs."""
+    entries, target = search.atlas.deployments, search.task.target.lps_mm
+    start, tangent = entries.positions[chosen], entries.tangents[chosen]
+    way = target - start
+    ahead = (way * tangent).sum(axis=1, keepdims=True)
+    aside = way - ahead * tangent
+    off = np.linalg.norm(aside, axis=1, keepdims=True)
+    normal = np.divide(aside, off, out=np.zeros_like(aside), where=off > 1e-9)
+    turn = 2.0 * np.arctan2(off, ahead)
+    share = np.linspace(0.0, 1.0, SAMPLES)
+    angle = turn[:, :, None] * share[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radius = np.where(off > 1e-9, 0.5 * (off**2 + ahead**2) / off, 0.0)[:, :, None]
+    straight = (off <= 1e-9)[:, :, None] * ahead[:, :, None] * share[:, None]
+    along = radius * np.sin(angle) + straight
+    bent = radius * (1.0 - np.cos(angle))
+    return np.asarray(start[:, None] + along * tangent[:, None] + bent * normal[:, None])

@@ -1,0 +1,182 @@
+"""The needle stage alone: from a given pose to a target, with any of its planners."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+from anatomy.errors import SettingsError, TargetError
+from anatomy.grid import Float
+from anatomy.kernels.field import exact_distance
+from anatomy.lung import Lung
+from anatomy.structures import AIRWAY, BRANCH_SHIFT
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target
+from stages.needle.objective import Objective
+from stages.needle.path import ArcPath
+from stages.needle.search.base import Query, Search
+from stages.needle.search.planners import PLANNERS
+from stages.needle.space import NeedleSpace, needle_space
+
+SLICE = 500
+OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
+"""Planners of OMPL itself.  They steer by chance, and end within OMPL_TOLERANCE_MM of the target."""
+OMPL_TOLERANCE_MM = 1.0
+WALL_MM = 3.0
+"""A start so near to an airway is taken to have pierced its wall."""
+
+OBJECTIVES = {
+    "inverse-clearance": Objective(inverse_clearance=1.0),
+    "cost-map": Objective(cost_map=1.0),
+    "voxel-sum": Objective(voxel_sum=1.0),
+    "length": Objective(length=1.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NeedleAnswer:
+    """What a planner found.
+
+    Parameters
+    ----------
+    outcome : str
+        "path"; "no path", if there is a proof; a search's own words for its end; else "nothing found".
+    path : ArcPath or None
+        Proved clear and within all limits.
+    cost : float
+        Of the path under the objective, as estimated within the search.
+    branch : int
+        Branch of the airway tree whose wall the start is taken to have pierced, -1 for none.
+    space : NeedleSpace
+        What the planner looked at.
+    first_path_s : float or None
+        Time to the first path.
+    """
+
+    outcome: str
+    path: ArcPath | None
+    cost: float
+    branch: int
+    space: NeedleSpace
+    first_path_s: float | None
+
+
+def plan_needle(
+    lung: Lung,
+    system: System,
+    lps_from_start: Float,
+    target: Target,
+    *,
+    planner: str = "decide",
+    objective: str = "length",
+    seed: int = 0,
+    iterations: int | None = None,
+    time_s: float | None = None,
+) -> NeedleAnswer:
+    """Plan the needle from a pose to a target.
+
+    Parameters
+    ----------
+    lung : Lung
+    system : System
+        Its needle and margins are used.
+    lps_from_start : (4, 4) float64
+        +z is the direction of insertion.
+    target : Target
+    planner : str
+        One of `search.planners.PLANNERS`, or of `OMPL_PLANNERS`: those look at no objective, end by time
+        alone, and can be seeded once in a process, so each call needs a process of its own.
+    objective : str
+        One of `OBJECTIVES`.
+    seed : int
+    iterations : int, optional
+    time_s : float, optional
+        The search ends by whichever comes first, or by itself.  At least one is needed.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such planner or objective, no limit, or a cost map is missing; if OMPL has been used
+        in this process.
+    TargetError
+        If the start lies outside the images.
+    """
+    known = (*PLANNERS, *OMPL_PLANNERS)
+    if planner not in known or objective not in OBJECTIVES:
+        raise SettingsError(
+            f"There is no needle planner {planner!r} with objective {objective!r}",
+            expected=f"a planner of {', '.join(known)}; an objective of {', '.join(OBJECTIVES)}",
+        )
+    if time_s is None and (iterations is None or planner in OMPL_PLANNERS):
+        raise SettingsError(
+            f"The needle search {planner} has no limit",
+            expected="a time in seconds" if planner in OMPL_PLANNERS else "iterations or a time in seconds",
+        )
+    if not lung.grid.contains(lps_from_start[:3, 3]).all():
+        raise TargetError(
+            f"The start lies outside the images, at LPS {lps_from_start[:3, 3].round(1).tolist()}",
+            expected="a pose inside the lung",
+            remedy="Check the frame of its numbers: RAS or LPS",
+        )
+    space = needle_space(lung, system.needle, system.margins, with_fissures=not system.fissures_allowed)
+    branch = pierced_branch(lung, lps_from_start[:3, 3])
+    query = Query(lps_from_start=lps_from_start, target=target.lps_mm, branch=branch)
+    if planner in OMPL_PLANNERS:
+        return _by_ompl(space, query, planner, seed, time_s or 0.0)
+    search = PLANNERS[planner](space, query, seed, OBJECTIVES[objective])
+    first_path_s = None
+    began = time.perf_counter()
+    left = iterations
+    while not search.finished and (left is None or left > 0):
+        if time_s is not None and time.perf_counter() - began >= time_s:
+            break
+        portion = SLICE if left is None else min(SLICE, left)
+        search.advance(portion)
+        left = None if left is None else left - portion
+        if first_path_s is None and search.path is not None:
+            first_path_s = time.perf_counter() - began
+    return NeedleAnswer(
+        outcome=_outcome(search),
+        path=search.path,
+        cost=search.cost,
+        branch=branch,
+        space=space,
+        first_path_s=first_path_s,
+    )
+
+
+def _by_ompl(space: NeedleSpace, query: Query, planner: str, seed: int, time_s: float) -> NeedleAnswer:
+    """Let a planner of OMPL search; its cost is the length of the path."""
+    from stages.needle.ompl import NeedleProblem, seed_ompl
+
+    seed_ompl(seed + 1)
+    problem = NeedleProblem(space)
+    problem.setup.setPlanner(problem.planners()[planner](problem.si))
+    problem.pose(query, goal_tolerance_mm=OMPL_TOLERANCE_MM)
+    began = time.perf_counter()
+    problem.setup.solve(time_s)
+    first_path_s = time.perf_counter() - began
+    path = problem.solution()
+    return NeedleAnswer(
+        outcome="nothing found" if path is None else "path",
+        path=path,
+        cost=math.inf if path is None else path.length_mm,
+        branch=query.branch,
+        space=space,
+        first_path_s=None if path is None else first_path_s,
+    )
+
+
+def _outcome(search: Search) -> str:
+    stated = str(getattr(search, "outcome", "running"))
+    if stated != "running":
+        return stated
+    return "nothing found" if search.path is None else "path"
+
+
+def pierced_branch(lung: Lung, point: Float) -> int:
+    """Return the airway branch within `WALL_MM` of a point that is nearest to it, -1 if there is none."""
+    x, y, z = (float(c) for c in point)
+    _distance, label = exact_distance(lung.labels, lung.geometry, x, y, z, AIRWAY, -1, WALL_MM)
+    return (int(label) >> BRANCH_SHIFT) - 1 if label else -1

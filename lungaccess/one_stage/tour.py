@@ -1,0 +1,275 @@
+"""Plan a tour of the airway to several lesions of one patient."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anatomy.errors import FileError, TargetError
+from anatomy.grid import Float
+from anatomy.io.files import read_text
+from anatomy.io.frames import parse_point
+from anatomy.lung import Lung
+from stages.scope.tour.circuit import MOST_COMBINATIONS, Circuits, Reading, circuits, combinations
+from stages.scope.tour.exits import Exit, ExitRule, Vet, exits_of
+from stages.scope.tour.itinerary import Itinerary, itinerary, one_by_one_mm
+from stages.scope.tour.resistance import Resistances
+from stages.scope.tour.shortest import shortest_tour
+from stages.scope.tour.subtree import MOST_LESIONS, Ways, ways_to
+
+if TYPE_CHECKING:
+    from lungaccess.coupled.atlas import Atlas
+
+FARTHEST_MM = 200.0
+PROOFS_PER_SITE = 3
+"""How many deployments of a site are tried in full before the site counts as refused."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TourAnswer:
+    """Tours to M lesions.
+
+    Parameters
+    ----------
+    lesions_lps : (M, 3) float64, LPS mm
+    numbers : tuple of int
+        Their numbers, from 1, in the order in which the user gave them.
+    left_out : mapping of int to str
+        Numbers of lesions that cannot be reached, and why.
+    ways : Ways
+    shortest : Itinerary
+        The shortest tour over all choices of exits.
+    least_resistance : Itinerary or None
+        The shortest tour over the exits of the circuit with the least resistance [Pan2025]; None if there
+        are too many combinations.
+    circuits : Circuits or None
+    one_by_one_mm : float
+        Length of the way if the scope returns to the root between any two lesions, over the exits of
+        `shortest`.
+    vetted : bool
+        Whether an exit counted only if a coupled plan from there exists.
+    """
+
+    lesions_lps: Float
+    numbers: tuple[int, ...]
+    left_out: Mapping[int, str]
+    ways: Ways
+    shortest: Itinerary
+    least_resistance: Itinerary | None
+    circuits: Circuits | None
+    one_by_one_mm: float
+    vetted: bool
+
+
+def read_lesions(path: str | Path) -> Float:
+    """Read lesions from a text file, one `ras:x,y,z` or `lps:x,y,z` a line; return `(M, 3)` LPS mm.
+
+    Empty lines, and what follows a `#`, are passed over.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or names no lesion, or more than 62.
+    FrameError
+        If a line states no frame.
+    """
+    lines = [line.split("#")[0].strip() for line in read_text(path).splitlines()]
+    points = [parse_point(line) for line in lines if line]
+    if not 1 <= len(points) <= MOST_LESIONS:
+        raise FileError(
+            f"{path} names {len(points)} lesions",
+            expected=f"1 to {MOST_LESIONS}, one a line",
+            remedy="Write lines such as lps:-57,131,-520",
+        )
+    return np.array(points)
+
+
+def plan_tour(
+    lung: Lung,
+    lesions_lps: Float,
+    *,
+    rule: ExitRule | None = None,
+    weights: Resistances | None = None,
+    reading: Reading = "printed",
+    closed: bool = False,
+    tissue_weight: float = 0.0,
+    atlas: Atlas | None = None,
+) -> TourAnswer:
+    """Plan the shortest tour to all lesions, and the one by least resistance beside it.
+
+    Parameters
+    ----------
+    lung : Lung
+    lesions_lps : (M, 3) float64, LPS mm
+    rule : ExitRule, optional
+        By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
+    weights : Resistances, optional
+    reading : str
+        How resistances are merged: "printed" or "reduced", see `stages.scope.tour.circuit`.
+    closed : bool
+        Whether the tour returns to the root.
+    tissue_weight : float
+        How many mm of the scope's way a mm between exit and lesion is worth; 0 for the shortest way.
+    atlas : Atlas, optional
+        If given, an exit counts only if a coupled plan from there exists: scope, tubes, and a direct arc
+        of the needle, all proved.
+
+    A lesion without an exit is left out of the tour, and named in the answer.
+
+    Raises
+    ------
+    TargetError
+        If a lesion lies outside the image, or none can be reached.
+    """
+    lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
+    for number, inside in enumerate(lung.grid.contains(lesions).tolist(), 1):
+        if not inside:
+            raise TargetError(
+                f"Lesion {number} lies outside the image of {lung.name}",
+                expected="a point in the lungs, in LPS mm",
+                remedy="Check the frame of the coordinates",
+            )
+    chosen = rule or _rule_of(atlas)
+    exits: list[tuple[Exit, ...]] = []
+    numbers: list[int] = []
+    left_out: dict[int, str] = {}
+    for number, lesion in enumerate(lesions, 1):
+        try:
+            vet = None if atlas is None else coupled_vet(atlas, lesion)
+            exits.append(exits_of(lung.tree, len(exits), lesion, chosen, vet))
+            numbers.append(number)
+        except TargetError as error:
+            left_out[number] = error.found
+    if not exits:
+        raise TargetError(
+            "No lesion can be reached: " + "; ".join(f"{n}: {why}" for n, why in left_out.items()),
+            remedy="Name other lesions, or use --no-vet to see a tour without the tubes and the needle",
+        )
+    cost = [[tissue_weight * each.distance_mm for each in of_one] for of_one in exits]
+    ways = ways_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)
+    best = shortest_tour(ways, closed=closed)
+    found = circuits(ways) if combinations(ways) <= MOST_COMBINATIONS else None
+    return TourAnswer(
+        lesions_lps=lesions[np.array(numbers) - 1],
+        numbers=tuple(numbers),
+        left_out=left_out,
+        ways=ways,
+        shortest=best,
+        least_resistance=None if found is None else itinerary(ways, found.choice(reading), closed=closed),
+        circuits=found,
+        one_by_one_mm=one_by_one_mm(ways, best.chosen, closed=closed),
+        vetted=atlas is not None,
+    )
+
+
+def _rule_of(atlas: Atlas | None) -> ExitRule:
+    if atlas is None:
+        return ExitRule()
+    system = atlas.system
+    reach = system.tubes.max_extension_mm + system.needle.max_length_mm
+    return ExitRule(reach_mm=min(reach, FARTHEST_MM))
+
+
+def coupled_vet(atlas: Atlas, lesion_lps: Float) -> Vet:
+    """Return the test whether a coupled plan leads from a tree point to a lesion, `(3,)` LPS mm.
+
+    All deployments of the atlas whose workspace holds the lesion are tried with the direct arc; a site counts
+    if one of its best deployments is proved in full.  Searches around obstacles are not tried, so that a
+    refused exit may still be possible.
+
+    Raises
+    ------
+    TargetError
+        If the lesion lies outside the lung or inside an obstacle.
+    """
+    good = _good_points(atlas, lesion_lps)
+    return lambda _lesion, point: point in good
+
+
+def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
+    """Return the tree points from where a lesion can be reached."""
+    from lungaccess.coupled.search import AtlasSearch
+    from lungaccess.plans.assemble import Task
+    from lungaccess.problem.target import point_target
+    from stages.needle.space import direct_arcs
+
+    task = Task(
+        lung=atlas.lung,
+        system=atlas.system,
+        target=point_target(atlas.lung, lesion),
+        objective="length_mm",
+        with_fissures=atlas.with_fissures,
+        method="atlas",
+        seed=0,
+    )
+    search = AtlasSearch(task, atlas)
+    entries, held = atlas.deployments, search.in_workspace
+    if not len(held):
+        return frozenset()
+    blockers, lengths, _costs = direct_arcs(
+        search.desk.space, entries.positions[held], entries.tangents[held], entries.branch[held], lesion
+    )
+    clear = np.flatnonzero(blockers == 0)
+    clear = held[clear[np.argsort(lengths[clear], kind="stable")]]
+    points = atlas.sites.tree_point[entries.site[clear]]
+    good: set[int] = set()
+    tried: dict[int, int] = {}
+    for entry, point in zip(clear.tolist(), points.tolist(), strict=True):
+        if point in good or tried.get(point, 0) >= PROOFS_PER_SITE:
+            continue
+        tried[point] = tried.get(point, 0) + 1
+        if search.finished(entry) is not None:
+            good.add(int(point))
+    return frozenset(good)
+
+
+def record(answer: TourAnswer) -> dict[str, Any]:
+    """Return a tour as plain JSON types: points in LPS mm, lengths in mm, lesions counted from 1."""
+    least = answer.least_resistance
+    return {
+        "lesions": [
+            {"number": number, "lps_mm": place}
+            for number, place in zip(answer.numbers, answer.lesions_lps.tolist(), strict=True)
+        ],
+        "left_out": {str(number): why for number, why in answer.left_out.items()},
+        "exits_vetted_by_coupled_plans": answer.vetted,
+        "shortest": _itinerary_record(answer.shortest, answer.numbers),
+        "least_resistance": None if least is None else _itinerary_record(least, answer.numbers),
+        "circuits": None if answer.circuits is None else answer.circuits.count,
+        "one_by_one_mm": answer.one_by_one_mm,
+    }
+
+
+def _itinerary_record(tour: Itinerary, numbers: Sequence[int]) -> dict[str, Any]:
+    ways = tour.ways
+    used = [v for v in range(1, ways.n_vertices) if tour.passes[v] > 0]
+    return {
+        "closed": tour.closed,
+        "length_mm": tour.length_mm,
+        "order": [numbers[lesion] for lesion in tour.order],
+        "visits": [
+            {
+                "lesion": numbers[visit.lesion],
+                "tree_point": visit.tree_point,
+                "roles": list(visit.roles),
+                "distance_mm": visit.distance_mm,
+                "angle_rad": visit.angle_rad,
+            }
+            for visit in tour.visits
+        ],
+        "tree_points_in_order": [int(ways.tree_point[v]) for v in tour.vertices()],
+        "stretches": [
+            {
+                "from_tree_point": int(ways.tree_point[ways.parent[v]]),
+                "to_tree_point": int(ways.tree_point[v]),
+                "length_mm": float(ways.length_mm[v]),
+                "passes": int(tour.passes[v]),
+                "loops": int(tour.loops[v]),
+            }
+            for v in used
+        ],
+    }

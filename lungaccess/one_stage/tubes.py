@@ -1,0 +1,248 @@
+"""One deployment of two concentric tubes: what it does, whether it is stable, what would sweep less."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from anatomy.errors import SettingsError
+from anatomy.io.files import read_text
+from anatomy.settings import impossible, parse, settings, text, to_mapping
+from lungaccess.problem.system import System, load_system
+from stages.tube.device import Tube
+from stages.tube.following import DeployedSequence, SnapError, deploy
+from stages.tube.mechanics import Equilibrium, TubeMechanics, check_nesting
+from stages.tube.proposals import (
+    DesignProposal,
+    MakerLimits,
+    SequenceComparison,
+    judge_design,
+    least_sweep_sequence,
+    propose_designs,
+)
+from stages.tube.sequences import kuntz2015
+
+AS_FAR = 0.95
+"""Share of the present reach that counts as about as far."""
+BEND_RAD = 0.5 * math.pi
+"""Base angle at which a tube bends towards +x of the scope tip."""
+
+
+@settings
+class TubePair:
+    """Two tubes without the rest of a system, both of which may be curved.
+
+    Parameters
+    ----------
+    name : str
+    tubes : tuple of Tube
+        The inner and the outer one, in this order.
+
+    Raises
+    ------
+    SettingsError
+        If there are not two tubes, or they do not nest.
+    """
+
+    name: Annotated[str, text("name of the tubes")]
+    tubes: Annotated[tuple[Tube, ...], Field(description="inner and outer tube, in this order")]
+
+    def __post_init__(self) -> None:
+        if len(self.tubes) != 2:
+            raise impossible("tubes", len(self.tubes), "two tables [[tubes]], the inner tube first")
+        try:
+            check_nesting(self.tubes)
+        except SettingsError as error:
+            raise impossible("tubes", error.found, error.expected) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TubeAnswer:
+    """A deployment as in [Kuntz2015], judged.
+
+    Parameters
+    ----------
+    name : str
+        Of the system or pair of tubes.
+    system : System or None
+        None for a bare pair of tubes.
+    outer_mm, inner_mm, rotation_rad, relative_rad : float
+        What was asked for.
+    final : Equilibrium
+        The deployed tubes; if they snap on the way, an equilibrium that cannot be had in this way.
+    deployed : DeployedSequence or None
+        All steps; None if the tubes snap.
+    snap : SnapError or None
+    """
+
+    name: str
+    system: System | None
+    outer_mm: float
+    inner_mm: float
+    rotation_rad: float
+    relative_rad: float
+    final: Equilibrium
+    deployed: DeployedSequence | None
+    snap: SnapError | None
+
+    @property
+    def acceptable(self) -> bool:
+        """Whether the tubes are stable all the way."""
+        return self.snap is None and self.final.stable
+
+
+def load_tubes(name_or_path: str | os.PathLike[str]) -> System | TubePair:
+    """Read a system, or a TOML file that holds just a name and two tables `[[tubes]]`, the inner tube first.
+
+    Raises
+    ------
+    SettingsError, FileError
+        As `lungaccess.problem.system.load_system`.
+    """
+    given = os.fspath(name_or_path)
+    if given.endswith(".toml"):
+        try:
+            mapping = tomllib.loads(read_text(Path(given)))
+        except tomllib.TOMLDecodeError:
+            mapping = {}  # load_system says what is wrong with the file
+        if isinstance(mapping.get("tubes"), list):
+            return parse(TubePair, mapping, given)
+    return load_system(given)
+
+
+def deploy_tubes(
+    device: System | TubePair,
+    outer_mm: float,
+    inner_mm: float,
+    *,
+    rotation_rad: float = 0.0,
+    relative_rad: float = 0.0,
+) -> TubeAnswer:
+    """Turn, insert both tubes, insert the inner one, and look at every step.
+
+    Parameters
+    ----------
+    device : System or TubePair
+    outer_mm, inner_mm : float
+        How far the tubes come out of the scope.
+    rotation_rad : float
+        Direction of the inner tube's bend about +z of the scope tip, from its +x, as in a plan.
+    relative_rad : float
+        How much farther the base of the outer tube is turned.
+
+    Raises
+    ------
+    SettingsError
+        If the insertions are impossible, nothing comes out, or an angle is not finite.
+    """
+    tubes = _tubes(device)
+    if inner_mm == 0.0:
+        raise SettingsError("The inner tube stays in the scope", expected="an insertion above 0")
+    angles = np.array([rotation_rad, rotation_rad + relative_rad]) + BEND_RAD
+    sequence = kuntz2015(tubes, angles, outer_mm, inner_mm)
+    mechanics = TubeMechanics(tubes)
+    deployed, snap = None, None
+    try:
+        deployed = deploy(mechanics, sequence)
+        final = deployed.final
+    except SnapError as error:
+        snap = error
+        final = mechanics.given_base_angles(sequence.base_angles_rad[-1], sequence.beta_mm[-1])
+    return TubeAnswer(
+        name=device.name,
+        system=device if isinstance(device, System) else None,
+        outer_mm=float(outer_mm),
+        inner_mm=float(inner_mm),
+        rotation_rad=float(rotation_rad),
+        relative_rad=float(relative_rad),
+        final=final,
+        deployed=deployed,
+        snap=snap,
+    )
+
+
+def compare_sequences(answer: TubeAnswer) -> SequenceComparison:
+    """Compare the sequences that lead to the same deployment."""
+    final = answer.final
+    angles = np.array([answer.rotation_rad, answer.rotation_rad + answer.relative_rad]) + BEND_RAD
+    return least_sweep_sequence(
+        final.mechanics.tubes, angles, (answer.inner_mm, answer.outer_mm), mechanics=final.mechanics
+    )
+
+
+def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProposal, ...]]:
+    """Return the present design, and one proposal for each curved length, the least sweep first.
+
+    Of each length it is the design with the least sweep that reaches about as far to the side as the present
+    one, or else the one that reaches farthest.  None sweeps more than the system allows.
+
+    Raises
+    ------
+    SettingsError
+        If the tubes are no system: its limits are needed.
+    """
+    system = answer.system
+    if system is None:
+        raise SettingsError(
+            f"{answer.name} is a pair of tubes without a system",
+            expected="a system, whose channel and limits say what can be made",
+            remedy="Give a system, not just two tubes",
+        )
+    limits = MakerLimits(channel_diameter_mm=system.scope.channel_diameter_mm)
+    present = judge_design(system.tubes, answer.outer_mm, answer.inner_mm)
+    found = propose_designs(
+        system.tubes, answer.outer_mm, answer.inner_mm, system.tubes.max_lateral_sweep_mm, limits
+    )
+    enough = AS_FAR * present.tip_offset_mm
+
+    def rank(each: DesignProposal) -> tuple[float, float, float]:
+        short = max(enough - each.tip_offset_mm, 0.0)
+        return short, each.lateral_sweep_mm, each.tip_angle_rad
+
+    lengths = {each.tubes.inner.curved_length_mm for each in found}
+    chosen = [
+        min((each for each in found if each.tubes.inner.curved_length_mm == length), key=rank)
+        for length in sorted(lengths)
+    ]
+    return present, tuple(sorted(chosen, key=lambda each: each.lateral_sweep_mm))
+
+
+def record(answer: TubeAnswer) -> dict[str, Any]:
+    """Return a deployment as plain JSON types: mm, rad, frame of the scope tip."""
+    deployed, snap = answer.deployed, answer.snap
+    return {
+        "name": answer.name,
+        "tubes": [to_mapping(tube) for tube in answer.final.mechanics.tubes],
+        "outer_mm": answer.outer_mm,
+        "inner_mm": answer.inner_mm,
+        "rotation_rad": answer.rotation_rad,
+        "relative_rad": answer.relative_rad,
+        "tip_mm": answer.final.base_from_tip[:3, 3].tolist(),
+        "tip_direction": answer.final.base_from_tip[:3, 2].tolist(),
+        "tip_angles_rad": answer.final.tip_angles_rad.tolist(),
+        "stable": answer.final.stable,
+        "least_determinant": answer.final.least_determinant,
+        "lateral_sweep_mm": None if deployed is None else deployed.lateral_sweep_mm,
+        "follow_the_leader_error_mm": None if deployed is None else deployed.follow_the_leader_error_mm,
+        "snap": None
+        if snap is None
+        else {
+            "why": snap.why,
+            "move": snap.move,
+            "base_angles_rad": snap.base_angles_rad.tolist(),
+            "insertions_mm": snap.insertions_mm.tolist(),
+        },
+    }
+
+
+def _tubes(device: System | TubePair) -> tuple[Tube, ...]:
+    if isinstance(device, System):
+        return device.tubes.inner, device.tubes.outer
+    return device.tubes

@@ -1,0 +1,258 @@
+"""Join the three stages into a `Plan`, with exact clearances and costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from anatomy.structures import BITS
+from lungaccess.plans import costs
+from lungaccess.plans.plan import (
+    Exemption,
+    NeedleArc,
+    NeedlePath,
+    Plan,
+    ScopeRoute,
+    TubeDeployment,
+    WallExit,
+)
+from lungaccess.problem.system import System, system_fingerprint
+from lungaccess.problem.target import Target
+from stages.needle.path import ArcPath
+from stages.scope.sites import Sites, approach_depth_mm
+from stages.scope.tips import ScopeTip, approach, leaving_point
+from stages.tube.deployments import Deployment
+from stages.tube.shape import centreline
+
+CLEARANCE_CAP_MM = 5.0
+SAMPLE_MM = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidate:
+    """The choices that make a plan; everything else follows from them."""
+
+    tip: ScopeTip
+    deployment: Deployment
+    path: ArcPath
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Task:
+    """What a search is asked: patient, device, target, objective."""
+
+    lung: Lung
+    system: System
+    target: Target
+    objective: str
+    with_fissures: bool
+    method: str
+    seed: int
+
+
+def assemble(
+    task: Task, sites: Sites, candidate: Candidate, *, iteration: int, timing: Mapping[str, float]
+) -> Plan:
+    """Return the plan of a candidate."""
+    system, lung = task.system, task.lung
+    margin = system.margins.total_mm
+    return Plan(
+        software_version=software_version(),
+        patient_name=lung.name,
+        lung_key=lung.key,
+        sources=lung.sources,
+        breath_hold=lung.breath_hold,
+        system=system,
+        system_fingerprint=system_fingerprint(system),
+        target_lps=task.target.lps_mm,
+        target_origin=task.target.origin,
+        fissures_are_obstacles=task.with_fissures,
+        objective=task.objective,
+        scope=_scope_route(task, sites, candidate.tip),
+        tube=_tube(task, candidate),
+        needle=_needle(candidate.path),
+        exemption=Exemption(
+            branch=candidate.deployment.branch,
+            exit_point_lps=_exit_point(task, candidate),
+            needle_length_mm=system.needle.exit_exemption_mm,
+        ),
+        required_clearance_mm={
+            "outer_tube": system.tubes.outer.radius_mm + margin,
+            "inner_tube": system.tubes.inner.radius_mm + margin,
+            "needle": system.needle.radius_mm + margin,
+        },
+        clearance_mm={"tube": _tube_clearance(task, candidate), "needle": _needle_clearance(task, candidate)},
+        costs={
+            name: costs.path_cost(lung, candidate.path, name, with_fissures=task.with_fissures)
+            for name in costs.OBJECTIVES
+        },
+        method=task.method,
+        seed=task.seed,
+        iterations=iteration,
+        timing=timing,
+    )
+
+
+@cache
+def software_version() -> str:
+    """Return the version of the installed package."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("lungaccess")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _scope_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
+    tree = task.lung.tree
+    if tip.turned:
+        return _turned_route(task, sites, tip)
+    points = tree.route(tip.tree_point)
+    position = tip.lps_from_scope_tip[:3, 3]
+    route, radius = tree.points_lps[points].copy(), tree.radius_mm[points].copy()
+    if tip.back_mm > 0.0:
+        route[-1] = position
+        radius[-1] = task.lung.lumen_depth.lower_bound_mm(position)[0]
+    branches = tree.branch_of_point[points]
+    length = float(tree.distance_from_root_mm[tip.tree_point] - tip.back_mm)
+    carina = float(tree.distance_from_root_mm[tree.carina_point])
+    return ScopeRoute(
+        points_lps=route,
+        lumen_radius_mm=radius,
+        branches=branches,
+        lps_from_scope_tip=tip.lps_from_scope_tip,
+        site_point=tip.tree_point if tip.back_mm == 0.0 else -1,
+        generation=int(tree.generation[branches[-1]]),
+        length_mm=length,
+        length_from_carina_mm=length - carina,
+        min_lumen_margin_mm=float(sites.lumen_radius_mm[tip.tree_point]) - task.system.scope.radius_mm,
+    )
+
+
+def _turned_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
+    """Return the route of a scope whose tip is turned aside: it leaves the medial axis before the tip."""
+    lung, tree = task.lung, task.lung.tree
+    on_axis = tree.route(leaving_point(tree, tip))
+    aside = approach(tree, tip)
+    if aside is None:
+        raise AnatomyError("The scope's tip is turned farther than the scope bends")
+    route = np.concatenate([tree.points_lps[on_axis], aside[1:]])
+    nearest = cKDTree(tree.points_lps).query(aside[1:])[1]
+    branches = np.concatenate([tree.branch_of_point[on_axis], tree.branch_of_point[nearest]])
+    branches[-1] = tree.branch_of_point[tip.tree_point]
+    length = float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
+    depth = min(float(sites.lumen_radius_mm[on_axis[-1]]), approach_depth_mm(lung, tip))
+    return ScopeRoute(
+        points_lps=route,
+        lumen_radius_mm=np.concatenate([tree.radius_mm[on_axis], lung.lumen_depth.lower_bound_mm(aside[1:])]),
+        branches=branches,
+        lps_from_scope_tip=tip.lps_from_scope_tip,
+        site_point=tip.tree_point if tip.back_mm == 0.0 else -1,
+        generation=int(tree.generation[branches[-1]]),
+        length_mm=length,
+        length_from_carina_mm=length - float(tree.distance_from_root_mm[tree.carina_point]),
+        min_lumen_margin_mm=depth - task.system.scope.radius_mm,
+    )
+
+
+def _tube(task: Task, candidate: Candidate) -> TubeDeployment:
+    deployment = candidate.deployment
+    return TubeDeployment(
+        rotation_rad=deployment.rotation_rad,
+        outer_insertion_mm=deployment.outer_mm,
+        inner_insertion_mm=deployment.inner_mm,
+        lps_from_tip=deployment.lps_from_tip,
+        exit=WallExit(
+            branch=deployment.branch,
+            point_lps=_exit_point(task, candidate),
+            arc_length_mm=deployment.exit_mm,
+            wall_angle_rad=deployment.wall_angle_rad,
+        ),
+        lateral_sweep_mm=deployment.lateral_sweep_mm,
+        follow_the_leader_error_mm=deployment.lateral_sweep_mm,
+    )
+
+
+def _exit_point(task: Task, candidate: Candidate) -> Float:
+    return np.asarray(_tube_points(task, candidate, np.array([candidate.deployment.exit_mm]))[0])
+
+
+def _tube_points(task: Task, candidate: Candidate, arc_lengths: Float) -> Float:
+    deployment = candidate.deployment
+    return centreline(
+        task.system.tubes,
+        candidate.tip.lps_from_scope_tip,
+        deployment.rotation_rad,
+        deployment.outer_mm,
+        deployment.inner_mm,
+        arc_lengths,
+    )
+
+
+def _needle(path: ArcPath) -> NeedlePath:
+    return NeedlePath(
+        lps_from_start=path.lps_from_start,
+        arcs=tuple(
+            NeedleArc(length_mm=float(length), roll_rad=float(roll), curvature_per_mm=float(curvature))
+            for length, roll, curvature in path.arcs
+        ),
+        end_lps=path.frames()[-1][:3, 3],
+        length_mm=path.length_mm,
+        max_angle_from_start_rad=path.max_angle_from_start_rad(),
+        accumulated_turn_rad=path.accumulated_turn_rad,
+    )
+
+
+def _tube_clearance(task: Task, candidate: Candidate) -> dict[str, float]:
+    """Return the smallest distance of the tube's axis from each structure, beyond the exit."""
+    begin, end = candidate.deployment.exit_mm, candidate.deployment.inner_mm
+    count = max(2, math.ceil((end - begin) / SAMPLE_MM) + 1)
+    points = _tube_points(task, candidate, np.linspace(begin, end, count))
+    branch = candidate.deployment.branch
+    return {name: _least_clearance(task.lung, points, name, branch) for name in _structures(task)}
+
+
+def _needle_clearance(task: Task, candidate: Candidate) -> dict[str, float]:
+    """Return the smallest distance of the needle's axis from each structure.
+
+    From the airway beyond the exempt length; where the needle ends before that, only other branches count.
+    """
+    points, lengths = candidate.path.sample(SAMPLE_MM)
+    beyond = lengths >= task.system.needle.exit_exemption_mm - 0.5 * SAMPLE_MM
+    out = {}
+    for name in _structures(task):
+        if name == "airway":
+            exempt = candidate.deployment.branch
+            parts = [_least_clearance(task.lung, points, name, exempt)]
+            if beyond.any():
+                parts.append(_least_clearance(task.lung, points[beyond], name, -1))
+            out[name] = min(parts)
+        else:
+            out[name] = _least_clearance(task.lung, points, name, -1)
+    return out
+
+
+def _structures(task: Task) -> tuple[str, ...]:
+    return ("airway", "vessel", "outside", *(("fissure",) if task.lung.has_fissures else ()))
+
+
+def _least_clearance(lung: Lung, points: Float, name: str, exempt_branch: int) -> float:
+    """Return a distance that the curve through `points` never falls below.
+
+    Exact distances below 5 mm, else the field's lower bound; between two samples the distance is at
+    most half their spacing less.
+    """
+    field = "pleura" if name == "outside" else name
+    least = lung.least_clearance_mm(
+        points, field, BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=exempt_branch
+    )
+    return max(least - 0.5 * SAMPLE_MM, 0.0)

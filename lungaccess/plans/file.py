@@ -1,0 +1,180 @@
+"""Plans as JSON: nothing lost, nothing unknown accepted, protected by a digest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from anatomy.errors import PlanFileError, SettingsError
+from anatomy.settings import parse, to_mapping
+from lungaccess.plans.plan import SCHEMA, Plan
+from lungaccess.problem.system import System
+
+P = TypeVar("P", bound=Plan)
+_REMEDY = "Run `lungaccess plan` again"
+
+
+def digest(plan: Plan) -> str:
+    """Return the SHA-256 (hex) of the canonical JSON of `plan` without `timing`."""
+    return _digest(_encode(plan, "plan"))
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    kept = {key: value for key, value in content.items() if key not in ("timing", "digest")}
+    canonical = json.dumps(kept, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(canonical.encode("ascii")).hexdigest()
+
+
+def to_json(plan: Plan) -> str:
+    """Return the plan as JSON text, one list of numbers a line, ending with its digest."""
+    content = _encode(plan, "plan")
+    content["digest"] = _digest(content)
+    text = json.dumps(content, indent=1, ensure_ascii=True, allow_nan=False)
+    return re.sub(r"\[[^][{}]*\]", lambda match: re.sub(r"\n\s*", "", match.group()), text) + "\n"
+
+
+def from_json(cls: type[P], text: str) -> P:
+    """Return the plan that `to_json` wrote; see `Plan.from_json`."""
+    try:
+        content = json.loads(text, object_pairs_hook=_unique, parse_constant=_not_finite)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise PlanFileError(f"The plan is not JSON ({error})", remedy=_REMEDY) from error
+    if not isinstance(content, dict):
+        raise PlanFileError("The plan is not a JSON object", remedy=_REMEDY)
+    if content.get("schema") != SCHEMA:
+        raise PlanFileError(
+            f"The plan has the schema {content.get('schema')!r}", expected=SCHEMA, remedy=_REMEDY
+        )
+    stated = content.pop("digest", None)
+    plan = _decode(cls, content, "plan")
+    if stated != plan.digest:
+        raise PlanFileError(
+            "The plan does not match its own digest: it was edited or damaged",
+            expected=str(stated),
+            remedy=_REMEDY,
+        )
+    return typing.cast(P, plan)
+
+
+def save(plan: Plan, path: str | os.PathLike[str]) -> None:
+    """Write `plan` beside `path` under a temporary name, then put it in place."""
+    from anatomy.io.files import atomic_write
+
+    text = to_json(plan)
+    with atomic_write(os.fspath(path)) as temporary:
+        temporary.write_text(text, encoding="ascii", newline="\n")
+
+
+def load(cls: type[P], path: str | os.PathLike[str]) -> P:
+    """Read a plan; see `Plan.load`."""
+    try:
+        text = Path(path).read_bytes().decode("utf-8")
+    except OSError as error:
+        raise PlanFileError(
+            f"The plan {os.fspath(path)} cannot be read ({error.strerror})", expected="a plan.json file"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise PlanFileError(f"The plan {os.fspath(path)} is not text", remedy=_REMEDY) from error
+    return from_json(cls, text)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        raise PlanFileError("The plan states a value twice", remedy=_REMEDY)
+    return content
+
+
+def _not_finite(constant: str) -> float:
+    raise PlanFileError(f"The plan holds the number {constant}", expected="finite numbers", remedy=_REMEDY)
+
+
+def _encode(value: Any, where: str) -> Any:
+    """Return plain JSON types; floats are written by `repr`, so that none changes."""
+    if isinstance(value, System):
+        return to_mapping(value)
+    if is_dataclass(value):
+        return {
+            item.name: _encode(_as_declared(item.type, getattr(value, item.name)), f"{where}.{item.name}")
+            for item in fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {str(key): _encode(inner, f"{where}.{key}") for key, inner in value.items()}
+    if isinstance(value, np.ndarray):
+        return _encode(value.tolist(), where)
+    if isinstance(value, tuple | list):
+        return [_encode(inner, f"{where}[{n}]") for n, inner in enumerate(value)]
+    if isinstance(value, float | np.floating) and not math.isfinite(value):
+        raise PlanFileError(f"{where} is {value}", expected="a finite number")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _as_declared(annotation: object, value: Any) -> Any:
+    """Write an integer given for a float as a float, so that a stored plan is stored the same again."""
+    if annotation == "float":
+        return float(value)
+    if annotation == "Mapping[str, float]":
+        return {key: float(inner) for key, inner in value.items()}
+    if annotation == "Mapping[str, Mapping[str, float]]":
+        return {key: {k: float(v) for k, v in inner.items()} for key, inner in value.items()}
+    return value
+
+
+def _decode(wanted: Any, value: Any, where: str) -> Any:
+    """Build `wanted` (a type annotation) from plain JSON types, or raise."""
+    if wanted is System:
+        return _system(value, where)
+    if is_dataclass(wanted):
+        return _record(typing.cast(type, wanted), value, where)
+    origin, arguments = typing.get_origin(wanted), typing.get_args(wanted)
+    if origin is np.ndarray:
+        return _numbers(value, where)
+    if origin is tuple:
+        return tuple(_decode(arguments[0], v, f"{where}[{n}]") for n, v in enumerate(_is(list, value, where)))
+    if origin is Mapping or isinstance(origin, type) and issubclass(origin, Mapping):
+        return {k: _decode(arguments[1], v, f"{where}.{k}") for k, v in _is(dict, value, where).items()}
+    if origin in (typing.Union, types.UnionType):
+        return None if value is None else _decode(arguments[0], value, where)
+    return _is(wanted, value, where)
+
+
+def _record(cls: type, value: Any, where: str) -> Any:
+    content = _is(dict, value, where)
+    hints = typing.get_type_hints(cls)
+    names = {item.name for item in fields(cls)}
+    for problem, keys in (("lacks", names - content.keys()), ("has the unknown key", content.keys() - names)):
+        if keys:
+            raise PlanFileError(f"{where} {problem} {', '.join(sorted(keys))}", remedy=_REMEDY)
+    return cls(**{name: _decode(hints[name], content[name], f"{where}.{name}") for name in names})
+
+
+def _system(value: Any, where: str) -> System:
+    try:
+        return parse(System, _is(dict, value, where), where)
+    except SettingsError as error:
+        raise PlanFileError(f"The plan's system is not valid: {error}", remedy=_REMEDY) from error
+
+
+def _numbers(value: Any, where: str) -> Any:
+    """Return nested lists of finite numbers unchanged."""
+    if isinstance(value, list):
+        return [_numbers(inner, f"{where}[{n}]") for n, inner in enumerate(value)]
+    return _is(int, value, where) if isinstance(value, int) else _is(float, value, where)
+
+
+def _is(wanted: type, value: Any, where: str) -> Any:
+    fits = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
+    if not fits or isinstance(value, float) and not math.isfinite(value):
+        raise PlanFileError(f"{where} is {value!r:.60}", expected=f"a value of type {wanted.__name__}")
+    return value

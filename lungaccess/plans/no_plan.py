@@ -1,0 +1,41 @@
+"""`NoPlan`: the answer when there is no plan, with the reasons counted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from anatomy.errors import LungaccessError
+
+if TYPE_CHECKING:
+    from lungaccess.plans.plan import Plan
+
+
+class NoPlan(LungaccessError):  # noqa: N818
+    """No plan was found; says why, stage by stage.
+
+    Parameters
+    ----------
+    found : str
+        One sentence: what stands in the way.
+    reasons : mapping of str to int
+        How many sites, deployments or needle paths each reason ruled out.
+    advice : str
+        The smallest change of device that would make the target reachable, if one was found.
+    plans_with_changes : mapping of str to Plan
+        For each change of one parameter that was found to help, a plan with it.
+    """
+
+    def __init__(
+        self,
+        found: str,
+        *,
+        reasons: Mapping[str, int],
+        advice: str = "",
+        plans_with_changes: Mapping[str, Plan] | None = None,
+    ) -> None:
+        self.plans_with_changes: Mapping[str, Plan] = MappingProxyType(dict(plans_with_changes or {}))
+        self.reasons: Mapping[str, int] = MappingProxyType(dict(reasons))
+        self.advice = advice
+        super().__init__(found, remedy=advice)

@@ -1,0 +1,1 @@
+"""What is asked: a patient, a system of devices, a target."""

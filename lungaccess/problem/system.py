@@ -1,0 +1,150 @@
+"""The whole device: bronchoscope, tubes, needle and margins, read from a preset or a TOML file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from anatomy.errors import FileError, SettingsError
+from anatomy.margins import Margins
+from anatomy.settings import impossible, parse, settings, switch, text, to_mapping
+from lungaccess.problem.suggestion import did_you_mean
+from stages.needle.device import Needle
+from stages.scope.device import Bronchoscope
+from stages.tube.device import ConcentricTubes
+
+_PRESETS = "presets"
+
+
+@settings
+class System:
+    """Everything a plan depends on besides the patient and the target.
+
+    Parameters
+    ----------
+    name, description : str
+        What it is, for people.
+    sources : tuple of str
+        Where the numbers come from; what has no source says "assumption".
+    scope : Bronchoscope
+    tubes : ConcentricTubes
+        The outer tube runs in the channel of the scope.
+    needle : Needle
+        Runs inside the inner tube.
+    margins : Margins, optional
+        Kept around every device.
+    fissures_allowed : bool, optional
+        Whether tubes and needle may cross a fissure, which pierces the pleura twice.
+
+    Raises
+    ------
+    SettingsError
+        If a value is wrong or one device does not fit into the other.
+    """
+
+    name: Annotated[str, text("name of the system")]
+    description: Annotated[str, text("one sentence for people", may_be_empty=True)] = ""
+    sources: Annotated[tuple[str, ...], Field(description="where the numbers come from")] = ()
+    scope: Bronchoscope
+    tubes: ConcentricTubes
+    needle: Needle
+    margins: Margins = Margins()
+    fissures_allowed: Annotated[bool, switch("whether a fissure may be crossed")] = False
+
+    def __post_init__(self) -> None:
+        outer, channel = self.tubes.outer.outer_diameter_mm, self.scope.channel_diameter_mm
+        if outer >= channel:
+            raise impossible(
+                "tubes.outer.outer_diameter_mm",
+                outer,
+                f"less than scope.channel_diameter_mm = {channel:g}",
+            )
+        bore = self.tubes.inner.inner_diameter_mm
+        if self.needle.diameter_mm >= bore:
+            raise impossible(
+                "needle.diameter_mm",
+                self.needle.diameter_mm,
+                f"less than tubes.inner.inner_diameter_mm = {bore:g}",
+            )
+
+
+def preset_names() -> tuple[str, ...]:
+    """Return the names of the systems that ship with the package, sorted."""
+    folder = resources.files("lungaccess") / _PRESETS
+    return tuple(sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml")))
+
+
+def load_system(name_or_path: str | os.PathLike[str]) -> System:
+    """Read a system from a preset or from a TOML file.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        Name of a preset (see `preset_names`), or path of a file that ends in ``.toml``.
+
+    Returns
+    -------
+    System
+
+    Raises
+    ------
+    SettingsError
+        If there is no such preset, the file is not TOML, or a value in it is wrong.
+    FileError
+        If the file cannot be read.
+
+    Examples
+    --------
+    >>> load_system("lung-default").needle.diameter_mm
+    1.0
+    """
+    given = os.fspath(name_or_path)
+    if given in preset_names():
+        content = (resources.files("lungaccess") / _PRESETS / f"{given}.toml").read_bytes()
+    elif isinstance(name_or_path, str) and not given.endswith(".toml"):
+        raise SettingsError(
+            f"There is no system called {given!r}",
+            expected=f"a preset ({', '.join(preset_names())}) or the path of a .toml file",
+            remedy=did_you_mean(given, preset_names()) or "docs/devices.md shows how to write one",
+        )
+    else:
+        content = _read(Path(name_or_path))
+    return _parse_toml(content, given)
+
+
+def system_fingerprint(system: System) -> str:
+    """Return the SHA-256 (hex) of the canonical JSON of a system: equal settings, equal fingerprint."""
+    canonical = json.dumps(
+        to_mapping(system), sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False
+    )
+    return hashlib.sha256(canonical.encode("ascii")).hexdigest()
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FileError(
+            f"The device file {path} cannot be read ({error.strerror})",
+            expected="a readable .toml file",
+            remedy="Check the path",
+        ) from error
+
+
+def _parse_toml(content: bytes, where: str) -> System:
+    try:
+        mapping = tomllib.loads(content.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(
+            f"{where} is not valid TOML ({error})",
+            expected="UTF-8 text in TOML syntax",
+            remedy="docs/devices.md has a working example",
+        ) from error
+    return parse(System, mapping, where)

@@ -1,0 +1,1 @@
+"""What a system reaches of a lung, and proofs of what it does not."""

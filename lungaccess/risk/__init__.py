@@ -1,0 +1,1 @@
+"""What happens when the devices deviate from a plan."""

@@ -1,0 +1,210 @@
+"""How large the errors of each kind may be, all others being 0, before a plan fails."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from lungaccess.plans.plan import Plan
+from lungaccess.risk.assessment import RiskAssessor, Share
+from lungaccess.risk.errors import (
+    CURVATURE,
+    FIELD_OF,
+    UNITS,
+    Deviations,
+    Draws,
+    ErrorModel,
+    in_radians,
+    no_deviations,
+)
+
+DEFAULT_PROBABILITY = 0.95
+DEFAULT_SAMPLES = 2000
+LARGEST = {"mm": 20.0, "deg": 90.0, "factor": 3.0}
+"""Sizes beyond which no tolerance is looked for."""
+BISECTIONS = 10
+LADDER = 64
+AZIMUTHS = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """How large errors of one kind may be, all others being 0.
+
+    Parameters
+    ----------
+    kind, unit : str
+        See `lungaccess.risk.errors.UNITS`.
+    stated : float or (float, float)
+        The size in the error model; for the curvature its two factors.
+    probability : float
+    largest : float
+        The largest standard deviation at which successes are that probable, at most `LARGEST`; 0 if none
+        was found.  For the curvature the largest `f` of factors uniform between 1 / f and f.
+    margin : (float, float)
+        Errors up to this size never fail: (below 0, above 0) for errors with a sign, the same twice for
+        errors with directions; factors for the curvature.  Tried at steps and in some directions, not
+        proved.
+    alone : Share
+        Successes at the stated size.
+    """
+
+    kind: str
+    unit: str
+    stated: float | tuple[float, float]
+    probability: float
+    largest: float
+    margin: tuple[float, float]
+    alone: Share
+
+
+def tolerances(
+    plan: Plan,
+    lung: Lung,
+    *,
+    model: ErrorModel | None = None,
+    probability: float = DEFAULT_PROBABILITY,
+    samples: int = DEFAULT_SAMPLES,
+    seed: int = 0,
+    radius_mm: float | None = None,
+) -> tuple[Tolerance, ...]:
+    """Return the tolerance of a plan to each kind of error alone.
+
+    The largest standard deviation is found by bisection over a scale, every size with the same draws.
+
+    Parameters
+    ----------
+    plan, lung, radius_mm
+        See `RiskAssessor`.
+    model : ErrorModel, optional
+        States the sizes to compare with.
+    probability : float
+        Probability of success that is asked for, above 0 and below 1.
+    samples, seed : int
+        Draws for each size.
+
+    Raises
+    ------
+    PlanFileError, SettingsError
+        See `RiskAssessor`; also if the probability is not between 0 and 1.
+    """
+    if not 0.0 < probability < 1.0:
+        raise SettingsError(f"The probability is {probability}", expected="above 0 and below 1")
+    if samples < 1:
+        raise SettingsError(f"The number of samples is {samples}", expected="at least 1")
+    stated = model or ErrorModel()
+    assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
+    draws = Draws(samples, assessor.n_arcs, seed)
+    return tuple(_tolerance(assessor, draws, stated, name, probability) for name in UNITS)
+
+
+def _tolerance(
+    assessor: RiskAssessor, draws: Draws, model: ErrorModel, name: str, probability: float
+) -> Tolerance:
+    unit = UNITS[name]
+
+    def share(size: float) -> Share:
+        if name == CURVATURE:
+            return assessor.success(draws, {}, (1.0 / size, size))
+        return assessor.success(draws, {name: size})
+
+    curved = name == CURVATURE
+    least = 1.0 if curved else 0.0
+    return Tolerance(
+        kind=name,
+        unit=unit,
+        stated=model.curvature_factors if curved else model.sizes[name],
+        probability=probability,
+        largest=_largest(lambda size: share(size).value >= probability, least, LARGEST[unit]),
+        margin=_curvature_margin(assessor) if curved else _margin(assessor, name),
+        alone=assessor.success(draws, {}, model.curvature_factors) if curved else share(model.sizes[name]),
+    )
+
+
+def _largest(holds: Callable[[float], bool], least: float, most: float) -> float:
+    """Return the largest size between two that holds; `least` if none does."""
+    if holds(most):
+        return most
+    low, high = least, most
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if holds(middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _margin(assessor: RiskAssessor, name: str) -> tuple[float, float]:
+    """Return the sizes up to which errors of a kind never fail: of both signs, or of all directions."""
+    field = FIELD_OF[name]
+    directions = _directions(name, assessor.n_arcs)
+    shape = no_deviations(1, assessor.n_arcs)[field].shape[1:]
+
+    def made(sizes: Float, chosen: Float) -> Deviations:
+        scaled = np.array([in_radians(name, float(size)) for size in sizes])
+        errors = (scaled[:, None, None] * chosen).reshape(-1, *shape)
+        return Deviations(**{**no_deviations(len(errors), assessor.n_arcs), field: errors})
+
+    if not shape or shape == (1,):
+        low, high = (_unfailing(assessor, made, directions[[n]], LARGEST[UNITS[name]]) for n in (0, 1))
+        return low, high
+    size = _unfailing(assessor, made, directions, LARGEST[UNITS[name]])
+    return size, size
+
+
+def _curvature_margin(assessor: RiskAssessor) -> tuple[float, float]:
+    """Return the factors of curvature down to which, and up to which, nothing fails."""
+
+    def made(sizes: Float, chosen: Float) -> Deviations:
+        factors = np.maximum(1.0 + (sizes[:, None] * chosen[None, :, 0]).ravel(), 0.0)
+        return Deviations(**{**no_deviations(len(factors), assessor.n_arcs), "factor": factors})
+
+    below = _unfailing(assessor, made, np.array([[-1.0]]), 1.0)
+    above = _unfailing(assessor, made, np.array([[1.0]]), LARGEST["factor"] - 1.0)
+    return 1.0 - below, 1.0 + above
+
+
+def _unfailing(
+    assessor: RiskAssessor, made: Callable[[Float, Float], Deviations], directions: Float, most: float
+) -> float:
+    """Return the size up to which no step of a ladder fails in any direction, refined once."""
+
+    def first_failure(sizes: Float) -> int:
+        done = assessor.succeeded(assessor.outcomes(made(sizes, directions)))
+        failed = ~done.reshape(len(sizes), len(directions)).all(axis=1)
+        return int(np.argmax(failed)) if failed.any() else len(sizes)
+
+    # Squares: small sizes matter most.
+    sizes = np.concatenate([[0.0], most * (np.arange(1, LADDER + 1) / LADDER) ** 2])
+    first = first_failure(sizes)
+    if first == 0:
+        return 0.0
+    if first == len(sizes):
+        return most
+    between = np.linspace(sizes[first - 1], sizes[first], LADDER)
+    return float(between[max(first_failure(between) - 1, 0)])
+
+
+def _directions(name: str, n_arcs: int) -> Float:
+    """Return the unit errors `(D, n)` of a kind that are tried."""
+    if name in ("scope_position", "target_position"):
+        steps = np.array([step for step in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(step)])
+        return np.asarray(steps / np.linalg.norm(steps, axis=1)[:, None])
+    if name == "scope_direction":
+        turns = 2.0 * math.pi * np.arange(AZIMUTHS) / AZIMUTHS
+        return np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    if name == "tube_rotation":
+        return np.array([[-1.0], [1.0]])
+    n = 2 if name == "tube_insertion" else n_arcs
+    signs = (-1.0, 1.0)
+    single = [sign * row for row in np.eye(n) for sign in signs]
+    joint = [sign * np.ones(n) for sign in signs]
+    return np.array(single + (joint if n > 1 else []))

@@ -1,0 +1,446 @@
+"""A proof that there is no needle path: over-estimates of all states that a path can pass.
+
+First, cubes that lie between start and target and are not certainly blocked are filled from the start on.  If
+that does not part start and target, planes perpendicular to the line between them cut every path.  On each
+plane the states, position times direction, lie in cells.  From one plane to the next the cells spread as far
+as curvature allows and more by what a cell is wide; cells vanish from which obstacles, or the places of start
+and target, leave no way.  If none is left on a plane, no path exists: none can slip through, since every step
+over-estimates.  If some are left, those that lie on a chain of cells from start to target are cut into
+smaller ones and the same is done again.  docs/certificate.md has the inequalities.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
+from stages.needle.infeasibility.kernels import reachability_pruning as hopes
+from stages.needle.infeasibility.kernels import reachable_sets as sets
+from stages.needle.kernels import limits as index
+from stages.needle.search.base import Query
+from stages.needle.space import NeedleSpace
+
+Bits = NDArray[np.uint64]
+Window = NDArray[np.int64]
+
+CUBES_MM = (0.5, 0.25)
+FIRST_CELL_MM = 0.5
+LARGEST_SLOPE_CELL = 0.17
+LEVELS = 9
+CELLS_PER_BOW = 16.0
+"""Planes are moved nearer to each other where curvature times their distance squared is more."""
+DEPTH_SHARE = 0.1
+"""Distance of the planes as a share of the radius of curvature."""
+SLOPE_CHANGE_EDGES = np.array([0.5, 0.75, 0.92, 1.0])
+PROBES_PER_DEPTH = 8
+SLACK_RATIO = 1.08
+"""Of the amounts of missing clearance that are told apart."""
+SLACKS = 48
+LARGEST_DEPTH_MM = 12.5
+LEAST_KAPPA = 1e-5
+"""In 1/mm; what bends less is taken to bend so much, for the sake of rounding."""
+LEAST_WAY_MM = 1e-3
+ROUNDING = 1e-8
+STEEPEST = 0.995
+"""Largest sine of the angle between paths and the planes' normal for which planes are tried."""
+MAX_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class Plane:
+    """States on one plane: bits (V, U, Y, W) and the cell numbers (v, u, y, x) of their first cell."""
+
+    bits: Bits
+    window: Window
+
+    def trimmed(self) -> Plane:
+        """Return the same without empty rows and columns at the edges."""
+        box = np.zeros(8, dtype=np.int64)
+        bitmaps.extent(self.bits, box)
+        v0, v1, u0, u1, y0, y1, w0, w1 = (int(n) for n in box)
+        bits = self.bits[v0 : v1 + 1, u0 : u1 + 1, y0 : y1 + 1, w0 : w1 + 1]
+        return Plane(np.ascontiguousarray(bits), self.window + np.array([v0, u0, y0, 64 * w0]))
+
+    @property
+    def ends(self) -> Window:
+        """Cell numbers of the last cell."""
+        nv, nu, rows, words = self.bits.shape
+        last: Window = self.window + np.array([nv, nu, rows, 64 * words]) - 1
+        return last
+
+
+class _TooMuchError(Exception):
+    """The states do not fit the memory allowed."""
+
+
+class NoPathProof:
+    """Tries to prove that no path leads from a start to within the goal tolerance of a target.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    query : Query
+    max_bytes : int
+        Most memory for states and tables.
+
+    Attributes
+    ----------
+    outcome : str
+        "running", "no path" (proved) or "undecided" (paths may exist).
+    reason : str
+        What proves it, or why the end is undecided.
+    cell_mm, slope_cell : float
+        Sides of the cells of the present level: of position in mm, and of direction as a slope (1 is 45
+        degrees).
+
+    Raises
+    ------
+    SettingsError
+        If `max_bytes` is not positive.
+
+    Notes
+    -----
+    Among the limits, those of curvature and of the angle from the reference count; those of length and of
+    accumulated turn count only in so far as together they forbid turning by more than 180 degrees in all.
+    Without that, nothing is proved.  Where the exit may touch a pierced branch, that branch is no obstacle.
+    """
+
+    def __init__(self, space: NeedleSpace, query: Query, *, max_bytes: int = MAX_BYTES) -> None:
+        if max_bytes <= 0:
+            raise SettingsError(f"The memory for a proof is {max_bytes} bytes", expected="more than 0")
+        self.outcome = "running"
+        self.reason = ""
+        self.cell_mm = math.inf
+        self.slope_cell = math.inf
+        self.states = 0
+        """Largest number of states on a plane so far."""
+        self._space = space
+        self._query = query
+        self._max_bytes = max_bytes
+        self._required = float(space.limits[index.REQUIRED])
+        self._exempt_mm = float(space.limits[index.EXEMPT_LENGTH]) - query.inserted_mm
+        self._kappa = max(float(space.limits[index.KAPPA]) * (1.0 + ROUNDING), LEAST_KAPPA)
+        self._tolerance = space.goal_tolerance_mm + bounds.SPARE
+        self._planes: list[Plane] = []
+        self._coarse: list[Plane] = []
+        self._too_steep = False
+        self._steps = self._run()
+
+    def advance(self) -> bool:
+        """Do the next step, a plane of one level; return whether the proof has ended."""
+        if self.outcome == "running":
+            try:
+                next(self._steps, None)
+            except _TooMuchError:
+                self._end("undecided", "more states than fit the memory allowed")
+            if self.outcome != "running":
+                self._planes, self._coarse = [], []
+        return self.outcome != "running"
+
+    def run(self) -> str:
+        """Go on to the end; return the outcome."""
+        while not self.advance():
+            pass
+        return self.outcome
+
+    def _end(self, outcome: str, reason: str) -> None:
+        self.outcome, self.reason = outcome, reason
+
+    def _run(self) -> Iterator[None]:
+        """Try one kind of proof after the other."""
+        self._measure()
+        if self.outcome != "running":
+            return
+        for side in CUBES_MM:
+            yield
+            if self._parted(side):
+                self._end("no path", f"blocked, whatever the curvature, by cubes of {side:g} mm")
+                return
+        yield
+        self._aim_planes()
+        if self.outcome == "running":
+            yield from self._refine()
+
+    def _measure(self) -> None:
+        """Set up the line from start to target, and look whether the proof can hold or is already done."""
+        space, query = self._space, self._query
+        start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
+        chord = query.target - start
+        total = float(np.linalg.norm(chord))
+        length = float(space.limits[index.MAX_LENGTH]) - query.inserted_mm + bounds.SPARE
+        turn = min(float(space.limits[index.MAX_TURN]) - query.turned_rad, self._kappa * length)
+        if space.limits[index.LOOKUP_STEP] > 0.0:
+            self._end("undecided", "paths of this space need not be clear")
+        elif turn > math.pi * (1.0 + ROUNDING):
+            self._end("undecided", "the needle may turn by more than 180 degrees in all")
+        elif total <= self._tolerance + LEAST_WAY_MM:
+            self._end("undecided", "the target lies at the start")
+        elif total - self._tolerance > length:
+            self._end("no path", "the target is farther than the needle is long")
+        elif self._clearance_at_most(start) < self._required - bounds.SPARE:
+            self._end("no path", "the start is too near to obstacles")
+        else:
+            ahead = float(chord @ forward)
+            aside = math.sqrt(max(total**2 - ahead**2, 0.0))
+            if hopes.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_WAY_MM:
+                self._end("no path", "the target lies outside the workspace of the start")
+        if self.outcome == "running":
+            normal = chord / total
+            column = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+            column /= np.linalg.norm(column)
+            self._frame = np.stack([start, normal, np.cross(normal, column), column])
+            self._bound(total, length)
+
+    def _clearance_at_most(self, point: Float) -> float:
+        exempt = self._query.branch if self._exempt_mm > 0.0 else -1
+        return float(blocked.clearance_above(self._space.arrays, self._required, 0.0, exempt, *point))
+
+    def _bound(self, total: float, length: float) -> None:
+        """Bound the places and the angle to the line that a path of at most `length` mm can have."""
+        radius = 1.0 / self._kappa
+        widest = total + self._tolerance
+        self._ends = np.zeros(bounds.ENDS_SIZE)
+        self._ends[: bounds.LONGEST] = total, self._tolerance
+        self._ends[bounds.SPINDLE_RADIUS] = math.inf
+        self._steepest = 1.0
+        longest = length
+        if widest < 2.0 * radius:
+            half = math.asin(0.5 * widest / radius)
+            tilt = math.asin(self._tolerance / total)
+            offset = radius * math.cos(half)
+            self._ends[bounds.SPINDLE_MIDDLE :] = 0.5 * widest, offset, radius + widest * tilt
+            self._steepest = math.sin(min(half + tilt + ROUNDING, 0.5 * math.pi))
+            longest = min(longest, 2.0 * half * radius)
+        longest += self._tolerance
+        self._ends[bounds.LONGEST] = longest
+        self._aside = 0.5 * math.sqrt(longest**2 - total**2) + bounds.SPARE
+        self._before = 0.5 * (longest - total) + bounds.SPARE
+        if widest < 2.0 * radius:
+            self._aside = min(self._aside, radius + widest * tilt - offset)
+        local = self._frame[1:] @ self._query.lps_from_start[:3, 2]
+        self._along = float(local[0])
+        self._scale = np.zeros(bounds.SCALE_SIZE)
+        self._scale[bounds.KAPPA] = self._kappa
+        if self._along > 0.0:
+            self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
+
+    def _parted(self, side: float) -> bool:
+        """Tell whether cubes that no path can pass part the target from the start."""
+        if self._along <= 0.0:
+            return False
+        beside = math.ceil(self._aside / side) + 1
+        before = math.ceil(self._before / side) + 1
+        shape = (
+            np.array([before + math.ceil(self._ends[bounds.TOTAL] / side) + before, 2 * beside, 2 * beside])
+            + 1
+        )
+        size = math.prod(int(n) for n in shape)
+        if 5 * size > self._max_bytes or size >= 1 << 31:
+            return False
+        return not cubes.flood(
+            self._space.arrays, self._required, self._query.branch, self._exempt_mm, self._scale, self._ends,
+            self._frame, side, np.array([-before, -beside, -beside]), np.zeros(shape, dtype=np.bool_),
+            np.zeros(size, dtype=np.int32),
+        )  # fmt: skip
+
+    def _aim_planes(self) -> None:
+        """Choose the planes and the direction from which the limit of the angle counts."""
+        last = float(self._ends[bounds.TOTAL]) - self._tolerance
+        self._count = math.ceil(last / min(DEPTH_SHARE / self._kappa, LARGEST_DEPTH_MM))
+        self._depth = last / self._count
+        self._proved_steepest = self._steepest <= STEEPEST
+        sine = self._steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
+        self._scale[bounds.TOP_SINE] = sine
+        if self._along <= 0.0 or math.sqrt(max(1.0 - self._along**2, 0.0)) >= sine:
+            self._end("undecided", "the start looks away from the target")
+        reference = self._query.reference
+        if reference is None:
+            reference = self._query.lps_from_start[:3, 2]
+        self._reference = self._frame[1:] @ reference
+
+    def _refine(self) -> Iterator[None]:
+        """Go through all planes forward and backward, again and again with smaller cells."""
+        self.cell_mm = min(FIRST_CELL_MM, 0.5 * LARGEST_SLOPE_CELL * self._depth)
+        for level in range(LEVELS):
+            self._split = False
+            if level > 0:
+                # Halving positions and depth leaves the cells of directions as they are.
+                self._split = self._kappa * self._depth**2 > CELLS_PER_BOW * self.cell_mm
+                self.cell_mm *= 0.5
+                self._depth *= 0.5 if self._split else 1.0
+                self._count *= 2 if self._split else 1
+            self.slope_cell = 2.0 * self.cell_mm / self._depth
+            self._scale[bounds.CELL], self._scale[bounds.SLOPE_CELL] = self.cell_mm, self.slope_cell
+            if not self._proved_steepest:
+                self._scale[bounds.TOP_SINE] = 1.0 - self._kappa * self._depth
+            self._planes = []
+            for number in range(self._count + 1):
+                self._forward(number)
+                if self.outcome != "running":
+                    return
+                yield
+            for number in range(self._count - 1, -1, -1):
+                self._backward(number)
+                if self.outcome != "running":
+                    return
+                yield
+            self._coarse = self._planes
+        self._end("undecided", "states are left at the finest level")
+
+    def _forward(self, number: int) -> None:
+        """Add a plane: the states reached from the plane before, or the start."""
+        plane = self._allowed(number)
+        hopes.keep_hopeful(
+            plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
+            float(self._space.limits[index.MAX_ANGLE]),
+        )  # fmt: skip
+        if number > 0 and plane.bits.any():
+            plane = plane.trimmed()
+            self._step(self._planes[-1], 1, plane, 2.0 if number > 1 else 1.0)
+        if plane.bits.any():
+            plane = plane.trimmed()
+            self._keep_clear(plane, number)
+        if not plane.bits.any():
+            self._end("no path", f"no state is left {number * self._depth:.1f} mm from the start")
+            return
+        plane = plane.trimmed()
+        self.states = max(self.states, int(np.bitwise_count(plane.bits).sum()))
+        if not self._proved_steepest and not self._coarse and number < self._count:
+            sine = bounds.steepest_of(plane.bits, plane.window, self._scale)
+            self._too_steep = self._too_steep or sine > 1.0 - 2.0 * self._kappa * self._depth
+        if self._too_steep:
+            self._end("undecided", "paths may be too steep for the planes")
+            return
+        self._planes.append(plane)
+
+    def _backward(self, number: int) -> None:
+        """Remove from a plane what does not lead to the next one."""
+        plane = self._planes[number]
+        self._step(self._planes[number + 1], -1, plane, 2.0)
+        if not plane.bits.any():
+            self._end("no path", f"no state {number * self._depth:.1f} mm from the start leads to the target")
+            return
+        self._planes[number] = plane.trimmed()
+
+    def _allowed(self, number: int) -> Plane:
+        """Return all states of a plane that are to be looked at."""
+        if number == 0:
+            return Plane(np.ones((1, 1, 1, 1), dtype=np.uint64), np.zeros(4, dtype=np.int64))
+        if self._coarse and not (self._split and number % 2):
+            coarse = self._coarse[number // 2 if self._split else number]
+            halved = np.array([not self._split, not self._split, True, True])
+            shape = np.where(halved, 2 * np.array(coarse.bits.shape) + 1, coarse.bits.shape)
+            self._require(8 * math.prod(int(n) for n in shape))
+            bits = np.zeros(tuple(shape), dtype=np.uint64)
+            bitmaps.refine(coarse.bits, not self._split, bits)
+            return Plane(bits, np.where(halved, 2 * coarse.window - 1, coarse.window))
+        low, high = self._reached(self._planes[-1].window, self._planes[-1].ends, 1, number)
+        if self._coarse:
+            after = self._coarse[number // 2 + 1]
+            # Cells of position, halved, overlap one more to either side.
+            twice, more = np.array([1, 1, 2, 2]), np.array([0, 0, 1, 1])
+            back = self._reached(after.window * twice - more, after.ends * twice + more, -1, number)
+            low = np.maximum(low, back[0])
+            high = np.maximum(np.minimum(high, back[1]), low)
+        shape = high - low + 1
+        shape[3] = -(-int(shape[3]) // 64)
+        self._require(8 * math.prod(int(n) for n in shape))
+        return Plane(np.full(tuple(shape), bitmaps.ALL, dtype=np.uint64), low)
+
+    def _reached(self, low: Window, high: Window, way: int, number: int) -> tuple[Window, Window]:
+        """Return the first and last cell numbers on a plane that states between others may reach.
+
+        `way` is 1 from the plane before and -1 from the one after.
+        """
+        scale = self._scale
+        reach = bounds.largest_reach(scale, self._depth, 2.0, low, *(high - low + 1)[:2])
+        top = scale[bounds.TOP_SINE]
+        steep = top / math.sqrt(1.0 - top * top)
+        aside = math.ceil(bounds.largest_aside(top, scale, self._depth, 0.0, 1e9) / self.cell_mm + 4.0)
+        least, most = low.copy(), high.copy()
+        for axis in (0, 1):
+            first = scale[bounds.FIRST_V + axis]
+            least[axis] = max(low[axis] - reach, math.floor((-steep - first) / self.slope_cell) - 1)
+            most[axis] = max(
+                min(high[axis] + reach, math.ceil((steep - first) / self.slope_cell) + 1), least[axis]
+            )
+            moves = way * (low[axis] + least[axis]), way * (high[axis] + most[axis])
+            least[axis + 2] += min(moves) - aside
+            most[axis + 2] += max(moves) + aside
+            middle = number * self._depth * first
+            least[axis + 2] = max(least[axis + 2], math.floor((-self._aside - middle) / self.cell_mm) - 1)
+            most[axis + 2] = min(most[axis + 2], math.ceil((self._aside - middle) / self.cell_mm) + 1)
+            most[axis + 2] = max(most[axis + 2], least[axis + 2])
+        return least, most
+
+    def _require(self, size: int) -> None:
+        """Raise if so many bytes more do not fit the memory allowed."""
+        used = sum(plane.bits.nbytes for plane in self._planes + self._coarse)
+        if used + size > self._max_bytes:
+            raise _TooMuchError
+
+    def _step(self, plane: Plane, way: int, other: Plane, blur: float) -> None:
+        """Keep of another plane what a plane's states reach, as many rows of directions at once as fit."""
+        nv, nu, rows, words = other.bits.shape
+        reach = bounds.largest_reach(self._scale, self._depth, blur, other.window, nv, nu)
+        chunk = nv
+        while True:
+            part = plane.bits[: chunk + 2 * reach]
+            try:
+                self._require(8 * math.prod(sets.table_shape(part, reach)) + 2 * other.bits.nbytes)
+                break
+            except _TooMuchError:
+                if chunk == 1:
+                    raise
+                chunk = (chunk + 1) // 2
+        for first in range(0, nv, chunk):
+            target = other.bits[first : first + chunk]
+            offset = int(other.window[0] - plane.window[0]) + first
+            low, high = max(offset - reach, 0), max(offset + chunk + reach, 0)
+            source = plane.bits[low:high]
+            if source.shape[0] == 0:
+                target[:] = 0
+                continue
+            sets.step_sets(
+                source, plane.window + np.array([low, 0, 0, 0]), self._scale, self._depth, way, blur,
+                SLOPE_CHANGE_EDGES, target, other.window + np.array([first, 0, 0, 0]),
+            )  # fmt: skip
+
+    def _keep_clear(self, plane: Plane, number: int) -> None:
+        """Test half a slab to either side of a plane."""
+        here = number * self._depth
+        last = self._count * self._depth
+        probes = self._depth / PROBES_PER_DEPTH * np.arange(-PROBES_PER_DEPTH // 2, PROBES_PER_DEPTH // 2 + 1)
+        probes = probes[(here + probes > -1e-9) & (here + probes < last + 1e-9)]
+        low, high = plane.window, plane.ends
+        corners = np.zeros((len(probes), 2), dtype=np.int64)
+        shape = np.zeros((len(probes), 2), dtype=np.int64)
+        for axis in (0, 1):
+            move = probes * self.slope_cell / self.cell_mm
+            ends = np.stack([move * low[axis], move * high[axis]])
+            corners[:, axis] = low[axis + 2] + np.floor(ends.min(axis=0)) - 1
+            shape[:, axis] = high[axis + 2] + np.ceil(ends.max(axis=0)) + 2 - corners[:, axis]
+        rows, words = int(shape[:, 0].max()), -(-int(shape[:, 1].max()) // 64)
+        slacks = bounds.HALF_DIAGONAL * self.cell_mm * SLACK_RATIO ** np.arange(SLACKS)
+        self._require(len(probes) * rows * words * (8 + 64 + 8 * SLACKS))
+        probed = np.zeros((len(probes), rows, words), dtype=np.uint64)
+        blocked.mark_probed(plane.bits, plane.window, self._scale, probes, probed, corners)
+        grades = np.zeros((len(probes), rows, 64 * words), dtype=np.uint8)
+        across = self._frame[2:] * self.cell_mm
+        for n, probe in enumerate(probes):
+            depth = here + float(probe)
+            # A path at this depth is at least as long, so beyond the exempt length nothing is spared.
+            exempt = self._query.branch if depth < self._exempt_mm else -1
+            tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
+            origin = self._frame[0] + depth * (self._frame[1] + tangent) + corners[n] @ across
+            blocked.grade_clearance(
+                self._space.arrays, self._required, exempt, origin, across, probed[n], slacks, grades[n]
+            )
+        blocked.keep_clear(plane.bits, plane.window, self._scale, probes, corners, grades, slacks)

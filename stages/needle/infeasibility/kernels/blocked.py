@@ -1,0 +1,159 @@
+"""States around which every path is blocked, and sets without them."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.field import exact_distance, interpolate_squared
+from stages.needle.infeasibility.kernels.bitmaps import ONE, and_shifted, find_box, or_shifted
+from stages.needle.infeasibility.kernels.bounds import (
+    CELL,
+    KAPPA,
+    SLOPE_CELL,
+    SPARE,
+    largest_second_derivative,
+    slope_of,
+    steepest_sine,
+)
+
+FIELD_STEP_MM = 0.005
+"""What a clearance field rounds off is less."""
+
+
+@inner_kernel
+def _probed_at(v, u, window, scale, depth):
+    """Return the whole cells (y, x) by which a tangent has moved at a depth, and what that leaves in mm."""
+    move = depth * scale[SLOPE_CELL] / scale[CELL]
+    move_y = (v + window[0]) * move
+    move_x = (u + window[1]) * move
+    y = int(round(move_y))
+    x = int(round(move_x))
+    return y, x, abs(move_y - y) * scale[CELL], abs(move_x - x) * scale[CELL]
+
+
+@numba.njit(cache=True)
+def mark_probed(states, window, scale, depths, probed, corners):
+    """Set the bits of the cells that the tangents of a plane's states meet at some depths.
+
+    Parameters
+    ----------
+    states : (V, U, Y, W) uint64, window : (4,) int64
+    scale : (SCALE_SIZE,) float64
+    depths : (D,) float64
+        As seen from the plane, mm.
+    probed : (D, Y', W') uint64
+    corners : (D, 2) int64
+        Cell numbers (y, x) of the first cell of each.
+    """
+    nv, nu, _rows, _words = states.shape
+    box = np.zeros(4, np.int64)
+    for v in range(nv):
+        for u in range(nu):
+            if find_box(states[v, u], box):
+                for d in range(depths.shape[0]):
+                    y, x, _left_y, _left_x = _probed_at(v, u, window, scale, depths[d])
+                    or_shifted(
+                        probed[d], states[v, u], window[2] + y - corners[d, 0], window[3] + x - corners[d, 1]
+                    )
+
+
+@numba.njit(cache=True)
+def clearance_above(space, required, spare, exempt_branch, x, y, z):
+    """Return a clearance in mm that the true one of a point is never above, as far as it is worth knowing.
+
+    Where the clearance is at least `required - spare` and the field says so, `required` is returned.
+    """
+    field, labels, geometry, bits = space
+    squared, spread2 = interpolate_squared(field, geometry, x, y, z)
+    least = max(required - spare, 0.0)
+    if squared > 0.0 and squared - spread2 >= least * least:
+        return required
+    above = math.sqrt(squared) + math.sqrt(spread2) + FIELD_STEP_MM
+    if exempt_branch < 0 and squared > 0.0 and above < 0.5 * required:
+        return above
+    return exact_distance(labels, geometry, x, y, z, bits, exempt_branch, required)[0]
+
+
+@inner_kernel
+def _grade_of(slacks, value):
+    """Return which of the rising `slacks` is the first not below a value; their number if none is."""
+    for q in range(slacks.shape[0]):
+        if slacks[q] >= value:
+            return q
+    return slacks.shape[0]
+
+
+@numba.njit(cache=True)
+def grade_clearance(space, required, exempt_branch, origin, across, probed, slacks, grades):
+    """Fill `grades` (Y, 64 W) uint8 with the first of the `slacks` that a cell's lack of clearance is within.
+
+    Of the cells of one plane only those are looked at that are set in `probed` (Y, W).  A lack is required
+    clearance less the clearance at the cell's centre; one beyond all of the Q `slacks` (rising) gets Q.
+    `origin` is the first cell's centre, `across` (2, 3) are the steps from row to row and column to column.
+    Airway voxels of `exempt_branch` (-1: none) do not count.
+    """
+    rows, words = probed.shape
+    for y in range(rows):
+        for x in range(64 * words):
+            if not (probed[y, x // 64] >> np.uint64(x % 64)) & ONE:
+                continue
+            above = clearance_above(
+                space, required, slacks[0], exempt_branch,
+                origin[0] + y * across[0, 0] + x * across[1, 0],
+                origin[1] + y * across[0, 1] + x * across[1, 1],
+                origin[2] + y * across[0, 2] + x * across[1, 2],
+            )  # fmt: skip
+            grades[y, x] = _grade_of(slacks, required - above - SPARE)
+
+
+@numba.njit(cache=True)
+def keep_clear(states, window, scale, depths, corners, grades, slacks):
+    """Remove the states from which half a slab behind or ahead is blocked for every path.
+
+    Parameters
+    ----------
+    states : (V, U, Y, W) uint64, window : (4,) int64
+    scale : (SCALE_SIZE,) float64
+    depths, corners
+        See `mark_probed`.
+    grades : (D, Y', X') uint8, slacks : (Q,) float64
+        See `grade_clearance`.
+    """
+    nv, nu, _rows, _words = states.shape
+    free = np.zeros((depths.shape[0], slacks.shape[0], grades.shape[1], grades.shape[2] // 64), np.uint64)
+    made = np.zeros((depths.shape[0], slacks.shape[0]), np.bool_)
+    box = np.zeros(4, np.int64)
+    for v in range(nv):
+        for u in range(nu):
+            slope_v, slope_u = slope_of(v, u, window, scale)
+            sine = steepest_sine(slope_v, slope_u, scale)
+            for d in range(depths.shape[0]):
+                if not find_box(states[v, u], box):
+                    break
+                depth = abs(depths[d])
+                y, x, left_y, left_x = _probed_at(v, u, window, scale, depths[d])
+                half = 0.5 * (scale[CELL] + scale[SLOPE_CELL] * depth)
+                bound = largest_second_derivative(sine + scale[KAPPA] * depth, scale)
+                slack = math.hypot(half + left_y, half + left_x) + 0.5 * bound * depth * depth + SPARE
+                q = _grade_of(slacks, slack)
+                if q == slacks.shape[0]:
+                    continue
+                if not made[d, q]:
+                    made[d, q] = True
+                    _free_within(grades[d], q, free[d, q])
+                and_shifted(
+                    states[v, u], free[d, q], corners[d, 0] - window[2] - y, corners[d, 1] - window[3] - x
+                )
+
+
+@inner_kernel
+def _free_within(grades, most, out):
+    """Set the bits of the cells whose grade is at most `most`."""
+    for y in range(grades.shape[0]):
+        for x in range(grades.shape[1]):
+            if grades[y, x] <= most:
+                out[y, x // 64] |= ONE << np.uint64(x % 64)

@@ -1,0 +1,73 @@
+"""Cubes that paths may pass, filled from the start."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from stages.needle.infeasibility.kernels.blocked import clearance_above
+from stages.needle.infeasibility.kernels.bounds import SPARE, TOLERANCE, TOTAL
+from stages.needle.infeasibility.kernels.reachability_pruning import hope_of_place
+
+
+@numba.njit(cache=True)
+def flood(space, required, exempt_branch, exempt_mm, scale, ends, frame, side, corner, seen, queue):
+    """Fill the cubes that may be passed, from that of the start on; return whether one of the goal's is met.
+
+    A path goes from one cube to another through a point of both, so to one of its 26 neighbours.
+
+    Parameters
+    ----------
+    space : tuple
+        See `stages.needle.kernels.proof`.
+    required : float
+    exempt_branch : int, exempt_mm : float
+        Branch whose airway voxels do not count less than so many mm away from the start.
+    scale, ends : (SCALE_SIZE,), (ENDS_SIZE,) float64
+    frame : (4, 3) float64
+        Position of the start; the planes' normal, row and column direction.
+    side : float
+        Of the cubes, mm.
+    corner : (3,) int64
+        Cube numbers (depth, y, x) of the first cube; that of the start has numbers 0.
+    seen : (H, Y, X) bool
+        All False; those looked at are set.
+    queue : (H Y X,) int32
+    """
+    nh, ny, nx = seen.shape
+    half = 0.8661 * side + SPARE
+    first = (-corner[0] * ny - corner[1]) * nx - corner[2]
+    queue[0] = first
+    seen[-corner[0], -corner[1], -corner[2]] = True
+    begin = 0
+    end = 1
+    while begin < end:
+        number = queue[begin]
+        begin += 1
+        i = number // (ny * nx)
+        j = number // nx - i * ny
+        k = number - (i * ny + j) * nx
+        h, y, x = (i + corner[0]) * side, (j + corner[1]) * side, (k + corner[2]) * side
+        if math.sqrt((ends[TOTAL] - h) ** 2 + y * y + x * x) <= ends[TOLERANCE] + half:
+            return True
+        for a in range(max(i - 1, 0), min(i + 2, nh)):
+            for b in range(max(j - 1, 0), min(j + 2, ny)):
+                for c in range(max(k - 1, 0), min(k + 2, nx)):
+                    if seen[a, b, c]:
+                        continue
+                    seen[a, b, c] = True
+                    h, y, x = (a + corner[0]) * side, (b + corner[1]) * side, (c + corner[2]) * side
+                    if hope_of_place(h, y, x, scale, ends) + half < 0.0:
+                        continue
+                    exempt = exempt_branch if math.sqrt(h * h + y * y + x * x) - half < exempt_mm else -1
+                    above = clearance_above(
+                        space, required, half, exempt,
+                        frame[0, 0] + h * frame[1, 0] + y * frame[2, 0] + x * frame[3, 0],
+                        frame[0, 1] + h * frame[1, 1] + y * frame[2, 1] + x * frame[3, 1],
+                        frame[0, 2] + h * frame[1, 2] + y * frame[2, 2] + x * frame[3, 2],
+                    )  # fmt: skip
+                    if above + half >= required:
+                        queue[end] = (a * ny + b) * nx + c
+                        end += 1
+    return False

@@ -1,0 +1,169 @@
+"""States from which the target, or to which the start, is out of reach, and sets without them."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.compiling import inner_kernel
+from stages.needle.infeasibility.kernels.bitmaps import ALL, find_box
+from stages.needle.infeasibility.kernels.bounds import (
+    CELL,
+    FIRST_U,
+    FIRST_V,
+    HALF_DIAGONAL,
+    KAPPA,
+    LONGEST,
+    SLOPE_CELL,
+    SPARE,
+    SPINDLE_MIDDLE,
+    SPINDLE_OFFSET,
+    SPINDLE_RADIUS,
+    TOLERANCE,
+    TOP_SINE,
+    TOTAL,
+    slope_of,
+)
+
+# With a type of its own a constant is no literal, for each of which what is called would be compiled anew.
+_FIRST_BIT = np.int64(0)
+
+
+@numba.njit(cache=True)
+def escape_depth(rho, h, radius):
+    """Return how deep a point lies among the points that no needle reaches, as a number below 0, in mm.
+
+    It is `rho` mm aside of the needle and `h` mm ahead.  A needle that turns by 180 degrees in all reaches
+    neither points in the torus of its tightest circles nor, behind it, points less than two radii aside.
+    Points outside get 0 or more.  The number is 1-Lipschitz.
+    """
+    if h >= 0.0:
+        return math.hypot(radius - rho, h) - radius
+    return -min(math.hypot(rho, h), 2.0 * radius - rho)
+
+
+@inner_kernel
+def hope_of_place(h, y, x, scale, ends):
+    """Return by how much a place may be moved before no path leads through it, in mm; below 0 if none does.
+
+    It lies `h` mm deep, and (y, x) mm aside of the line from start to target.
+    """
+    radius = 1.0 / scale[KAPPA]
+    norm2 = 1.0 + scale[FIRST_V] ** 2 + scale[FIRST_U] ** 2
+    ahead = (h + y * scale[FIRST_V] + x * scale[FIRST_U]) / math.sqrt(norm2)
+    aside2 = y * y + x * x
+    rho = math.sqrt(max(h * h + aside2 - ahead * ahead, 0.0))
+    hope = escape_depth(rho, ahead, radius)
+    way = math.sqrt(h * h + aside2) + math.sqrt((ends[TOTAL] - h) ** 2 + aside2)
+    hope = min(hope, 0.5 * (ends[LONGEST] - way))
+    if ends[SPINDLE_RADIUS] < math.inf:
+        from_centre = math.hypot(math.sqrt(aside2) + ends[SPINDLE_OFFSET], h - ends[SPINDLE_MIDDLE])
+        hope = min(hope, ends[SPINDLE_RADIUS] - from_centre)
+    return hope + SPARE
+
+
+@inner_kernel
+def _hope_of_state(h, y, x, slope_v, slope_u, blur, scale, ends):
+    """Return the same for a state; `blur` is the angle between a cell's directions and its centre's."""
+    radius = 1.0 / scale[KAPPA]
+    norm = math.sqrt(1.0 + slope_v * slope_v + slope_u * slope_u)
+    aside2 = y * y + x * x
+    left = ends[TOTAL] - h
+    sideways = y * slope_v + x * slope_u
+    ahead = (left - sideways) / norm
+    away2 = left * left + aside2
+    hope = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius)
+    hope += math.sqrt(away2) * blur + ends[TOLERANCE]
+    # The same path backward leads to the start.
+    ahead = (h + sideways) / norm
+    away2 = h * h + aside2
+    back = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius) + math.sqrt(away2) * blur
+    return min(hope, back) + HALF_DIAGONAL * scale[CELL] + SPARE
+
+
+@numba.njit(cache=True)
+def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
+    """Remove the states of a plane from which the goal cannot be reached, or which the start cannot reach.
+
+    Parameters
+    ----------
+    states : (V, U, Y, W) uint64, window : (4,) int64
+    scale, ends : (SCALE_SIZE,), (ENDS_SIZE,) float64
+    depth : float
+        Of the plane, mm.
+    reference : (3,) float64
+        Direction from which the limit of the angle counts: its component along the planes' normal, and its
+        row and column.
+    max_angle : float
+        That limit, rad.
+    """
+    nv, nu, rows, words = states.shape
+    cell = scale[CELL]
+    top = scale[TOP_SINE] / math.sqrt(1.0 - scale[TOP_SINE] ** 2)
+    possible = np.zeros((rows, words), np.uint64)
+    for y in range(rows):
+        side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
+        x = _FIRST_BIT
+        while x < 64 * words:
+            side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
+            hope = hope_of_place(depth, side_y, side_x, scale, ends) + HALF_DIAGONAL * cell
+            x = _set_run(possible[y], x, hope, cell)
+    box = np.zeros(4, np.int64)
+    row = np.zeros(words, np.uint64)
+    for v in range(nv):
+        for u in range(nu):
+            slope_v, slope_u = slope_of(v, u, window, scale)
+            slope = math.hypot(slope_v, slope_u)
+            least = max(slope - HALF_DIAGONAL * scale[SLOPE_CELL], 0.0)
+            blur = HALF_DIAGONAL * scale[SLOPE_CELL] / math.sqrt(1.0 + least * least)
+            cosine = (reference[0] + slope_v * reference[1] + slope_u * reference[2]) / math.hypot(1.0, slope)
+            if least > top or math.acos(max(min(cosine, 1.0), -1.0)) - blur > max_angle + SPARE:
+                states[v, u] = 0
+                continue
+            for y in range(rows):
+                for w in range(words):
+                    states[v, u, y, w] &= possible[y, w]
+            if not find_box(states[v, u], box):
+                continue
+            # All of the box may be decided by the hope at its middle.
+            middle_y = (0.5 * (box[0] + box[1]) + window[2]) * cell + depth * scale[FIRST_V]
+            middle_x = (32.0 * (box[2] + box[3] + 1) - 0.5 + window[3]) * cell + depth * scale[FIRST_U]
+            away = 0.5 * cell * math.hypot(box[1] - box[0], 64.0 * (box[3] - box[2] + 1))
+            hope = _hope_of_state(depth, middle_y, middle_x, slope_v, slope_u, blur, scale, ends)
+            if hope >= (1.0 + blur) * away:
+                continue
+            if hope < -(1.0 + blur) * away:
+                states[v, u] = 0
+                continue
+            for y in range(box[0], box[1] + 1):
+                row[box[2] : box[3] + 1] = 0
+                side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
+                x = 64 * box[2]
+                while x < 64 * (box[3] + 1):
+                    side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
+                    hope = _hope_of_state(depth, side_y, side_x, slope_v, slope_u, blur, scale, ends)
+                    x = _set_run(row[: box[3] + 1], x, hope, (1.0 + blur) * cell)
+                for w in range(box[2], box[3] + 1):
+                    states[v, u, y, w] &= row[w]
+
+
+@inner_kernel
+def _set_run(row, x, hope, step):
+    """Set the bits from `x` on to whether there is hope, as far as its sign is sure; return where that ends.
+
+    Hope changes by at most `step` from bit to bit.
+    """
+    run = min(max(int(math.ceil(abs(hope) / step)), 1), 64 * row.shape[0] - x)
+    end = x + run
+    if hope < 0.0:
+        return end
+    for w in range(x // 64, (end - 1) // 64 + 1):
+        value = ALL
+        if w == x // 64:
+            value &= ALL << np.uint64(x - 64 * w)
+        if end < 64 * (w + 1):
+            value &= ALL >> np.uint64(64 * (w + 1) - end)
+        row[w] |= value
+    return end

@@ -1,0 +1,24 @@
+"""The needle problem in OMPL: an SE(3) control problem, and planners whose search is a compiled kernel.
+
+The only package that imports OMPL; docs/ompl.md tells how it is used and which traps it avoids.  What
+OMPL's own planners propagate is proved clear step by step; what they find is proved once more as arcs.
+"""
+
+from stages.needle.ompl.benchmark import benchmark
+from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question
+from stages.needle.ompl.problem import Allocator, NeedleProblem, SearchFactory, seed_ompl
+from stages.needle.ompl.states import path_of, read_state, write_state
+
+__all__ = [
+    "Allocator",
+    "NeedleGoal",
+    "NeedlePlanner",
+    "NeedleProblem",
+    "Question",
+    "SearchFactory",
+    "benchmark",
+    "path_of",
+    "read_state",
+    "seed_ompl",
+    "write_state",
+]

@@ -1,0 +1,91 @@
+"""How the needle moves in OMPL: bounds, and steps that are proved clear one by one."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from ompl import base
+
+from anatomy.grid import Float
+from anatomy.kernels.field import MIN_GAP_MM
+from stages.needle.kernels import limits as index
+from stages.needle.kernels import states
+from stages.needle.ompl.planner import Question
+from stages.needle.ompl.states import numbers_of, put_numbers
+from stages.needle.space import NeedleSpace
+
+ARC_STEPS = 20
+"""A control of duration 1 is an arc; OMPL propagates it in so many steps."""
+LONGEST_STEP_MM = 1.0
+"""Longest step of a propagation."""
+
+
+def position_bounds(space: NeedleSpace) -> Any:
+    """Bound positions by the box of the grid."""
+    grid = space.grid
+    corners = grid.lps(list(itertools.product(*[(-0.5, n - 0.5) for n in grid.shape])))
+    bounds = base.RealVectorBounds(3)
+    for axis in range(3):
+        bounds.setLow(axis, float(corners[:, axis].min()))
+        bounds.setHigh(axis, float(corners[:, axis].max()))
+    return bounds
+
+
+def control_bounds(space: NeedleSpace) -> Any:
+    """Bound length, roll and curvature of an arc, so that a step is at most 1 mm long."""
+    bounds = base.RealVectorBounds(3)
+    highs = (ARC_STEPS * LONGEST_STEP_MM, math.pi, space.needle.max_curvature_per_mm)
+    for n, (low, high) in enumerate(zip((0.0, -math.pi, 0.0), highs, strict=True)):
+        bounds.setLow(n, low)
+        bounds.setHigh(n, high)
+    return bounds
+
+
+def _limits_of_steps(space: NeedleSpace) -> Float:
+    """Return the limits by which steps are proved, so that whatever is proved as an arc passes.
+
+    The proof refuses points that have less than MIN_GAP_MM to spare.  Between its points half of that is
+    left at least; so arcs that passed, cut anywhere, pass again with so much less required clearance, and
+    what passes this way still has all of it.
+    """
+    limits = np.array(space.limits)
+    limits[index.REQUIRED] = max(limits[index.REQUIRED] - 0.5 * MIN_GAP_MM, 0.0)
+    return limits
+
+
+def propagator(space: NeedleSpace, question: Question) -> Callable[[Any, Any, float, Any], None]:
+    """Return how OMPL moves a state by a control."""
+    limits = _limits_of_steps(space)
+
+    def propagate(state: Any, u: Any, duration: float, result: Any) -> None:
+        """Advance along a share `duration` of an arc that bends towards `u[1]`, if that is proved clear."""
+        moved = states.proved_step(
+            space.arrays,
+            limits,
+            numbers_of(state),
+            u[1],
+            u[2],
+            duration * u[0],
+            question.origin,
+            question.branch,
+        )
+        put_numbers(result, moved)
+
+    return propagate
+
+
+def validity(space: NeedleSpace, question: Question) -> Callable[[Any], bool]:
+    """Return how OMPL tells whether a state is allowed."""
+    limits = _limits_of_steps(space)
+
+    def is_valid(state: Any) -> bool:
+        # A numpy.bool_ would raise std::bad_cast.
+        return bool(
+            states.is_allowed(space.arrays, limits, numbers_of(state), question.origin, question.branch)
+        )
+
+    return is_valid

@@ -1,0 +1,242 @@
+"""A needle search as a planner of OMPL, its goal, and the question that both are asked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ompl import base, control
+
+from anatomy import poses
+from anatomy.errors import FileError
+from anatomy.grid import Float
+from anatomy.io.files import atomic_write
+from stages.needle.kernels import states, tree
+from stages.needle.ompl.states import numbers_of, put_numbers, write_state
+from stages.needle.path import ArcPath, arc_transform
+from stages.needle.search.base import Query, Search, TreeSearch
+from stages.needle.violations import SAME_MM
+
+ROUNDING_MM = 1e-6
+"""What every goal tolerance is larger for OMPL, whose states are rounded."""
+SLICE_ITERATIONS = 200
+NO_LIMIT = 2**62
+
+
+class Question:
+    """The query that is asked at the moment, as planners, propagation and validity checker share it."""
+
+    def __init__(self) -> None:
+        self.query: Query | None = None
+        self.start = self.origin = (math.nan,) * 7
+        self.branch = -1
+
+    def ask(self, query: Query) -> None:
+        """Set start, direction, inserted length and branch, see `stages.needle.kernels.states`."""
+        frame = query.lps_from_start
+        forward = frame[:3, 2] if query.reference is None else query.reference
+        self.query = query
+        self.start = states.state_of(frame)
+        self.origin = (*self.start[:3], *forward.tolist(), query.inserted_mm)
+        self.branch = query.branch
+
+    def begins_at(self, state: Any) -> bool:
+        """Tell whether a state of OMPL is the start of the query."""
+        return max(abs(a - b) for a, b in zip(numbers_of(state), self.start, strict=True)) < 1e-9
+
+
+class NeedleGoal(base.GoalSampleableRegion):
+    """The tip is at the target; its orientation is free.
+
+    Parameters
+    ----------
+    si : control.SpaceInformation
+    target : (3,) float64, LPS mm
+    tolerance_mm : float
+        How far from the target a path may end.
+    """
+
+    def __init__(self, si: Any, target: Float, tolerance_mm: float = 0.0) -> None:
+        super().__init__(si)
+        self._si = si
+        self._sampler: Any = None
+        self.target = tuple(float(v) for v in target)
+        self.setThreshold(tolerance_mm + ROUNDING_MM)
+
+    def distanceGoal(self, state: Any) -> float:  # noqa: N802
+        """Return the distance in mm."""
+        return math.dist((state.getX(), state.getY(), state.getZ()), self.target)
+
+    def sampleGoal(self, state: Any) -> None:  # noqa: N802
+        """Put a state of any orientation at the target."""
+        if self._sampler is None:
+            self._sampler = self._si.allocStateSampler()
+        self._sampler.sampleUniform(state)
+        for put, value in zip((state.setX, state.setY, state.setZ), self.target, strict=True):
+            put(value)
+
+    def maxSampleCount(self) -> int:  # noqa: N802
+        """Return a number without meaning: samples never run out."""
+        return 2**31 - 1
+
+
+class NeedlePlanner(base.Planner):
+    """A needle search as an OMPL planner.
+
+    `solve` runs the search in slices until it is finished, the termination condition holds, or the
+    iterations are spent; without `anytime` it stops at the first path.  Each better path replaces the one
+    before in the problem definition, which would rank by the number of arcs, not by cost.
+
+    Parameters
+    ----------
+    si : control.SpaceInformation
+    make_search : callable
+        Makes a search of a query and a seed.
+    question : Question
+        Where the query stands when `solve` is called.
+    name : str
+    """
+
+    def __init__(
+        self,
+        si: Any,
+        make_search: Callable[[Query, int], Search],
+        question: Question,
+        name: str = "rrt",
+    ) -> None:
+        super().__init__(si, name)
+        self._si = si
+        self._make_search = make_search
+        self._question = question
+        self.seed = 1
+        self.iterations = NO_LIMIT
+        """Most iterations to spend."""
+        self.anytime = False
+        self.query: Query | None = None
+        self.path: ArcPath | None = None
+        self.search: Search | None = None
+        """What the last `solve` was asked, found, and found it with."""
+        self.iterations_used = 0
+
+    def solve(self, termination: Any) -> Any:
+        """Search from the start; hand paths to the problem definition as arcs of duration 1."""
+        self.path, self.search, self.iterations_used = None, None, 0
+        self.query = query = self._question.query
+        start = self.getPlannerInputStates().nextStart()
+        if query is None or start is None or not self._question.begins_at(start):
+            return base.PlannerStatus(base.PlannerStatus.INVALID_START)
+        self.search = search = self._make_search(query, self.seed)
+        status = base.PlannerStatus.TIMEOUT
+        while not (termination() or search.finished):
+            portion = min(SLICE_ITERATIONS, self.iterations - self.iterations_used)
+            self.iterations_used += portion
+            if search.advance(portion) and search.path is not None:
+                self.path = search.path
+                status = self._hand_over(search.path)
+                if not self.anytime:
+                    break
+            if self.iterations_used >= self.iterations:
+                break
+        return base.PlannerStatus(status)
+
+    def _hand_over(self, path: ArcPath) -> Any:
+        """Make the path the problem's only solution; return the status that it earns."""
+        solution = control.PathControl(self._si)
+        longest = self._si.getControlSpace().getBounds().high[0]
+        # OMPL propagates equal controls in steps, so here the roll is counted from the start.
+        roll = 0.0
+        frames = path.frames()
+        for frame, (length, turned, curvature) in zip(frames, path.arcs.tolist(), strict=False):
+            begin = self._state(frame, roll)
+            roll = math.remainder(roll + turned, 2.0 * math.pi)
+            pieces = max(1, math.ceil(length / longest))
+            for piece in range(pieces):
+                if piece > 0:
+                    cut = arc_transform(length * piece / pieces, turned, curvature)
+                    begin = self._state(frame @ cut, roll)
+                u = self._si.allocControl()
+                u[0], u[1], u[2] = length / pieces, roll, curvature
+                solution.append(begin, u, 1.0)
+        last = self._state(frames[-1], roll)
+        solution.append(last)
+        definition = self.getProblemDefinition()
+        met, distance = definition.getGoal().isSatisfiedWithDistance(last)
+        definition.clearSolutionPaths()
+        definition.addSolutionPath(solution, not met, distance, self.getName())
+        return base.PlannerStatus.EXACT_SOLUTION if met else base.PlannerStatus.APPROXIMATE_SOLUTION
+
+    def _state(self, frame: Float, roll: float) -> Any:
+        state = self._si.allocState()
+        put_numbers(state, states.rolled(states.state_of(frame), -roll))
+        return state
+
+    def search_tree(self) -> Any:
+        """Return the last search's tree as `base.PlannerData`; an edge weighs its length in mm.
+
+        Holds what the search holds now, and the best path if that is not part of it: some searches drop
+        a tree that has succeeded, some grow none.
+        """
+        vertices = [] if self.search is None or self.query is None else _vertices(self.search, self.query)
+        data = base.PlannerData(self._si)
+        kept = []
+        for n, vertex in enumerate(vertices):
+            state = self._si.allocState()
+            write_state(state, vertex.frame)
+            kept.append(state)
+            add = data.addGoalVertex if vertex.ends_path else data.addVertex
+            (data.addStartVertex if n == 0 else add)(base.PlannerDataVertex(state))
+        for n, vertex in enumerate(vertices[1:], start=1):
+            data.addEdge(vertex.parent, n, base.PlannerDataEdge(), base.Cost(vertex.length_mm))
+        # Until here the vertices point to the states in `kept`; now they get their own.
+        data.decoupleFromPlanner()
+        return data
+
+    def save_search_tree(self, file: str | Path) -> None:
+        """Write the tree as text where the name ends in .graphml, else as OMPL's binary file.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be written.
+        """
+        data = self.search_tree()
+        with atomic_write(file) as temporary:
+            if temporary.suffix == ".graphml":
+                temporary.write_text(data.printGraphML(), encoding="utf-8")
+            elif not base.PlannerDataStorage().store(data, str(temporary)):
+                raise not_written(file)
+
+
+@dataclass(frozen=True)
+class _Vertex:
+    frame: Float
+    parent: int = 0
+    length_mm: float = 0.0
+    ends_path: bool = False
+
+
+def _vertices(search: Search, query: Query) -> list[_Vertex]:
+    """List the start, the nodes of the tree and, unless it is among them, the best path."""
+    vertices = [_Vertex(query.lps_from_start)]
+    path = search.path
+    end = np.full(3, np.nan) if path is None else path.frames()[-1][:3, 3]
+    if isinstance(search, TreeSearch):
+        for row, parent in zip(search.nodes[1 : search.count], search.parents[1 : search.count], strict=True):
+            ends_path = float(np.abs(row[:3] - end).max()) < SAME_MM
+            frame = poses.pose(row[:3], row[3:6])
+            vertices.append(_Vertex(frame, int(parent), float(row[tree.ARC_LENGTH]), ends_path))
+    if path is not None and not any(vertex.ends_path for vertex in vertices):
+        parent = 0
+        for n, frame in enumerate(path.frames()[1:]):
+            vertices.append(_Vertex(frame, parent, float(path.arcs[n, 0]), n == len(path.arcs) - 1))
+            parent = len(vertices) - 1
+    return vertices
+
+
+def not_written(file: str | Path) -> FileError:
+    """Return the error of a file that OMPL could not write."""
+    return FileError(f"{file} was not written by OMPL", expected="a folder that may be written to")

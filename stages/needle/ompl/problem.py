@@ -1,0 +1,224 @@
+"""The needle problem as OMPL takes it, made once and asked many times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ompl import base, control, util
+
+from anatomy.errors import SettingsError
+from stages.needle.ompl.motion import ARC_STEPS, control_bounds, position_bounds, propagator, validity
+from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question
+from stages.needle.ompl.states import path_of, put_numbers
+from stages.needle.path import ArcPath
+from stages.needle.search.base import Query, Search
+from stages.needle.search.planners import PLANNERS
+from stages.needle.space import NeedleSpace
+from stages.needle.violations import objection
+
+util.setLogLevel(util.LogLevel.LOG_ERROR)
+
+SearchFactory = Callable[[NeedleSpace, Query, int], Search]
+"""Makes a search of a space, a query and a seed."""
+Allocator = Callable[[Any], Any]
+"""Makes an OMPL planner of a `control.SpaceInformation`."""
+
+
+class NeedleProblem:
+    """Plans needle paths among obstacles with OMPL; made once, asked many times.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    searches : mapping of names to callables, optional
+        Each makes a search of a space, a query and a seed.  The first is the default; without any,
+        all of `stages.needle.search.planners`.
+
+    Attributes
+    ----------
+    setup : control.SimpleSetup
+        The question of `pose`, for OMPL's own tools.
+    planner : NeedlePlanner
+        The planner installed in `setup`: the default search, which may also be `anytime`.
+    """
+
+    def __init__(self, space: NeedleSpace, searches: Mapping[str, SearchFactory] | None = None) -> None:
+        self.space = space
+        self._searches = dict(searches or PLANNERS)
+        self._question = Question()
+        self._own: dict[str, NeedlePlanner] = {}
+        self._tolerance_mm = 0.0
+        position = base.SE3StateSpace()
+        position.setBounds(position_bounds(space))
+        controls = control.RealVectorControlSpace(position, 3)
+        controls.setBounds(control_bounds(space))
+        self.setup = control.SimpleSetup(controls)
+        self.si = self.setup.getSpaceInformation()
+        self.si.setPropagationStepSize(1.0 / ARC_STEPS)
+        self.si.setMinMaxControlDuration(1, ARC_STEPS)
+        self.setup.setStatePropagator(propagator(space, self._question))
+        self.setup.setStateValidityChecker(validity(space, self._question))
+        self.planner = self.planners()[self.default](self.si)
+        self.setup.setPlanner(self.planner)
+
+    @property
+    def default(self) -> str:
+        """Name of the search that is used unless another is named."""
+        return next(iter(self._searches))
+
+    def planners(self) -> dict[str, Allocator]:
+        """Return what makes each planner: our searches by their names, and OMPL's own.
+
+        For `setup.setPlanner(allocator(problem.si))` or `setup.setPlannerAllocator(allocator)`.
+        """
+        # The allocators may be kept by `setup`, so they must not refer to it: it would never be freed.
+        space, question = self.space, self._question
+
+        def ours(name: str, make: SearchFactory) -> Allocator:
+            def search(query: Query, seed: int) -> Search:
+                return make(space, query, seed)
+
+            return lambda si: NeedlePlanner(si, search, question, name)
+
+        found = {name: ours(name, make) for name, make in self._searches.items()}
+        return found | {
+            "control.RRT": control.RRT,
+            "control.EST": control.EST,
+            "control.KPIECE1": control.KPIECE1,
+        }
+
+    def own(self, method: str | None = None) -> NeedlePlanner:
+        """Return the planner that `plan` uses, made once for each search.
+
+        Raises
+        ------
+        SettingsError
+            If there is no such search.
+        """
+        name = self.default if method is None else method
+        if name not in self._searches:
+            raise SettingsError(f"There is no needle search {name!r}", expected=", ".join(self._searches))
+        if name not in self._own:
+            self._own[name] = self.planners()[name](self.si)
+        return self._own[name]
+
+    def plan(
+        self,
+        query: Query,
+        *,
+        seed: int,
+        iterations: int,
+        time_s: float = math.inf,
+        method: str | None = None,
+        anytime: bool = False,
+    ) -> ArcPath | None:
+        """Search a path of arcs.
+
+        Parameters
+        ----------
+        query : Query
+        seed, iterations : int
+            The same pair gives the same path, if the time does not run out first.
+        time_s : float
+            Stop after this time.
+        method : str, optional
+            Name of the search.
+        anytime : bool
+            Go on to better paths until time, iterations or search are at their end.
+
+        Returns
+        -------
+        ArcPath or None
+            A path proved clear and within all limits; None if none was found.
+        """
+        planner = self.own(method)
+        planner.seed, planner.iterations, planner.anytime = seed, iterations, anytime
+        definition = base.ProblemDefinition(self.si)
+        definition.setGoal(self._ask(query, 0.0))
+        definition.addStartState(self._start())
+        planner.clear()
+        planner.setProblemDefinition(definition)
+        # Not through SimpleSetup.solve, which sets everything up again for each query.
+        planner.solve(_termination(time_s))
+        return planner.path
+
+    def pose(self, query: Query, *, goal_tolerance_mm: float = 0.0) -> None:
+        """Put a query to `setup`, whose planner, start and goal then wait for `setup.solve`.
+
+        `plan` asks its own query; pose again before `setup` is used after it.
+
+        Parameters
+        ----------
+        query : Query
+        goal_tolerance_mm : float
+            How far from the target a path may end, where the space's own tolerance is smaller.  OMPL's
+            planners steer by chance and need about 1 mm; ours aim at what the space allows.
+        """
+        self.setup.clear()
+        self.setup.setGoal(self._ask(query, goal_tolerance_mm))
+        self.setup.setStartState(self._start())
+
+    def solution(self) -> ArcPath | None:
+        """Return the path that `setup` found, proved; None if there is none or it is refused."""
+        path = self.unproved_solution()
+        return None if path is None or self.objection(path) else path
+
+    def objection(self, path: ArcPath) -> str:
+        """Tell why a path is no answer to the query posed last; "" if it is one.
+
+        OMPL's states do not know how long the needle is or how much it has turned: see
+        `stages.needle.violations`.
+        """
+        query = self._question.query
+        if query is None:
+            return "no query was posed"
+        return objection(self.space, query, path, goal_tolerance_mm=self._tolerance_mm)
+
+    def unproved_solution(self) -> ArcPath | None:
+        """Return the path that `setup` found, whether or not it is an answer; None if there is none."""
+        return path_of(self.setup.getSolutionPath()) if self.setup.haveExactSolutionPath() else None
+
+    def _ask(self, query: Query, goal_tolerance_mm: float) -> NeedleGoal:
+        self._question.ask(query)
+        self._tolerance_mm = max(goal_tolerance_mm, self.space.goal_tolerance_mm)
+        return NeedleGoal(self.si, query.target, self._tolerance_mm)
+
+    def _start(self) -> Any:
+        state = self.si.allocState()
+        put_numbers(state, self._question.start)
+        return state
+
+
+_seeds: list[int] = []
+"""What OMPL was seeded with in this process."""
+
+
+def seed_ompl(seed: int) -> None:
+    """Make OMPL's own planners repeatable; call it before anything else is made with OMPL.
+
+    Raises
+    ------
+    SettingsError
+        If OMPL has been seeded or has drawn random numbers in this process already, or the seed is less
+        than 1.
+    """
+    level = util.getLogLevel()
+    util.setLogLevel(util.LogLevel.LOG_NONE)
+    util.RNG.setSeed(seed)
+    util.setLogLevel(level)
+    refused = _seeds or seed < 1 or util.RNG.getSeed() != seed
+    _seeds.append(seed)
+    if refused:
+        raise SettingsError(
+            f"OMPL cannot begin with the seed {seed}",
+            expected="a number of 1 or more, before OMPL has drawn its first",
+            remedy="Call it first in a new process",
+        )
+
+
+def _termination(time_s: float) -> Any:
+    if math.isinf(time_s):
+        return base.plannerNonTerminatingCondition()
+    return base.timedPlannerTerminationCondition(time_s)

@@ -1,0 +1,376 @@
+"""Replanning on the way: a new path from wherever the needle's tip really is [Patil2014]."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Annotated
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from anatomy.kernels.arcs import arc_to_point
+from anatomy.kernels.field import MIN_GAP_MM
+from anatomy.settings import quantity, settings
+from stages.needle.kernels import limits as index
+from stages.needle.kernels import tree
+from stages.needle.kernels.connections import length_ahead, nearest_turn, seen_from
+from stages.needle.objective import SHORTEST, Objective
+from stages.needle.path import CURVATURE, ArcPath
+from stages.needle.replanning.escaping import (
+    blocker_at,
+    roots_of_tip,
+    structure_name,
+    tip_clearance,
+    with_limit,
+)
+from stages.needle.replanning.reaiming import (
+    Root,
+    Source,
+    Trials,
+    Way,
+    plan_ahead,
+    pose_at,
+    ways_ahead,
+)
+from stages.needle.search.base import Query, root_of
+from stages.needle.space import NeedleSpace
+
+ITERATIONS = 1500
+"""Iterations of the search in a replan; see docs/replanning.md for what they take."""
+
+MAX_ESCAPES_SEARCHED = 3
+
+
+class Failure(StrEnum):
+    """Why there is no path."""
+
+    TOUCHES = "the needle touches an obstacle"
+    STUCK = "no way back to the required clearance"
+    TARGET_BLOCKED = "the target is too near to an obstacle"
+    OUT_OF_LENGTH = "out of length"
+    OUT_OF_REACH = "out of reach"
+    NOT_FOUND = "no clear path found"
+
+
+@settings
+class ReplanSettings:
+    """What a replan may do.
+
+    Parameters
+    ----------
+    curvature_reserve : float
+        Share of the needle's largest curvature that is kept back.  It is spent only where there is no
+        path without it.
+    relaxed_mm : float
+        Length at the tip, mm, within which the required clearance must be regained if the tip has lost it.
+    largest_miss_mm : float
+        A target that cannot be met any more may be missed by this, mm.
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite or outside its range.
+    """
+
+    curvature_reserve: Annotated[
+        float, quantity("share of the largest curvature that is kept back", at_least=0.0, at_most=0.9)
+    ] = 0.0
+    relaxed_mm: Annotated[
+        float, quantity("length within which a lost clearance must be regained", at_least=0.0, at_most=20.0)
+    ] = 5.0
+    largest_miss_mm: Annotated[
+        float, quantity("distance by which the target may be missed", at_least=0.0, at_most=10.0)
+    ] = 1.0
+
+
+DEFAULT_SETTINGS = ReplanSettings()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Replan:
+    """What came of replanning from one pose.
+
+    Parameters
+    ----------
+    path : ArcPath or None
+        From the pose to the target, proved clear and within all limits counted from the needle's first
+        start; without arcs if the tip is there already.
+    cost : float
+        Cost of the path under the objective, as estimated within the searches; infinite without a path.
+    source : Source or None
+        What the path was made of.
+    failure : Failure or None
+    why : str
+        The failure in a sentence, with numbers.
+    reserve_spent : bool
+        Whether an arc bends more than the reserve leaves.
+    miss_mm : float
+        Distance from the end of the path to the target.
+    relaxed_mm, relaxed_clearance_mm : float
+        Length of path for which only this clearance of the axis is proved, because the tip had lost the
+        required one; both 0 otherwise.
+    """
+
+    path: ArcPath | None
+    cost: float = math.inf
+    source: Source | None = None
+    failure: Failure | None = None
+    why: str = ""
+    reserve_spent: bool = False
+    miss_mm: float = math.inf
+    relaxed_mm: float = 0.0
+    relaxed_clearance_mm: float = 0.0
+
+
+def with_reserve(space: NeedleSpace, reserve: float) -> NeedleSpace:
+    """Return a space whose needle bends less by a share of its largest curvature.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    reserve : float
+        At least 0, less than 1.
+
+    Raises
+    ------
+    SettingsError
+        If the share is outside its range.
+    """
+    if not 0.0 <= reserve < 1.0:
+        raise SettingsError(f"The curvature reserve is {reserve}", expected="a share of at least 0, below 1")
+    curvature = space.needle.max_curvature_per_mm * (1.0 - reserve)
+    needle = replace(space.needle, max_curvature_per_mm=curvature)
+    return replace(with_limit(space, index.KAPPA, curvature), needle=needle)
+
+
+def _arrived(query: Query, miss_mm: float) -> Replan:
+    path = ArcPath(lps_from_start=query.lps_from_start, arcs=np.zeros((0, 3)))
+    return Replan(path=path, cost=0.0, source=Source.ARRIVED, miss_mm=miss_mm)
+
+
+class Replanner:
+    """Holds the plan that is being followed, and makes a new one from any pose the needle is in.
+
+    A replan is made from, in this order: what is left of the plan, steered exactly through its own
+    points; the single arc; ways back to the plan; the shortest path in free space; the RRT, with a given
+    number of iterations, for what is cheaper.  Nothing depends on a clock.
+
+    Limits count from the needle's first start: length and turn behind the tip, the exemption at the exit,
+    and the angle, which is measured from the first direction.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    query : Query
+        What the plan was made for.
+    plan : ArcPath
+        From the query's start.
+    objective : Objective
+    settings : ReplanSettings
+    iterations : int
+        Of the search, for each replan.
+    seed : int
+        The same seed and the same sequence of calls give the same replans.
+
+    Raises
+    ------
+    SettingsError
+        If `iterations` is negative.
+
+    References
+    ----------
+    .. [Patil2014]
+    """
+
+    def __init__(
+        self,
+        space: NeedleSpace,
+        query: Query,
+        plan: ArcPath,
+        *,
+        objective: Objective = SHORTEST,
+        settings: ReplanSettings = DEFAULT_SETTINGS,
+        iterations: int = ITERATIONS,
+        seed: int = 1,
+    ) -> None:
+        if iterations < 0:
+            raise SettingsError(f"A replan has {iterations} iterations", expected="0 or more")
+        self.plan = plan
+        """The plan that is being followed; the last replan, if there is one."""
+        self._space = space
+        self._query = query
+        self._objective = objective
+        self._objective_arrays = space.objective_arrays(objective)
+        self._settings = settings
+        self._iterations = iterations
+        self._seed = seed
+        self._replans = 0
+        self._begin_mm = query.inserted_mm
+        self._turned_rad = query.turned_rad
+        exact = with_limit(space, index.GOAL_TOLERANCE, 0.0)
+        self._variants = [exact]
+        if settings.curvature_reserve > 0.0:
+            self._variants.insert(0, with_reserve(exact, settings.curvature_reserve))
+        if space.goal_tolerance_mm > 0.0:
+            self._variants.append(space)
+
+    def replan(
+        self,
+        lps_from_tip: Float,
+        target: Float,
+        inserted_mm: float,
+        *,
+        turned_rad: float | None = None,
+    ) -> Replan:
+        """Plan from the pose that the tip is in; a path that is found becomes the plan.
+
+        Parameters
+        ----------
+        lps_from_tip : (4, 4) float64
+            +z is the direction of insertion.
+        target : (3,) float64, LPS mm
+        inserted_mm : float
+            Length of needle from its first start to the tip.
+        turned_rad : float, optional
+            Turn accumulated on this length; by default what the plans so far say.
+
+        Raises
+        ------
+        FrameError
+            If pose or target are not finite numbers or the pose is not rigid.
+        SettingsError
+            If length or turn are negative or not finite.
+        """
+        turned, corners, meetings = plan_ahead(self.plan, inserted_mm - self._begin_mm)
+        reference = self._query.reference
+        query = Query(
+            lps_from_start=lps_from_tip,
+            target=target,
+            branch=self._query.branch,
+            inserted_mm=inserted_mm,
+            turned_rad=self._turned_rad + turned if turned_rad is None else turned_rad,
+            reference=self._query.lps_from_start[:3, 2] if reference is None else reference,
+        )
+        self._replans += 1
+        found = self._find(query, list(ways_ahead(corners, meetings)))
+        if found.path is not None:
+            self.plan, self._begin_mm, self._turned_rad = found.path, inserted_mm, query.turned_rad
+        return found
+
+    def _find(self, query: Query, ways: list[Way]) -> Replan:
+        away = float(np.linalg.norm(query.target - query.lps_from_start[:3, 3]))
+        if away <= max(self._space.goal_tolerance_mm, index.MIN_ARC_MM):
+            return _arrived(query, away)
+        roots, relaxed = roots_of_tip(self._space, self._objective_arrays, query, self._settings.relaxed_mm)
+        if not roots:
+            return self._stuck(query)
+        failure, why = self._out_of_reach(query)
+        if failure is None:
+            left = self._iterations
+            for n, variant in enumerate(self._variants):
+                best, spent = self._try(variant, roots, ways, left // (len(self._variants) - n))
+                if best is not None:
+                    return self._found(best, query, relaxed)
+                left -= spent
+            failure = Failure.NOT_FOUND
+            why = f"No clear path to the target was found in {self._iterations} iterations"
+        missed = self._near_miss(query, roots, relaxed, away)
+        return missed or Replan(path=None, failure=failure, why=why)
+
+    def _try(
+        self, space: NeedleSpace, roots: list[Root], ways: list[Way], iterations: int
+    ) -> tuple[Trials | None, int]:
+        """Try all ways from all roots, then search; return the best, and the iterations spent."""
+        tried = []
+        most = max(len(points) for points, _source in ways)
+        for root in roots:
+            trials = Trials(space, self._objective_arrays, root, most)
+            for points, source in ways:
+                trials.through(points, source)
+            trials.by_legs()
+            tried.append(trials)
+        tried.sort(key=lambda trials: trials.total)
+        to_search = tried[:1] if tried[0].path is not None else tried[:MAX_ESCAPES_SEARCHED]
+        spent = 0
+        for n, trials in enumerate(to_search):
+            share = (iterations - spent) // (len(to_search) - n)
+            spent += trials.search(share, self._seed + self._replans, self._objective)
+        best = min(tried, key=lambda trials: trials.total)
+        return (None if best.path is None else best), spent
+
+    def _found(self, trials: Trials, query: Query, relaxed: float) -> Replan:
+        root, path = trials.root, trials.path
+        arcs = root.arcs if path is None else np.concatenate([root.arcs, path.arcs])
+        whole = ArcPath(lps_from_start=query.lps_from_start, arcs=arcs)
+        left = (1.0 - self._settings.curvature_reserve) * float(self._space.limits[index.KAPPA])
+        return Replan(
+            path=whole,
+            cost=trials.total,
+            source=trials.source,
+            reserve_spent=bool((arcs[:, CURVATURE] > left * (1.0 + index.TINY)).any()),
+            miss_mm=float(np.linalg.norm(whole.frames()[-1][:3, 3] - query.target)),
+            relaxed_mm=root.away_mm,
+            relaxed_clearance_mm=relaxed if len(root.arcs) else 0.0,
+        )
+
+    def _near_miss(self, query: Query, roots: list[Root], relaxed: float, away: float) -> Replan | None:
+        """Return the tightest arc towards the target if it passes near enough, or stay if the tip is."""
+        best: Trials | None = None
+        least = min(away, self._settings.largest_miss_mm)
+        kappa = float(self._space.limits[index.KAPPA])
+        for root in roots:
+            trials = Trials(self._space, self._objective_arrays, root)
+            pose, target = pose_at(root.query.lps_from_start), query.goal
+            turn, miss = nearest_turn(*seen_from(pose, target), kappa)
+            if turn > index.MIN_ARC_MM * kappa and miss < least:
+                _length, bend, _turn = arc_to_point(pose, target)
+                trials.by_arc((kappa, *bend[1:]), turn / kappa, Source.NEAREST)
+                if trials.path is not None:
+                    best, least = trials, miss
+        if best is not None:
+            return self._found(best, query, relaxed)
+        return _arrived(query, away) if away <= self._settings.largest_miss_mm else None
+
+    def _out_of_reach(self, query: Query) -> tuple[Failure | None, str]:
+        """Tell why no path leads to the target even in free space."""
+        limits = self._space.limits
+        left = float(limits[index.MAX_LENGTH]) - query.inserted_mm
+        if left <= index.MIN_ARC_MM:
+            return Failure.OUT_OF_LENGTH, f"All of the needle ({limits[index.MAX_LENGTH]:g} mm) is inserted"
+        tolerance = self._space.goal_tolerance_mm
+        if tolerance == 0.0:
+            at_target = (*query.goal, 0.0, 0.0, 1.0)
+            label = blocker_at(self._space, at_target, math.inf, -1)
+            if label:
+                required, name = self._space.required_clearance_mm, structure_name(label)
+                return Failure.TARGET_BLOCKED, f"The target is nearer than {required:.2f} mm to {name}"
+        pose, reference = pose_at(query.lps_from_start), tree.reference_of(root_of(query))
+        angle = math.acos(float(np.clip(np.dot(pose[3:], reference), -1.0, 1.0)))
+        turn_left = float(limits[index.MAX_TURN]) - query.turned_rad
+        length = length_ahead(
+            *seen_from(pose, query.goal), limits,
+            min(float(limits[index.MAX_ANGLE]) + angle, math.pi), turn_left,
+        )  # fmt: skip
+        if not length < math.inf:
+            return Failure.OUT_OF_REACH, (
+                f"The target cannot be reached from a tip turned by {math.degrees(angle):.1f} degrees from "
+                f"the start, with {math.degrees(max(turn_left, 0.0)):.1f} degrees of turning left"
+            )
+        if length > left + tolerance:
+            return Failure.OUT_OF_LENGTH, f"The target is {length:.1f} mm ahead, {left:.1f} mm are left"
+        return None, ""
+
+    def _stuck(self, query: Query) -> Replan:
+        clearance, label = tip_clearance(self._space, query)
+        radius = self._space.needle.radius_mm
+        where = f"The axis at the tip is {clearance:.2f} mm from {structure_name(label)}"
+        if clearance < radius + MIN_GAP_MM:
+            return Replan(
+                path=None, failure=Failure.TOUCHES, why=f"{where}, the needle's radius is {radius:g} mm"
+            )
+        required, longest = self._space.required_clearance_mm, self._settings.relaxed_mm
+        why = f"{where}, and no arc of up to {longest:g} mm leads back to {required:.2f} mm"
+        return Replan(path=None, failure=Failure.STUCK, why=why)

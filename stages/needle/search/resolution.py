@@ -1,0 +1,391 @@
+"""The search that ends: with the best path at its resolution, or with the statement that it has none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float
+from anatomy.kernels import arcs as arc_kernels
+from anatomy.kernels.field import UNITS_PER_MM
+from stages.needle.kernels import limits as index
+from stages.needle.kernels import tree
+from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
+from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
+from stages.needle.path import ArcPath, path_from_tree
+from stages.needle.search.base import Query, root_of
+from stages.needle.search.kernels import rank_queue
+from stages.needle.search.kernels import resolution as kernel
+from stages.needle.space import NeedleSpace
+
+T = TypeVar("T", bound=np.generic)
+Ints = NDArray[np.int64]
+Words = tuple[float, Float, Float, Ints, Ints]
+Store = tuple[Float, NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32]]
+Queue = tuple[Float, NDArray[np.int32], Float, NDArray[np.int32], NDArray[np.int32]]
+
+FIRST_NODES = 1024
+FIRST_ENTRIES = 4096
+MOST_STEPS = 128
+MOST_ROLLS = 64
+EQUAL_CELL_MM = 1e-3
+"""Where only equal poses are duplicates, poses are looked for in cells of this size."""
+
+
+class Outcome(StrEnum):
+    """What a search can say."""
+
+    RUNNING = "running"
+    BEST = "best at resolution"
+    NONE = "none at resolution"
+    OUT_OF_MEMORY = "out of memory"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resolution:
+    """The words of a search: pieces of whole steps, in equally spaced directions of bending.
+
+    Parameters
+    ----------
+    coarse_mm, fine_mm : float
+        Length of the longest piece, which is tried first, and of the step, down to which it is halved.
+    coarse_rolls, fine_rolls : int
+        Number of directions of bending that are tried first, and of all.
+
+    Raises
+    ------
+    SettingsError
+        If a number is out of range, or coarse and fine are not a power of two apart.
+    """
+
+    coarse_mm: float = 16.0
+    fine_mm: float = 1.0
+    coarse_rolls: int = 4
+    fine_rolls: int = 16
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.fine_mm <= self.coarse_mm < math.inf and 0 < self.coarse_rolls <= self.fine_rolls):
+            raise SettingsError(f"{self} is no resolution", expected="0 < fine <= coarse")
+        for name, ratio, most in (
+            ("lengths", self.coarse_mm / self.fine_mm, MOST_STEPS),
+            ("rolls", self.fine_rolls / self.coarse_rolls, MOST_ROLLS),
+        ):
+            if ratio != 2.0 ** round(math.log2(ratio)) or ratio > most:
+                raise SettingsError(
+                    f"The {name} of {self} are a factor of {ratio:g} apart",
+                    expected=f"a power of two, at most {most}",
+                )
+        if self.fine_rolls > MOST_ROLLS:
+            raise SettingsError(f"{self} has too many rolls", expected=f"at most {MOST_ROLLS}")
+
+    @property
+    def steps(self) -> int:
+        """Steps of the longest piece."""
+        return round(self.coarse_mm / self.fine_mm)
+
+    def primitives(self) -> tuple[Ints, Ints]:
+        """Return all primitives by level, `(P, 2)` direction and steps, and the first of each level.
+
+        The level counts how often length and roll are halved; the direction `fine_rolls` is straight.
+        """
+        halvings = [_halvings(self.steps, k) for k in range(1, self.steps + 1)]
+        apart = self.fine_rolls // self.coarse_rolls
+        by_level: dict[int, list[tuple[int, int]]] = {}
+        for direction in (self.fine_rolls, *range(self.fine_rolls)):
+            rolled = 0 if direction == self.fine_rolls else _halvings(apart, direction % apart or apart)
+            for k, halved in enumerate(halvings, start=1):
+                by_level.setdefault(rolled + halved, []).append((direction, k))
+        levels = [by_level[level] for level in sorted(by_level)]
+        first = np.cumsum([0, *map(len, levels)])
+        return np.array([p for level in levels for p in level], dtype=np.int64), first.astype(np.int64)
+
+
+def _halvings(whole: int, part: int) -> int:
+    """Return how often a power of two must be halved until a number of such parts makes `part`."""
+    return (whole // (part & -part)).bit_length() - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """Cells of poses: of all that fall into one cell, only the cheapest so far is followed.
+
+    What a search with cells says holds up to them: a path that was not looked for leaves a cell in which
+    a pose at most as dear was followed, in place of its own.
+
+    Parameters
+    ----------
+    position_mm : float
+        Side of a cell, mm.
+    angle_deg : float
+        Side in each component of the tip's direction, as the angle at its centre, degrees.
+
+    Raises
+    ------
+    SettingsError
+        If a size is not positive and finite.
+    """
+
+    position_mm: float = 0.5
+    angle_deg: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.position_mm < math.inf and 0.0 < self.angle_deg < math.inf):
+            raise SettingsError(f"{self} has no size", expected="finite sizes of more than 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counts:
+    """What a search has done.
+
+    Parameters
+    ----------
+    pops : int
+        Entries taken off the queue.
+    nodes : int
+        Poses reached by words that are proved clear.
+    duplicates : int
+        Words dropped because another one, not dearer, ends there.
+    pruned : int
+        Words dropped because no path within the limits leads on to the goal for less than the best.
+    refused : int
+        Words dropped because their last piece is not proved clear.
+    """
+
+    pops: int
+    nodes: int
+    duplicates: int
+    pruned: int
+    refused: int
+
+
+class ResolutionSearch:
+    """The search over words of arcs and straight pieces, from coarse to fine [Fu2021, Fu2022].
+
+    See docs/resolution_search.md; it is a `searches.Search`.  Nothing in it is random.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    query : Query
+        The directions of bending count from +x of the start pose.
+    resolution : Resolution, optional
+    objective : Objective
+    duplicates : Cells, optional
+        Poses that count as one; by default only those that are equal up to rounding, so that nothing is lost.
+    max_memory_mb : float
+        The search ends before its arrays take more.
+
+    Raises
+    ------
+    SettingsError
+        If the space is one in which arcs are looked up instead of proved.
+
+    Attributes
+    ----------
+    path, cost, finished
+        See `searches.Search`.
+    outcome : Outcome
+    """
+
+    def __init__(
+        self,
+        space: NeedleSpace,
+        query: Query,
+        *,
+        resolution: Resolution | None = None,
+        objective: Objective = SHORTEST,
+        duplicates: Cells | None = None,
+        max_memory_mb: float = 1000.0,
+    ) -> None:
+        if space.limits[index.LOOKUP_STEP] > 0.0:
+            raise SettingsError(
+                "The resolution search is asked for a space whose arcs are looked up, not proved",
+                expected="a space with a clearance field, because the search goes on from what is proved",
+            )
+        self.space = space
+        self.query = query
+        self.path: ArcPath | None = None
+        self.cost = math.inf
+        self.finished = False
+        self.outcome = Outcome.RUNNING
+        self.resolution = resolution or Resolution()
+        self.duplicates = duplicates
+        self.max_memory_mb = max_memory_mb
+        self.objective = space.objective_arrays(objective)
+        self._rates = _rates(self.objective[0], space)
+        self._merge = (EQUAL_CELL_MM, EQUAL_CELL_MM, False)
+        if duplicates is not None:
+            self._merge = (duplicates.position_mm, math.radians(duplicates.angle_deg), True)
+        self._words = _words(self.resolution, float(space.limits[index.KAPPA]))
+        self._reference = tree.reference_of(root_of(query))
+        self._store = self._first_store()
+        left = space.limits[index.MAX_LENGTH] - query.inserted_mm
+        pieces = max(int(left / self.resolution.fine_mm), 0) + 2
+        self._queue = _first_queue(pieces * len(self._words[4]) + rank_queue.LOOK_AHEAD + 1)
+        self._state = np.zeros(rank_queue.STATE_SIZE, dtype=np.int64)
+        self._state[rank_queue.FREE] = -1
+        self._counts = np.zeros(kernel.COUNTS, dtype=np.int64)
+        self._counts[kernel.NODES] = 1
+        self._best = np.zeros(kernel.BEST_SIZE)
+
+    def _first_store(self) -> Store:
+        nodes = np.zeros((FIRST_NODES, kernel.NODE_COLUMNS))
+        links = np.zeros((FIRST_NODES, kernel.LINK_COLUMNS), dtype=np.int32)
+        proved = np.zeros((FIRST_NODES, self.resolution.fine_rolls + 1, 2), dtype=np.uint8)
+        start, root = self.query.lps_from_start, nodes[0]
+        root[:6] = *start[:3, 3], *start[:3, 2]
+        root[kernel.NORMAL : kernel.NORMAL + 3] = start[:3, 0]
+        root[kernel.PATH_LENGTH], root[kernel.PATH_TURN] = self.query.inserted_mm, self.query.turned_rad
+        links[0] = -1, -1, 0, 0
+        proved[0, :, kernel.USELESS] = self.resolution.steps + 1
+        return nodes, links, proved, np.zeros(4 * FIRST_NODES, dtype=np.int32)
+
+    @property
+    def counts(self) -> Counts:
+        """What the search has done so far."""
+        return Counts(
+            pops=int(self._counts[kernel.POPS]),
+            nodes=int(self._counts[kernel.NODES]),
+            duplicates=int(self._counts[kernel.DUPLICATES]),
+            pruned=int(self._counts[kernel.PRUNED]),
+            refused=int(self._counts[kernel.REFUSED]),
+        )
+
+    @property
+    def memory_mb(self) -> float:
+        """Size of the search's arrays."""
+        return _megabytes((*self._store, *self._queue))
+
+    def advance(self, iterations: int) -> bool:
+        """Take up to `iterations` entries off the queue; see `searches.Search`."""
+        stop = int(self._counts[kernel.POPS]) + iterations
+        while not self.finished and self._counts[kernel.POPS] < stop:
+            reason, self.cost = kernel.search_words(
+                self.space.arrays, self.space.limits, self.objective, self._rates, self.query.branch,
+                self.query.goal, self._reference, self._words, self._merge, self._store, self._queue,
+                self._state, self._counts, self._best, self.cost, stop - int(self._counts[kernel.POPS]),
+            )  # fmt: skip
+            if reason == kernel.BETTER:
+                self.path = self._best_path()
+                if self._state[rank_queue.WAITING] == 0:
+                    self._end(Outcome.BEST)
+                return True
+            if reason == kernel.EXHAUSTED:
+                self._end(Outcome.NONE if self.path is None else Outcome.BEST)
+            elif reason == kernel.FULL_OF_NODES:
+                self._more_nodes()
+            elif reason == kernel.FULL_OF_ENTRIES:
+                self._more_entries()
+        return False
+
+    def _end(self, outcome: Outcome) -> None:
+        self.outcome = outcome
+        self.finished = True
+
+    def _may_double(self, arrays: tuple[NDArray[Any], ...]) -> bool:
+        """Tell whether arrays may take twice their memory; end if not."""
+        fits = self.memory_mb + _megabytes(arrays) <= self.max_memory_mb
+        if not fits:
+            self._end(Outcome.OUT_OF_MEMORY)
+        return fits
+
+    def _more_nodes(self) -> None:
+        if self._may_double(self._store):
+            nodes, links, proved, seen = self._store
+            larger = np.zeros(2 * len(seen), dtype=np.int32)
+            kernel.rehash(nodes, self._merge, seen, larger)
+            self._store = _doubled(nodes), _doubled(links), _doubled(proved), larger
+
+    def _more_entries(self) -> None:
+        f, entries, heap_f, heap, ranks = self._queue
+        if self._may_double((f, entries, heap_f, heap)):
+            self._queue = _doubled(f), _doubled(entries), _doubled(heap_f), _doubled(heap), ranks
+
+    def _best_path(self) -> ArcPath:
+        """Return the path to the best node and on to the goal."""
+        nodes, links = self._store[:2]
+        fine_mm, rolls = self._words[:2]
+        chain = []
+        at = int(self._best[kernel.BEST_NODE])
+        while at != 0:
+            chain.append(at)
+            at = int(links[at, kernel.PARENT])
+        rows = [np.zeros(tree.NODE_COLUMNS)]
+        for at in reversed(chain):
+            parent, direction, steps = (int(v) for v in links[at, : kernel.NODE_RANK])
+            bend = kernel.bend_of(nodes, rolls, self.space.limits[index.KAPPA], parent, direction)
+            rows.append(_row(fine_mm * steps, bend))
+        for leg in range(2):
+            length, *bend = self._best[kernel.BEST_LEGS + kernel.LEG_SIZE * leg :][: kernel.LEG_SIZE]
+            if length > 0.0:
+                rows.append(_row(length, bend))
+        parents = np.arange(-1, len(rows) - 1)
+        return path_from_tree(self.query.lps_from_start, np.stack(rows), parents, len(rows) - 1)
+
+
+def _first_queue(ranks: int) -> Queue:
+    lists = np.zeros((ranks, 2), dtype=np.int32)
+    lists[:, rank_queue.HEAD] = -1
+    entries = np.zeros((FIRST_ENTRIES, rank_queue.ENTRY_COLUMNS), dtype=np.int32)
+    heap = np.zeros(FIRST_ENTRIES, dtype=np.int32)
+    return np.zeros(FIRST_ENTRIES), entries, np.zeros(FIRST_ENTRIES), heap, lists
+
+
+def _megabytes(arrays: Iterable[NDArray[Any]]) -> float:
+    return sum(array.nbytes for array in arrays) / 1e6
+
+
+def _row(length_mm: float, bend: ArrayLike) -> Float:
+    """Return a row of a tree as far as `path_from_tree` reads it."""
+    row = np.zeros(tree.NODE_COLUMNS)
+    row[tree.ARC_LENGTH] = length_mm
+    row[tree.BEND : tree.BEND + 4] = bend
+    return row
+
+
+def _doubled(array: NDArray[T]) -> NDArray[T]:
+    """Return a copy with twice as many rows, the new ones 0."""
+    larger = np.zeros((2 * len(array), *array.shape[1:]), dtype=array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+def _words(resolution: Resolution, kappa: float) -> Words:
+    """Return what the kernel has to know of a resolution, see `kernels.resolution.search_words`."""
+    lengths = resolution.fine_mm * np.arange(resolution.steps + 1)
+    arcs = [
+        (
+            arc_kernels.sine_length(kappa, s),
+            arc_kernels.versine_length(kappa, s),
+            math.cos(kappa * s),
+            math.sin(kappa * s),
+        )
+        for s in lengths
+    ]
+    rolls = 2.0 * math.pi * np.arange(resolution.fine_rolls) / resolution.fine_rolls
+    primitives, first = resolution.primitives()
+    return (
+        resolution.fine_mm,
+        np.stack([np.cos(rolls), np.sin(rolls)], axis=1),
+        np.array(arcs),
+        primitives,
+        first,
+    )
+
+
+def _rates(weights: Float, space: NeedleSpace) -> tuple[float, float]:
+    """Return the least cost of a mm in this space, and what a mm costs by which a path ends short.
+
+    The former counts the largest clearance that there is, where an objective knows none.
+    """
+    least = float(weights[LEAST_RATE])
+    largest = max(float(space.arrays[0].max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
+    gain = weights[INVERSE_CLEARANCE] * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
+    return least + max(float(gain), 0.0), least

@@ -1,0 +1,196 @@
+"""Ways on lattices from a start pose to a target: the cheapest over all of the space, or around a way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.grid import Float
+from stages.needle.kernels import limits as index
+from stages.needle.objective import Objective
+from stages.needle.path import ArcPath
+from stages.needle.search.base import Query
+from stages.needle.search.kernels import state_lattice as kernel
+from stages.needle.space import NeedleSpace, workspace_lengths
+
+MOST_STATES = 1 << 15
+"""States of a lattice, in 2 MB; so many are looked at in 0.1 s."""
+SLACK = 0.97
+"""Share of the greatest curvature that ways take: the arcs laid along them bend a little more than they."""
+LEAST_COSINE = 0.3
+"""Of the angle between a start and the line to the target; steeper ones get no ways."""
+SKEWS = 6
+"""Lattices are turned in so many ways."""
+REACH = 9
+"""How many cells from a way those around it go."""
+ANYWHERE = 1 << 14
+SAMPLE_MM = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Way:
+    """The cheapest way through a lattice of L layers, if there is one.
+
+    Parameters
+    ----------
+    controls : (L + 2, 3) float64, LPS mm
+        Start, control points of a quadratic spline, and target; None if there is no way.
+    cost : float
+        Of the arcs along it, infinite without a way.
+    arcs : int
+        Arcs that were tried, a measure of the work.
+    is_whole : bool
+        False if the lattice had too many states: then there is no way.
+    """
+
+    controls: Float | None
+    cost: float
+    arcs: int
+    is_whole: bool
+
+
+class Lattices:
+    """Lattices between a start pose and a target.
+
+    Parameters
+    ----------
+    space : NeedleSpace
+    query : Query
+    objective : Objective
+    """
+
+    def __init__(self, space: NeedleSpace, query: Query, objective: Objective) -> None:
+        self._space, self._query = space, query
+        self._objective = space.objective_arrays(objective)
+        self._kappa = SLACK * float(space.limits[index.KAPPA])
+        self._start, self._tangent = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
+        ahead = query.target - self._start
+        self._distance = float(np.linalg.norm(ahead))
+        self._axis = ahead / max(self._distance, index.MIN_ARC_MM)
+        self._cosine = float(self._tangent @ self._axis)
+        length = workspace_lengths(space, self._start[None], self._tangent[None], query.target)[0]
+        self.is_possible = bool(
+            self._distance > index.MIN_ARC_MM and self._cosine > LEAST_COSINE and np.isfinite(length)
+        )
+        """Whether there may be ways: the target is in the workspace, and the start not too steep."""
+        self._states = np.zeros((MOST_STATES, kernel.STATE_COLUMNS), dtype=np.int64)
+        self._before = np.zeros(MOST_STATES, dtype=np.int32)
+        self._costs = np.zeros(MOST_STATES)
+        self._order = np.zeros(MOST_STATES, dtype=np.int32)
+        self._table = np.zeros(2 * MOST_STATES, dtype=np.int32)
+
+    def everywhere(self, layers: int, *, skew: int = 0) -> Way:
+        """Return the cheapest way of all.
+
+        Parameters
+        ----------
+        layers : int
+            More are finer, and take time by about the 7th power.
+        skew : int
+            Turns the lattice, less than SKEWS.
+        """
+        base, axes, goal_cells = self._straight(layers, skew)
+        return self._explore(base, axes, goal_cells, ANYWHERE, math.inf)
+
+    def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> Way:
+        """Return the cheapest way near another one, if it costs less than `bound`.
+
+        Parameters
+        ----------
+        controls : (L + 2, 3) float64, LPS mm
+            As those of `Way`.
+        cells : float
+            Size of a cell, as a share of what the greatest curvature allows.
+        turn_rad : float
+            Of the lattice about the line to the target.
+        bound : float
+        """
+        axes = self._axes(cells * self._largest_cell(len(controls) - 2), _beside(self._axis), turn_rad)
+        return self._explore(controls, axes, np.zeros(2, dtype=np.int64), REACH, bound)
+
+    def controls_of(self, path: ArcPath, layers: int) -> Float | None:
+        """Return controls `(L + 2, 3)` of a spline near a path; None if that does not always lead ahead.
+
+        A control point is where the tangents at the two planes beside it meet.
+        """
+        points, _ = path.sample(SAMPLE_MM)
+        ahead = (points - self._start) @ self._axis
+        if (np.diff(ahead) <= 0.0).any():
+            return None
+        slopes = np.gradient(points, ahead, axis=0)
+        slopes[0] = self._tangent / self._cosine
+        between = self._distance / layers
+        planes = between * np.arange(layers + 1)
+        p, t = (
+            np.stack([np.interp(planes, ahead, column) for column in values.T], axis=1)
+            for values in (points, slopes)
+        )
+        inner = 0.5 * (p[:-1] + p[1:]) + 0.25 * between * (t[:-1] - t[1:])
+        inner[0] = self._start + 0.5 * between * t[0]
+        return np.concatenate([self._start[None], inner, self._query.target[None]])
+
+    def _largest_cell(self, layers: int) -> float:
+        return self._kappa * (self._distance / layers) ** 2
+
+    def _straight(self, layers: int, skew: int) -> tuple[Float, Float, Float]:
+        """Return what goes straight on from the start, and a lattice around it that meets the target.
+
+        Steps of half a cell lead aside to the target, `skew` of them along the second axis; where it lies
+        straight ahead, any turn will do.
+        """
+        pace = self._tangent * (self._distance / layers / self._cosine)
+        end = self._start + layers * pace
+        aside = self._query.target - end
+        offset, largest = float(np.linalg.norm(aside)), self._largest_cell(layers)
+        if offset < index.MIN_ARC_MM:
+            turn = skew * math.pi / (3.0 * SKEWS)
+            axes, goal_cells = self._axes(largest, _beside(self._axis), turn), (0, 0)
+            end = self._query.target
+        else:
+            along = 0
+            while largest * _norm(along, skew) < 2.0 * offset:
+                along += 1
+            turn = -math.atan2(math.sqrt(0.75) * skew, along + 0.5 * skew)
+            axes, goal_cells = self._axes(2.0 * offset / _norm(along, skew), aside, turn), (along, skew)
+        inner = self._start + (np.arange(layers)[:, None] + 0.5) * pace
+        return np.concatenate([self._start[None], inner, end[None]]), axes, np.array(goal_cells)
+
+    def _axes(self, cell: float, side: Float, turn_rad: float) -> Float:
+        """Return the axes of a hexagonal lattice across the line to the target, from a direction on."""
+        side = side / np.linalg.norm(side)
+        up = np.cross(self._axis, side)
+        return np.array(
+            [cell * (math.cos(a) * side + math.sin(a) * up) for a in (turn_rad, turn_rad + math.pi / 3)]
+        )
+
+    def _explore(self, base: Float, axes: Float, goal_cells: Float, reach: int, bound: float) -> Way:
+        self._table.fill(kernel.NONE)
+        begins = np.zeros(len(base), dtype=np.int64)
+        arrays = (begins, self._states, self._before, self._costs)
+        query = self._query
+        arcs, is_whole = kernel.explore(
+            self._space.arrays, self._space.limits, self._objective, query.branch, base, axes, goal_cells,
+            self._kappa, reach, query.inserted_mm, bound, *arrays, self._table, self._order,
+        )  # fmt: skip
+        controls, cost = np.zeros_like(base), math.inf
+        if is_whole:
+            cost = float(kernel.cheapest_way(base, axes, goal_cells, *arrays, controls))
+        found = controls if cost < math.inf else None
+        return Way(controls=found, cost=cost, arcs=int(arcs), is_whole=bool(is_whole))
+
+
+def via_points(controls: Float) -> Float:
+    """Return the ends of the arcs `(L, 3)` along a way: the middles of its pieces, and the target."""
+    return np.concatenate([0.5 * (controls[1:-2] + controls[2:-1]), controls[-1:]])
+
+
+def _norm(a: int, b: int) -> float:
+    """Return the length of a vector of a hexagonal lattice, in cells."""
+    return math.sqrt(a * a + a * b + b * b)
+
+
+def _beside(axis: Float) -> Float:
+    """Return a direction across another."""
+    return np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])

@@ -1,0 +1,197 @@
+"""How a bronchoscope moves: advance, twist and bend of a chain of links [Rosell2012, sec. IV-C]."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Float, read_only
+from anatomy.poses import pose
+from anatomy.settings import impossible, quantity, settings
+from stages.scope.advisor.kernels import chain
+from stages.scope.device import Bronchoscope
+
+FREEST_TWIST_DEG = 90.0
+"""A device is turned so far to either side; bending both ways, it then bends in every direction."""
+TIGHTEST_BEND_DEG_PER_MM = 12.0
+"""The tip of a device is bent at most so much for each mm of its chain, as that of [Rosell2012]."""
+
+TIP_FROM_TOOL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""The tool frame looks along its -z, a tip frame along its +z."""
+
+
+@settings
+class ScopeModel:
+    """A chain of links; the defaults are those of [Rosell2012].
+
+    Parameters
+    ----------
+    links : int
+        Number n of links with coupled joints.
+    link_mm : float
+        Length l of a link; n l is the length of the bending tip.
+    radius_mm : float
+        Radius of the whole scope, with the gap it has to keep.
+    twist_low_deg, twist_high_deg : float
+        Range of alpha, which holds 0.
+    bend_low_deg, bend_high_deg : float
+        Range of beta, the bend of all links together, which holds 0.
+    bend_step_deg : float
+        Spacing of the candidates' bends (eq. 3).
+
+    Raises
+    ------
+    SettingsError
+        If a value is absurd, or one joint would bend by 90 degrees or more.
+    """
+
+    links: Annotated[int, Field(description="links with coupled joints", strict=True, ge=1, le=200)] = 10
+    link_mm: Annotated[float, quantity("length of a link", above=0.0, at_most=20.0)] = 1.0
+    radius_mm: Annotated[float, quantity("radius of the scope with its gap", above=0.0, at_most=15.0)] = 1.0
+    twist_low_deg: Annotated[float, quantity("least twist", at_least=-360.0, at_most=0.0)] = -60.0
+    twist_high_deg: Annotated[float, quantity("largest twist", at_least=0.0, at_most=360.0)] = 90.0
+    bend_low_deg: Annotated[float, quantity("least bend", at_least=-270.0, at_most=0.0)] = -90.0
+    bend_high_deg: Annotated[float, quantity("largest bend", at_least=0.0, at_most=270.0)] = 120.0
+    bend_step_deg: Annotated[float, quantity("spacing of bends to choose from", above=0.0, at_most=45.0)] = (
+        5.0
+    )
+
+    def __post_init__(self) -> None:
+        most = max(-self.bend_low_deg, self.bend_high_deg)
+        if most >= 90.0 * self.links:
+            raise impossible(
+                "links", self.links, f"more than {most / 90.0:g}: a joint bends by less than 90 degrees"
+            )
+
+    @property
+    def length_mm(self) -> float:
+        """Length of the bending tip, n l."""
+        return self.links * self.link_mm
+
+
+def model_of(scope: Bronchoscope, *, links: int = 10, link_mm: float = 1.0) -> ScopeModel:
+    """Return the chain of a device: its radius with the gap it keeps, its bends, twists of 90 degrees.
+
+    Its bends are those of its whole bending section; a shorter chain bends at most as tightly as that of
+    [Rosell2012], 120 degrees in 10 mm.
+    """
+    most = TIGHTEST_BEND_DEG_PER_MM * links * link_mm
+    return ScopeModel(
+        links=links,
+        link_mm=link_mm,
+        radius_mm=scope.radius_mm + scope.lumen_margin_mm,
+        twist_low_deg=-FREEST_TWIST_DEG,
+        twist_high_deg=FREEST_TWIST_DEG,
+        bend_low_deg=-min(scope.bend_down_deg, most),
+        bend_high_deg=min(scope.bend_up_deg, most),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScopeState:
+    """Where the scope is: the base of its bending tip, and how the tip is turned.
+
+    Parameters
+    ----------
+    lps_from_base : (4, 4) float64
+        The scope points along -z; a positive bend at twist 0 turns it towards +y.  The base never rolls
+        about its axis.
+    twist_rad : float
+        Alpha.
+    bend_rad : float
+        Beta.
+    """
+
+    lps_from_base: Float
+    twist_rad: float = 0.0
+    bend_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "lps_from_base", read_only(np.array(self.lps_from_base, dtype=np.float64)))
+
+    @property
+    def array(self) -> Float:
+        """The `(14,)` array that kernels take."""
+        frame = self.lps_from_base
+        return np.concatenate([frame[:3, :3].ravel(), frame[:3, 3], [self.twist_rad, self.bend_rad]])
+
+    @classmethod
+    def of_array(cls, array: Float) -> ScopeState:
+        """Return the state in a `(14,)` array."""
+        frame = np.eye(4)
+        frame[:3, :3] = array[:9].reshape(3, 3)
+        frame[:3, 3] = array[9:12]
+        return cls(lps_from_base=frame, twist_rad=float(array[12]), bend_rad=float(array[13]))
+
+
+def straight_state(base_lps: Float, forward: Float) -> ScopeState:
+    """Return the state of a straight scope whose bending tip begins at a point (3,) LPS mm.
+
+    Twist 0 and a positive bend turn the tip anteriorly, or superiorly where it looks along that axis.
+    """
+    frame = pose(base_lps, forward)
+    base = np.eye(4)
+    base[:3, :3] = np.column_stack([frame[:3, 1], frame[:3, 0], -frame[:3, 2]])
+    base[:3, 3] = base_lps
+    return ScopeState(lps_from_base=base)
+
+
+def base_from_tool(model: ScopeModel, twist_rad: float, bend_rad: float) -> Float:
+    """Return the tool frame (4, 4) in the base frame: the chain of Table I.
+
+    Table I prints no angle between the axes of twist and bend; they are perpendicular here, as fig. 3 draws
+    them.  A link is a step along the axis, then the turn of its joint: only in this order do all joints
+    lie on the circle of Algorithm 1.
+    """
+    state = ScopeState(lps_from_base=np.eye(4), twist_rad=twist_rad, bend_rad=bend_rad)
+    return np.asarray(tool_frames(model, state.array)[0])
+
+
+def advanced(
+    model: ScopeModel, state: ScopeState, way_mm: float, twist_rad: float, bend_rad: float
+) -> ScopeState:
+    """Return the state after Algorithm 1: a new twist and bend, then the base moved along its circle.
+
+    A negative way with the present twist and bend takes an advance back exactly.
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite, or a joint would bend by 180 degrees or more.
+    """
+    values = (way_mm, twist_rad, bend_rad)
+    if not np.isfinite(values).all() or abs(bend_rad) >= math.pi * model.links:
+        raise SettingsError(
+            f"The scope cannot move by {way_mm:g} mm with twist {twist_rad:g} and bend {bend_rad:g} rad",
+            expected="finite values, a joint bent by less than 180 degrees",
+        )
+    moved = chain.advance(state.array, model.link_mm, model.links, *(float(value) for value in values))
+    return ScopeState.of_array(moved)
+
+
+def joints(model: ScopeModel, states: Float) -> Float:
+    """Return base, joints and tool centre point of states (M, 14): `(M, links + 1, 3)` LPS mm."""
+    return _bodies(model, states)[0]
+
+
+def tool_frames(model: ScopeModel, states: Float) -> Float:
+    """Return the tool frames `(M, 4, 4)` of states (M, 14); the camera looks along -z [Rosell2012]."""
+    return _bodies(model, states)[1]
+
+
+def tip_frames(model: ScopeModel, states: Float) -> Float:
+    """Return `lps_from_tip` `(M, 4, 4)` of states (M, 14): the tool frames turned to look along +z."""
+    return np.asarray(tool_frames(model, states) @ TIP_FROM_TOOL)
+
+
+def _bodies(model: ScopeModel, states: Float) -> tuple[Float, Float]:
+    rows: NDArray[np.float64] = np.ascontiguousarray(np.atleast_2d(states))
+    points, frames = np.zeros((len(rows), model.links + 1, 3)), np.zeros((len(rows), 4, 4))
+    chain.bodies(rows, model.link_mm, model.links, points, frames)
+    return points, frames

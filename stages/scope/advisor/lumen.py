@@ -1,0 +1,174 @@
+"""The interior voxels of the airways as a graph, and how wide the lumen is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import AnatomyError
+from anatomy.fields import DistanceField, corner_geometry, distance_field
+from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.kernels.field import exact_at
+from anatomy.lung import Lung
+from anatomy.structures import OUTSIDE
+from stages.scope.advisor.kernels.collision import FINE_DEPTH_MM
+from stages.scope.advisor.kernels.field import WALL, clearance_l1, number_component, widest_ways
+
+Int32 = NDArray[np.int32]
+
+
+DEPTH_UNITS_PER_MM = 256.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lumen:
+    """The piece of the lumen that hangs together by voxel faces; N interior voxels.
+
+    Make it with `lumen_of_lung` or `lumen_of_mask`.
+
+    Parameters
+    ----------
+    grid : Grid
+        The box of the piece and one voxel more all around.
+    index : (ni, nj, nk) int32
+        Number of each interior voxel, -1 elsewhere.
+    voxels : (N, 3) int32
+        Their indices in `grid`, in raster order.
+    neighbours : (N, 6) int32
+        The voxels before and after along i, j and k, -1 for the wall.
+    depth : DistanceField
+        Distance to the nearest voxel that is not lumen, as a solid box.
+    voxels_dropped : int
+        Lumen voxels that do not hang together with the piece.
+    """
+
+    grid: Grid
+    index: Int32
+    voxels: Int32
+    neighbours: Int32
+    depth: DistanceField
+    voxels_dropped: int
+    _widths: dict[int, Float] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("index", "voxels", "neighbours"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @property
+    def count(self) -> int:
+        """Number of interior voxels, N."""
+        return len(self.voxels)
+
+    @cached_property
+    def geometry(self) -> Float:
+        """The `(3, 6)` array that maps LPS mm to voxel corners, for kernels."""
+        return corner_geometry(self.grid)
+
+    @cached_property
+    def solid(self) -> NDArray[np.uint16]:
+        """What is not lumen, as OUTSIDE labels, `(ni, nj, nk)` uint16."""
+        return read_only(np.asfortranarray(np.where(self.index < 0, OUTSIDE, 0).astype(np.uint16)))
+
+    @cached_property
+    def steps_to_wall(self) -> Float:
+        """L1 distance of each voxel to the wall in voxels, `(N,)` [Rosell2012, sec. IV-A]."""
+        return self.clearance(np.ones(3))
+
+    def clearance(self, steps: ArrayLike) -> Float:
+        """Return the L1 distance `(N,)` to the wall, a step along each axis counting `steps` (3,)."""
+        out = np.zeros(self.count)
+        clearance_l1(self.neighbours, np.array(steps, dtype=np.float64), out)
+        return read_only(out)
+
+    def centres(self, numbers: ArrayLike | None = None) -> Float:
+        """Return the centres of voxels by their numbers, of all by default, `(M, 3)` LPS mm."""
+        return self.grid.lps(self.voxels if numbers is None else self.voxels[np.asarray(numbers)])
+
+    @cached_property
+    def depth_mm(self) -> Float:
+        """Distance of voxel centres to the wall, `(N,)` mm: exact in narrow places, else a lower bound."""
+        centres = np.ascontiguousarray(self.centres())
+        out = self.depth.lower_bound_mm(centres)
+        narrow = np.flatnonzero(out < FINE_DEPTH_MM)
+        exact = np.zeros(len(narrow))
+        cap = FINE_DEPTH_MM + float(np.linalg.norm(self.grid.spacing_mm))
+        exact_at(self.solid, self.geometry, centres[narrow], OUTSIDE, -1, cap, exact)
+        out[narrow] = exact
+        return read_only(out)
+
+    def width_from(self, start: int) -> Float:
+        """Return the radius (N,) mm of the largest ball that gets from voxel `start` to each voxel.
+
+        The ball goes from centre to centre of neighbouring voxels; between them it may touch by less
+        than half a voxel.
+        """
+        if start not in self._widths:
+            depth = (self.depth_mm * DEPTH_UNITS_PER_MM).astype(np.int64)
+            out = np.zeros(self.count, dtype=np.int64)
+            widest_ways(self.neighbours, depth, start, out)
+            self._widths[start] = read_only(out / DEPTH_UNITS_PER_MM)
+        return self._widths[start]
+
+    def voxel_at(self, point_lps: ArrayLike) -> int:
+        """Return the number of the voxel that holds a point `(3,)` LPS mm, -1 if it is no interior one."""
+        ijk = np.floor(self.grid.ijk(point_lps) + 0.5).astype(np.int64)
+        if (ijk < 0).any() or (ijk >= self.grid.shape).any():
+            return -1
+        return int(self.index[tuple(ijk)])
+
+    def nearest_voxel(self, point_lps: ArrayLike) -> tuple[int, float]:
+        """Return the voxel whose centre is nearest to a point (the first on ties), and the distance in mm."""
+        away = np.linalg.norm(self.centres() - np.asarray(point_lps, dtype=np.float64), axis=1)
+        nearest = int(np.argmin(away))
+        return nearest, float(away[nearest])
+
+
+def lumen_of_lung(lung: Lung) -> Lumen:
+    """Return the lumen that hangs together with the root of a lung's airway tree.
+
+    Raises
+    ------
+    AnatomyError
+        If the lung has no lumen.
+    """
+    mask = lung.mask("lumen")
+    return _lumen(mask, lung.tree.points_lps[0], lung.lumen_depth)
+
+
+def lumen_of_mask(mask: Volume, root_lps: ArrayLike) -> Lumen:
+    """Return the piece of a bool mask nearest to a point `(3,)` LPS mm.
+
+    Raises
+    ------
+    AnatomyError
+        If the mask is empty.
+    """
+    return _lumen(mask, root_lps, None)
+
+
+def _lumen(mask: Volume, root_lps: ArrayLike, depth: DistanceField | None) -> Lumen:
+    voxels = np.argwhere(mask.array)
+    if not len(voxels):
+        raise AnatomyError("The airway lumen is empty", expected="at least one voxel of lumen")
+    low = voxels.min(axis=0) - 1
+    grid = mask.grid.crop(low, voxels.max(axis=0) + 2)
+    inside = np.zeros(grid.shape, dtype=bool)
+    inside[tuple((voxels - low).T)] = True
+    away = np.linalg.norm(mask.grid.lps(voxels) - np.asarray(root_lps, dtype=np.float64), axis=1)
+    index = np.full(grid.shape, WALL, dtype=np.int32)
+    stack = np.zeros((len(voxels), 3), dtype=np.int16)
+    seed = (voxels[int(np.argmin(away))] - low).astype(np.int64)
+    numbered, neighbours = number_component(inside, seed, stack, index)
+    if depth is None:
+        depth = distance_field("lumen_depth", index < 0, grid)
+    return Lumen(
+        grid=grid,
+        index=index,
+        voxels=numbered,
+        neighbours=neighbours,
+        depth=depth,
+        voxels_dropped=len(voxels) - len(numbered),
+    )

@@ -1,0 +1,187 @@
+"""Navigation functions on the lumen: which way leads to the goal, keeping to the middle [Rosell2012, V-A].
+
+Eq. 2 revisits a voxel whenever a neighbour offers a lower potential: that is the shortest-path problem whose
+edges cost what entering a voxel costs, and it is solved as such.  All edges cost more than 0, so a voxel
+without a lower neighbour can only be the goal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anatomy.errors import TargetError
+from anatomy.grid import Float, read_only
+from stages.scope.advisor.kernels.field import shortest_ways
+from stages.scope.advisor.lumen import Lumen
+
+Metric = Literal["mm", "voxels"]
+Kind = Literal["clearance", "plain"]
+
+THRESHOLD = 0.9
+LEAST = 0.1
+"""Eq. 2: from this share of C_max on, entering a voxel costs the least."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Goal:
+    """The voxel where the tip has to end.
+
+    Parameters
+    ----------
+    voxel : int
+        Number of the interior voxel.
+    centre_lps : (3,) float64, LPS mm
+        Its centre.
+    lesion_lps : (3,) float64, LPS mm
+        Centre of the lesion.
+    lesion_radius_mm : float
+    distance_mm : float
+        From the centre of the lesion to that of the voxel.
+    in_lesion : bool
+        Whether the voxel lies in the lesion; if not, it is the lumen voxel nearest to it.
+    """
+
+    voxel: int
+    centre_lps: Float
+    lesion_lps: Float
+    lesion_radius_mm: float
+    distance_mm: float
+    in_lesion: bool
+
+
+def goal_at(
+    lumen: Lumen,
+    lesion_lps: ArrayLike,
+    lesion_radius_mm: float = 0.0,
+    *,
+    preferred: NDArray[np.bool_] | None = None,
+) -> Goal:
+    """Return the goal for a lesion, a sphere: the interior voxel nearest to its centre [Rosell2012, IV-B].
+
+    Parameters
+    ----------
+    lumen : Lumen
+    lesion_lps : (3,) float64, LPS mm
+    lesion_radius_mm : float
+    preferred : (N,) bool, optional
+        Voxels of the lesion that come before all others, such as those where a scope fits.
+
+    Raises
+    ------
+    TargetError
+        If centre or radius are not finite, or the radius is negative.
+    """
+    lesion = np.array(lesion_lps, dtype=np.float64)
+    if lesion.shape != (3,) or not np.isfinite(lesion).all() or not 0.0 <= lesion_radius_mm < np.inf:
+        raise TargetError(
+            f"A lesion at {lesion.tolist()} with a radius of {lesion_radius_mm} mm is no sphere",
+            expected="three finite mm and a finite radius, 0 or above",
+        )
+    voxel, distance = lumen.nearest_voxel(lesion)
+    if preferred is not None and preferred.any():
+        numbers = np.flatnonzero(preferred)
+        away = np.linalg.norm(lumen.centres(numbers) - lesion, axis=1)
+        if away.min() <= lesion_radius_mm:
+            voxel, distance = int(numbers[np.argmin(away)]), float(away.min())
+    return Goal(
+        voxel=voxel,
+        centre_lps=read_only(lumen.centres(voxel)),
+        lesion_lps=read_only(lesion),
+        lesion_radius_mm=float(lesion_radius_mm),
+        distance_mm=distance,
+        in_lesion=distance <= lesion_radius_mm,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NavigationField:
+    """Potential of every interior voxel, 0 at the goal and without any other local minimum.
+
+    Parameters
+    ----------
+    lumen : Lumen
+    goal : int
+        Number of the goal voxel.
+    kind : str
+        "clearance": NF1 lowered where there is clearance (eq. 2); "plain": NF1.
+    metric : str
+        What a step counts: its length ("mm", right for any voxel size) or 1 ("voxels", the paper's).
+    clearance : (N,) float64
+        L1 distance to the wall in this metric.
+    largest_clearance : float
+        C_max of eq. 2.
+    potential : (N,) float64
+    """
+
+    lumen: Lumen
+    goal: int
+    kind: Kind
+    metric: Metric
+    clearance: Float
+    largest_clearance: float
+    potential: Float
+
+    def route(self, voxel: int) -> Float:
+        """Return the centres `(M, 3)` LPS mm of the steepest way down from a voxel to the goal."""
+        way = [int(voxel)]
+        while way[-1] != self.goal:
+            others = self.lumen.neighbours[way[-1]]
+            others = others[others >= 0]
+            way.append(int(others[np.argmin(self.potential[others])]))
+        return self.lumen.centres(way)
+
+
+def navigation_field(
+    lumen: Lumen,
+    goal: int,
+    *,
+    kind: Kind = "clearance",
+    metric: Metric = "mm",
+    largest_clearance: float | None = None,
+) -> NavigationField:
+    """Compute NF1 or clearance-based NF1 (eq. 2) from a goal voxel.
+
+    Parameters
+    ----------
+    lumen : Lumen
+    goal : int
+        Number of an interior voxel.
+    kind, metric : str
+        See `NavigationField`.
+    largest_clearance : float, optional
+        C_max in the unit of the metric; half the largest clearance in the lumen if None.
+
+    References
+    ----------
+    .. [Rosell2012] docs/bibliography.md
+    """
+    if not 0 <= goal < lumen.count:
+        raise TargetError(
+            f"The lumen has no interior voxel {goal}", expected=f"a number from 0 to {lumen.count - 1}"
+        )
+    steps = np.ones(3) if metric == "voxels" else np.array(lumen.grid.spacing_mm)
+    clearance = lumen.clearance(steps)
+    most = 0.5 * float(clearance.max()) if largest_clearance is None else float(largest_clearance)
+    weights = entering_costs(clearance, most) if kind == "clearance" else np.ones(lumen.count)
+    potential = np.zeros(lumen.count)
+    extremes = np.array([steps.min() * weights.min(), steps.max() * weights.max()])
+    shortest_ways(lumen.neighbours, steps, weights, extremes, goal, potential)
+    return NavigationField(
+        lumen=lumen,
+        goal=int(goal),
+        kind=kind,
+        metric=metric,
+        clearance=clearance,
+        largest_clearance=most,
+        potential=read_only(potential),
+    )
+
+
+def entering_costs(clearance: Float, largest_clearance: float) -> Float:
+    """Return what entering each voxel costs by eq. 2, `(N,)`, for a step that counts 1."""
+    share = clearance / largest_clearance
+    return np.where(share < THRESHOLD, 1.0 - share, LEAST)

@@ -1,0 +1,195 @@
+"""Paths to a goal: Algorithm 2 of [Rosell2012], and what to do when it is stuck.
+
+The paper stops where no candidate is valid.  Here the look-ahead is first halved, down to a voxel; then the
+scope is pulled back some way, as it came, and tries again with other weights and another look-ahead.  What
+comes nearest is kept.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from anatomy.grid import Float
+from anatomy.settings import impossible, quantity, settings, switch
+from stages.scope.advisor.best_motion import Weights
+from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.kernels import motion as kernel
+from stages.scope.advisor.kinematics import ScopeState, tool_frames
+from stages.scope.advisor.navigation import Goal
+from stages.scope.advisor.path import ScopePath
+
+RETREATS_MM = (3.0, 6.0, 12.0, 24.0, 48.0)
+"""Lengths of retreat, taken in turn, each times 0.5 to 1.5."""
+LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
+"""Of these shares of the look-ahead one is drawn for a retry."""
+LOOKS_PER_MM = 4
+"""So many poses between two states are tried for collision."""
+SAME_POTENTIAL = 1e-9
+
+
+@settings
+class PathSettings:
+    """How a path is computed.
+
+    Parameters
+    ----------
+    look_ahead_mm : float
+        Advance of the candidates (dz).
+    sub_step_mm : float
+        Advance until the candidates are weighed anew.
+    weights : Weights
+        Of eq. 9.
+    random_offsets : bool
+        Whether candidates are moved at random within their spacing.
+    retreats : int
+        Most retreats when stuck; 0 stops there, as the paper does.
+    max_length_mm : float
+        Longest path.
+    """
+
+    look_ahead_mm: Annotated[float, quantity("advance of the candidates", above=0.0, at_most=50.0)] = 5.0
+    sub_step_mm: Annotated[float, quantity("advance between two choices", above=0.0, at_most=50.0)] = 1.0
+    weights: Weights = Weights()
+    random_offsets: Annotated[bool, switch("whether candidates are moved at random")] = True
+    retreats: Annotated[int, Field(description="most retreats when stuck", strict=True, ge=0, le=10_000)] = (
+        200
+    )
+    max_length_mm: Annotated[float, quantity("longest path", above=0.0, at_most=2000.0)] = 600.0
+
+    def __post_init__(self) -> None:
+        if self.sub_step_mm > self.look_ahead_mm:
+            raise impossible(
+                "sub_step_mm", self.sub_step_mm, f"at most look_ahead_mm = {self.look_ahead_mm:g}"
+            )
+
+
+class PathSearch:
+    """Looks for a path from a state, again and again.
+
+    Parameters
+    ----------
+    scene : Scene
+    goal : Goal
+        Of the scene's field.
+    options : PathSettings
+        In reproduction the look-ahead is never shortened and nothing is retried.
+    seed : int
+    """
+
+    def __init__(self, scene: Scene, goal: Goal, options: PathSettings, seed: int) -> None:
+        self._scene = scene
+        self._goal = goal
+        self._options = options
+        self._rng = np.random.default_rng(seed)
+        self._looks = 1 if scene.reproduction else max(1, round(LOOKS_PER_MM * options.sub_step_mm))
+        self._least = min(options.sub_step_mm, float(scene.lumen.grid.spacing_mm.min()))
+
+    def run(self, start: ScopeState) -> ScopePath:
+        """Return the path from a state that ends at the goal or comes nearest to it."""
+        return self.resume(start.array[None], np.zeros(1))
+
+    def resume(self, states: Float, steps_mm: Float) -> ScopePath:
+        """Return the path that goes on from the last of some states, or from where it must be pulled back to.
+
+        Parameters
+        ----------
+        states : (K, 14) float64
+            How the scope came; the path begins with the first of them.
+        steps_mm : (K,) float64
+            Advance of each state from the one before, 0 for the first.
+        """
+        options = self._options
+        begin = np.zeros((len(states), 4))
+        begin[:, 2], begin[:, 3] = steps_mm, self._potentials(states)
+        states, info, end = self._follow(states, begin, options.weights, options.look_ahead_mm)
+        if self._scene.reproduction:
+            return self._path(states, info, end == kernel.REACHED, 0)
+        states, info = _cut(states, info)
+        used = 0
+        enough = self._lowest_that_fits(states[0]) + SAME_POTENTIAL
+        while end != kernel.REACHED and info[-1, 3] > enough and used < options.retreats:
+            kept = self._retreat(info, used)
+            ahead = max(options.look_ahead_mm * float(self._rng.choice(LOOK_AHEADS)), options.sub_step_mm)
+            more, more_info, new_end = self._follow(
+                states[: kept + 1], info[: kept + 1], self._random_weights(), ahead
+            )
+            more, more_info = _cut(more, more_info)
+            used += 1
+            if more_info[-1, 3] < info[-1, 3]:
+                states, info, end = more, more_info, new_end
+        return self._path(states, info, end == kernel.REACHED, used)
+
+    def _potentials(self, states: Float) -> Float:
+        """Return the potential at the tip of states, infinity outside the lumen."""
+        tips = tool_frames(self._scene.model, states)[:, :3, 3]
+        voxels = [self._scene.lumen.voxel_at(tip) for tip in tips]
+        return np.array([self._scene.field.potential[v] if v >= 0 else np.inf for v in voxels])
+
+    def _random_weights(self) -> Weights:
+        low, high = (float(value) for value in np.sort(self._rng.uniform(size=2)))
+        return Weights(nf1=low, clearance=high - low, twist=1.0 - high)
+
+    def _retreat(self, info: Float, used: int) -> int:
+        """Return the number of the state to which the scope is pulled back."""
+        way = RETREATS_MM[used % len(RETREATS_MM)] * self._rng.uniform(0.5, 1.5)
+        behind = np.cumsum(info[::-1, 2])[::-1]
+        return int(np.flatnonzero(behind >= way).max(initial=0))
+
+    def _lowest_that_fits(self, state: Float) -> float:
+        """Return the lowest potential of a voxel to which a ball of the scope's radius gets."""
+        scene = self._scene
+        start = scene.lumen.voxel_at(state[9:12])
+        if start < 0:
+            start, _away = scene.lumen.nearest_voxel(state[9:12])
+        fits = scene.lumen.width_from(start) >= scene.model.radius_mm
+        return float(scene.field.potential[fits].min(initial=np.inf)) if fits.any() else -np.inf
+
+    def _follow(
+        self, begin: Float, begin_info: Float, weights: Weights, look_ahead_mm: float
+    ) -> tuple[Float, Float, int]:
+        """Go on from the last of some states; return all states, their numbers and the end."""
+        options = self._options
+        done = len(begin) - 1
+        left_mm = max(options.max_length_mm - float(begin_info[:, 2].sum()), 0.0)
+        room = len(begin) + 1 + int(left_mm / min(self._least, look_ahead_mm))
+        states, info = np.zeros((room, 14)), np.zeros((room, 4))
+        states[: done + 1], info[: done + 1] = begin, begin_info
+        randomness = np.zeros(1, dtype=np.uint64)
+        if options.random_offsets:
+            randomness[0] = self._rng.integers(1, 2**62)
+        least = look_ahead_mm if self._scene.reproduction else self._least
+        count, end = kernel.compute_path(
+            self._scene.space,
+            self._scene.scope,
+            weights.array,
+            self._goal.voxel,
+            np.array([look_ahead_mm, options.sub_step_mm, least, left_mm]),
+            randomness,
+            self._looks,
+            states[done:],
+            info[done:],
+        )
+        return states[: done + count], info[: done + count], int(end)
+
+    def _path(self, states: Float, info: Float, reached: bool, used: int) -> ScopePath:
+        return ScopePath(
+            model=self._scene.model,
+            goal=self._goal,
+            states=states,
+            steps_mm=info[:, 2],
+            costs=info[:, 0],
+            potentials=info[:, 3],
+            reached=reached,
+            nearest=int(np.argmin(info[:, 3])),
+            retreats=used,
+            reproduction=self._scene.reproduction,
+        )
+
+
+def _cut(states: Float, info: Float) -> tuple[Float, Float]:
+    """Leave out what comes after the first state of least potential."""
+    end = int(np.argmin(info[:, 3])) + 1
+    return states[:end], info[:end]

@@ -1,0 +1,115 @@
+"""Advice on the way: a plan is followed, made anew when the scope leaves it, undone where it is stuck."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy.grid import Float
+from stages.scope.advisor.advisor import Advice, Advisor
+from stages.scope.advisor.best_motion import Motion
+from stages.scope.advisor.kinematics import ScopeState, joints
+from stages.scope.advisor.path import ScopePath
+from stages.scope.advisor.path_search import PathSearch
+
+ON_THE_WAY_MM = 0.75
+"""The scope is where a state of the plan is, if its base, its tip and all between are so near."""
+
+
+class Session:
+    """Advises a person who holds the scope, call after call.
+
+    The best motion of the moment can lead into a place from which no motion leads on.  A session therefore
+    looks for the whole path and advises its next motion.  It remembers how the scope came, and knows how
+    far to pull it back if it is in the wrong airway or stuck.
+
+    Parameters
+    ----------
+    advisor : Advisor
+        Not in reproduction: the paper advises the best motion alone.
+    start : ScopeState
+        Where the scope is.
+    seed : int
+    """
+
+    def __init__(self, advisor: Advisor, start: ScopeState, *, seed: int = 0) -> None:
+        self._advisor = advisor
+        self._search = PathSearch(advisor.scene, advisor.goal, advisor.options, seed)
+        self.plan: ScopePath = self._search.run(start)
+        self._at = 0
+        self._way_back = np.zeros((0, 14))
+        self._back_mm = np.zeros(0)
+
+    def advise(self, state: ScopeState, *, own: Motion | None = None) -> Advice:
+        """Return what to do now: the next motion of the plan, or how far to pull back.
+
+        "arrived" is where the plan ends, be it the goal or the nearest point found.
+
+        Parameters
+        ----------
+        state : ScopeState
+            Where the scope is now, in the lumen.
+        own : Motion, optional
+            A motion that somebody is about to make, to be judged.
+
+        Raises
+        ------
+        AnatomyError
+            If the tip is not in the lumen.
+        """
+        advice = self._advisor.advise(state, own=own)
+        if advice.action == "arrived":
+            return advice
+        pulled = self._pulling(state)
+        if pulled is not None:
+            return replace(advice, action="pull back", motion=pulled, cost=0.0)
+        number = self._place(self.plan.states, state)
+        if number < 0:
+            pulled = self._plan_anew(state)
+            if pulled is not None:
+                return replace(advice, action="pull back", motion=pulled, cost=0.0)
+            number = self._at
+        self._at = number
+        if number >= self.plan.nearest:
+            return replace(advice, action="arrived", motion=None, cost=0.0)
+        following = self.plan.states[number + 1]
+        motion = Motion(
+            advance_mm=float(self.plan.steps_mm[number + 1]),
+            twist_rad=float(following[12]),
+            bend_rad=float(following[13]),
+        )
+        return replace(advice, action="advance", motion=motion, cost=float(self.plan.costs[number + 1]))
+
+    def _place(self, states: Float, state: ScopeState) -> int:
+        """Return the state that the scope is in, -1 if in none; the last on ties."""
+        if not len(states):
+            return -1
+        model = self._advisor.scene.model
+        away = np.linalg.norm(joints(model, states) - joints(model, state.array), axis=2).max(axis=1)
+        nearest = len(away) - 1 - int(np.argmin(away[::-1]))
+        return nearest if away[nearest] <= ON_THE_WAY_MM else -1
+
+    def _pulling(self, state: ScopeState) -> Motion | None:
+        """Return how far to pull back still, if the scope is on its way back."""
+        number = self._place(self._way_back, state)
+        if number < 0 or self._place(self.plan.states, state) >= 0:
+            return None
+        return self._back(float(self._back_mm[: number + 1].sum()))
+
+    def _back(self, way_mm: float) -> Motion:
+        target = self.plan.states[self._at]
+        return Motion(advance_mm=-way_mm, twist_rad=float(target[12]), bend_rad=float(target[13]))
+
+    def _plan_anew(self, state: ScopeState) -> Motion | None:
+        """Plan from where the scope is and how it came; return how far to pull back, if that is the plan."""
+        came, steps = self.plan.states[: self._at + 1], self.plan.steps_mm[: self._at + 1]
+        step = float(np.linalg.norm(state.lps_from_base[:3, 3] - came[-1, 9:12]))
+        history, ways = np.vstack([came, state.array]), np.append(steps, step)
+        self.plan = self._search.resume(history, ways)
+        common = min(len(history), self.plan.count)
+        same = (self.plan.states[:common] == history[:common]).all(axis=1)
+        kept = common if same.all() else int(np.argmin(same))
+        self._at = kept - 1
+        self._way_back, self._back_mm = history[kept:], ways[kept:]
+        return self._back(float(ways[kept:].sum())) if kept < len(history) else None

@@ -1,0 +1,139 @@
+"""Menus of plans to one target: different, proved, and honestly compared."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lungaccess as la
+from anatomy.errors import SettingsError
+from anatomy.lung import Lung
+from lungaccess.cli import app as cli
+from lungaccess.coupled.alternatives import Alternative, alternatives, judged
+from lungaccess.coupled.kernels.separation import choose_apart
+from lungaccess.coupled.search.diverse import _branches_first, _lines, _samples
+from stages.needle.path import direct_path
+from tests.lungaccess.resample import needle_walk
+
+SYSTEM = la.load_system("ultrathin")
+
+
+@pytest.fixture(scope="module")
+def atlas(small_lung: Lung) -> la.Atlas:
+    return la.build_atlas(small_lung, SYSTEM)
+
+
+@pytest.fixture(scope="module")
+def menu(small_lung: Lung, atlas: la.Atlas) -> tuple[Alternative, ...]:
+    target = la.resolve_target(small_lung)
+    return alternatives(small_lung, SYSTEM, target, atlas=atlas, count=8, apart_mm=3.0)
+
+
+def test_plans_differ_and_pass_the_check(menu: tuple[Alternative, ...], small_lung: Lung) -> None:
+    assert len(menu) >= 3
+    for one, other in itertools.combinations(menu, 2):
+        a, b = needle_walk(one.plan).points[::20], needle_walk(other.plan).points[::20]
+        gaps = np.linalg.norm(a[:, None] - b[None], axis=-1)
+        assert max(gaps.min(axis=1).max(), gaps.min(axis=0).max()) >= 3.0 - 0.3
+    for each in menu:
+        assert la.check(each.plan, small_lung).accepted
+
+
+def test_each_branch_comes_first_once(menu: tuple[Alternative, ...]) -> None:
+    branches = [each.plan.tube.exit.branch for each in menu]
+    first = list(dict.fromkeys(branches))
+    assert branches[: len(first)] == first
+    assert _branches_first(np.array([4, 4, 2, 4, 7, 2])).tolist() == [0, 2, 4, 1, 3, 5]
+
+
+def test_samples_are_all_and_hold_every_branch_first() -> None:
+    rng = np.random.default_rng(0)
+    for total in (0, 5, 40_000):
+        branch = np.sort(rng.integers(0, 5, total)) * 3
+        branch[-1:] = 99
+        parts = list(_samples(branch))
+        assert sorted(np.concatenate(parts).tolist()) == list(range(total))
+        assert set(branch[parts[0]]) == set(branch)
+        assert len(parts[0]) <= 10_000
+
+
+def test_lines_are_apart_if_a_point_strays() -> None:
+    straight = np.column_stack([np.zeros((9, 2)), np.linspace(0.0, 40.0, 9)])
+    bowed, near, longer = straight.copy(), straight.copy(), straight.copy()
+    bowed[4, 0], near[4, 0], longer[-1, 2] = 6.0, 3.0, 45.5
+    lines, chosen = np.stack([straight, near, bowed, straight, longer]), np.zeros(5, dtype=np.int64)
+    count = choose_apart(lines, np.arange(5), 5.0, chosen)
+    assert chosen[:count].tolist() == [0, 2, 4]
+    assert choose_apart(lines, np.arange(5), 5.0, chosen[:2]) == 2
+
+
+def test_criteria_are_those_of_the_plan(menu: tuple[Alternative, ...]) -> None:
+    for each in menu:
+        plan, values = each.plan, each.criteria
+        assert values["inverse_clearance"] == plan.costs["inverse_clearance"]
+        beyond = plan.tube.inner_insertion_mm - plan.tube.exit.arc_length_mm
+        assert values["length_in_tissue_mm"] == pytest.approx(plan.needle.length_mm + beyond)
+        assert values["clearance_mm"] <= min(plan.clearance_mm["needle"]["vessel"], values["pleura_mm"])
+
+
+def test_front(menu: tuple[Alternative, ...]) -> None:
+    assert any(each.on_front for each in menu)
+    alone = judged([menu[0].plan])
+    assert alone[0].on_front
+    worse = replace(menu[0].plan, costs={name: cost + 1.0 for name, cost in menu[0].plan.costs.items()})
+    assert [each.on_front for each in judged([worse, menu[0].plan])] == [False, True]
+
+
+def test_lines_are_the_arcs() -> None:
+    rng = np.random.default_rng(0)
+    tangents = rng.standard_normal((20, 3))
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    entries = SimpleNamespace(positions=rng.standard_normal((20, 3)), tangents=tangents)
+    target = np.array([3.0, 40.0, -10.0])
+    entries.tangents[0] = (target - entries.positions[0]) / np.linalg.norm(target - entries.positions[0])
+    search: Any = SimpleNamespace(
+        atlas=SimpleNamespace(deployments=entries),
+        task=SimpleNamespace(target=SimpleNamespace(lps_mm=target)),
+    )
+    for line, position, tangent in zip(
+        _lines(search, np.arange(20)), entries.positions, tangents, strict=True
+    ):
+        frame = np.eye(4)
+        frame[:3, 2] = tangent
+        frame[:3, 0] = np.linalg.svd(tangent[None])[2][1]
+        frame[:3, 1] = np.cross(tangent, frame[:3, 0])
+        frame[:3, 3] = position
+        points = direct_path(frame, target).sample(0.01)[0]
+        gaps = np.linalg.norm(line[:, None] - points[None], axis=-1).min(axis=1)
+        assert gaps.max() < 0.011 and np.allclose(line[[0, -1]], [position, target], atol=1e-9)
+
+
+def test_bad_input(small_lung: Lung, atlas: la.Atlas) -> None:
+    target = la.resolve_target(small_lung)
+    for wrong in ({"count": 0}, {"apart_mm": 0.0}, {"objective": "beauty"}):
+        with pytest.raises(SettingsError):
+            alternatives(small_lung, SYSTEM, target, atlas=atlas, **wrong)
+    other = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=2.9))
+    with pytest.raises(SettingsError, match="atlas"):
+        alternatives(small_lung, other, target, atlas=atlas)
+
+
+def test_an_atlas_serves_another_needle(small_lung: Lung, atlas: la.Atlas) -> None:
+    other = replace(SYSTEM, needle=replace(SYSTEM.needle, max_curvature_per_mm=1.0 / 40.0))
+    target = la.resolve_target(small_lung)
+    assert alternatives(small_lung, other, target, atlas=atlas, count=1)[0].plan.system == other
+
+
+def test_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lungaccess.cli.commands.alternatives.load_lung", lambda *_: small_lung)
+    words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]
+    assert cli.main([*words, "--out", str(tmp_path / "menu"), "--cache", str(tmp_path)]) == 0
+    saved = sorted(path.name for path in (tmp_path / "menu").iterdir())
+    assert saved == ["plan-01.json", "plan-02.json"]
+    assert la.check(la.Plan.load(tmp_path / "menu" / "plan-01.json"), small_lung).accepted

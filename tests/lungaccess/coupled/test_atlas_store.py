@@ -1,0 +1,87 @@
+"""Atlases on disk: found again, also for another needle; damaged or foreign ones are made anew."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lungaccess as la
+from anatomy.errors import FileError
+from anatomy.lung import Lung
+from lungaccess.coupled import atlas_store
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.atlas_store import open_atlas
+
+SYSTEM = la.load_system("ultrathin")
+COARSE: dict[str, Any] = {"rotations": 4, "stop_spacing_mm": 10.0, "site_spacing_mm": 4.0}
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The systems for which an atlas was enumerated."""
+    names: list[str] = []
+    build = atlas_store.build_atlas
+
+    def counted(lung: Lung, system: Any, **options: Any) -> Atlas:
+        names.append(system.name)
+        return build(lung, system, **options)
+
+    monkeypatch.setattr(atlas_store, "build_atlas", counted)
+    return names
+
+
+def same(one: Atlas, other: Atlas) -> bool:
+    parts = [(one.sites, other.sites), (one.deployments, other.deployments)]
+    return all(
+        np.array_equal(getattr(a, field.name), getattr(b, field.name))
+        if isinstance(getattr(a, field.name), np.ndarray)
+        else getattr(a, field.name) == getattr(b, field.name)
+        for a, b in parts
+        for field in fields(a)
+    )
+
+
+def test_found_again(small_lung: Lung, tmp_path: Path, made: list[str]) -> None:
+    first = open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
+    again = open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
+    assert made == [SYSTEM.name] and same(first, again) and first.deployments.count > 0
+    assert not again.deployments.positions.flags.writeable
+    other = replace(SYSTEM, name="other", needle=replace(SYSTEM.needle, max_curvature_per_mm=1 / 40))
+    served = open_atlas(small_lung, other, cache=tmp_path, **COARSE)
+    assert len(made) == 1 and served.system == other, "the needle does not matter"
+
+
+def test_what_matters_is_made_anew(small_lung: Lung, tmp_path: Path, made: list[str]) -> None:
+    open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
+    changes: list[Any] = [
+        replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=3.2)),
+        replace(SYSTEM, tubes=replace(SYSTEM.tubes, min_wall_angle_deg=20.0)),
+        replace(SYSTEM, margins=replace(SYSTEM.margins, segmentation_margin_mm=0.7)),
+        replace(SYSTEM, fissures_allowed=not SYSTEM.fissures_allowed),
+    ]
+    for number, system in enumerate(changes, start=2):
+        open_atlas(small_lung, system, cache=tmp_path, **COARSE)
+        assert len(made) == number
+    open_atlas(replace(small_lung, key="another"), SYSTEM, cache=tmp_path, **COARSE)
+    open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE | {"rotations": 5})
+    assert len(made) == len(changes) + 3
+
+
+@pytest.mark.parametrize("keep", [0, 100, 5000])
+def test_a_damaged_file_is_replaced(small_lung: Lung, tmp_path: Path, made: list[str], keep: int) -> None:
+    first = open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:keep])
+    again = open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
+    assert len(made) == 2 and same(first, again)
+    assert same(open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE), first) and len(made) == 2
+
+
+def test_a_folder_that_cannot_be(small_lung: Lung, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileError, match="--cache"):
+        open_atlas(small_lung, SYSTEM, cache=tmp_path / "file" / "cache", **COARSE)

@@ -1,0 +1,242 @@
+"""`NoPlan` tells the truth: constructed causes are named, and what it advises gives a plan."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lungaccess as la
+from anatomy.grid import Float
+from anatomy.lung import Lung
+from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target, point_target
+from tests.stages.scenes import lung_of
+
+# The check compares a system that has the name of a preset with the preset.
+SYSTEM = replace(la.load_system("ultrathin"), name="changed")
+# Already bends most tightly, needs much room: what is left to advise is a thinner needle, or a fissure.
+THICK = replace(
+    SYSTEM,
+    needle=replace(SYSTEM.needle, max_curvature_per_mm=1 / 30, diameter_mm=1.0),
+    margins=replace(SYSTEM.margins, segmentation_margin_mm=0.8),
+)
+
+
+@pytest.fixture(scope="module")
+def atlas_of(small_lung: Lung) -> Callable[[System], la.Atlas]:
+    """Atlases of the small lung, each made once."""
+    made: dict[str, la.Atlas] = {}
+
+    def atlas(system: System) -> la.Atlas:
+        key = repr(system)
+        if key not in made:
+            made[key] = la.build_atlas(small_lung, system)
+        return made[key]
+
+    return atlas
+
+
+def explained(lung: Lung, system: System, target: Target, **options: Any) -> NoPlan:
+    with pytest.raises(la.NoPlan) as caught:
+        list(la.plan(lung, system, target, **{"iterations": 60, **options}))
+    return caught.value
+
+
+def scattered_targets(lung: Lung, count: int, seed: int) -> list[Target]:
+    rng, found = np.random.default_rng(seed), []
+    while len(found) < count:
+        point: Float = lung.grid.lps(rng.uniform(0, np.array(lung.grid.shape) - 1))
+        clear = lung.fields["obstacle_fissure"].lower_bound_mm(point)[0]
+        if lung.label_at(point) & (AIRWAY | VESSEL | OUTSIDE) == 0 and clear > 1.5:
+            found.append(point_target(lung, point))
+    return found
+
+
+class TestScope:
+    """The bronchoscope does not fit."""
+
+    THICK_SCOPE = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=15.0))
+
+    def test_nowhere_to_stand(self, small_lung: Lung) -> None:
+        error = explained(small_lung, self.THICK_SCOPE, la.resolve_target(small_lung))
+        assert "the scope (15 mm) has nowhere to stand" in str(error)
+        assert error.reasons["scope: sites"] == 0
+        generation = int(re.search(r"too narrow at generation (\d+)", str(error))[1])
+        closed = next(count for reason, count in error.reasons.items() if "too narrow" in reason)
+        assert generation == 0 and closed == small_lung.tree.n_points
+
+    def test_the_advised_diameter_has_a_place_and_a_larger_one_has_none(self, small_lung: Lung) -> None:
+        advice = explained(small_lung, self.THICK_SCOPE, la.resolve_target(small_lung)).advice
+        widest = float(re.search(r"of ([\d.]+) mm or less", advice)[1])
+        for diameter, stands in ((widest, True), (widest + 0.11, False)):
+            scope = replace(SYSTEM.scope, outer_diameter_mm=diameter)
+            atlas = la.build_atlas(
+                small_lung, replace(SYSTEM, scope=scope), rotations=1, stop_spacing_mm=20.0
+            )
+            assert (atlas.sites.count > 0) == stands
+
+    def test_no_airway_in_lung_tissue(self, small_lung: Lung) -> None:
+        """The lung is far from every airway: a thinner scope is no help, and none is advised."""
+        labels = small_lung.labels.copy(order="F")
+        labels[labels & AIRWAY == 0] |= OUTSIDE
+        target = la.resolve_target(small_lung)
+        where = tuple(np.rint(small_lung.grid.ijk(target.lps_mm)).astype(int))
+        labels[where] = 0
+        lung = lung_of(labels, small_lung.grid, small_lung.tree)
+        error = explained(lung, replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=1.8)), target)
+        assert "nowhere to stand" in str(error)
+        assert error.reasons["scope: sites"] == 0 and error.advice == ""
+
+
+def test_tubes_that_never_leave(small_lung: Lung) -> None:
+    system = replace(SYSTEM, tubes=replace(SYSTEM.tubes, min_wall_angle_deg=90.0))
+    error = explained(small_lung, system, la.resolve_target(small_lung))
+    assert "the tubes cannot leave the airway safely" in str(error)
+    assert error.reasons["scope: sites"] > 0
+    refused = {k: v for k, v in error.reasons.items() if k.startswith("tube: the tube")}
+    assert sum(refused.values()) == error.reasons["tube: deployments looked at"]
+    assert refused["tube: the tube meets the airway wall at too flat an angle"] > 0
+
+
+class TestNeedle:
+    """The needle does not get there."""
+
+    def test_outside_the_workspace(self, small_lung: Lung, atlas_of: Any) -> None:
+        atlas = atlas_of(SYSTEM)
+        error = explained(small_lung, SYSTEM, la.resolve_target(small_lung, nodule=3), atlas=atlas)
+        assert "outside the needle's workspace" in str(error)
+        outside = error.reasons["needle: deployments whose workspace does not hold the target"]
+        assert outside == atlas.deployments.count > 0
+
+    def test_walled_in_by_a_vessel(self, small_lung: Lung) -> None:
+        """A shell of vessel about a target that was reached before."""
+        target = la.resolve_target(small_lung)
+        centres = small_lung.grid.lps(np.argwhere(small_lung.labels >= 0)).reshape(
+            *small_lung.labels.shape, 3
+        )
+        distance = np.linalg.norm(centres - target.lps_mm, axis=-1)
+        labels = small_lung.labels.copy(order="F")
+        labels[(distance > 3.0) & (distance < 5.5)] = VESSEL
+        walled = lung_of(labels, small_lung.grid, small_lung.tree)
+        error = explained(walled, SYSTEM, target)
+        assert "is blocked, mostly by a vessel" in str(error)
+        stopped = {k: v for k, v in error.reasons.items() if k.startswith("needle: arcs stopped by")}
+        assert set(stopped) <= {
+            "needle: arcs stopped by a vessel", "needle: arcs stopped by the needle's limits",
+        }  # fmt: skip
+        assert stopped["needle: arcs stopped by a vessel"] > 0
+        assert "reaches it" in error.advice
+
+    def test_a_search_cut_short_says_so(self, small_lung: Lung, atlas_of: Any) -> None:
+        target = la.resolve_target(small_lung)
+        error = explained(
+            small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), method="kuntz2015", iterations=1
+        )
+        assert "too short" in error.advice
+        assert next(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM))) is not None
+
+
+class TestAdvice:
+    """What is advised gives a plan that the check accepts."""
+
+    @staticmethod
+    def accepted(lung: Lung, system: System, target: Target, atlas: la.Atlas) -> bool:
+        try:
+            found = next(la.plan(lung, system, target, atlas=atlas, iterations=0))
+        except la.NoPlan:
+            return False
+        report = la.check(found, lung, system)
+        assert report.accepted, [f.name for f in report.findings if not f.ok]
+        return True
+
+    def test_the_least_tightening_and_no_less(self, small_lung: Lung, atlas_of: Any) -> None:
+        """Three targets: a plan with the named radius, none with a radius 3 mm larger."""
+        seen = 0
+        for target in scattered_targets(small_lung, 25, 0):
+            try:
+                list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
+            except la.NoPlan as error:
+                named = [
+                    (float(re.search(r"curvature of (\d+) mm instead of 121 mm", change)[1]), made)
+                    for change, made in error.plans_with_changes.items()
+                    if "curvature" in change
+                ]
+                if not named:
+                    continue
+                radius, made = named[0]
+                assert la.check(made, small_lung).accepted
+                assert made.system.needle.min_radius_of_curvature_mm == pytest.approx(radius)
+                for r, reaches in ((radius, True), (radius + 3.0, False)):
+                    needle = replace(SYSTEM.needle, max_curvature_per_mm=1 / r)
+                    system = replace(SYSTEM, needle=needle)
+                    assert self.accepted(small_lung, system, target, atlas_of(SYSTEM)) == reaches
+                seen += 1
+                if seen == 3:
+                    break
+        assert seen == 3
+
+    def test_thinner_needles_and_scopes_and_crossing_a_fissure(self, small_lung: Lung, atlas_of: Any) -> None:
+        seen = set()
+        for target in scattered_targets(small_lung, 60, 0):
+            if seen >= {"needle", "fissure"}:
+                break
+            try:
+                list(la.plan(small_lung, THICK, target, atlas=atlas_of(THICK), iterations=0))
+            except la.NoPlan as error:
+                for change, made in error.plans_with_changes.items():
+                    seen.add("needle" if "needle" in change else "scope")
+                    assert la.check(made, small_lung).accepted, change
+                    assert made.system != THICK
+                if "--allow-fissures" in error.advice:
+                    seen.add("fissure")
+                    system = replace(THICK, fissures_allowed=True)
+                    assert self.accepted(small_lung, system, target, atlas_of(system))
+        assert seen >= {"needle", "fissure"}
+
+    def test_a_thinner_scope(self, small_lung: Lung) -> None:
+        """The named diameter gives a plan, and the sites of one a tenth thicker do not."""
+        thick = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=4.5))
+        atlas = la.build_atlas(small_lung, thick)
+        for target in scattered_targets(small_lung, 40, 1):
+            try:
+                list(la.plan(small_lung, thick, target, atlas=atlas, iterations=0))
+            except la.NoPlan as error:
+                changes = [change for change in error.plans_with_changes if "bronchoscope" in change]
+                if not changes:
+                    continue
+                made = error.plans_with_changes[changes[0]]
+                assert la.check(made, small_lung).accepted
+                needed = made.system.scope.outer_diameter_mm
+                assert f"diameter of {needed:g} mm instead of 4.5 mm" in changes[0]
+                thicker = replace(thick, scope=replace(thick.scope, outer_diameter_mm=needed + 0.11))
+                again = la.build_atlas(small_lung, thicker)
+                assert not self.accepted(small_lung, thicker, target, again)
+                return
+        raise AssertionError("no target needed a thinner scope")
+
+    def test_changes_are_named_smallest_first(self, small_lung: Lung, atlas_of: Any) -> None:
+        for target in scattered_targets(small_lung, 25, 0):
+            try:
+                list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
+            except la.NoPlan as error:
+                shares = []
+                for change in error.plans_with_changes:
+                    needed, present = map(float, re.findall(r"([\d.]+) mm", change))
+                    shares.append(abs(needed - present) / present)
+                assert shares == sorted(shares)
+                first = next(iter(error.plans_with_changes), "")
+                assert not first or error.advice.lower().startswith(first)
+
+
+def test_reasons_cannot_be_changed() -> None:
+    error = NoPlan("nothing found", reasons={"a": 1}, advice="wait")
+    with pytest.raises(TypeError):
+        error.reasons["a"] = 2  # type: ignore[index]
+    assert str(error) == "nothing found. wait."

@@ -1,0 +1,412 @@
+"""The coupled planner: better and better plans, all of them valid, the same from the same seed."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lungaccess as la
+from anatomy.errors import SettingsError, TargetError
+from anatomy.grid import Float, Volume
+from anatomy.lung import Lung
+from lungaccess.coupled.kernels import direct_arcs as pricing
+from lungaccess.coupled.planner import ProgressEvent
+from lungaccess.coupled.search import AtlasSearch
+from lungaccess.coupled.search.entries import different, least_costs
+from lungaccess.coupled.search.local_search import Climber, needle_of, path_through
+from lungaccess.coupled.search.scope_poses import Stands
+from lungaccess.plans.assemble import Task
+from lungaccess.plans.costs import OBJECTIVES
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.target import Target
+from stages.needle.space import direct_arcs, workspace_lengths
+from tests.lungaccess.cli.ahead import turned_candidates
+from tests.lungaccess.resample import needle_walk, problems
+
+SYSTEM = la.load_system("ultrathin")
+ITERATIONS = 150
+
+KUNTZ_TARGET = "lps:-64,53.3,-86.7"
+"""One that random placement finds within a few thousand draws."""
+
+
+@pytest.fixture(scope="module")
+def atlas(small_lung: Lung) -> la.Atlas:
+    return la.build_atlas(small_lung, SYSTEM)
+
+
+@pytest.fixture(scope="module")
+def target(small_lung: Lung) -> Target:
+    return la.resolve_target(small_lung)
+
+
+def plans_of(lung: Lung, target: Target, atlas: la.Atlas, **options: Any) -> list[Plan]:
+    return list(la.plan(lung, SYSTEM, target, atlas=atlas, **{"iterations": ITERATIONS, **options}))
+
+
+@pytest.fixture(scope="module")
+def by_objective(small_lung: Lung, target: Target, atlas: la.Atlas) -> dict[str, list[Plan]]:
+    """Plans under every objective, on a lung with a cost map that falls to the patient's left."""
+    lung = mapped(small_lung)
+    return {name: plans_of(lung, target, atlas, objective=name, iterations=600) for name in OBJECTIVES}
+
+
+def mapped(lung: Lung) -> Lung:
+    """A cost map between 0.2 and 1, higher where y is."""
+    share = np.linspace(0.2, 1.0, lung.grid.shape[1], dtype=np.float32)
+    values = np.asfortranarray(np.broadcast_to(share[None, :, None], lung.grid.shape))
+    return replace(lung, cost=Volume(grid=lung.grid, array=values))
+
+
+def same_run(plans: list[Plan]) -> list[str]:
+    records = [json.loads(plan.to_json()) for plan in plans]
+    return [json.dumps({k: v for k, v in r.items() if k != "timing"}, sort_keys=True) for r in records]
+
+
+class TestPlans:
+    """Every plan that is yielded."""
+
+    def test_each_is_better_than_the_one_before(self, by_objective: dict[str, list[Plan]]) -> None:
+        for name, plans in by_objective.items():
+            costs = [plan.costs[name] for plan in plans]
+            assert len(costs) >= 2
+            assert all(b < a for a, b in zip(costs[:-1], costs[1:], strict=True))
+            assert {plan.objective for plan in plans} == {name}
+
+    def test_each_objective_is_served_best_by_its_own_search(
+        self, by_objective: dict[str, list[Plan]]
+    ) -> None:
+        for name in OBJECTIVES:
+            best = {other: plans[-1].costs[name] for other, plans in by_objective.items()}
+            # A short random search comes this near to the best, no nearer.
+            assert best[name] <= 1.02 * min(best.values())
+            assert best[name] < 0.999 * max(best.values())
+
+    @pytest.mark.parametrize(
+        "every", [pytest.param(1, marks=pytest.mark.slow, id="all"), pytest.param(9, id="some")]
+    )
+    def test_the_check_accepts_them(
+        self, by_objective: dict[str, list[Plan]], small_lung: Lung, target: Target, every: int
+    ) -> None:
+        lung = mapped(small_lung)
+        for plans in by_objective.values():
+            for plan in plans[::-every]:
+                report = la.check(plan, lung, SYSTEM, target_lps=target.lps_mm)
+                assert report.accepted, [f.name for f in report.findings if not f.ok]
+
+    def test_walked_again_in_small_steps_they_keep_all_limits(
+        self, by_objective: dict[str, list[Plan]], small_lung: Lung
+    ) -> None:
+        for plans in by_objective.values():
+            for plan in (plans[0], plans[-1]):
+                assert problems(plan, small_lung) == []
+
+    def test_they_state_what_they_are(self, by_objective: dict[str, list[Plan]], small_lung: Lung) -> None:
+        plan = by_objective["inverse_clearance"][-1]
+        assert plan.system == SYSTEM and plan.lung_key == small_lung.key
+        assert plan.target_origin == "nodule 1" and plan.method == "atlas" and plan.seed == 0
+        assert plan.fissures_are_obstacles
+        assert plan.required_clearance_mm["needle"] == pytest.approx(0.4 + 0.5)
+        assert set(plan.timing) == {"planning_s", "atlas_s"}
+        walk = needle_walk(plan)
+        assert plan.needle.length_mm == pytest.approx(walk.s[-1])
+        assert plan.costs["length_mm"] == plan.needle.length_mm
+        dense = np.arccos(np.clip(walk.tangents @ walk.tangents[0], -1, 1)).max()
+        assert plan.needle.max_angle_from_start_rad == pytest.approx(dense, abs=1e-6)
+        assert plan.clearance_mm["needle"]["vessel"] >= plan.required_clearance_mm["needle"] - 0.03
+
+
+class TestRepeatability:
+    """Iterations, not time, decide."""
+
+    @pytest.mark.parametrize(("method", "iterations"), [("atlas", 150), ("kuntz2015", 3000)])
+    def test_the_same_seed_gives_the_same_bytes(
+        self, small_lung: Lung, atlas: la.Atlas, method: str, iterations: int
+    ) -> None:
+        target = la.resolve_target(small_lung, KUNTZ_TARGET)
+        first, again = (
+            plans_of(small_lung, target, atlas, seed=1, method=method, iterations=iterations)
+            for _ in range(2)
+        )
+        assert len(first) >= 2
+        assert same_run(first) == same_run(again)
+        assert [p.digest for p in first] == [p.digest for p in again]
+
+    def test_the_atlas_made_inside_gives_the_same_plans(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        inside = list(la.plan(small_lung, SYSTEM, target, iterations=20))
+        assert same_run(inside) == same_run(plans_of(small_lung, target, atlas, iterations=20))
+
+    def test_more_iterations_continue_the_same_run(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        short, long = (plans_of(small_lung, target, atlas, iterations=n) for n in (40, 160))
+        assert same_run(long)[: len(short)] == same_run(short)
+        assert long[-1].costs["inverse_clearance"] <= short[-1].costs["inverse_clearance"]
+        assert all(plan.iterations <= 40 for plan in short)
+
+    def test_another_seed_refines_differently(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        first, other = (plans_of(small_lung, target, atlas, seed=seed) for seed in (0, 1))
+        assert first[-1].digest != other[-1].digest
+        direct = [[p for p in plans if p.iterations == 0] for plans in (first, other)]
+        assert [p.costs for p in direct[0]] == [p.costs for p in direct[1]]
+
+
+class TestBudget:
+    """What ends a search."""
+
+    def test_no_iterations_leave_the_direct_arcs(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        plans = plans_of(small_lung, target, atlas, iterations=0)
+        assert plans and all(plan.iterations == 0 and len(plan.needle.arcs) == 1 for plan in plans)
+
+    def test_no_time_still_gives_the_first_direct_arc(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        (plan,) = la.plan(small_lung, SYSTEM, target, atlas=atlas, time_s=0.0)
+        assert plan.iterations == 0
+        assert plan.digest == plans_of(small_lung, target, atlas, iterations=0)[0].digest
+
+    def test_time_that_is_over_ends_the_search(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        with pytest.raises(la.NoPlan, match="after 1 iterations"):
+            list(la.plan(small_lung, SYSTEM, target, atlas=atlas, method="kuntz2015", time_s=0.0))
+
+    def test_the_caller_may_stop_at_any_time(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+        plans = la.plan(small_lung, SYSTEM, target, atlas=atlas)
+        costs = [next(plans).costs["inverse_clearance"] for _ in range(3)]
+        plans.close()  # type: ignore[attr-defined]
+        assert costs[0] > costs[1] > costs[2]
+
+    def test_a_hopeless_search_without_budget_ends(self, small_lung: Lung, atlas: la.Atlas) -> None:
+        far = la.resolve_target(small_lung, nodule=3)
+        with pytest.raises(la.NoPlan, match="outside the needle's workspace"):
+            list(la.plan(small_lung, SYSTEM, far, atlas=atlas))
+
+    def test_progress(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+        told: list[ProgressEvent] = []
+        list(la.plan(small_lung, SYSTEM, target, time_s=0.6, on_progress=told.append))
+        assert {"atlas"} < {event.phase for event in told}
+        searching = [event for event in told if event.phase != "atlas"]
+        assert [e.elapsed_s for e in searching] == sorted(e.elapsed_s for e in searching)
+        assert [e.iteration for e in searching] == sorted(e.iteration for e in searching)
+        best = [e.best_cost for e in searching if e.best_cost is not None]
+        assert best == sorted(best, reverse=True) and best
+
+
+@pytest.fixture(scope="module")
+def kuntz_plans(small_lung: Lung, atlas: la.Atlas) -> list[Plan]:
+    target = la.resolve_target(small_lung, KUNTZ_TARGET)
+    return plans_of(small_lung, target, atlas, method="kuntz2015", seed=1, iterations=3000)
+
+
+class TestKuntz2015:
+    """Algorithm 1 of the paper."""
+
+    def test_it_finds_plans_between_the_points_of_the_atlas(self, kuntz_plans: list[Plan]) -> None:
+        assert len(kuntz_plans) >= 2 and all(plan.method == "kuntz2015" for plan in kuntz_plans)
+        assert all(plan.scope.site_point == -1 for plan in kuntz_plans)
+        assert max(len(plan.needle.arcs) for plan in kuntz_plans) >= 2
+        costs = [plan.costs["inverse_clearance"] for plan in kuntz_plans]
+        assert costs == sorted(costs, reverse=True)
+
+    def test_they_are_valid(self, kuntz_plans: list[Plan], small_lung: Lung) -> None:
+        for plan in kuntz_plans:
+            report = la.check(plan, small_lung, SYSTEM)
+            assert report.accepted, [f.name for f in report.findings if not f.ok]
+            assert problems(plan, small_lung) == []
+
+
+class TestInfiniteCost:
+    """Voxels of infinite cost are not entered, whatever is minimised."""
+
+    def test_they_are_avoided(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+        best = plans_of(small_lung, target, atlas)[-1]
+        walk = needle_walk(best)
+        values = np.zeros(small_lung.grid.shape, dtype=np.float32, order="F")
+        for share in (0.4, 0.5, 0.6):
+            point = walk.points[int(share * len(walk.points))]
+            values[tuple(np.rint(small_lung.grid.ijk(point)).astype(int))] = np.inf
+        lung = replace(small_lung, cost=Volume(grid=small_lung.grid, array=values))
+        for objective in OBJECTIVES:
+            plans = plans_of(lung, target, atlas, objective=objective, iterations=60)
+            assert plans and all(math.isfinite(plan.costs["cost_map"]) for plan in plans)
+            for plan in plans:
+                index = np.rint(lung.grid.ijk(needle_walk(plan).points)).astype(int)
+                assert np.isfinite(values[tuple(index.T)]).mean() > 0.99
+                plan.to_json()
+
+
+class TestBadInput:
+    """Typed errors, before any work."""
+
+    @pytest.mark.parametrize("option", [{"objective": "speed"}, {"method": "magic"}])
+    def test_unknown_words(self, small_lung: Lung, target: Target, option: dict[str, str]) -> None:
+        with pytest.raises(SettingsError, match="one of"):
+            la.plan(small_lung, SYSTEM, target, **option)  # type: ignore[arg-type]
+
+    def test_an_atlas_of_another_device_or_patient(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        other = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=2.5))
+        with pytest.raises(SettingsError, match="build_atlas"):
+            la.plan(small_lung, other, target, atlas=atlas)
+        with pytest.raises(SettingsError, match="build_atlas"):
+            la.plan(replace(small_lung, key="other"), SYSTEM, target, atlas=atlas)
+
+    def test_a_target_of_another_patient(self, small_lung: Lung, atlas: la.Atlas) -> None:
+        far = Target(lps_mm=np.array([900.0, 0.0, 0.0]), origin="point")
+        with pytest.raises(TargetError, match="outside the lung"):
+            la.plan(small_lung, SYSTEM, far, atlas=atlas)
+
+
+class TestProcesses:
+    """Several processes at once."""
+
+    def test_same_plans_every_time_and_all_valid(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas
+    ) -> None:
+        one, two = (plans_of(small_lung, target, atlas, processes=2, iterations=200) for _ in range(2))
+        assert same_run(one) == same_run(two)
+        costs = [plan.costs["inverse_clearance"] for plan in one]
+        assert costs == sorted(costs, reverse=True)
+        assert la.check(one[-1], small_lung).accepted
+        alone = plans_of(small_lung, target, atlas, iterations=0)
+        assert costs[-1] <= alone[-1].costs["inverse_clearance"]
+
+    def test_bad_numbers(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+        for options in ({"processes": 0}, {"processes": -2}, {"processes": 2, "method": "kuntz2015"}):
+            with pytest.raises(SettingsError, match="processes"):
+                plans_of(small_lung, target, atlas, **options)
+
+
+@pytest.fixture(scope="module")
+def search(small_lung: Lung, target: Target, atlas: la.Atlas) -> AtlasSearch:
+    task = Task(
+        lung=small_lung, system=SYSTEM, target=target, objective="inverse_clearance",
+        with_fissures=atlas.with_fissures, method="atlas", seed=0,
+    )  # fmt: skip
+    return AtlasSearch(task, atlas)
+
+
+def prices(search: AtlasSearch, slack: float) -> tuple[NDArray[np.int64], Float]:
+    """Return blockers and estimated costs of the direct arcs from all deployments in the workspace."""
+    entries, near = search.atlas.deployments, search.in_workspace
+    blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
+    x, y, z = search.task.target.lps_mm.tolist()
+    pricing.priced_arcs(
+        needle_of(search.desk.space, search.task), entries.positions[near], entries.tangents[near],
+        entries.branch[near], (x, y, z), slack, math.inf, blockers, costs,
+    )  # fmt: skip
+    return blockers, costs
+
+
+class TestPrices:
+    """Direct arcs with a running best, and lower bounds."""
+
+    def test_what_is_not_passed_over_is_judged_as_by_the_needle_stage(self, search: AtlasSearch) -> None:
+        entries, near = search.atlas.deployments, search.in_workspace
+        labels, _lengths, inverse = direct_arcs(
+            search.desk.space, entries.positions[near], entries.tangents[near], entries.branch[near],
+            search.task.target.lps_mm,
+        )  # fmt: skip
+        blockers, costs = prices(search, math.inf)
+        assert (blockers == labels).all() and (costs[labels == 0] == inverse[labels == 0]).all()
+        blockers, costs = prices(search, 1.0)
+        dear = blockers == pricing.TOO_DEAR
+        assert 0 < dear.sum() < len(near) and (blockers[~dear] == labels[~dear]).all()
+        best = inverse[labels == 0].min()
+        assert costs[blockers == 0].min() == best
+        assert (inverse[dear & (labels == 0)] >= best).all()
+
+    def test_lower_bounds_are_below_exact_costs(self, search: AtlasSearch) -> None:
+        entries, near = search.atlas.deployments, search.in_workspace
+        needle, target = needle_of(search.desk.space, search.task), search.task.target.lps_mm
+        lengths = workspace_lengths(
+            search.desk.space, entries.positions[near], entries.tangents[near], target
+        )
+        bounds = least_costs(needle, entries, near, lengths, target)
+        clear = np.flatnonzero(prices(search, math.inf)[0] == 0)
+        for n in clear[:: max(len(clear) // 60, 1)].tolist():
+            candidate = search.finished(int(near[n]))
+            assert candidate is not None and 0.0 < bounds[n] <= search.desk.cost(candidate.path)
+
+    def test_different_deployments_are_the_first_of_their_kind(self, search: AtlasSearch) -> None:
+        entries, near = search.atlas.deployments, search.in_workspace
+        kept = different(entries, near)
+        assert kept[0] == near[0] and 0 < len(kept) < len(near)
+        assert (np.diff([near.tolist().index(n) for n in kept.tolist()]) > 0).all()
+        assert set(entries.branch[kept]) == set(entries.branch[near])
+        assert (different(entries, kept) == kept).all()
+
+
+class TestClimbs:
+    """Random improvement in compiled batches."""
+
+    @pytest.mark.parametrize("turned", [False, True])
+    def test_they_only_fall_and_end_at_what_is_proved(
+        self, search: AtlasSearch, small_lung: Lung, atlas: la.Atlas, turned: bool
+    ) -> None:
+        if turned:
+            search, begun = next(turned_candidates(small_lung, atlas))
+        else:
+            last = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][-1]))
+            assert last is not None
+            begun = last
+        climber = Climber(search.desk, search.judge, search.atlas.sites, np.random.default_rng(0))
+        climb = climber.begin(begun)
+        assert climb is not None
+        again = climber.candidate(climb)
+        assert again is not None and np.allclose(again.path.arcs, begun.path.arcs, atol=1e-9)
+        costs = []
+        for _ in range(12):
+            climber.advance(climb, 50)
+            costs.append(climb.cost)
+            found = search.desk.finished(0, "climb", climber.candidate(climb))
+            assert found.candidate is not None
+            assert found.cost == pytest.approx(climb.cost, rel=0.05)
+            assert found.candidate.tip.turned == turned
+        assert costs == sorted(costs, reverse=True) and costs[-1] < 0.99 * search.desk.cost(begun.path)
+
+    def test_kicked_ones_find_back_to_what_is_proved(self, search: AtlasSearch) -> None:
+        climber = Climber(search.desk, search.judge, search.atlas.sites, np.random.default_rng(0))
+        begun = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][0]))
+        assert begun is not None
+        finite = 0
+        for _ in range(8):
+            climb = climber.begin(begun)
+            assert climb is not None
+            climber.kick(climb)
+            climber.advance(climb, 300)
+            if math.isfinite(climb.cost):
+                finite += 1
+                assert search.desk.finished(0, "climb", climber.candidate(climb)).candidate is not None
+        assert finite >= 1
+
+    def test_rows_hold_the_tips(self, search: AtlasSearch, small_lung: Lung) -> None:
+        tip = search.atlas.sites.tip(small_lung.tree, 0)
+        stands = Stands(small_lung, SYSTEM.scope, search.atlas.sites, tip, np.random.default_rng(0))
+        assert stands.allowed[stands.home] and stands.rotation_rad(stands.home, 0.7) == pytest.approx(0.7)
+        for row, each in zip(stands.rows, stands.tips, strict=True):
+            frame = each.lps_from_scope_tip
+            assert np.allclose(row[:6], [*frame[:3, 3], *frame[:3, 2]])
+            assert abs(row[3:6] @ row[6:]) < 1e-9 and np.linalg.norm(row[6:]) == pytest.approx(1.0)
+
+    def test_paths_lead_through_their_points(self, search: AtlasSearch) -> None:
+        begun = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][0]))
+        assert begun is not None
+        target = search.task.target.lps_mm
+        vias = begun.path.sample(2.0)[0][[3, 6]] + 0.3
+        path = path_through(begun.deployment, vias, target)
+        assert np.allclose(path.frames()[1:, :3, 3], [*vias, target], atol=1e-9)

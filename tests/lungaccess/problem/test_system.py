@@ -1,0 +1,141 @@
+"""Presets and device files: what fits, what is refused, and that equal systems have equal fingerprints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from anatomy.errors import FileError, SettingsError
+from anatomy.settings import override, parse, to_mapping
+from lungaccess.problem.system import System, load_system, preset_names, system_fingerprint
+
+PRESETS = Path(__file__).resolve().parents[3] / "lungaccess" / "presets"
+DEFAULT = (PRESETS / "lung-default.toml").read_text(encoding="utf-8")
+
+
+def write(folder: Path, content: str) -> Path:
+    path = folder / "device.toml"
+    path.write_text(content, encoding="utf-8")
+    return path
+
+
+def test_presets_ship_with_the_package() -> None:
+    assert preset_names() == ("flexure-needle", "lung-default", "therapeutic-scope", "ultrathin")
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_preset_is_valid_sourced_and_survives_a_round_trip(name: str) -> None:
+    system = load_system(name)
+    assert system.name == name
+    assert system.description
+    assert any("assumption" in source for source in system.sources)
+    assert parse(System, to_mapping(system), name) == system
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_sources_of_presets_are_in_the_bibliography(name: str) -> None:
+    bibliography = (PRESETS.parents[1] / "docs" / "bibliography.md").read_text(encoding="utf-8")
+    keys = {part.split("]")[0] for source in load_system(name).sources for part in source.split("[")[1:]}
+    assert keys
+    assert not {key for key in keys if f"[{key}]" not in bibliography}
+
+
+def test_needle_radii_of_presets() -> None:
+    assert load_system("lung-default").needle.min_radius_of_curvature_mm == pytest.approx(121.0, rel=1e-15)
+    assert load_system("flexure-needle").needle.min_radius_of_curvature_mm == 50.0
+
+
+def test_default_needle_keeps_one_millimetre_in_all() -> None:
+    system = load_system("lung-default")
+    assert system.needle.radius_mm + system.margins.total_mm == 1.0
+
+
+def test_presets_differ_in_what_they_are_named_for() -> None:
+    default, large, thin = map(load_system, ("lung-default", "therapeutic-scope", "ultrathin"))
+    assert thin.scope.outer_diameter_mm < default.scope.outer_diameter_mm < large.scope.outer_diameter_mm
+    assert (thin.scope.channel_diameter_mm, large.scope.channel_diameter_mm) == (1.7, 2.8)
+
+
+def test_file_and_preset_give_the_same_system(tmp_path: Path) -> None:
+    path = write(tmp_path, DEFAULT)
+    assert load_system(path) == load_system(str(path)) == load_system("lung-default")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[needle]\ndiameter_mm = 1.0", "[needle]\ndiameter_mm = nan", r"needle\.diameter_mm = nan"),
+        ("[needle]\ndiameter_mm = 1.0", "[needle]\ndiameter_mm = -1.0", r"needle\.diameter_mm = -1\.0"),
+        ("[needle]\ndiameter_mm = 1.0", "[needle]\ndiameter_mm = 1.3", r"needle\.diameter_mm = 1\.3"),
+        ("[needle]\ndiameter_mm = 1.0", "[needle]\ndiameter_mm = '1'", r"needle\.diameter_mm = '1'"),
+        ("[needle]\ndiameter_mm = 1.0", "[needle]\nwidth_mm = 1.0", r"needle\.width_mm is not a setting"),
+        ("max_length_mm = 150.0", "max_length_mm = inf", r"needle\.max_length_mm = inf"),
+        ("channel_diameter_mm = 2.0", "channel_diameter_mm = 1.9", r"tubes\.outer\.outer_diameter_mm = 1\.9"),
+        ("channel_diameter_mm = 2.0", "channel_diameter_mm = 5.0", r"scope\.channel_diameter_mm = 5\.0"),
+        ("max_strain = 0.04", "max_strain = 0.01", r"tubes\.inner\.precurvature_per_mm = 0\.025"),
+        ("segmentation_margin_mm = 0.5", "segmentation_margin_mm = -0.5", "segmentation_margin_mm = -0.5"),
+        ("[margins]", "[margin]", "margin is not a setting"),
+        ("[needle]", "fissures_allowed = 'no'\n[needle]", "fissures_allowed"),
+        ("[needle]", "[needle", "not valid TOML"),
+        ("diameter_mm = 1.0\n", "diameter_mm = 1.0\ndiameter_mm = 2.0\n", "not valid TOML"),
+    ],
+)
+def test_bad_device_files_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert DEFAULT.count(old) == 1
+    path = write(tmp_path, DEFAULT.replace(old, new))
+    with pytest.raises(SettingsError, match=message) as caught:
+        load_system(path)
+    assert str(path) in caught.value.found
+
+
+def test_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "device.toml"
+    path.write_bytes(b"name = '\xff\xfe'")
+    with pytest.raises(SettingsError, match="not valid TOML"):
+        load_system(path)
+
+
+def test_unknown_names_list_the_presets() -> None:
+    with pytest.raises(SettingsError, match="no system called 'lung'") as caught:
+        load_system("lung")
+    assert "lung-default" in caught.value.expected
+
+
+def test_missing_file_is_a_file_error(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="cannot be read"):
+        load_system(tmp_path / "absent.toml")
+    with pytest.raises(FileError, match="cannot be read"):
+        load_system(str(tmp_path / "absent.toml"))
+
+
+def test_fingerprint_depends_on_every_number_and_nothing_else() -> None:
+    system = load_system("lung-default")
+    assert system_fingerprint(system) == system_fingerprint(parse(System, to_mapping(system), ""))
+    assert len(system_fingerprint(system)) == 64
+    finer = math.nextafter(system.needle.diameter_mm, 0.0)
+    changed = (
+        override(system, {"needle.diameter_mm": finer}),
+        override(system, {"margins.registration_margin_mm": 0.1}),
+        replace(system, fissures_allowed=True),
+    )
+    assert len({system_fingerprint(other) for other in (system, *changed)}) == 4
+
+
+def test_example_of_the_documentation_works(tmp_path: Path) -> None:
+    page = (PRESETS.parents[1] / "docs" / "devices.md").read_text(encoding="utf-8")
+    example = page.split("```toml\n")[1].split("```")[0]
+    system = load_system(write(tmp_path, example))
+    assert system.needle.min_radius_of_curvature_mm == pytest.approx(100.0)
+
+
+def test_documentation_names_every_key() -> None:
+    page = (PRESETS.parents[1] / "docs" / "devices.md").read_text(encoding="utf-8")
+
+    def keys(mapping: dict[str, object]) -> set[str]:
+        nested = (keys(value) for value in mapping.values() if isinstance(value, dict))
+        return set(mapping).union(*nested)
+
+    assert not {key for key in keys(to_mapping(load_system("lung-default"))) if f"`{key}`" not in page}

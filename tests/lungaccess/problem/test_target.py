@@ -1,0 +1,121 @@
+"""Targets: points with a stated frame, nodules, and every way of being wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import lungaccess as la
+from anatomy.errors import FrameError, TargetError
+from anatomy.lung import Lung
+from anatomy.phantom import Phantom
+from anatomy.structures import OUTSIDE, VESSEL
+from lungaccess.problem.target import nodule_target, point_target
+from tests.stages.scenes import Canvas, nodules_of
+
+
+@pytest.fixture(scope="module")
+def lung() -> Lung:
+    return make_lung()
+
+
+def make_lung(**more: object) -> Lung:
+    canvas = Canvas.empty([-20, -20, -20], [20, 20, 20], 1.0)
+    canvas.add(canvas.points[..., 0] < -15, OUTSIDE)
+    canvas.add(canvas.ball([10, 0, 0], 3.0), VESSEL)
+    canvas.airway(canvas.ball([0, 10, 0], 3.0), canvas.ball([0, 10, 0], 4.0), 0)
+    nodules = canvas.ball([0, 0, -10], 3.0) | canvas.ball([0, -12, 5], 2.0) | canvas.ball([0, 0, 14.0], 2.5)
+    # The core of the third nodule is a vessel.
+    canvas.add(canvas.ball([0, 0, 14.0], 1.2), VESSEL)
+    return canvas.lung(**{"nodules": nodules_of(canvas, nodules), **more})
+
+
+def test_a_point_states_its_frame(lung: Lung) -> None:
+    assert la.resolve_target(lung, "lps:1,2,3").lps_mm.tolist() == [1.0, 2.0, 3.0]
+    assert la.resolve_target(lung, "ras:1,2,3").lps_mm.tolist() == [-1.0, -2.0, 3.0]
+    assert la.resolve_target(lung, "ras:1,2,3").origin == "point ras:1,2,3"
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "xyz:1,2,3", "ras:1,2", "ras:1,2,nan", "ras:a,b,c", ""])
+def test_text_that_is_no_point_with_a_frame(lung: Lung, text: str) -> None:
+    with pytest.raises(FrameError):
+        la.resolve_target(lung, text)
+
+
+@pytest.mark.parametrize(
+    ("point", "where"),
+    [
+        ((-17.0, 0, 0), "outside the lung"),
+        ((500.0, 0, 0), "outside the lung"),
+        ((10.0, 0, 1), "inside a vessel"),
+        ((0.0, 10, 0), "inside an airway"),
+        ((0.0, 10, 3.6), "inside an airway"),
+    ],
+)
+def test_points_where_no_needle_may_end(lung: Lung, point: tuple[float, ...], where: str) -> None:
+    with pytest.raises(TargetError, match=where):
+        point_target(lung, np.array(point))
+    with pytest.raises(TargetError, match=where):
+        la.resolve_target(lung, "lps:" + ",".join(map(str, point)))
+
+
+@pytest.mark.parametrize("point", [(np.nan, 0, 0), (np.inf, 0, 0), (1.0, 2.0), ((1.0, 2.0, 3.0),)])
+def test_arrays_that_are_no_point(lung: Lung, point: object) -> None:
+    with pytest.raises(TargetError, match="not a point"):
+        point_target(lung, np.array(point, dtype=float))
+
+
+def test_the_frame_is_suspected_when_the_point_is_outside(lung: Lung) -> None:
+    with pytest.raises(TargetError, match="RAS and LPS"):
+        point_target(lung, np.array([-17.0, 0.0, 0.0]))
+
+
+def test_a_target_is_a_copy_that_cannot_be_written(lung: Lung) -> None:
+    point = np.array([1.0, 2.0, 3.0])
+    target = point_target(lung, point)
+    point[0] = 9.0
+    assert target.lps_mm[0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        target.lps_mm[0] = 2.0
+
+
+def test_nodules_are_numbered_by_size(lung: Lung) -> None:
+    assert np.linalg.norm(nodule_target(lung, 1).lps_mm - [0, 0, -10]) < 1.0
+    assert np.linalg.norm(nodule_target(lung, 3).lps_mm - [0, -12, 5]) < 1.0
+    assert nodule_target(lung, 1).origin == "nodule 1"
+    assert np.array_equal(la.resolve_target(lung).lps_mm, nodule_target(lung, 1).lps_mm)
+    assert la.resolve_target(lung, nodule=3).origin == "nodule 3"
+
+
+def test_a_nodule_around_a_vessel_is_entered_beside_it(lung: Lung) -> None:
+    target = nodule_target(lung, 2)
+    assert lung.label_at(target.lps_mm) & VESSEL == 0
+    assert lung.mask("nodule").array[tuple(np.rint(lung.grid.ijk(target.lps_mm)).astype(int))]
+    assert 1.2 < np.linalg.norm(target.lps_mm - [0, 0, 14.0]) <= 2.6
+
+
+@pytest.mark.parametrize("number", [0, -1, 4])
+def test_a_nodule_that_is_not_there(lung: Lung, number: int) -> None:
+    with pytest.raises(TargetError, match="from 1 to 3"):
+        nodule_target(lung, number)
+
+
+def test_a_patient_without_nodules() -> None:
+    empty = Canvas.empty([-5, -5, -5], [5, 5, 5], 1.0)
+    for lung in (make_lung(nodules=None), make_lung(nodules=nodules_of(empty, empty.ball([0, 0, 0], -1.0)))):
+        with pytest.raises(TargetError, match="no nodule mask"):
+            la.resolve_target(lung)
+
+
+def test_a_nodule_that_is_all_vessel() -> None:
+    canvas = Canvas.empty([-8, -8, -8], [8, 8, 8], 1.0)
+    canvas.add(canvas.ball([0, 0, 0], 3.0), VESSEL)
+    with pytest.raises(TargetError, match="inside a vessel"):
+        nodule_target(canvas.lung(nodules=nodules_of(canvas, canvas.ball([0, 0, 0], 2.0))), 1)
+
+
+def test_the_nodules_of_the_phantom_are_where_it_grew_them(small_lung: Lung, small_phantom: Phantom) -> None:
+    by_size = sorted(small_phantom.nodules, key=lambda nodule: -nodule.radius_mm)
+    for number, nodule in enumerate(by_size, start=1):
+        target = nodule_target(small_lung, number)
+        assert np.linalg.norm(target.lps_mm - nodule.centre_lps) < 1.25

@@ -1,0 +1,46 @@
+"""Pages for tests: of plans and of a map of the small phantom."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lungaccess as la
+from anatomy.grid import Volume
+from anatomy.lung import Lung
+from lungaccess.plans.plan import Plan
+from lungaccess.reachability.reach_map import ReachMap, reachability
+from lungaccess.report.html import PageOptions, plan_page, reach_page
+
+SYSTEM = la.load_system("ultrathin")
+SIZE_LIMIT = 15_000_000
+
+
+def make_plans(lung: Lung) -> tuple[Plan, ...]:
+    """Return the best plan to a nodule, and the first one that was found."""
+    found = list(la.plan(lung, SYSTEM, la.resolve_target(lung), iterations=60))
+    return found[-1], found[0]
+
+
+def make_reach(lung: Lung) -> ReachMap:
+    """Return a coarse map."""
+    atlas = la.build_atlas(lung, SYSTEM, rotations=8, stop_spacing_mm=6.0, site_spacing_mm=5.0)
+    return reachability(lung, SYSTEM, spacing_mm=9.0, atlas=atlas)
+
+
+def plan_file(plans: tuple[Plan, ...], lung: Lung, ct: Volume | None, folder: Path) -> Path:
+    """Write the page of a plan with an alternative, with or without a CT."""
+    table = folder / "cost_over_time.csv"
+    table.write_text("elapsed_s,iteration,best_cost\n0.1,0,\n0.5,3,9.5\n1.25,8,7.0\n")
+    options = PageOptions(
+        alternatives=plans[1:],
+        ct=ct,
+        ct_name="" if ct is None else "simulated",
+        cost_over_time=table,
+        risk_samples=200,
+    )
+    return plan_page(plans[0], lung, folder / "report.html", options)
+
+
+def reach_file(reach: ReachMap, lung: Lung, folder: Path) -> Path:
+    """Write the page of a map."""
+    return reach_page([reach], lung, folder / "reach.html")

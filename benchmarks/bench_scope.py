@@ -13,7 +13,7 @@ from stages.scope.advisor.collision import Scene
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
 from stages.scope.advisor.navigation import goal_at, navigation_field
-from stages.scope.advisor.orientability import orientability
+from stages.scope.advisor.orientability import measure_orientability
 from stages.scope.advisor.path_search import PathSettings
 
 SPACING_MM = (0.7, 0.7, 0.6)
@@ -97,7 +97,7 @@ class Stage:
     def time_orientability(self) -> None:
         """Where the tip can point in the trachea."""
         scene = Scene(model=self.model, field=self.advisor.field)
-        orientability(scene, self.tree, 60)
+        measure_orientability(scene, self.tree, 60)
 
 
 class Compile(FreshProcess):

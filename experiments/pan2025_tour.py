@@ -30,7 +30,7 @@ from experiments.support.tour_models import random_airway, random_lesions
 from lungaccess.report import style
 from stages.scope.tour.circuit import SAME_RESISTANCE, circuits
 from stages.scope.tour.exits import Exit, find_exits
-from stages.scope.tour.itinerary import itinerary, one_by_one_mm
+from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary
 from stages.scope.tour.shortest import shortest_tour
 from stages.scope.tour.subtree import Ways, ways_to
 
@@ -72,7 +72,7 @@ def compare(ways: Ways) -> dict[str, float]:
         "most_loops": int(best.loops.max()),
     }
     for reading in ("printed", "reduced"):
-        tour = itinerary(ways, found.choice(reading))  # type: ignore[arg-type]
+        tour = plan_itinerary(ways, found.choice(reading))  # type: ignore[arg-type]
         row[f"{reading}_mm"] = tour.length_mm
         row[f"{reading}_one_by_one_mm"] = one_by_one_mm(ways, tour.chosen)
     depth = ways.depth_mm[ways.exit_vertex]
@@ -80,7 +80,7 @@ def compare(ways: Ways) -> dict[str, float]:
         next(x for x in range(len(ways.exits)) if _is_nearest(ways.exits[x], m))
         for m in range(ways.n_lesions)
     ]
-    row["nearest_mm"] = itinerary(ways, nearest).length_mm
+    row["nearest_mm"] = plan_itinerary(ways, nearest).length_mm
     row["nearest_one_by_one_mm"] = float(2 * depth[nearest].sum() - depth[nearest].max())
     return row
 

@@ -15,8 +15,9 @@ print(la.check(plan, lung).accepted)
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from anatomy.facade import facade
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree as AirwayTree
@@ -35,51 +36,4 @@ if TYPE_CHECKING:
     from lungaccess.problem.target import Target as Target
     from lungaccess.problem.target import resolve_target as resolve_target
 
-_HOME = {
-    "AirwayTree": "anatomy.airway_tree",
-    "Atlas": "lungaccess.coupled.atlas",
-    "Lung": "anatomy.lung",
-    "LungaccessError": "anatomy.errors",
-    "NoPlan": "lungaccess.plans.no_plan",
-    "Plan": "lungaccess.plans.plan",
-    "System": "lungaccess.problem.system",
-    "Target": "lungaccess.problem.target",
-    "build_atlas": "lungaccess.coupled.atlas",
-    "check": "lungaccess.checking",
-    "load_patient": "lungaccess.problem.patients",
-    "load_system": "lungaccess.problem.system",
-    "plan": "lungaccess.coupled.planner",
-    "preset_names": "lungaccess.problem.system",
-    "resolve_target": "lungaccess.problem.target",
-}
-
-__all__ = [
-    "AirwayTree",
-    "Atlas",
-    "Lung",
-    "LungaccessError",
-    "NoPlan",
-    "Plan",
-    "System",
-    "Target",
-    "build_atlas",
-    "check",
-    "load_patient",
-    "load_system",
-    "plan",
-    "preset_names",
-    "resolve_target",
-]
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used, so that `import lungaccess` stays light."""
-    if name not in _HOME:
-        raise AttributeError(f"module 'lungaccess' has no attribute {name!r}")
-    value = getattr(import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+__getattr__, __dir__ = facade(__name__, __file__)

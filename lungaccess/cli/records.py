@@ -46,7 +46,7 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
 
 def needle_record(answer: NeedleAnswer) -> dict[str, Any]:
     """Return what a needle planner found; poses in LPS mm, angles in rad."""
-    from stages.needle.costs import path_costs
+    from stages.needle import path_costs
 
     path = answer.path
     record: dict[str, Any] = {

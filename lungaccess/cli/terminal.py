@@ -105,7 +105,7 @@ def needle_tables(answer: NeedleAnswer) -> list[Table]:
     rows = [("outcome", words.get(answer.outcome, answer.outcome))]
     if answer.branch >= 0:
         rows.append(("taken to have pierced", f"branch {answer.branch}"))
-    from stages.needle.costs import path_costs
+    from stages.needle import path_costs
 
     path = answer.path
     if path is None:

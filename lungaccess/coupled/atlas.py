@@ -13,22 +13,18 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Float
 from anatomy.lung import Lung
 from lungaccess.problem.system import System
-from stages.needle.start_index import StartIndex
-from stages.scope.advisor.collision import Scene
-from stages.scope.advisor.kinematics import model_of
-from stages.scope.advisor.lumen import lumen_of_lung
-from stages.scope.advisor.navigation import navigation_field
-from stages.scope.advisor.orientability import orientability
-from stages.scope.sites import Sites, sites
-from stages.tube.deployments import (
+from stages.needle import StartIndex
+from stages.scope import Sites, find_sites
+from stages.scope.advisor import Scene, lumen_of_lung, measure_orientability, model_of, navigation_field
+from stages.tube import (
     DEFAULT_ROTATIONS,
     DEFAULT_STOP_MM,
     Deployments,
-    deployments,
+    TubeMechanics,
+    enumerate_deployments,
     joined,
     tracking_length_mm,
 )
-from stages.tube.mechanics import TubeMechanics
 
 SITE_SPACING_MM = 1.0
 TURNED_COARSER = 2
@@ -100,7 +96,9 @@ class Atlas:
         is room.  About 0.05 s a site; sites themselves are chosen by a stricter rule.
         """
         point = int(self.sites.tree_point[site])
-        return orientability(self._scope_scene, self.lung.tree, point).angle_rad(self.sites.poses[site, 3:])
+        return measure_orientability(self._scope_scene, self.lung.tree, point).angle_rad(
+            self.sites.poses[site, 3:]
+        )
 
     @cached_property
     def _scope_scene(self) -> Scene:
@@ -149,13 +147,13 @@ def build_atlas(
     began = time.perf_counter()
     with_fissures = lung.has_fissures and not system.fissures_allowed
     reach = tracking_length_mm(system.tubes)
-    places = sites(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
+    places = find_sites(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
     straight = int((~places.turned).sum())
     share = straight / max(places.count, 1)
     tell = progress or (lambda _share: None)
 
     def enumerated(poses: Float, rotations: int, spacing_mm: float, begin: float, end: float) -> Deployments:
-        return deployments(
+        return enumerate_deployments(
             lung,
             system.tubes,
             system.margins,

@@ -20,9 +20,9 @@ from anatomy.lung import Lung
 from anatomy.settings import to_mapping
 from lungaccess.coupled.atlas import SITE_SPACING_MM, Atlas, build_atlas
 from lungaccess.problem.system import System
-from stages.needle.start_index import StartIndex
-from stages.scope.sites import Sites
-from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
+from stages.needle import StartIndex
+from stages.scope import Sites
+from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
 FORMAT = 3
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""

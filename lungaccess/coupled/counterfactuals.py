@@ -16,9 +16,9 @@ from lungaccess.coupled.search.diverse import different_candidates
 from lungaccess.plans.assemble import Candidate, Task, assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
-from stages.needle.space import direct_arcs
-from stages.scope.device import Bronchoscope
-from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
+from stages.needle import direct_arcs
+from stages.scope import Bronchoscope
+from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 TIGHTEST_RADIUS_MM = 20.0
 THINNEST_NEEDLE_MM = 0.3

@@ -7,8 +7,7 @@ import math
 from lungaccess.coupled.counterfactuals import Remedy, remedies
 from lungaccess.coupled.search import AtlasSearch
 from lungaccess.plans.no_plan import NoPlan
-from stages.needle.device import Needle
-from stages.needle.space import direct_arcs, needle_space
+from stages.needle import Needle, direct_arcs, needle_space
 
 
 def explain(search: AtlasSearch, iterations: int) -> NoPlan:

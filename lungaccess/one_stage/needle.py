@@ -13,11 +13,7 @@ from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from stages.needle.objective import Objective
-from stages.needle.path import ArcPath
-from stages.needle.search.base import Query, Search
-from stages.needle.search.planners import PLANNERS
-from stages.needle.space import NeedleSpace, needle_space
+from stages.needle import PLANNERS, ArcPath, NeedleSpace, Objective, Query, Search, needle_space
 
 SLICE = 500
 OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")

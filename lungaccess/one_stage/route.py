@@ -13,8 +13,7 @@ from anatomy.grid import Float
 from anatomy.io.frames import Frame
 
 if TYPE_CHECKING:
-    from stages.scope.route.centreline import Centreline
-    from stages.scope.route.planner import Route
+    from stages.scope.route import Centreline, Route
 
 CENTRELINE_SUFFIXES = (".vtp", ".vtu")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -59,7 +58,7 @@ def open_source(
     LungaccessError
         If the source cannot be read or holds no tubes.
     """
-    from stages.scope.route.centreline import from_graph, from_image, from_lung, from_mask
+    from stages.scope.route import from_graph, from_image, from_lung, from_mask
 
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -116,7 +115,7 @@ def widest_end(centreline: Centreline) -> Float:
 def record(source: RouteSource, route: Route) -> dict[str, Any]:
     """Return a route as plain JSON types, in LPS mm."""
     from anatomy.settings import to_mapping
-    from stages.scope.route.metrics import measure
+    from stages.scope.route import measure
 
     measured = measure(route.curve, source.centreline)
     count = max(round(route.curve.length_mm() / CURVE_SPACING_MM), 1)

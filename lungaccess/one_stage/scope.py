@@ -11,13 +11,19 @@ from anatomy.grid import Float
 from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
 from lungaccess.problem.system import System
-from stages.scope.advisor.advisor import Advisor, ThinnerScope, start_state, why_stopped
-from stages.scope.advisor.fly_through import fly_through
-from stages.scope.advisor.instructions import Instruction, instructions
-from stages.scope.advisor.kinematics import model_of
-from stages.scope.advisor.lumen import lumen_of_lung
-from stages.scope.advisor.navigation import goal_at
-from stages.scope.advisor.path import ScopePath
+from stages.scope.advisor import (
+    Advisor,
+    Instruction,
+    ScopePath,
+    ThinnerScope,
+    camera_flight,
+    goal_at,
+    instructions_along,
+    lumen_of_lung,
+    model_of,
+    start_state,
+    why_stopped,
+)
 
 ADVICE_FILE, CAMERA_FILE = "advice.json", "camera.mrk.json"
 ROOM_AT_GOAL_MM = 0.25
@@ -105,7 +111,7 @@ def advise_scope(
     path = advisor.path(start, seed=seed)
     return ScopeAdvice(
         path=path,
-        told=instructions(path, lung.tree),
+        told=instructions_along(path, lung.tree),
         why_stopped=why_stopped(path, advisor.field, lung.tree),
         thinner=() if path.reached else advisor.thinner(start, seed=seed),
     )
@@ -119,7 +125,7 @@ def save_advice(advice: ScopeAdvice, folder: Path) -> None:
     FileError
         If the folder is missing or not writable.
     """
-    contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: fly_through(advice.path).markups()}
+    contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: camera_flight(advice.path).markups()}
     for name, content in contents.items():
         with atomic_write(folder / name) as temporary:
             temporary.write_text(json.dumps(content, indent=1))

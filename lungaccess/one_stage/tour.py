@@ -14,12 +14,25 @@ from anatomy.grid import Float
 from anatomy.io.files import read_text
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
-from stages.scope.tour.circuit import MOST_COMBINATIONS, Circuits, Reading, circuits, combinations
-from stages.scope.tour.exits import Exit, ExitRule, Vet, exits_of
-from stages.scope.tour.itinerary import Itinerary, itinerary, one_by_one_mm
-from stages.scope.tour.resistance import Resistances
-from stages.scope.tour.shortest import shortest_tour
-from stages.scope.tour.subtree import MOST_LESIONS, Ways, ways_to
+from stages.scope.tour import (
+    MOST_COMBINATIONS,
+    MOST_LESIONS,
+    Circuits,
+    Exit,
+    ExitRule,
+    Itinerary,
+    Reading,
+    Resistances,
+    Vet,
+    Ways,
+    circuits,
+    combinations,
+    exits_of,
+    one_by_one_mm,
+    plan_itinerary,
+    shortest_tour,
+    ways_to,
+)
 
 if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas
@@ -159,7 +172,9 @@ def plan_tour(
         left_out=left_out,
         ways=ways,
         shortest=best,
-        least_resistance=None if found is None else itinerary(ways, found.choice(reading), closed=closed),
+        least_resistance=None
+        if found is None
+        else plan_itinerary(ways, found.choice(reading), closed=closed),
         circuits=found,
         one_by_one_mm=one_by_one_mm(ways, best.chosen, closed=closed),
         vetted=atlas is not None,
@@ -195,7 +210,7 @@ def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
     from lungaccess.coupled.search import AtlasSearch
     from lungaccess.plans.assemble import Task
     from lungaccess.problem.target import point_target
-    from stages.needle.space import direct_arcs
+    from stages.needle import direct_arcs
 
     task = Task(
         lung=atlas.lung,

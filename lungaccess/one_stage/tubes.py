@@ -16,18 +16,22 @@ from anatomy.errors import SettingsError
 from anatomy.io.files import read_text
 from anatomy.settings import impossible, parse, settings, text, to_mapping
 from lungaccess.problem.system import System, load_system
-from stages.tube.device import Tube
-from stages.tube.following import DeployedSequence, SnapError, deploy
-from stages.tube.mechanics import Equilibrium, TubeMechanics, check_nesting
-from stages.tube.proposals import (
+from stages.tube import (
+    DeployedSequence,
     DesignProposal,
+    Equilibrium,
     MakerLimits,
     SequenceComparison,
+    SnapError,
+    Tube,
+    TubeMechanics,
+    check_nesting,
+    deploy,
     judge_design,
+    kuntz2015,
     least_sweep_sequence,
     propose_designs,
 )
-from stages.tube.sequences import kuntz2015
 
 AS_FAR = 0.95
 """Share of the present reach that counts as about as far."""

@@ -26,11 +26,9 @@ from lungaccess.plans.plan import (
 )
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.target import Target
-from stages.needle.path import ArcPath
-from stages.scope.sites import Sites, approach_depth_mm
-from stages.scope.tips import ScopeTip, approach, leaving_point
-from stages.tube.deployments import Deployment
-from stages.tube.shape import centreline
+from stages.needle import ArcPath
+from stages.scope import ScopeTip, Sites, approach, approach_depth_mm, leaving_point
+from stages.tube import Deployment, centreline
 
 CLEARANCE_CAP_MM = 5.0
 SAMPLE_MM = 0.05

@@ -7,9 +7,7 @@ from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
 from lungaccess.problem.suggestion import did_you_mean
-from stages.needle import costs
-from stages.needle.path import ArcPath
-from stages.needle.space import Arrays
+from stages.needle import ArcPath, SpaceArrays, costs
 
 OBJECTIVES = ("inverse_clearance", "cost_map", "voxel_sum", "length_mm")
 
@@ -53,7 +51,7 @@ def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> 
     return costs.obstacle_clearance_mm(_obstacles(lung, with_fissures), points)
 
 
-def _obstacles(lung: Lung, with_fissures: bool) -> Arrays:
+def _obstacles(lung: Lung, with_fissures: bool) -> SpaceArrays:
     """Return the arrays of a lung as a `NeedleSpace` holds them."""
     bits = OBSTACLES | (FISSURE if with_fissures else 0)
     return lung.obstacle_field(with_fissures=with_fissures).corners, lung.labels, lung.geometry, bits

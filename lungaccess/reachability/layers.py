@@ -15,7 +15,7 @@ from anatomy.grid import Float, Grid
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
-from stages.needle.reach import Reached, ReachScan
+from stages.needle import Reached, ReachScan
 
 THREADS = 2
 

@@ -21,8 +21,7 @@ from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.reachability.layers import LayerStore, counted_voxels, scan_layers
 from lungaccess.reachability.regions import Regions, lung_regions
-from stages.needle.reach import DEFAULT_ARCS, DIRECT, NO_ROOM, SEARCHED, UNREACHED, ReachScan
-from stages.needle.space import needle_space
+from stages.needle import DEFAULT_ARCS, DIRECT, NO_ROOM, SEARCHED, UNREACHED, ReachScan, needle_space
 
 DEFAULT_SPACING_MM = 3.0
 FORMAT = b"lungaccess-reach-1"

@@ -26,12 +26,11 @@ from lungaccess.reachability.kernels.unreachable import (
     greatest_insertions,
     rule_out,
 )
-from stages.needle.kernels.limits import GOAL_TOLERANCE, REQUIRED
-from stages.needle.space import needle_space
-from stages.scope.sites import sites
-from stages.scope.tips import LEAVING_MM, MAX_TURN_AT_TIP_RAD
-from stages.tube.deployments import tube_constants
-from stages.tube.kernels.deployment import MAX_EXTENSION
+from stages.needle import needle_space
+from stages.needle.kernels import GOAL_TOLERANCE, REQUIRED
+from stages.scope import LEAVING_MM, MAX_TURN_AT_TIP_RAD, find_sites
+from stages.tube import tube_constants
+from stages.tube.kernels import MAX_EXTENSION
 
 Mask = NDArray[np.bool_]
 
@@ -228,7 +227,7 @@ def _pieces(lung: Lung, system: System, leaving: Mask, reach_mm: float) -> Itera
         return
     nearest = cKDTree(lung.grid.lps(exits))
     reach_mm += float(np.linalg.norm(lung.grid.spacing_mm))
-    passable = sites(lung, system.scope, reach_mm=reach_mm).passable
+    passable = find_sites(lung, system.scope, reach_mm=reach_mm).passable
     knots: list[Float] = []
     cones: list[Float] = []
     last = -1

@@ -9,8 +9,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Float
 from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM
-from stages.scope.sites import Sites
-from stages.scope.tips import ScopeTip, looks_ahead, tip_at
+from stages.scope import ScopeTip, Sites, looks_ahead, tip_at
 
 SAMPLE_MM = 0.125
 ROUNDING_MM = 1e-9

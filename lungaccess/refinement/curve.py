@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from anatomy.grid import Float
-from stages.needle.path import ArcPath, arc_transform, bend_direction
+from stages.needle import ArcPath, arc_transform, bend_direction
 
 AIM_STEPS = 6
 AIM_MM = 1e-10

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.refinement.problem import ARC_COUNTS, WEIGHTS, Court, Problem
-from stages.scope.sites import Sites
+from stages.scope import Sites
 
 ITERATIONS = 40
 NEEDLE_SHARES = (1.0, 0.5)

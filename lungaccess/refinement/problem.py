@@ -18,15 +18,10 @@ from lungaccess.refinement import boxes as fields
 from lungaccess.refinement.axis import axis_of, standing_still
 from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_WAY_MM, Layout, Numbers
-from stages.needle.path import CURVATURE
-from stages.needle.search.base import Query
-from stages.needle.space import needle_space
-from stages.needle.violations import objection
-from stages.scope.sites import Sites
-from stages.scope.tips import ScopeTip
-from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm, tube_constants
+from stages.needle import CURVATURE, Query, needle_space, objection
+from stages.scope import ScopeTip, Sites
+from stages.tube import Deployment, TubeJudge, centreline, tracking_length_mm, tube_constants
 from stages.tube.kernels import deployment as index
-from stages.tube.shape import centreline
 
 ARC_COUNTS = (3, 5, 8)
 """A program is built for each; shorter paths are split."""

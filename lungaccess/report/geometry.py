@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from lungaccess.plans.plan import NeedlePath, Plan, TubeDeployment
-    from stages.tube.device import ConcentricTubes
+    from stages.tube import ConcentricTubes
 
 Float = NDArray[np.float64]
 

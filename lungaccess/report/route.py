@@ -17,8 +17,7 @@ from lungaccess.report import drawing, style
 from lungaccess.report.views import CORONAL, SAGITTAL, View
 
 if TYPE_CHECKING:
-    from stages.scope.route.centreline import Centreline
-    from stages.scope.route.planner import Route
+    from stages.scope.route import Centreline, Route
 
 Float = NDArray[np.float64]
 

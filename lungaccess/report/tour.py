@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
     from anatomy.lung import Lung
     from lungaccess.one_stage.tour import TourAnswer
-    from stages.scope.tour.itinerary import Itinerary
+    from stages.scope.tour import Itinerary
 
 Float = NDArray[np.float64]
 

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from lungaccess.report import drawing, style
 
 if TYPE_CHECKING:
-    from stages.tube.device import Tube
-    from stages.tube.following import DeployedSequence
-    from stages.tube.mechanics import Equilibrium
+    from stages.tube import DeployedSequence, Equilibrium, Tube
 
 Float = NDArray[np.float64]
 

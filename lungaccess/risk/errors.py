@@ -18,7 +18,7 @@ from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, quantity, settings
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel
-from stages.tube.deployments import tube_constants
+from stages.tube import tube_constants
 from stages.tube.kernels import deployment as tube_kernel
 
 CURVATURE = "needle_curvature"

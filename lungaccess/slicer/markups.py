@@ -6,7 +6,7 @@ from typing import Any
 
 from lungaccess.plans.curves import Course
 from lungaccess.plans.plan import Plan
-from stages.scope.advisor.fly_through import MARKUPS_SCHEMA
+from stages.scope.advisor import MARKUPS_SCHEMA
 
 TARGET_COLOUR = (0.17, 0.63, 0.17)
 

@@ -14,8 +14,7 @@ from lungaccess.one_stage.needle import OMPL_TOLERANCE_MM, plan_needle
 from lungaccess.problem.target import point_target
 from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
 from lungaccess.study.runs import Run
-from stages.needle.search.base import Query
-from stages.needle.violations import objection
+from stages.needle import Query, objection
 
 OBJECTIVES = {
     "inverse_clearance": "inverse-clearance",

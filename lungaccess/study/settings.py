@@ -13,7 +13,7 @@ from pydantic import Field
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.io.files import read_text
 from anatomy.settings import impossible, parse, quantity, settings, switch, text
-from stages.tube.deployments import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
+from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
 PHANTOM = "phantom"
@@ -191,7 +191,7 @@ def methods(kind: str) -> tuple[str, ...]:
     """Return the names of the planners of a kind, "plan" or "needle"."""
     if kind == "needle":
         from lungaccess.one_stage.needle import OMPL_PLANNERS
-        from stages.needle.search.planners import PLANNERS
+        from stages.needle import PLANNERS
 
         return (*PLANNERS, *OMPL_PLANNERS)
     from lungaccess.coupled.planner import METHODS

@@ -1,0 +1,41 @@
+"""The steerable needle: paths of arcs, searches for them, and proofs that there are none."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import facade
+
+if TYPE_CHECKING:
+    from stages.needle.costs import path_costs as path_costs
+    from stages.needle.device import Needle as Needle
+    from stages.needle.objective import NO_MAP as NO_MAP
+    from stages.needle.objective import SHORTEST as SHORTEST
+    from stages.needle.objective import Objective as Objective
+    from stages.needle.objective import ObjectiveArrays as ObjectiveArrays
+    from stages.needle.path import CURVATURE as CURVATURE
+    from stages.needle.path import ArcPath as ArcPath
+    from stages.needle.path import arc_transform as arc_transform
+    from stages.needle.path import bend_direction as bend_direction
+    from stages.needle.path import direct_path as direct_path
+    from stages.needle.reach import DEFAULT_ARCS as DEFAULT_ARCS
+    from stages.needle.reach import DIRECT as DIRECT
+    from stages.needle.reach import NO_ROOM as NO_ROOM
+    from stages.needle.reach import SEARCHED as SEARCHED
+    from stages.needle.reach import UNREACHED as UNREACHED
+    from stages.needle.reach import Reached as Reached
+    from stages.needle.reach import ReachScan as ReachScan
+    from stages.needle.search.base import Query as Query
+    from stages.needle.search.base import Search as Search
+    from stages.needle.search.optimal import OptimalSearch as OptimalSearch
+    from stages.needle.search.planners import PLANNERS as PLANNERS
+    from stages.needle.space import RRT_STEP_MM as RRT_STEP_MM
+    from stages.needle.space import NeedleSpace as NeedleSpace
+    from stages.needle.space import SpaceArrays as SpaceArrays
+    from stages.needle.space import direct_arcs as direct_arcs
+    from stages.needle.space import needle_space as needle_space
+    from stages.needle.space import workspace_lengths as workspace_lengths
+    from stages.needle.start_index import StartIndex as StartIndex
+    from stages.needle.violations import objection as objection
+
+__getattr__, __dir__ = facade(__name__, __file__)

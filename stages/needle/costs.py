@@ -13,7 +13,7 @@ from anatomy.kernels import field as field_kernel
 from stages.needle.kernels import cost as kernel
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, _kernel_arcs
-from stages.needle.space import Arrays, NeedleSpace
+from stages.needle.space import NeedleSpace, SpaceArrays
 
 SAMPLE_MM = 0.1
 EXACT_BELOW_VOXELS = 8.0
@@ -21,7 +21,7 @@ EXACT_BELOW_VOXELS = 8.0
 bound is less than 0.6 % off."""
 
 
-def obstacle_clearance_mm(arrays: Arrays, points: Float) -> Float:
+def obstacle_clearance_mm(arrays: SpaceArrays, points: Float) -> Float:
     """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle.
 
     Parameters
@@ -41,7 +41,7 @@ def obstacle_clearance_mm(arrays: Arrays, points: Float) -> Float:
     return clearance
 
 
-def inverse_clearance(arrays: Arrays, path: ArcPath) -> float:
+def inverse_clearance(arrays: SpaceArrays, path: ArcPath) -> float:
     """Return the integral of 1 / clearance over the length of a path [Kuntz2015, eq. 1].
 
     By the trapezoid rule with steps of at most 0.1 mm; clearance is that of the needle's axis, no less than

@@ -11,7 +11,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Float, read_only
 from stages.needle.kernels import cost as index
 
-Arrays = tuple[Float, NDArray[np.float32]]
+ObjectiveArrays = tuple[Float, NDArray[np.float32]]
 
 MAX_CLEARANCE_MM = 256.0
 """No clearance field holds more, so that 1 / clearance has a least value."""
@@ -66,7 +66,7 @@ class Objective:
         """Whether it weighs nothing but length."""
         return self.inverse_clearance == 0.0 and not self.weighs_map
 
-    def arrays(self, cost_map: NDArray[np.float32] | None) -> Arrays:
+    def arrays(self, cost_map: NDArray[np.float32] | None) -> ObjectiveArrays:
         """Return the weights and the map for the kernels, see `stages.needle.kernels.cost`.
 
         The least cost of a mm is a proved lower bound.  The voxel sum adds nothing to it: however small the

@@ -17,10 +17,9 @@ from anatomy.structures import FISSURE, OBSTACLES
 from stages.needle.device import Needle
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import scan
-from stages.needle.objective import Arrays as ObjectiveArrays
-from stages.needle.objective import Objective
+from stages.needle.objective import Objective, ObjectiveArrays
 
-Arrays = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int]
+SpaceArrays = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int]
 
 RRT_STEP_MM = 20.0
 COST_STEP_MM = 0.5
@@ -52,7 +51,7 @@ class NeedleSpace:
     needle: Needle
     required_clearance_mm: float
     goal_tolerance_mm: float
-    arrays: Arrays
+    arrays: SpaceArrays
     limits: Float
     cost_map: Volume | None
     _objectives: dict[Objective, ObjectiveArrays] = field(default_factory=dict, init=False, repr=False)

@@ -87,7 +87,7 @@ class Sites:
         return ScopeTip(tree_point=point, back_mm=0.0, lps_from_scope_tip=frame, turned=True)
 
 
-def sites(
+def find_sites(
     lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float = 1.0, turning: bool = True
 ) -> Sites:
     """Find where the scope tip can stand so that tubes can leave the airway from there.

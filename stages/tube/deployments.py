@@ -168,7 +168,7 @@ def insertion_stops(tubes: ConcentricTubes, spacing_mm: float = DEFAULT_STOP_MM)
     return np.linspace(0.0, longest, max(1, round(longest / spacing_mm)) + 1)
 
 
-def deployments(
+def enumerate_deployments(
     lung: Lung,
     tubes: ConcentricTubes,
     margins: Margins,

@@ -13,7 +13,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from stages.scope.route.planner import Route
+    from stages.scope.route import Route
 
 PROVED, NO_ROUTE = 0, 1
 
@@ -70,8 +70,7 @@ def route(
     """
     from lungaccess.one_stage.route import open_source, record, widest_end
     from lungaccess.report.route import route_png
-    from stages.scope.route.planner import try_route
-    from stages.scope.route.settings import RouteLimits
+    from stages.scope.route import RouteLimits, try_route
 
     limits = RouteLimits(
         max_curvature_per_mm=curvature,
@@ -116,8 +115,7 @@ def _rows(found: Route, written: dict[str, object]) -> list[terminal.Row]:
 
 
 def _verdict(found: Route) -> int:
-    from stages.scope.route.planner import require_proved
-    from stages.scope.route.search import NoRouteError
+    from stages.scope.route import NoRouteError, require_proved
 
     try:
         require_proved(found)

@@ -14,7 +14,7 @@ from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
     from lungaccess.one_stage.tour import TourAnswer
-    from stages.scope.tour.itinerary import Itinerary
+    from stages.scope.tour import Itinerary
 
 ALL_REACHED, SOME_LEFT_OUT = 0, 1
 
@@ -70,7 +70,7 @@ def tour(
     from lungaccess.one_stage.tour import plan_tour, read_lesions, record
     from lungaccess.problem.system import load_system
     from lungaccess.report.tour import tour_png
-    from stages.scope.tour.resistance import Resistances
+    from stages.scope.tour import Resistances
 
     if not tissue_weight >= 0.0:
         raise SettingsError(f"--tissue-weight is {tissue_weight:g}", expected="at least 0")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lungaccess.one_stage.tubes import TubeAnswer
-    from stages.tube.proposals import DesignProposal, SequenceComparison
+    from stages.tube import DesignProposal, SequenceComparison
 
 ACCEPTABLE, REFUSED = 0, 1
 

@@ -16,11 +16,18 @@ import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, normal_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
-from stages.needle.kernels.connections import least_cosine
-from stages.needle.kernels.cost import cost_of_arc, map_costs_on_arc
-from stages.needle.kernels.limits import COST_STEP, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN
-from stages.needle.kernels.proof import blocker_on_arc
-from stages.tube.kernels.deployment import (
+from stages.needle.kernels import (
+    COST_STEP,
+    KAPPA,
+    MAX_ANGLE,
+    MAX_LENGTH,
+    MAX_TURN,
+    blocker_on_arc,
+    cost_of_arc,
+    least_cosine,
+    map_costs_on_arc,
+)
+from stages.tube.kernels import (
     ACCEPTED,
     BRANCH,
     CURVED_LENGTH,

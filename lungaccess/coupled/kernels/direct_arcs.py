@@ -12,15 +12,19 @@ import numba
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_estimate
-from stages.needle.kernels.cost import (
+from stages.needle.kernels import (
     CLEARANCE_FLOOR_MM,
+    COST_STEP,
     INVERSE_CLEARANCE,
+    KAPPA,
     LEAST_RATE,
     LENGTH,
+    MAX_ANGLE,
+    MAX_LENGTH,
+    MAX_TURN,
+    blocker_on_arc,
     cost_of_arc,
 )
-from stages.needle.kernels.limits import COST_STEP, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN
-from stages.needle.kernels.proof import blocker_on_arc
 
 TOO_DEAR = -2
 """Stands for the label of what blocks an arc that was not looked at because of its cost."""

@@ -13,7 +13,7 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, ROTATION, STAND, judged_cost
-from stages.tube.kernels.deployment import N_TRACE
+from stages.tube.kernels import N_TRACE
 
 MAX_VIAS = 5
 STAND_SPREAD = 8.0

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from anatomy.grid import Float
 from anatomy.poses import roll_towards
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, chord_mm
-from stages.needle.device import Needle
-from stages.needle.kernels.connections import least_cosine
-from stages.needle.path import ArcPath, arc_transform
-from stages.needle.space import RRT_STEP_MM
+from stages.needle import RRT_STEP_MM, ArcPath, Needle, arc_transform
+from stages.needle.kernels import least_cosine
 
 SPREAD = 1.2
 """Samples lie up to so many times the distance of the goal ahead of the start."""

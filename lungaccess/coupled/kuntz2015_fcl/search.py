@@ -17,9 +17,9 @@ from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.coupled.kuntz2015_fcl.tubes import TubeTrial
 from lungaccess.coupled.search import AtlasSearch, Step
 from lungaccess.plans.assemble import Candidate, Task
-from stages.needle.path import ArcPath
-from stages.scope.tips import MedialAxis, looks_ahead
-from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
+from stages.needle import ArcPath
+from stages.scope import MedialAxis, looks_ahead
+from stages.tube import Deployment, TubeJudge, tracking_length_mm
 
 PHASE = "reference"
 FOUND = "found"

@@ -17,8 +17,8 @@ from lungaccess.coupled.kuntz2015_fcl.obstacles import (
     labels_at,
 )
 from lungaccess.problem.system import System
-from stages.needle.path import ArcPath, arc_transform
-from stages.tube.deployments import REASONS, Deployment, tube_constants
+from stages.needle import ArcPath, arc_transform
+from stages.tube import REASONS, Deployment, tube_constants
 from stages.tube.kernels import deployment as kernels
 
 NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"

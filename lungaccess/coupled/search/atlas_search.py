@@ -18,9 +18,8 @@ from lungaccess.coupled.search.evaluator import NeedleDesk, Step
 from lungaccess.coupled.search.local_sampling import MOST, Scatter, nearly_reaching
 from lungaccess.coupled.search.local_search import Climb, Climber, needle_of, objective_of
 from lungaccess.plans.assemble import Candidate, Task
-from stages.needle.path import direct_path
-from stages.needle.search.optimal import OptimalSearch
-from stages.tube.deployments import TubeJudge
+from stages.needle import OptimalSearch, direct_path
+from stages.tube import TubeJudge
 
 CHUNK = 1000
 FINALISTS = 3

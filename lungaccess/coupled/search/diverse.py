@@ -11,7 +11,7 @@ from lungaccess.coupled.kernels.separation import choose_apart
 from lungaccess.coupled.search.atlas_search import AtlasSearch
 from lungaccess.coupled.search.entries import Int
 from lungaccess.plans.assemble import Candidate
-from stages.needle.space import direct_arcs
+from stages.needle import direct_arcs
 
 SAMPLES = 17
 """Points of each path that are compared; between two of them a path strays less than 1 mm from a line."""

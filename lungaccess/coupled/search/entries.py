@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from anatomy.grid import Float
 from lungaccess.coupled.kernels import direct_arcs as pricing
 from lungaccess.coupled.search.local_search import Needle
-from stages.tube.deployments import Deployments
+from stages.tube import Deployments
 
 Int = NDArray[np.int64]
 

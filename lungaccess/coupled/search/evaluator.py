@@ -15,11 +15,8 @@ from anatomy.grid import Float
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.plans.costs import path_cost
-from stages.needle.path import CURVATURE, ArcPath
-from stages.needle.search.base import Query
-from stages.needle.space import NeedleSpace, needle_space, workspace_lengths
-from stages.needle.violations import objection
-from stages.tube.deployments import Deployment
+from stages.needle import CURVATURE, ArcPath, NeedleSpace, Query, needle_space, objection, workspace_lengths
+from stages.tube import Deployment
 
 if TYPE_CHECKING:
     from stages.needle.ompl import NeedleProblem

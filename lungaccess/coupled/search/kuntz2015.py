@@ -11,8 +11,8 @@ import numpy as np
 from lungaccess.coupled.search.atlas_search import AtlasSearch
 from lungaccess.coupled.search.evaluator import Step
 from lungaccess.plans.assemble import Candidate
-from stages.scope.tips import MedialAxis, looks_ahead
-from stages.tube.deployments import tracking_length_mm
+from stages.scope import MedialAxis, looks_ahead
+from stages.tube import tracking_length_mm
 
 RRT_ITERATIONS = 300
 

@@ -14,9 +14,8 @@ from lungaccess.coupled.kernels import local_search as climbing
 from lungaccess.coupled.search.entries import Int
 from lungaccess.coupled.search.local_search import Climber
 from lungaccess.plans.assemble import Candidate
-from stages.needle.device import Needle
-from stages.needle.path import direct_path
-from stages.tube.deployments import TubeJudge
+from stages.needle import Needle, direct_path
+from stages.tube import TubeJudge
 
 MOST = 1000
 """Deployments that are varied."""

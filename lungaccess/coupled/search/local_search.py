@@ -14,14 +14,20 @@ from lungaccess.coupled.kernels import local_search as climbing
 from lungaccess.coupled.search.evaluator import NeedleDesk
 from lungaccess.coupled.search.scope_poses import Stands
 from lungaccess.plans.assemble import Candidate, Task
-from stages.needle.objective import NO_MAP, SHORTEST, Objective
-from stages.needle.objective import Arrays as ObjectiveArrays
-from stages.needle.path import ArcPath, direct_path
-from stages.needle.space import Arrays, NeedleSpace
-from stages.scope.sites import Sites
-from stages.tube.deployments import Deployment, TubeJudge, scene_of, tube_constants
+from stages.needle import (
+    NO_MAP,
+    SHORTEST,
+    ArcPath,
+    NeedleSpace,
+    Objective,
+    ObjectiveArrays,
+    SpaceArrays,
+    direct_path,
+)
+from stages.scope import Sites
+from stages.tube import Deployment, TubeJudge, scene_of, tube_constants
 
-Needle = tuple[Arrays, Float, ObjectiveArrays, bool, NDArray[np.float32]]
+Needle = tuple[SpaceArrays, Float, ObjectiveArrays, bool, NDArray[np.float32]]
 
 OBJECTIVES = {
     "inverse_clearance": Objective(inverse_clearance=1.0),

@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from anatomy import poses
 from anatomy.grid import Float
 from anatomy.lung import Lung
-from stages.scope.device import Bronchoscope
-from stages.scope.sites import Sites, can_stand
-from stages.scope.tips import ScopeTip, walk
+from stages.scope import Bronchoscope, ScopeTip, Sites, can_stand, walk
 
 STEP_MM = 0.25
 REACH_MM = 4.0

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from anatomy.kernels.compiling import inner_kernel
-from stages.tube.kernels.deployment import CURVED_LENGTH, INNER_CURVATURE, OVERLAP_CURVATURE, planar_point
+from stages.tube.kernels import CURVED_LENGTH, INNER_CURVATURE, OVERLAP_CURVATURE, planar_point
 
 # Columns of a box: middles, half widths, and the first and last knot of the place.
 EAST, NORTH, ROTATION, OUTER, INNER = range(5)

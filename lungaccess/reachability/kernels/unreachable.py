@@ -40,8 +40,8 @@ from lungaccess.reachability.kernels.deployment_boxes import (
     turned_vector,
 )
 from stages.needle.infeasibility.kernels.reachability_pruning import escape_depth
-from stages.needle.kernels.limits import EXEMPT_LENGTH, GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MAX_LENGTH
-from stages.tube.kernels.deployment import (
+from stages.needle.kernels import EXEMPT_LENGTH, GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MAX_LENGTH
+from stages.tube.kernels import (
     CURVED_LENGTH,
     INNER_CURVATURE,
     INNER_RADIUS,

@@ -1,4 +1,4 @@
-"""Arrays as text inside a page: deflated, in base64, with their type and shape beside them."""
+"""SpaceArrays as text inside a page: deflated, in base64, with their type and shape beside them."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from anatomy.kernels.field import EXACT_REACH_MM, exact_distance
 from anatomy.structures import BITS, LUMEN
 from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.objective import Arrays as ObjectiveArrays
+from stages.needle.objective import ObjectiveArrays
 from stages.needle.path import bend_direction
 from stages.needle.replanning.reaiming import Bend, Root, Source, Trials, as_point, pose_at, root_after
 from stages.needle.search.base import Query

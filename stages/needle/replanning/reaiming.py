@@ -13,8 +13,7 @@ from anatomy.grid import Float
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
-from stages.needle.objective import Arrays as ObjectiveArrays
-from stages.needle.objective import Objective
+from stages.needle.objective import Objective, ObjectiveArrays
 from stages.needle.path import LENGTH, ArcPath, arc_transform, path_from_tree
 from stages.needle.search.base import Query, RestartingRRT, root_of
 from stages.needle.space import NeedleSpace

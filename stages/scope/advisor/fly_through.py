@@ -57,7 +57,7 @@ class FlyThrough:
         return {"@schema": MARKUPS_SCHEMA, "markups": [curve]}
 
 
-def fly_through(
+def camera_flight(
     path: ScopePath, *, spacing_mm: float = 0.25, turn_rad: float = math.radians(2.0)
 ) -> FlyThrough:
     """Return the camera's poses along a path, up to the state nearest to the goal.

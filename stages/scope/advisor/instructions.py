@@ -92,7 +92,7 @@ def _place(from_carina_mm: float) -> str:
     return f"{abs(from_carina_mm):.0f} mm {'beyond' if from_carina_mm > 0.0 else 'above'} the carina"
 
 
-def instructions(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, ...]:
+def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, ...]:
     """Return what to do branch by branch, up to the state nearest to the goal.
 
     The tip is taken to be in the branch of the tree point nearest to it on the way to where it ends.

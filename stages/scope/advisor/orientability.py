@@ -66,7 +66,9 @@ class Orientability:
         return bool(self.possible.any()) and self.angle_rad(direction) <= tolerance_rad
 
 
-def orientability(scene: Scene, tree: AirwayTree, point: int, *, shaft_mm: float = 5.0) -> Orientability:
+def measure_orientability(
+    scene: Scene, tree: AirwayTree, point: int, *, shaft_mm: float = 5.0
+) -> Orientability:
     """Return where a scope can point whose tip stands at a tree point, give or take what room there is.
 
     The tip may stand aside from the medial axis as far as the lumen leaves room beside the scope.  The base

@@ -65,7 +65,7 @@ class Itinerary:
         return self.length_mm / speed_mm_per_s + per_lesion_s * len(self.order)
 
 
-def itinerary(ways: Ways, chosen: Sequence[int], *, closed: bool = False) -> Itinerary:
+def plan_itinerary(ways: Ways, chosen: Sequence[int], *, closed: bool = False) -> Itinerary:
     """Return the shortest tour over chosen exits.
 
     It passes each stretch twice, an open one only once where it leads to the last exit, which is the

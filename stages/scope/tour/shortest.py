@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.scope.tour.itinerary import Itinerary, itinerary
+from stages.scope.tour.itinerary import Itinerary, plan_itinerary
 from stages.scope.tour.kernels.steiner import solve
 from stages.scope.tour.subtree import Ways
 
@@ -40,7 +40,7 @@ def shortest_tour(ways: Ways, *, closed: bool = False) -> Itinerary:
         max(np.flatnonzero(taken & (lesion == m)).tolist(), key=lambda x: float(depth[x]))
         for m in range(ways.n_lesions)
     ]
-    return itinerary(ways, chosen, closed=closed)
+    return plan_itinerary(ways, chosen, closed=closed)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,7 +13,7 @@ from anatomy.phantom import Phantom, write_phantom
 from lungaccess.cli.app import BAD_INPUT, main
 from lungaccess.one_stage.scope import advise_scope
 from lungaccess.problem.system import System, load_system
-from stages.scope.advisor.instructions import instructions
+from stages.scope.advisor.instructions import instructions_along
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_the_advice_leads_to_a_place_in_the_airways(small_lung: Lung, system: Sy
     assert stored["frame"] == "LPS mm"
     assert len(stored["states"]) == advice.path.count
     assert [one["text"] for one in stored["instructions"]] == [
-        one.text() for one in instructions(advice.path, small_lung.tree)
+        one.text() for one in instructions_along(advice.path, small_lung.tree)
     ]
     assert stored["lps_from_tip"] == advice.path.lps_from_tip.tolist()
 

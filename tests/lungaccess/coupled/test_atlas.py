@@ -10,7 +10,7 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from stages.tube.deployments import DEFAULT_ROTATIONS, REASONS, deployments, insertion_stops
+from stages.tube.deployments import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, insertion_stops
 from stages.tube.kernels import deployment as kernels
 from stages.tube.shape import centreline
 from tests.stages.scenes import brute_clearance
@@ -80,7 +80,9 @@ def test_no_tube_leaves_trachea_or_main_bronchi(atlas: la.Atlas, small_lung: Lun
     def enumerated(lung: Lung) -> tuple[set[tuple[float, ...]], set[tuple[float, ...]]]:
         """Return the deployments from the first sites at whole steps, those through the mediastinum apart."""
         tips = atlas.sites.poses[:150]
-        found = deployments(lung, SYSTEM.tubes, SYSTEM.margins, tips, with_fissures=True, rotations=8)
+        found = enumerate_deployments(
+            lung, SYSTEM.tubes, SYSTEM.margins, tips, with_fissures=True, rotations=8
+        )
         columns = (found.branch, found.site, found.rotation_rad, found.outer_mm, found.inner_mm)
         rows = np.stack(columns, axis=1)[np.isclose(found.rotation_rad % (np.pi / 4), 0.0)]
         central = tree.mediastinal[rows[:, 0].astype(int)]
@@ -131,7 +133,9 @@ def test_further_rotations_lie_between_unlike_ones_and_only_there(atlas: la.Atla
     tubes, margins, turn = SYSTEM.tubes, SYSTEM.margins, 2 * np.pi
 
     def enumerated(rotations: int) -> dict[tuple[int, float], set[tuple[float, float]]]:
-        found = deployments(small_lung, tubes, margins, tips, with_fissures=True, rotations=rotations)
+        found = enumerate_deployments(
+            small_lung, tubes, margins, tips, with_fissures=True, rotations=rotations
+        )
         sets: dict[tuple[int, float], set[tuple[float, float]]] = {}
         for n in range(found.count):
             key = int(found.site[n]), round(float(found.rotation_rad[n]), 9)

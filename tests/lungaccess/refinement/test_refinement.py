@@ -23,9 +23,9 @@ from lungaccess.refinement.problem import Court, Problem
 from lungaccess.refinement.program import Program, program
 from stages.needle.path import ArcPath, direct_path
 from stages.needle.space import direct_arcs, needle_space
-from stages.scope.sites import Sites, sites
+from stages.scope.sites import Sites, find_sites
 from stages.scope.tips import looks_ahead, tip_at
-from stages.tube.deployments import Deployment, TubeJudge, deployments, tracking_length_mm
+from stages.tube.deployments import Deployment, TubeJudge, enumerate_deployments, tracking_length_mm
 from tests.lungaccess.cli.ahead import turned_candidates
 from tests.lungaccess.resample import problems
 
@@ -56,9 +56,9 @@ def case(small_lung: Lung) -> Case:
         method="atlas",
         seed=0,
     )
-    places = sites(lung, system.scope, reach_mm=tracking_length_mm(system.tubes))
+    places = find_sites(lung, system.scope, reach_mm=tracking_length_mm(system.tubes))
     fissures = {"with_fissures": task.with_fissures}
-    found = deployments(lung, system.tubes, system.margins, places.poses, **fissures)
+    found = enumerate_deployments(lung, system.tubes, system.margins, places.poses, **fissures)
     space = needle_space(lung, system.needle, system.margins, **fissures)
     blockers, _lengths, costs = direct_arcs(
         space, found.positions, found.tangents, found.branch, target.lps_mm

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation
 from anatomy.lung import Lung
 from anatomy.structures import BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 from stages.scope.device import Bronchoscope
-from stages.scope.sites import sites
+from stages.scope.sites import find_sites
 from stages.scope.tips import approach
 from tests.stages.scenes import Canvas, brute_clearance, forked_tree, lung_of
 
@@ -47,7 +47,7 @@ def scope(diameter_mm: float, margin_mm: float = 0.0) -> Bronchoscope:
 
 def branches_of(lung: Lung, diameter_mm: float, margin_mm: float = 0.0) -> set[int]:
     """Branches with a site in their second half: near its root a branch is as wide as its parent."""
-    found = sites(lung, scope(diameter_mm, margin_mm), reach_mm=30.0)
+    found = find_sites(lung, scope(diameter_mm, margin_mm), reach_mm=30.0)
     halves = [lung.tree.branch_points(b) for b in range(len(LINES))]
     return {
         b for b, points in enumerate(halves) if np.isin(points[len(points) // 2 :], found.tree_point).any()
@@ -77,14 +77,14 @@ def test_behind_a_narrow_place_nothing_is_passable(lung: Lung) -> None:
     in_left_bronchus = (labels >> BRANCH_SHIFT) == 2
     labels[in_left_bronchus & (np.abs(along - 20.0) < 1.0)] &= ~np.uint16(LUMEN)
     narrowed = lung_of(labels, lung.grid, lung.tree)
-    found = sites(narrowed, scope(2.0), reach_mm=30.0)
+    found = find_sites(narrowed, scope(2.0), reach_mm=30.0)
     assert 4 not in set(narrowed.tree.branch_of_point[found.tree_point].tolist())
     assert not found.passable[narrowed.tree.branch_points(4)].any()
 
 
 def test_radius_of_the_way_is_proved(lung: Lung) -> None:
     """Never more than the distance to the nearest voxel that is not lumen, anywhere on the way."""
-    found = sites(lung, scope(3.0), reach_mm=30.0)
+    found = find_sites(lung, scope(3.0), reach_mm=30.0)
     tree = lung.tree
     lumen = (lung.labels & LUMEN) != 0
     border = binary_dilation(lumen, np.ones((3, 3, 3))) & ~lumen
@@ -101,13 +101,13 @@ def test_radius_of_the_way_is_proved(lung: Lung) -> None:
 
 
 def test_airways_in_the_mediastinum_are_left_out(lung: Lung) -> None:
-    found = sites(lung, scope(2.0), reach_mm=1.0)
+    found = find_sites(lung, scope(2.0), reach_mm=1.0)
     x = np.abs(found.poses[:, 0])
     radius = lung.tree.radius_mm[found.tree_point]
     # A probe reaches 2.5 mm beyond the lumen, and the point it is sent from may lie 1 mm ahead.
     assert (x + radius + 2.5 + 1.0 >= MEDIASTINUM_MM - 0.6).all()
     assert len(x) > 20
-    everywhere = sites(forked_lung(0.0), scope(2.0), reach_mm=1.0)
+    everywhere = find_sites(forked_lung(0.0), scope(2.0), reach_mm=1.0)
     assert 0 in lung.tree.branch_of_point[everywhere.tree_point]
     assert 0 not in lung.tree.branch_of_point[found.tree_point]
 
@@ -115,14 +115,14 @@ def test_airways_in_the_mediastinum_are_left_out(lung: Lung) -> None:
 def test_reach_lets_the_tip_stand_before_the_lung(lung: Lung) -> None:
     distances = []
     for reach in (1.0, 10.0, 20.0):
-        found = sites(lung, scope(2.0), reach_mm=reach)
+        found = find_sites(lung, scope(2.0), reach_mm=reach)
         distances.append(float(np.abs(found.poses[:, 0]).min()))
         assert found.exits_ahead[found.tree_point].all()
     assert distances[0] > distances[1] >= distances[2] == 0.0
 
 
 def test_tips_look_along_the_airway(lung: Lung) -> None:
-    found = sites(lung, scope(2.0), reach_mm=30.0, turning=False)
+    found = find_sites(lung, scope(2.0), reach_mm=30.0, turning=False)
     assert np.array_equal(found.poses[:, :3], lung.tree.points_lps[found.tree_point])
     assert np.array_equal(found.poses[:, 3:], lung.tree.tangents[found.tree_point])
     assert found.count == len(found.poses) == len(found.tree_point)
@@ -130,7 +130,7 @@ def test_tips_look_along_the_airway(lung: Lung) -> None:
 
 @pytest.mark.parametrize("spacing", [0.5, 1.0, 3.0])
 def test_spacing(lung: Lung, spacing: float) -> None:
-    found = sites(lung, scope(2.0), reach_mm=100.0, spacing_mm=spacing, turning=False)
+    found = find_sites(lung, scope(2.0), reach_mm=100.0, spacing_mm=spacing, turning=False)
     way = lung.tree.distance_from_root_mm[found.tree_point]
     for branch in range(5):
         on_branch = np.sort(way[lung.tree.branch_of_point[found.tree_point] == branch])
@@ -138,23 +138,23 @@ def test_spacing(lung: Lung, spacing: float) -> None:
 
 
 def test_why_the_others_are_closed(lung: Lung) -> None:
-    assert sites(lung, scope(2.4), reach_mm=30.0).narrowest == (-1, 0.0)
-    generation, excess = sites(lung, scope(3.3), reach_mm=30.0).narrowest
+    assert find_sites(lung, scope(2.4), reach_mm=30.0).narrowest == (-1, 0.0)
+    generation, excess = find_sites(lung, scope(3.3), reach_mm=30.0).narrowest
     assert generation == 2 and 0.0 < excess < 0.6
-    generation, excess = sites(lung, scope(13.0), reach_mm=30.0).narrowest
+    generation, excess = find_sites(lung, scope(13.0), reach_mm=30.0).narrowest
     assert generation == 0 and 0.4 < excess < 1.5
 
 
 def test_the_widest_scope_that_has_a_site(lung: Lung) -> None:
     for margin in (0.0, 0.4):
-        widest = sites(lung, scope(14.0, margin), reach_mm=30.0).widest_scope_mm
+        widest = find_sites(lung, scope(14.0, margin), reach_mm=30.0).widest_scope_mm
         assert 9.0 < widest < 12.0
-        assert sites(lung, scope(widest - 1e-6, margin), reach_mm=30.0).count > 0
-        assert sites(lung, scope(widest + 1e-6, margin), reach_mm=30.0).count == 0
+        assert find_sites(lung, scope(widest - 1e-6, margin), reach_mm=30.0).count > 0
+        assert find_sites(lung, scope(widest + 1e-6, margin), reach_mm=30.0).count == 0
 
 
 def test_no_airway_in_lung_tissue() -> None:
-    found = sites(forked_lung(200.0), scope(2.0), reach_mm=30.0)
+    found = find_sites(forked_lung(200.0), scope(2.0), reach_mm=30.0)
     assert found.count == 0 and found.widest_scope_mm == 0.0
     assert found.passable.all() and not found.exits_ahead.any()
     assert found.poses.shape == (0, 6)
@@ -163,7 +163,7 @@ def test_no_airway_in_lung_tissue() -> None:
 def test_bodies_of_turned_scopes_are_inside_the_lumen(lung: Lung) -> None:
     """Every point of the polyline by which they leave the axis, measured to every voxel that is no lumen."""
     device = scope(3.0)
-    found = sites(lung, device, reach_mm=30.0)
+    found = find_sites(lung, device, reach_mm=30.0)
     turned = np.flatnonzero(found.turned)
     assert len(turned) > 20
     assert (np.diff(found.turned.astype(int)) >= 0).all(), "those along the axis come first"
@@ -177,6 +177,6 @@ def test_bodies_of_turned_scopes_are_inside_the_lumen(lung: Lung) -> None:
 
 
 def test_without_turning_tips_look_along_the_axis(lung: Lung) -> None:
-    found = sites(lung, scope(3.0), reach_mm=30.0, turning=False)
+    found = find_sites(lung, scope(3.0), reach_mm=30.0, turning=False)
     assert found.count and not found.turned.any()
     assert np.allclose(found.poses[:, 3:], lung.tree.tangents[found.tree_point])

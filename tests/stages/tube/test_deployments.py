@@ -16,7 +16,7 @@ from stages.tube.deployments import (
     REASONS,
     Deployment,
     TubeJudge,
-    deployments,
+    enumerate_deployments,
     insertion_stops,
     tracking_length_mm,
     tube_constants,
@@ -84,7 +84,7 @@ def test_every_reason_has_a_sentence() -> None:
 
 
 def test_every_candidate_is_accepted_or_counted(lung: Lung) -> None:
-    found = deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
+    found = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
     stops = len(insertion_stops(TUBES))
     a_turn = stops * (stops + 1) // 2 - 1
     assert 3 * 12 * a_turn <= found.candidates <= 3 * 24 * a_turn and found.candidates % a_turn == 0
@@ -99,7 +99,7 @@ def test_every_candidate_is_accepted_or_counted(lung: Lung) -> None:
 
 
 def test_each_is_what_the_judge_says(lung: Lung) -> None:
-    found = deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
+    found = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
     judge = TubeJudge(lung, TUBES, MARGINS, with_fissures=True)
     for n in np.random.default_rng(0).choice(found.count, 60, replace=False):
         tip = TIPS[found.site[n]]
@@ -114,8 +114,8 @@ def test_each_is_what_the_judge_says(lung: Lung) -> None:
 
 
 def test_without_fissures_as_obstacles_there_are_more(lung: Lung) -> None:
-    strict = deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=8)
-    free = deployments(lung, TUBES, MARGINS, TIPS, with_fissures=False, rotations=8)
+    strict = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=8)
+    free = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=False, rotations=8)
     assert strict.refused["the tube comes too near a fissure"] > 0
     assert "the tube comes too near a fissure" not in free.refused
     assert free.count > strict.count
@@ -125,7 +125,7 @@ def test_without_fissures_as_obstacles_there_are_more(lung: Lung) -> None:
 
 def test_larger_margins_leave_fewer(lung: Lung) -> None:
     counts = [
-        deployments(
+        enumerate_deployments(
             lung, TUBES, Margins(segmentation_margin_mm=margin), TIPS, with_fissures=True, rotations=8
         ).count
         for margin in (0.0, 0.6, 2.0)
@@ -135,7 +135,9 @@ def test_larger_margins_leave_fewer(lung: Lung) -> None:
 
 def test_the_same_call_gives_the_same_arrays(lung: Lung) -> None:
     first, again = (
-        deployments(lung, TUBES, MARGINS, np.repeat(TIPS, 5, axis=0), with_fissures=True, rotations=6)
+        enumerate_deployments(
+            lung, TUBES, MARGINS, np.repeat(TIPS, 5, axis=0), with_fissures=True, rotations=6
+        )
         for _ in range(2)
     )
     assert np.array_equal(first.positions, again.positions)
@@ -143,7 +145,7 @@ def test_the_same_call_gives_the_same_arrays(lung: Lung) -> None:
 
 
 def test_no_sites_no_deployments(lung: Lung) -> None:
-    found = deployments(lung, TUBES, MARGINS, np.zeros((0, 6)), with_fissures=False)
+    found = enumerate_deployments(lung, TUBES, MARGINS, np.zeros((0, 6)), with_fissures=False)
     assert found.count == 0 and found.candidates == 0 and found.refused == {}
     assert found.positions.shape == (0, 3)
 
@@ -151,7 +153,7 @@ def test_no_sites_no_deployments(lung: Lung) -> None:
 def test_progress_is_told(lung: Lung) -> None:
     told: list[float] = []
     tips = np.repeat(TIPS[:1], 100, axis=0)
-    deployments(
+    enumerate_deployments(
         lung,
         TUBES,
         MARGINS,
@@ -166,7 +168,7 @@ def test_progress_is_told(lung: Lung) -> None:
 
 def test_straight_tubes_leave_along_the_axis_of_the_scope(lung: Lung) -> None:
     tip = np.array([[-4.0, 0.0, -12.0, 0.6, 0.0, 0.8]])
-    found = deployments(lung, STRAIGHT, MARGINS, tip, with_fissures=False, rotations=1)
+    found = enumerate_deployments(lung, STRAIGHT, MARGINS, tip, with_fissures=False, rotations=1)
     assert found.count > 0
     along = (found.positions - tip[0, :3]) @ tip[0, 3:]
     assert np.allclose(found.positions, tip[0, :3] + along[:, None] * tip[0, 3:], atol=1e-9)

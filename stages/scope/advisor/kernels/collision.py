@@ -21,7 +21,7 @@ EASY_MM = 0.1
 
 
 class Space(NamedTuple):
-    """Arrays of a lumen of N interior voxels, for kernels.
+    """SpaceArrays of a lumen of N interior voxels, for kernels.
 
     numbers : (ni, nj, nk) int32, -1 for wall; geometry : (3, 6), see `anatomy.kernels.field`;
     lps_from_ijk : (3, 4); voxels : (N, 3) int32; depth, depth_geometry : field of the depth in the lumen;

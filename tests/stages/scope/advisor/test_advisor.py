@@ -14,8 +14,8 @@ from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, start_state, why_stopped
 from stages.scope.advisor.best_motion import Motion
 from stages.scope.advisor.collision import Scene
-from stages.scope.advisor.fly_through import fly_through
-from stages.scope.advisor.instructions import instructions, instructions_json
+from stages.scope.advisor.fly_through import camera_flight
+from stages.scope.advisor.instructions import instructions_along, instructions_json
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, advanced, straight_state, tip_frames
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.navigation import goal_at
@@ -222,7 +222,7 @@ def test_a_tip_outside_the_lumen_gets_no_advice(forked: tuple[Lung, Lumen]) -> N
 def test_instructions_name_every_bifurcation(forked: tuple[Lung, Lumen]) -> None:
     lung, _lumen = forked
     _advisor, path = path_to(forked, GOALS[1])
-    told = instructions(path, lung.tree)
+    told = instructions_along(path, lung.tree)
     assert [one.branch for one in told] == [0, 1, 3]
     assert [one.generation for one in told] == [0, 1, 2]
     assert told[1].from_carina_mm == pytest.approx(0.0, abs=0.6)
@@ -236,12 +236,12 @@ def test_instructions_name_every_bifurcation(forked: tuple[Lung, Lumen]) -> None
     assert "into generation 2" in stored[2]["text"]
     assert "At the carina" in stored[1]["text"]
     _advisor, right = path_to(forked, GOALS[0])
-    assert instructions(right, lung.tree)[1].heading == "to the patient's right"
+    assert instructions_along(right, lung.tree)[1].heading == "to the patient's right"
 
 
 def test_the_camera_flies_in_small_steps_from_state_to_state(forked: tuple[Lung, Lumen]) -> None:
     _advisor, path = path_to(forked, GOALS[1])
-    flight = fly_through(path, spacing_mm=0.3, turn_rad=0.05)
+    flight = camera_flight(path, spacing_mm=0.3, turn_rad=0.05)
     frames, tips = flight.lps_from_camera, path.tips()
     places = frames[:, :3, 3]
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() <= 0.3
@@ -256,7 +256,7 @@ def test_the_camera_flies_in_small_steps_from_state_to_state(forked: tuple[Lung,
     assert len(curve["controlPoints"]) == len(frames)
     assert curve["controlPoints"][3]["position"] == places[3].tolist()
     with pytest.raises(SettingsError):
-        fly_through(path, spacing_mm=0.0)
+        camera_flight(path, spacing_mm=0.0)
 
 
 def test_a_straight_tube_needs_no_bend() -> None:

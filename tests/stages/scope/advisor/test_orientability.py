@@ -12,7 +12,7 @@ from stages.scope.advisor.collision import Scene
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.navigation import navigation_field
-from stages.scope.advisor.orientability import BEND_STEP_RAD, Orientability, orientability
+from stages.scope.advisor.orientability import BEND_STEP_RAD, Orientability, measure_orientability
 from tests.stages.scope.airways import tube
 
 RANGES = {"twist_low_deg": -90.0, "bend_low_deg": -120.0}
@@ -21,7 +21,7 @@ RANGES = {"twist_low_deg": -90.0, "bend_low_deg": -120.0}
 def in_tube(radius_mm: float, scope_mm: float, **more: float) -> Orientability:
     lumen, tree = tube(radius_mm, 50.0, 0.5)
     model = ScopeModel(radius_mm=scope_mm, **{**RANGES, **more})  # type: ignore[arg-type]
-    return orientability(Scene(model=model, field=navigation_field(lumen, 0)), tree, 60)
+    return measure_orientability(Scene(model=model, field=navigation_field(lumen, 0)), tree, 60)
 
 
 def test_a_wide_tube_leaves_every_bend_a_narrow_one_none() -> None:
@@ -54,7 +54,7 @@ def test_directions_are_where_the_tip_looks(forked: tuple[Lung, Lumen]) -> None:
     lung, lumen = forked
     scene = Scene(model=ScopeModel(radius_mm=1.5, **RANGES), field=navigation_field(lumen, 0))
     for point in (40, 110, 150):
-        found = orientability(scene, lung.tree, point)
+        found = measure_orientability(scene, lung.tree, point)
         assert np.linalg.norm(found.directions, axis=1) == pytest.approx(1.0)
         assert found.angle_rad(found.forward) < math.radians(25.0)
         best = found.directions[found.possible][0]
@@ -69,9 +69,11 @@ def test_a_wider_scope_points_nowhere_where_a_thinner_one_cannot(forked: tuple[L
     bends = []
     for radius in sizes:
         scene = Scene(model=ScopeModel(radius_mm=radius, **RANGES), field=field)
-        bends.append(int(orientability(scene, lung.tree, 130).possible.sum()))
+        bends.append(int(measure_orientability(scene, lung.tree, 130).possible.sum()))
     assert bends[0] > bends[1] > bends[2] > bends[3] == 0
-    nowhere = orientability(Scene(model=ScopeModel(radius_mm=6.0, **RANGES), field=field), lung.tree, 130)
+    nowhere = measure_orientability(
+        Scene(model=ScopeModel(radius_mm=6.0, **RANGES), field=field), lung.tree, 130
+    )
     assert nowhere.largest_bend_rad == 0.0
     assert not nowhere.allows(nowhere.forward, math.pi)
 

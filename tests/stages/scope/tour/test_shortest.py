@@ -13,7 +13,7 @@ from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.tour import shortest
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
-from stages.scope.tour.itinerary import itinerary, one_by_one_mm
+from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary
 from stages.scope.tour.shortest import shortest_tour
 from stages.scope.tour.subtree import Ways, ways_to
 from tests.stages.scope.tour.trees import (
@@ -45,7 +45,7 @@ def test_figure_1_is_walked_as_the_paper_writes_it() -> None:
     """A B C D C E C B F G F H."""
     tree = figure_1()
     ways = ways_to(tree, [[exit_at(m, p)] for m, p in enumerate(ends_of(tree, [3, 4, 6, 7]))])
-    tour = itinerary(ways, (0, 1, 2, 3))
+    tour = plan_itinerary(ways, (0, 1, 2, 3))
     assert tour.order == (0, 1, 2, 3)
     points = [int(ways.tree_point[v]) for v in tour.vertices()]
     a, b, c, d, e, f, g, h = ends_of(tree, [0, 1, 2, 3, 4, 5, 6, 7])
@@ -77,14 +77,14 @@ def test_order_is_the_best_of_all_orders(closed: bool) -> None:
     rng = np.random.default_rng(2)
     for _ in range(25):
         ways = random_ways(rng, 5, exits=1)
-        tour = itinerary(ways, range(5), closed=closed)
+        tour = plan_itinerary(ways, range(5), closed=closed)
         assert tour.length_mm == pytest.approx(shortest_by_permutations(ways, tuple(range(5)), closed=closed))
 
 
 def test_open_tour_is_twice_the_union_less_the_deepest_way() -> None:
     rng = np.random.default_rng(3)
     ways = random_ways(rng, 6, exits=1)
-    tour = itinerary(ways, range(6))
+    tour = plan_itinerary(ways, range(6))
     union = float(ways.length_mm[tour.loops > 0].sum())
     assert tour.length_mm == pytest.approx(2 * union - ways.depth_mm[ways.exit_vertex].max())
 
@@ -118,7 +118,7 @@ def test_exact_tour_is_never_longer_than_that_of_least_resistance() -> None:
         ways = ways_to(tree, find_exits(tree, random_lesions(tree, 6, seed)))
         best = shortest_tour(ways).length_mm
         for reading in ("printed", "reduced"):
-            chosen = itinerary(ways, circuits(ways).choice(reading))
+            chosen = plan_itinerary(ways, circuits(ways).choice(reading))
             assert best <= chosen.length_mm + 1e-9
             assert chosen.length_mm <= one_by_one_mm(ways, chosen.chosen) + 1e-9
 
@@ -139,8 +139,8 @@ def test_one_by_one_returns_each_time() -> None:
     depth = ways.depth_mm[ways.exit_vertex]
     assert one_by_one_mm(ways, (0, 1)) == pytest.approx(2 * depth.sum() - depth.max())
     assert one_by_one_mm(ways, (0, 1), closed=True) == pytest.approx(2 * depth.sum())
-    assert itinerary(ways, (0, 1)).seconds(10.0, 60.0) == pytest.approx(
-        itinerary(ways, (0, 1)).length_mm / 10.0 + 120.0
+    assert plan_itinerary(ways, (0, 1)).seconds(10.0, 60.0) == pytest.approx(
+        plan_itinerary(ways, (0, 1)).length_mm / 10.0 + 120.0
     )
 
 
@@ -148,7 +148,7 @@ def test_wrong_exits_are_refused() -> None:
     tree = figure_1()
     ways = ways_to(tree, [[exit_at(0, 10)], [exit_at(1, 20)]])
     with pytest.raises(SettingsError):
-        itinerary(ways, (1, 0))
+        plan_itinerary(ways, (1, 0))
     with pytest.raises(SettingsError):
         ways_to(tree, [])
     with pytest.raises(SettingsError):
@@ -168,8 +168,8 @@ def test_thirty_lesions_with_scattered_exits_are_solved_by_integers() -> None:
     assert fewer.length_mm <= best.length_mm + 1e-6
     for _ in range(300):
         guess = [int(rng.choice(np.flatnonzero(ways.exit_lesion == m))) for m in range(30)]
-        assert best.length_mm <= itinerary(ways, guess, closed=True).length_mm + 1e-6
+        assert best.length_mm <= plan_itinerary(ways, guess, closed=True).length_mm + 1e-6
     for m in range(30):
         for other in np.flatnonzero(ways.exit_lesion == m).tolist():
             changed = [*best.chosen[:m], other, *best.chosen[m + 1 :]]
-            assert best.length_mm <= itinerary(ways, changed, closed=True).length_mm + 1e-6
+            assert best.length_mm <= plan_itinerary(ways, changed, closed=True).length_mm + 1e-6

@@ -9,7 +9,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.tree.branches import Strand, assemble
 from stages.scope.tour.exits import Exit
-from stages.scope.tour.itinerary import itinerary
+from stages.scope.tour.itinerary import plan_itinerary
 from stages.scope.tour.subtree import Ways
 
 
@@ -59,7 +59,7 @@ def ends_of(tree: AirwayTree, branches: list[int]) -> list[int]:
 def by_trying_everything(ways: Ways, *, closed: bool) -> float:
     """Return the least cost over all choices of exits."""
     of_lesion = [np.flatnonzero(ways.exit_lesion == m) for m in range(ways.n_lesions)]
-    return min(itinerary(ways, c, closed=closed).cost_mm for c in itertools.product(*of_lesion))
+    return min(plan_itinerary(ways, c, closed=closed).cost_mm for c in itertools.product(*of_lesion))
 
 
 def shortest_by_permutations(ways: Ways, chosen: tuple[int, ...], *, closed: bool) -> float:

@@ -1,0 +1,57 @@
+"""Package facades: a package names its public API once, and imports a name when it is first used.
+
+The `__init__` of a package imports its public names for type checkers alone, under `if TYPE_CHECKING:`, each
+as itself.  `facade` reads that block when a name is first asked for, so that importing the package costs
+nothing and the names stand in one place.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+
+@cache
+def public_names(file: str) -> dict[str, str]:
+    """Return the public names of a package and the modules that define them.
+
+    Parameters
+    ----------
+    file : str
+        The `__init__.py` of the package.
+    """
+    for node in ast.parse(Path(file).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            imports = [each for each in node.body if isinstance(each, ast.ImportFrom) and each.module]
+            return {alias.name: str(each.module) for each in imports for alias in each.names}
+    return {}
+
+
+def facade(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return the `__getattr__` and the `__dir__` of a package whose names are imported when they are used.
+
+    Parameters
+    ----------
+    package, file : str
+        `__name__` and `__file__` of the package.
+    """
+
+    def get(name: str) -> Any:
+        names = public_names(file)
+        if name == "__all__":
+            return sorted(names)
+        if name not in names:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(import_module(names[name]), name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    def names_of() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *public_names(file)})
+
+    return get, names_of

@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float, read_only
-
-Int = NDArray[np.int64]
+from anatomy.grid import read_only
+from anatomy.typed import Bool, Float, Int
 
 LEAST_CONTINUED_RADIUS = 0.85
 MOST_SIDE_RADIUS = 0.6
@@ -236,7 +235,7 @@ class AirwayTree:
         return carina
 
     @cached_property
-    def mediastinal(self) -> NDArray[np.bool_]:
+    def mediastinal(self) -> Bool:
         """Which branches `(B,)` lie in the mediastinum: the trachea and the main bronchi.
 
         Whoever leaves the airway there pierces the mediastinal pleura, whatever masks hold beside it.  The
@@ -248,7 +247,7 @@ class AirwayTree:
         for branch in range(1, self.n_branches):
             parent = int(self.branch_parent[branch])
             rank[branch] = rank[parent] + (not self._continues(branch, parent))
-        mediastinal: NDArray[np.bool_] = (rank <= 1) & (self.n_branches > 1)
+        mediastinal: Bool = (rank <= 1) & (self.n_branches > 1)
         return read_only(mediastinal)
 
     def _continues(self, branch: int, parent: int) -> bool:

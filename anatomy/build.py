@@ -5,28 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
-from anatomy.fields import (
-    MAX_STORED,
-    DistanceField,
-    UInt16,
-    corner_geometry,
-    distance_corners,
-    distance_field,
-)
+from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.sides import septum
+from anatomy.typed import Array, Int, Mask, UInt16
 
-Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
 
 FORMAT = 3
@@ -54,7 +45,7 @@ class WorkingBox:
         self._stop = high + 1 + PAD_VOXELS
         self.grid: Grid = images.grid.crop(self._start, self._stop)
 
-    def cut(self, array: NDArray[Any]) -> NDArray[Any]:
+    def cut(self, array: Array) -> Array:
         """Copy the part of `array` in the box; 0 beyond the image."""
         out = np.zeros(self.grid.shape, dtype=array.dtype, order="F")
         source = tuple(
@@ -65,7 +56,7 @@ class WorkingBox:
         return out
 
 
-def _bounds(mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _bounds(mask: Mask) -> tuple[Int, Int]:
     """Return the lowest and highest index of a True voxel along each axis."""
     low, high = [], []
     for axis in range(3):
@@ -80,7 +71,7 @@ def build_lung(
     images: PatientImages,
     *,
     key: str | None = None,
-    keep: Callable[[str, NDArray[Any]], NDArray[Any]] | None = None,
+    keep: Callable[[str, Array], Array] | None = None,
     progress: Progress | None = None,
 ) -> Lung:
     """Make the `Lung` of a patient.
@@ -235,7 +226,7 @@ def _field_arrays(
         yield "obstacle_fissure", np.minimum(union, corners)
 
 
-def _lumen_depth(lumen: Volume, keep: Callable[[str, NDArray[Any]], NDArray[Any]]) -> DistanceField:
+def _lumen_depth(lumen: Volume, keep: Callable[[str, Array], Array]) -> DistanceField:
     """Make the field of the depth inside the lumen, on the lumen's own box."""
     low, high = _bounds(lumen.array)
     grid = lumen.grid.crop(low - 1, high + 2)
@@ -251,6 +242,6 @@ def _cut_volume(
     volume: Volume | None,
     box: WorkingBox,
     name: str,
-    keep: Callable[[str, NDArray[Any]], NDArray[Any]],
+    keep: Callable[[str, Array], Array],
 ) -> Volume | None:
     return None if volume is None else Volume(grid=box.grid, array=keep(name, box.cut(volume.array)))

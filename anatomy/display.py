@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree

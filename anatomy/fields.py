@@ -8,16 +8,15 @@ corners that touch the structure: exact, with voxels as solid boxes and any voxe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import GridMismatchError
-from anatomy.grid import Float, Grid, read_only
+from anatomy.grid import Grid, read_only
 from anatomy.kernels import field as kernel
+from anatomy.typed import Array, Float, Mask, UInt16
 
-UInt16 = NDArray[np.uint16]
 MAX_STORED = np.iinfo(np.uint16).max
 
 SOLID = 0.5
@@ -92,10 +91,10 @@ class DistanceField:
         return out
 
 
-def touched_corners(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def touched_corners(mask: Mask) -> Mask:
     """Return the `(ni + 1, nj + 1, nk + 1)` corners that touch a voxel of `mask`."""
     shape = tuple(n + 1 for n in mask.shape)
-    corners: NDArray[np.bool_] = np.zeros(shape, dtype=bool, order="F")
+    corners: Mask = np.zeros(shape, dtype=bool, order="F")
     ni, nj, nk = mask.shape
     for di in (0, 1):
         for dj in (0, 1):
@@ -104,7 +103,7 @@ def touched_corners(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return corners
 
 
-def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike, half_voxels: float = SOLID) -> UInt16:
+def distance_corners(mask: Mask, spacing_mm: ArrayLike, half_voxels: float = SOLID) -> UInt16:
     """Return the distance from every voxel corner to the voxels of `mask`, in 1/256 mm rounded down.
 
     With `CENTRES`, from every voxel centre to the voxel centres of `mask`.
@@ -116,7 +115,7 @@ def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike, half_voxels
     if not free.any():
         return np.asfortranarray(np.full(free.shape, MAX_STORED, dtype=np.uint16))
     np.logical_not(free, out=free)
-    distance: NDArray[Any] = edt.edt(free, anisotropy=spacing, order="F", black_border=False, parallel=2)
+    distance: Array = edt.edt(free, anisotropy=spacing, order="F", black_border=False, parallel=2)
     # Never too long: the transform adds up float32 voxel sizes, one rounding a voxel, half of it on average.
     distance *= 1.0 - (max(free.shape) + 16) * FLOAT32_ROUNDING
     distance -= ROUNDING_MM
@@ -125,9 +124,7 @@ def distance_corners(mask: NDArray[np.bool_], spacing_mm: ArrayLike, half_voxels
     return distance.astype(np.uint16, order="F")
 
 
-def distance_field(
-    name: str, mask: NDArray[np.bool_], grid: Grid, half_voxels: float = SOLID
-) -> DistanceField:
+def distance_field(name: str, mask: Mask, grid: Grid, half_voxels: float = SOLID) -> DistanceField:
     """Make the field of the distance to `mask`, a bool array on `grid`, as `SOLID` boxes or `CENTRES`."""
     corners = distance_corners(mask, grid.spacing_mm, half_voxels)
     return DistanceField(name=name, corners=corners, geometry=corner_geometry(grid, half_voxels))

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import FrameError, GridMismatchError
-
-Float = NDArray[np.float64]
+from anatomy.typed import Array, Bool, Float
 
 ORTHONORMAL_TOLERANCE = 1e-4
 AFFINE_TOLERANCE = 1e-9
 
 
-def read_only(array: NDArray[Any]) -> NDArray[Any]:
+def read_only(array: Array) -> Array:
     """Return a view of `array` that cannot be written through."""
     view = array.view()
     view.flags.writeable = False
@@ -119,7 +118,7 @@ class Grid:
         """Map LPS mm `(..., 3)` to fractional indices."""
         return transform_points(self.ijk_from_lps, lps)
 
-    def contains(self, lps: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, lps: ArrayLike) -> Bool:
         """Tell which points `(..., 3)` lie in a voxel of the grid."""
         ijk = np.floor(self.ijk(lps) + 0.5)
         return np.asarray(((ijk >= 0) & (ijk < np.asarray(self.shape))).all(axis=-1))
@@ -167,7 +166,7 @@ class Volume:
     """
 
     grid: Grid
-    array: NDArray[Any]
+    array: Array
 
     def __post_init__(self) -> None:
         if self.array.shape != self.grid.shape:

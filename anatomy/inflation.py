@@ -7,13 +7,15 @@ its voxel; so paths in grown obstacles are for comparison alone.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from anatomy.typed import Int, Mask
 
 ROUNDING = 1e-6
 """Relative: quotients and squared distances are whole numbers and fractions of small ones."""
 
 
-def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> NDArray[np.int64]:
+def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> Int:
     """Return by how many voxels obstacles grow along i, j and k: `ceil(r_total / s_i)` [Fu2018, sec. IV-B].
 
     Parameters
@@ -27,7 +29,7 @@ def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> NDArray[n
     return np.ceil(quotient * (1.0 - ROUNDING)).astype(np.int64)
 
 
-def grown_by_voxels(mask: NDArray[np.bool_], axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+def grown_by_voxels(mask: Mask, axes: Int) -> Mask:
     """Return the voxels within an ellipsoid of semi-axes `axes`, in voxels, about a voxel of `mask`."""
     import edt
 

@@ -9,14 +9,14 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.fields import DistanceField, corner_geometry
-from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels import field as kernel
+from anatomy.typed import Float, Labels
 
 if TYPE_CHECKING:
     from anatomy.meshes import SurfaceMesh
@@ -63,7 +63,7 @@ class Lung:
     kind: str
     key: str
     grid: Grid
-    labels: NDArray[np.uint16]
+    labels: Labels
     fields: Mapping[str, DistanceField]
     lumen_depth: DistanceField
     tree: AirwayTree

@@ -22,12 +22,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float, Grid, Volume, read_only
-
-Int = NDArray[np.int64]
+from anatomy.grid import Grid, Volume, read_only
+from anatomy.typed import Array, Float, Int, Mask
 
 _RING = ((0, 0), (1, 0), (1, 1), (0, 1))
 
@@ -62,7 +61,7 @@ class SurfaceMesh:
         return trimesh.Trimesh(vertices=self.vertices_lps, faces=self.faces, process=False)
 
 
-def box_surface(mask: NDArray[np.bool_], grid: Grid, *, beyond: bool = False) -> SurfaceMesh:
+def box_surface(mask: Mask, grid: Grid, *, beyond: bool = False) -> SurfaceMesh:
     """Return the exact boundary of the voxels of `mask` as solid boxes.
 
     Parameters
@@ -92,7 +91,7 @@ def box_surface(mask: NDArray[np.bool_], grid: Grid, *, beyond: bool = False) ->
     )
 
 
-def _faces_of(padded: NDArray[np.bool_], axis: int, side: int) -> Int:
+def _faces_of(padded: Mask, axis: int, side: int) -> Int:
     """Return the `(F, 4, 3)` corner indices of the faces towards one side, counted outwards."""
     inner = padded[1:-1, 1:-1, 1:-1]
     window = [slice(1, -1)] * 3
@@ -128,7 +127,7 @@ def smooth_surface(volume: Volume) -> SurfaceMesh:
     )
 
 
-def _bounds(mask: NDArray[Any]) -> tuple[Int, Int]:
+def _bounds(mask: Array) -> tuple[Int, Int]:
     """Return the first index and the index beyond the last of the voxels of `mask`."""
     along = [np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3)]
     return np.asarray([hits[0] for hits in along]), np.asarray([hits[-1] + 1 for hits in along])

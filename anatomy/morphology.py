@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Mask
 
 
 def grown_by_one(mask: Mask) -> Mask:

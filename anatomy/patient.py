@@ -9,7 +9,8 @@ from types import MappingProxyType
 import numpy as np
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, read_only
+from anatomy.typed import Float
 
 MASKS = ("lumen", "wall", "vessels", "lung", "fissures", "nodules")
 

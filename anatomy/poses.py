@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import FrameError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float
 
 ANTERIOR = np.array([0.0, -1.0, 0.0])
 SUPERIOR = np.array([0.0, 0.0, 1.0])

@@ -6,14 +6,10 @@ layers of pleura lie together.  A path through it would leave one lung and enter
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, Grid
-
-Mask = NDArray[np.bool_]
+from anatomy.grid import Grid
+from anatomy.typed import Array, Float, Int32, Mask
 
 COARSE_VOXEL_MM = 2.4
 NECK_WIDTHS_MM = (0.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
@@ -61,7 +57,7 @@ def _pooled(mask: Mask, step: tuple[int, ...]) -> Mask:
     return pooled
 
 
-def grow_sides(core: Mask, tissue: Mask, axes: Float) -> NDArray[np.int32] | None:
+def grow_sides(core: Mask, tissue: Mask, axes: Float) -> Int32 | None:
     """Label the two lungs 1 and 2 over `tissue`, told apart by `core`, the voxels that are all tissue.
 
     The columns of `axes` are the voxel axes in LPS mm.
@@ -79,7 +75,7 @@ def grow_sides(core: Mask, tissue: Mask, axes: Float) -> NDArray[np.int32] | Non
     return None
 
 
-def _two_largest(mask: Mask, axes: Float, least: float) -> NDArray[np.int32] | None:
+def _two_largest(mask: Mask, axes: Float, least: float) -> Int32 | None:
     """Label the two largest parts of `mask` 1 and 2, if they are a lung's size and lie side by side.
 
     Parts of fewer than `least` voxels are what erosion leaves of one lung.
@@ -104,7 +100,7 @@ def _two_largest(mask: Mask, axes: Float, least: float) -> NDArray[np.int32] | N
     return markers
 
 
-def _border(sides: NDArray[np.int32], step: tuple[int, ...], tissue: Mask) -> Mask:
+def _border(sides: Int32, step: tuple[int, ...], tissue: Mask) -> Mask:
     """Mark the voxels of `tissue` that have a face neighbour in it on the other side."""
     border = np.zeros(tissue.shape, dtype=bool, order="F")
     meeting = np.argwhere(_differs_from_neighbour(sides))
@@ -112,7 +108,7 @@ def _border(sides: NDArray[np.int32], step: tuple[int, ...], tissue: Mask) -> Ma
         return border
     low = np.maximum(meeting.min(axis=0) - 1, 0)
     high = np.minimum(meeting.max(axis=0) + 2, sides.shape)
-    near: NDArray[Any] = sides[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    near: Array = sides[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     for axis, n in enumerate(step):
         near = np.repeat(near, n, axis=axis)
     start = low * step
@@ -123,7 +119,7 @@ def _border(sides: NDArray[np.int32], step: tuple[int, ...], tissue: Mask) -> Ma
     return border
 
 
-def _differs_from_neighbour(sides: NDArray[np.int32]) -> Mask:
+def _differs_from_neighbour(sides: Int32) -> Mask:
     """Mark both of any two face neighbours that lie on different sides; 0 is no side."""
     differs = np.zeros(sides.shape, dtype=bool)
     for axis in range(3):

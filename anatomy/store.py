@@ -15,16 +15,16 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.build import FORMAT, build_lung, lung_key
 from anatomy.cache import default_cache
 from anatomy.errors import FileError, LungaccessError
 from anatomy.fields import DistanceField, corner_geometry
-from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
+from anatomy.typed import Array, Float
 
 META = "lung.json"
 BUILDING = ".building-"
@@ -80,7 +80,7 @@ def _build_into(
     """Build a lung with its arrays in a new folder that gets its name when it is complete."""
     with _new_folder(folder) as work:
 
-        def keep(name: str, array: NDArray[Any]) -> NDArray[Any]:
+        def keep(name: str, array: Array) -> Array:
             np.save(work / f"{name}.npy", array)
             return _mapped(work, name)
 
@@ -181,7 +181,7 @@ def _load(folder: Path) -> Lung | None:
 
 
 def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
-    def array(name: str) -> NDArray[Any]:
+    def array(name: str) -> Array:
         return _mapped(folder, name)
 
     grid = Grid(shape=tuple(meta["shape"]), lps_from_ijk=np.array(meta["lps_from_ijk"]))
@@ -211,7 +211,7 @@ def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
     )
 
 
-def _mapped(folder: Path, name: str) -> NDArray[Any]:
+def _mapped(folder: Path, name: str) -> Array:
     """Open a stored array without reading it, as a plain read-only array."""
     return read_only(np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")))
 

@@ -19,13 +19,14 @@ __all__ = [
     "OBSTACLES",
     "OUTSIDE",
     "VESSEL",
+    "obstacle_bits",
 ]
 
 MAX_BRANCHES = (1 << (16 - BRANCH_SHIFT)) - 1
 """Most branches that a label can tell apart."""
 
 OBSTACLES = AIRWAY | VESSEL | OUTSIDE
-"""What a needle must always avoid; fissures are added unless they are allowed."""
+"""What a needle must always avoid."""
 
 BITS: dict[str, int] = {
     "airway": AIRWAY,
@@ -44,3 +45,8 @@ FIELD_BITS: dict[str, int] = {
     "obstacle_fissure": OBSTACLES | FISSURE,
 }
 """Clearance fields of a lung, and the structures each measures the distance to."""
+
+
+def obstacle_bits(with_fissures: bool) -> int:
+    """Return the bits of the structures that a needle must avoid, fissures among them or not."""
+    return OBSTACLES | FISSURE if with_fissures else OBSTACLES

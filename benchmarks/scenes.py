@@ -9,9 +9,9 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, Grid
+from anatomy.grid import Grid
+from anatomy.typed import Array, Float, Int16, Mask
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from stages.scope.tour.subtree import Ways
     from stages.tube.mechanics import TubeMechanics
 
-Mask = NDArray[np.bool_]
 
 OBSTACLE_SHARE = 1e-4
 PHANTOM_SEED = 3
@@ -47,7 +46,7 @@ class Chest:
     """A CT and its masks, `(n, n, n)` and Fortran-contiguous."""
 
     grid: Grid
-    hu: NDArray[np.int16]
+    hu: Int16
     lung: Mask
     vessels: Mask
     lumen: Mask
@@ -61,7 +60,7 @@ def chest(edge: int) -> Chest:
     made = phantom(seed=PHANTOM_SEED, size="small")
     at = [np.arange(edge) * n // edge for n in made.grid.shape]
 
-    def resampled(array: NDArray[np.generic]) -> NDArray[np.generic]:
+    def resampled(array: Array) -> Array:
         return np.asfortranarray(array[np.ix_(*at)])
 
     images = made.images

@@ -27,9 +27,9 @@ import numpy as np
 
 import lungaccess as la
 from anatomy.build import build_lung
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.phantom import phantom
+from anatomy.typed import Float
 from experiments.support.mutants import Case, Mutant
 from experiments.support.plan_mutations import mutate
 from experiments.support.random_plans import plans_of_batch

@@ -18,8 +18,8 @@ import numpy as np
 
 import lungaccess as la
 from anatomy.errors import TargetError
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
 from experiments.support.insertion.repeated import Study, Summary, study, summary
 from experiments.support.insertion.truth import Errors, tilt

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import SimpleITK
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from anatomy.grid import Volume
 from anatomy.io import load_patient
@@ -32,6 +31,7 @@ from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
 from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, vesselness
 from anatomy.segmentation.vessels import Vessels, segment_vessels
 from anatomy.tree import tree_from_mask
+from anatomy.typed import Float32
 from experiments.support import segmentation_scores as scores
 from experiments.support.results import (
     PHANTOM,
@@ -157,7 +157,7 @@ def vessel_rows(
     return groups
 
 
-def objectness(ct: Volume, lung: scores.Mask) -> Callable[[], NDArray[np.float32]]:
+def objectness(ct: Volume, lung: scores.Mask) -> Callable[[], Float32]:
     """Return SimpleITK's vesselness over the same scales and box, ready to be called; `(2, nk, nj, ni)`.
 
     First the greatest response of the scales that apply at a voxel [Fu2018, eq. 4], then that of all.
@@ -166,7 +166,7 @@ def objectness(ct: Volume, lung: scores.Mask) -> Callable[[], NDArray[np.float32
     image = SimpleITK.GetImageFromArray(space.hu.astype(np.float32))
     image.SetSpacing([float(s) for s in ct.grid.spacing_mm])
 
-    def run() -> NDArray[np.float32]:
+    def run() -> Float32:
         best = np.zeros((2, *space.hu.shape), dtype=np.float32)
         for scale, sigma in enumerate(SIGMAS_MM):
             smooth = SimpleITK.SmoothingRecursiveGaussian(image, sigma)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from experiments.support.cost_map_case import NEEDLE, SAFETY_MM, Case, case_of
 from experiments.support.cost_map_figure import draw
 from experiments.support.cost_map_problems import Scenario, choose_scenarios

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 import lungaccess as la
-from anatomy.grid import Float
+from anatomy.typed import Float
 from experiments.support import cost_over_time, workspace_rejection
 from experiments.support.results import (
     Result,

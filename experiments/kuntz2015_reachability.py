@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from experiments.support.results import (
     PHANTOM,
     Result,

@@ -23,8 +23,8 @@ from typing import Any
 
 import lungaccess as la
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.io.files import atomic_write
+from anatomy.typed import Float
 from lungaccess.cli.inputs import load_device
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch

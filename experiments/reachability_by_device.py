@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import lungaccess as la
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from experiments.support.results import (
     Result,
     anatomy,

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import FileError, FrameError
@@ -15,6 +14,7 @@ from anatomy.io.files import atomic_write
 from anatomy.io.frames import LPS_FROM, Frame
 from anatomy.io.vtk_xml import VtkFile, VtkPiece, read_vtk_xml
 from anatomy.tree import tree_from_graph
+from anatomy.typed import Float, Int
 
 RADIUS_NAMES = ("Radius", "radius", "MaximumInscribedSphereRadius")
 
@@ -43,9 +43,7 @@ def read_centerlines(path: str | Path, *, frame: Frame | None = None) -> AirwayT
     return tree_from_graph(*read_centerline_graph(path, frame=frame))
 
 
-def read_centerline_graph(
-    path: str | Path, *, frame: Frame | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+def read_centerline_graph(path: str | Path, *, frame: Frame | None = None) -> tuple[Float, Float, Int]:
     """Read the lines of a centreline file of any tubes, airways or vessels; see `read_centerlines`.
 
     Returns
@@ -102,7 +100,7 @@ def _frame(file: VtkFile, path: str | Path, given: Frame | None) -> Frame:
     return found or given or "lps"
 
 
-def _radius(piece: VtkPiece, path: str | Path) -> NDArray[np.float64]:
+def _radius(piece: VtkPiece, path: str | Path) -> Float:
     for name in RADIUS_NAMES:
         if name in piece.point_data:
             return piece.point_data[name].astype(np.float64)
@@ -113,7 +111,7 @@ def _radius(piece: VtkPiece, path: str | Path) -> NDArray[np.float64]:
     )
 
 
-def _edges(piece: VtkPiece, path: str | Path) -> NDArray[np.int64]:
+def _edges(piece: VtkPiece, path: str | Path) -> Int:
     """Return the pairs of points `(E, 2)` that follow each other on a line."""
     types = piece.cell_types
     if types is not None and not np.isin(types, (_VTK_LINE, _VTK_POLY_LINE)).all():

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.errors import FileError, FrameError
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.io.nifti_header import named_grid
+from anatomy.typed import Float
 
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import FileError, FrameError
-from anatomy.grid import ORTHONORMAL_TOLERANCE, Float, read_only, transform_points
+from anatomy.grid import ORTHONORMAL_TOLERANCE, read_only, transform_points
 from anatomy.io.files import read_text
+from anatomy.typed import Float
 
 Frame = Literal["ras", "lps"]
 
@@ -106,7 +106,7 @@ def read_points(path: str | Path, frame: Frame) -> Float:
     return transform_points(LPS_FROM[frame], values.reshape(-1, 3))
 
 
-def _numbers(path: str | Path) -> NDArray[np.float64]:
+def _numbers(path: str | Path) -> Float:
     text = read_text(path)
     try:
         values = np.loadtxt(StringIO(text), dtype=np.float64, ndmin=2) if text.strip() else np.zeros((0, 3))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
@@ -19,8 +18,7 @@ from anatomy.io.frames import Frame
 from anatomy.io.images import read_mask, read_volume
 from anatomy.io.nifti import require_numbers
 from anatomy.patient import PatientImages
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Array, Mask
 
 _READERS = 2  # decompression releases the interpreter; more threads only raise the peak of memory
 _REQUIRED = ("lumen", "vessels", "lung")
@@ -105,7 +103,7 @@ def _read_file(
     return volume.grid, masks, sha256(path)
 
 
-def select(values: NDArray[Any], labels: tuple[int, ...]) -> Mask:
+def select(values: Array, labels: tuple[int, ...]) -> Mask:
     """Return where `values` is one of `labels`, or not zero if there are none."""
     if not labels:
         return np.asarray(values != 0)

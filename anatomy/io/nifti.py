@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError, FileError
 from anatomy.grid import Volume
 from anatomy.io.compressed import pieces
 from anatomy.io.frames import Frame
 from anatomy.io.nifti_header import NiftiHeader, data_offset, parse_header
+from anatomy.typed import Array
 
 _HEADER_BYTES = 540
 
@@ -51,7 +50,7 @@ def read_nifti_mask(path: Path, frame: Frame | None = None) -> Volume:
     return Volume(grid=header.grid, array=mask[::-1] if header.is_reversed else mask)
 
 
-def require_numbers(values: NDArray[Any], path: Path) -> None:
+def require_numbers(values: Array, path: Path) -> None:
     """Raise `AnatomyError` if a value is not-a-number."""
     if values.dtype.kind == "f" and bool(np.isnan(values).any()):
         raise AnatomyError(
@@ -81,7 +80,7 @@ def _chain(first: bytes, rest: Iterator[bytes]) -> Iterator[bytes]:
     yield from rest
 
 
-def _chunks(header: NiftiHeader, stream: Iterator[bytes], path: Path) -> Iterator[tuple[int, NDArray[Any]]]:
+def _chunks(header: NiftiHeader, stream: Iterator[bytes], path: Path) -> Iterator[tuple[int, Array]]:
     """Yield (index of the first voxel, values) until the image is full, then drain the stream.
 
     Draining proves the checksum, which stands at the end of a compressed file.

@@ -17,8 +17,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from anatomy.errors import FileError, FrameError
-from anatomy.grid import Float, Grid, transform_points
+from anatomy.grid import Grid, transform_points
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
+from anatomy.typed import Float
 
 _VERSION_1: dict[str, tuple[int, str]] = {
     "dim": (40, "8h"), "datatype": (70, "h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),

@@ -10,9 +10,10 @@ import numpy as np
 from anatomy.io.files import sha256
 from anatomy.io.images import image_stem, image_suffix
 from anatomy.io.label_names import label_values, published_names, stored_names
-from anatomy.io.masks import Mask, MaskSet, MaskSource, assemble, read_masks
+from anatomy.io.masks import MaskSet, MaskSource, assemble, read_masks
 from anatomy.morphology import grown_by_one
 from anatomy.patient import PatientImages
+from anatomy.typed import Mask
 
 ROLES: Mapping[str, str] = {
     "lung_airways": "lumen",

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, read_only
-
-Int = NDArray[np.int64]
+from anatomy.grid import read_only
+from anatomy.typed import Bool, Float, Int
 
 
 def unit(vector: Float) -> Float:
@@ -76,7 +74,7 @@ class Sprouts:
         """Number of points of each branch, `(B,)`."""
         return np.array([len(line) for line in self.points], dtype=np.int64)
 
-    def pruned(self, keep: NDArray[np.bool_]) -> Sprouts:
+    def pruned(self, keep: Bool) -> Sprouts:
         """Return the tree of the branches `keep` `(B,)` whose ancestors are all kept."""
         tree, index = Sprouts(), {-1: -1}
         for branch, parent in enumerate(self.parent):
@@ -192,9 +190,7 @@ class Centerlines:
         return order
 
 
-def centerlines(
-    sprouts: Sprouts, radius_mm: Float, outer_radius_mm: Float, keep: NDArray[np.bool_]
-) -> Centerlines:
+def centerlines(sprouts: Sprouts, radius_mm: Float, outer_radius_mm: Float, keep: Bool) -> Centerlines:
     """Freeze the branches of `keep` `(B,)`, whose radii `(N,)` by point are given, into centrelines.
 
     Where a branch keeps a single child, the two become one branch: without a branching no generation begins.

@@ -13,13 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.chest import LEFT_LOWER, LEFT_UPPER, LOBES, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.growth import STEP_MM, GrowthRule, grow, limit_turn
 from anatomy.phantom.territory import Territory
+from anatomy.typed import Float, Int
 
 TRACHEA_DIAMETER_MM = 18.0
 TRACHEA_LENGTH_MM = 110.0
@@ -104,7 +103,7 @@ def _skeleton(scale: float, rng: np.random.Generator) -> dict[str, tuple[Float, 
     return ends
 
 
-def _share_out(cloud: Float, starts: Float, directions: Float) -> NDArray[np.int64]:
+def _share_out(cloud: Float, starts: Float, directions: Float) -> Int:
     """Assign points `(N, 3)` to segments by angle, weighted for about equal shares; return `(N,)` indices."""
     rays = unit(cloud[:, None, :] - starts[None])
     cosine = np.einsum("nsa,sa->ns", rays, directions)

@@ -7,12 +7,10 @@ All lengths in the code are those of an adult in mm, with the carina at the orig
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from anatomy.typed import Array
 
 RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
 LOBES = {

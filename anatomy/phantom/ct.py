@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Volume
 from anatomy.phantom.rasterize import LABELS, Canvas
+from anatomy.typed import Array, Float32
 
 AIR_HU = -1000.0
 PARENCHYMA_HU = -860.0
@@ -38,7 +36,7 @@ def simulate_ct(canvas: Canvas, noise_hu: float, rng: np.random.Generator) -> Vo
     return Volume(grid=canvas.grid, array=image.astype(np.int16))
 
 
-def _materials(canvas: Canvas) -> NDArray[np.float32]:
+def _materials(canvas: Canvas) -> Float32:
     """Mix the HU of what each voxel holds, slab by slab to stay in the cache."""
     shape = canvas.grid.shape
     image = np.zeros(shape, dtype=np.float32, order="F")
@@ -51,7 +49,7 @@ def _materials(canvas: Canvas) -> NDArray[np.float32]:
     for k in range(shape[2]):
         labels = canvas.labels[:, :, k]
         lobes = canvas.lobes[:, :, k] > 0
-        value: NDArray[Any] = table[labels]
+        value: Array = table[labels]
         inside = np.where(labels == LABELS["fissure"], lung + sheet * (FISSURE_HU - lung), lung)
         share = canvas.lung_cover[:, :, k] * np.float32(1 / 255)
         value = np.where(lobes, np.float32(TISSUE_HU["mediastinum"]), value)

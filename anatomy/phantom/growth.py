@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.territory import Territory
+from anatomy.typed import Float
 
 Room = Callable[[Float], Float]
 

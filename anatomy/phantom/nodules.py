@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
 from anatomy.phantom.territory import Territory
+from anatomy.typed import Float
 
 LEAST_PLEURA_MM, GREATEST_PLEURA_MM = 5.0, 30.0
 LEAST_RADIUS_MM, GREATEST_RADIUS_MM = 3.0, 8.0

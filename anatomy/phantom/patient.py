@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
 from anatomy.grid import Grid, Volume
@@ -21,6 +20,7 @@ from anatomy.phantom.nodules import Nodule
 from anatomy.phantom.plan import plan_patient
 from anatomy.phantom.rasterize import LABELS, Canvas, draw_ball, draw_body, draw_tree, phantom_grid
 from anatomy.phantom.territory import make_territory
+from anatomy.typed import Mask
 
 Size = Literal["adult", "small"]
 SCALES: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 0.7})
@@ -65,7 +65,7 @@ class Phantom:
         """The voxel grid of all volumes."""
         return self.images.grid
 
-    def mask(self, *names: str) -> NDArray[np.bool_]:
+    def mask(self, *names: str) -> Mask:
         """Return the voxels `(ni, nj, nk)` that carry one of the named labels."""
         table = np.zeros(256, dtype=np.bool_)
         table[[LABELS[name] for name in names]] = True

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.bronchi import grow_airways
 from anatomy.phantom.nodules import Nodule, place_nodules
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way
+from anatomy.typed import Float, UInt8
 
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
 GAPLESS_RADIUS = 0.87
@@ -32,7 +31,7 @@ class PlannedTree:
     sprouts: Sprouts
     inner_mm: Float
     outer_mm: Float
-    freedom: NDArray[np.uint8]
+    freedom: UInt8
 
     @property
     def points_lps(self) -> Float:
@@ -80,7 +79,7 @@ def wall_thickness_mm(diameter_mm: Float) -> Float:
     return np.asarray(np.maximum(THINNEST_WALL_MM, diameter_mm * (0.1 + 0.1 * np.exp(-diameter_mm / 6.0))))
 
 
-def _freedom(sprouts: Sprouts) -> NDArray[np.uint8]:
+def _freedom(sprouts: Sprouts) -> UInt8:
     """Let central branches be drawn in any case and named ones outside the lung."""
     named = np.array([bool(name) for name in sprouts.name])
     central = np.arange(len(named)) < CENTRAL_BRANCHES
@@ -112,7 +111,7 @@ def _vessels(
     obstacles: Obstacles,
     spacing_mm: float,
     fixed: int,
-    freedom: NDArray[np.uint8],
+    freedom: UInt8,
 ) -> PlannedTree:
     """Lead vessels around obstacles; they become thinner in narrow places, but never too thin to draw."""
     radius = make_way(sprouts, radius_mm, obstacles, VESSEL_GAP_MM, fixed)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, Grid
+from anatomy.grid import Grid
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.chest import CAGE_CENTRE_Z, Chest, Side
 from anatomy.phantom.kernels import NODULE_OWNER, paint_tree
 from anatomy.phantom.plan import PlannedTree
+from anatomy.typed import Array, Float, Int, Int16, Mask, UInt8
 
 LABELS = {
     "background": 0,
@@ -43,13 +42,13 @@ class Canvas:
     """
 
     grid: Grid
-    labels: NDArray[np.uint8]
-    lobes: NDArray[np.uint8]
-    owner: NDArray[np.int16]
-    lung_cover: NDArray[np.uint8]
-    lumen_cover: NDArray[np.uint8]
-    airway_cover: NDArray[np.uint8]
-    solid_cover: NDArray[np.uint8]
+    labels: UInt8
+    lobes: UInt8
+    owner: Int16
+    lung_cover: UInt8
+    lumen_cover: UInt8
+    airway_cover: UInt8
+    solid_cover: UInt8
 
     @property
     def spacing_mm(self) -> float:
@@ -99,7 +98,7 @@ def draw_body(chest: Chest, grid: Grid) -> Canvas:
     return canvas
 
 
-def _around(chest: Chest, side: Side, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> NDArray[np.uint8]:
+def _around(chest: Chest, side: Side, x: Array, y: Array, z: Array) -> UInt8:
     """Return the labels of what is not lung."""
     s = chest.scale
     heart = chest.heart(x, y, z) < 0
@@ -143,7 +142,7 @@ def _draw_fissures(canvas: Canvas, scale: float) -> None:
     canvas.labels[tuple(ijk[closed].T)] = LABELS["fissure"]
 
 
-def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> NDArray[np.bool_]:
+def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
     """Draw a tree of kind "airway", "artery" or "vein"; `base` is the number of branches drawn before.
 
     Returns
@@ -181,7 +180,7 @@ def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> NDArra
     return keep
 
 
-def _large_first(tree: Sprouts) -> NDArray[np.int64]:
+def _large_first(tree: Sprouts) -> Int:
     """Order branches by falling diameter; children are thinner than parents, so parents come first."""
     return np.argsort(-np.array(tree.diameter_mm), kind="stable").astype(np.int64)
 

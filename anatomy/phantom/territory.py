@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float
 from anatomy.phantom.chest import LOBES, Chest
+from anatomy.typed import Float, Float32, UInt8
 
 MAP_SPACING_MM = 3.0
 TISSUE_PER_POINT_MM = 6.6
@@ -35,11 +34,11 @@ class Territory:
 
     origin: Float
     spacing_mm: float
-    lobes: NDArray[np.uint8]
-    lobe_depth_mm: NDArray[np.float32]
-    pleura_depth_mm: NDArray[np.float32]
+    lobes: UInt8
+    lobe_depth_mm: Float32
+    pleura_depth_mm: Float32
     points_lps: Float
-    lobe_of_point: NDArray[np.uint8]
+    lobe_of_point: UInt8
 
     def index(self, point: Float) -> tuple[int, int, int]:
         """Return the voxel of a point `(3,)`, clamped to the map."""
@@ -56,8 +55,8 @@ class Territory:
 
 
 def _spread_points(
-    lobes: NDArray[np.uint8], origin: Float, spacing_mm: float, rng: np.random.Generator
-) -> tuple[Float, NDArray[np.uint8]]:
+    lobes: UInt8, origin: Float, spacing_mm: float, rng: np.random.Generator
+) -> tuple[Float, UInt8]:
     """Spread points `(N, 3)` LPS mm evenly over the lobes; return them and their lobes `(N,)`."""
     step = TISSUE_PER_POINT_MM / MAP_SPACING_MM
     axes = [np.arange(0, n - 1, step) for n in lobes.shape]

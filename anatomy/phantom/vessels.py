@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.phantom.branching import Sprouts, smooth_line, unit
 from anatomy.phantom.chest import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.growth import STEP_MM, GrowthRule, Room, grow, overlap_mm
 from anatomy.phantom.territory import Territory
+from anatomy.typed import Bool, Float, Int
 
 SHEATH_MM = 0.5
 OTHER_SIDE_SHARE = 0.3
@@ -197,15 +196,13 @@ def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: floa
     return np.asarray(np.clip(room, SQUEEZE * radius, radius))
 
 
-def _spread(flags: NDArray[np.bool_], steps: int) -> NDArray[np.bool_]:
+def _spread(flags: Bool, steps: int) -> Bool:
     for _ in range(steps):
         flags = np.asarray(flags | np.roll(flags, 1) | np.roll(flags, -1))
     return flags
 
 
-def _settle(
-    position: Float, shift: Float, start: NDArray[np.int64], owners: NDArray[np.int64], fixed: int
-) -> None:
+def _settle(position: Float, shift: Float, start: Int, owners: Int, fixed: int) -> None:
     """Apply shifts, smoothed along each branch, and join the branches again."""
     first, last = start[:-1], start[1:] - 1
     inner = np.ones(len(position), dtype=bool)

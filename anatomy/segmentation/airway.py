@@ -7,20 +7,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError, GridMismatchError
-from anatomy.grid import Float, Volume, read_only
+from anatomy.grid import Volume, read_only
 from anatomy.segmentation.airway_warnings import airway_warnings
 from anatomy.segmentation.coarse import bounds, window
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.local_minima import local_minima_map
+from anatomy.typed import Array, Float, Int16, Mask
 
 if TYPE_CHECKING:
     from anatomy.segmentation.lungs import Lungs
 
-Mask = NDArray[np.bool_]
-Int16 = NDArray[np.int16]
 
 BOX_MARGIN_MM = 3.0
 EDGE_MM = 3.0
@@ -132,7 +130,7 @@ def _box(mask: Mask, spacing_mm: Float) -> tuple[slice, slice, slice]:
     return window(np.maximum(low - margin, 0), np.minimum(high + margin, mask.shape))
 
 
-def _hounsfield(values: NDArray[np.generic]) -> Int16:
+def _hounsfield(values: Array) -> Int16:
     """Return the transposed values as int16, C-contiguous: between any two lies less than 2^15."""
     if values.dtype != np.int16:
         values = np.rint(values.astype(np.float32))

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Mask
 
 LEAST_TRACHEA_MM = 25.0
 LEAST_ENDS = 4

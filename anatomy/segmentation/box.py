@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Grid, Volume
 from anatomy.segmentation.coarse import bounds, window
 from anatomy.segmentation.lungs import Lungs
+from anatomy.typed import Array, Int
 
 BOX_PAD_MM = 10.0
 
@@ -20,8 +19,8 @@ class Box:
     """A box of voxels `low <= ijk < high` of a grid."""
 
     grid: Grid
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
+    low: Int
+    high: Int
 
     @classmethod
     def around(cls, lungs: Lungs, grid: Grid) -> Box:
@@ -37,7 +36,7 @@ class Box:
         """The grid of the box."""
         return self.grid.crop(self.low, self.high)
 
-    def cut(self, array: NDArray[Any]) -> NDArray[Any]:
+    def cut(self, array: Array) -> Array:
         """Copy the part of an array in the box."""
         return np.array(array[window(self.low, self.high)], order="F")
 
@@ -56,7 +55,7 @@ class Box:
             warnings=lungs.warnings,
         )
 
-    def whole(self, part: NDArray[Any], fill: float = 0) -> NDArray[Any]:
+    def whole(self, part: Array, fill: float = 0) -> Array:
         """Return an array on the whole grid that holds `part` in the box, and `fill` elsewhere."""
         whole = np.full(self.grid.shape, fill, dtype=part.dtype, order="F")
         whole[window(self.low, self.high)] = part

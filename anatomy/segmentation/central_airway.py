@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
 from anatomy.segmentation.coarse import CoarseCt, bounds, window
-
-Mask = NDArray[np.bool_]
-Int = NDArray[np.int64]
+from anatomy.typed import Float, Int, Mask
 
 COLUMN_HU = -850.0
 """The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`."""

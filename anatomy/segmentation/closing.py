@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Mask = NDArray[np.bool_]
+from anatomy.typed import Float32, Mask
 
 _THREADS = 2
 
@@ -66,7 +66,7 @@ def largest_piece(mask: Mask) -> Mask:
     return largest
 
 
-def distance_mm(mask: Mask, spacing_mm: ArrayLike) -> NDArray[np.float32]:
+def distance_mm(mask: Mask, spacing_mm: ArrayLike) -> Float32:
     """Return the distance of every True voxel to the nearest False one, centre to centre; 0 elsewhere."""
     import edt
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, Grid, Volume
-
-Mask = NDArray[np.bool_]
+from anatomy.grid import Grid, Volume
+from anatomy.typed import Array, Float, Float32, Int, Mask
 
 COARSE_MM = 1.5
 """Blocks of voxels come as near to this size as whole numbers of voxels allow."""
@@ -38,7 +36,7 @@ class CoarseCt:
         Whether an axis here runs against that axis of the CT.
     """
 
-    hu: NDArray[np.float32]
+    hu: Float32
     grid: Grid
     fine_shape: tuple[int, int, int]
     step: tuple[int, int, int]
@@ -73,7 +71,7 @@ class CoarseCt:
         """Volume of a block."""
         return self.grid.voxel_volume_mm3 / 1000.0
 
-    def to_ct(self, blocks: NDArray[Any], low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[Any]:
+    def to_ct(self, blocks: Array, low: Int, high: Int) -> Array:
         """Return the values of the blocks that the CT's voxels `low <= ijk < high` lie in."""
         # Transposed, so that the last pass, over the most voxels, copies whole planes.
         values = np.ascontiguousarray(self._turned_back(blocks).T)
@@ -82,7 +80,7 @@ class CoarseCt:
             values = np.take(values, index, axis=2 - axis)
         return values.T
 
-    def box_in_ct(self, mask: Mask, pad_mm: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def box_in_ct(self, mask: Mask, pad_mm: float) -> tuple[Int, Int]:
         """Return `low` and `high` of the CT's voxels around a mask of blocks, wider by `pad_mm`."""
         low, high = bounds(self._turned_back(mask))
         step = np.asarray(self.step)
@@ -90,7 +88,7 @@ class CoarseCt:
         pad = np.ceil(pad_mm / size).astype(np.int64)
         return np.maximum(low * step - pad, 0), np.minimum(high * step + pad, self.fine_shape)
 
-    def ct_voxel(self, block: NDArray[np.int64]) -> NDArray[np.int64]:
+    def ct_voxel(self, block: Int) -> Int:
         """Return the voxel of the CT in the middle of a block."""
         place = np.asarray(block, dtype=np.int64).copy()
         for axis in range(3):
@@ -105,19 +103,19 @@ class CoarseCt:
         i, j, k = (int(n) for n in np.floor(self.grid.ijk(lps) + 0.5))
         return (i, j, k) if bool(self.grid.contains(lps)) else None
 
-    def _turned(self, blocks: NDArray[Any]) -> NDArray[Any]:
-        turned: NDArray[Any] = np.flip(np.transpose(blocks, self.order), axis=self._reversed_axes())
+    def _turned(self, blocks: Array) -> Array:
+        turned: Array = np.flip(np.transpose(blocks, self.order), axis=self._reversed_axes())
         return turned
 
-    def _turned_back(self, blocks: NDArray[Any]) -> NDArray[Any]:
-        unflipped: NDArray[Any] = np.flip(blocks, axis=self._reversed_axes())
+    def _turned_back(self, blocks: Array) -> Array:
+        unflipped: Array = np.flip(blocks, axis=self._reversed_axes())
         return np.transpose(unflipped, np.argsort(self.order))
 
     def _reversed_axes(self) -> tuple[int, ...]:
         return tuple(axis for axis in range(3) if self.flipped[axis])
 
 
-def bounds(mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def bounds(mask: Mask) -> tuple[Int, Int]:
     """Return `low` and `high` such that every True voxel has `low <= ijk < high`; zeros if there is none."""
     low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
     lines = (mask.any(axis=(1, 2)), mask.any(axis=(0, 2)), mask.any(axis=(0, 1)))
@@ -128,13 +126,13 @@ def bounds(mask: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return low, high
 
 
-def window(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, slice, slice]:
+def window(low: Int, high: Int) -> tuple[slice, slice, slice]:
     """Return the slices of a box."""
     i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     return i, j, k
 
 
-def _block_means(values: NDArray[Any], step: tuple[int, ...]) -> NDArray[np.float32]:
+def _block_means(values: Array, step: tuple[int, ...]) -> Float32:
     shape = tuple(-(-n // s) for n, s in zip(values.shape, step, strict=True))
     total = np.zeros(shape, dtype=np.float32, order="F")
     count = np.zeros(shape, dtype=np.float32, order="F")

@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.inflation import grown_by_voxels, inflation_voxels
+from anatomy.typed import Mask
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
     from anatomy.segmentation.vessels import Vessels
-
-Mask = NDArray[np.bool_]
 
 
 def cost_map(

@@ -6,9 +6,9 @@ import hashlib
 import json
 import os
 
-from anatomy.grid import Float
 from anatomy.io.files import atomic_write, sha256
 from anatomy.segmentation.folder import SegmentationFolder
+from anatomy.typed import Float
 
 
 class Description:

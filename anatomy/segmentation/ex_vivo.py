@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float
 from anatomy.segmentation.central_airway import CentralAirway, grow_from
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.labels import RIGHT, sides_from_right
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Float, Int32, Mask
 
 GREATEST_LUNG_HU = -200.0
 """Denser than any inflated lung: trays, clamps, the heart."""
@@ -26,7 +23,7 @@ LEAST_AIRWAY_RADIUS_MM = 2.5
 
 def coarse_lung_ex_vivo(
     ct: CoarseCt, seed_lps: Float | None
-) -> tuple[float, CentralAirway, NDArray[np.int32], tuple[str, ...]]:
+) -> tuple[float, CentralAirway, Int32, tuple[str, ...]]:
     """Find a lung surrounded by air, and its largest airway.
 
     The background is grown from the edge of the image until the lung is encountered [Fu2018, III-A.1]: the

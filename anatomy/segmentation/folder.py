@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Grid, Volume
 from anatomy.io.files import atomic_write, read_text, require_writable_folder, sha256
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
+from anatomy.typed import Array
 
 STATE = "segmentation.json"
 FORMAT = 1
@@ -99,7 +99,7 @@ class SegmentationFolder:
             return None
         return str(entry["voxels"])
 
-    def write(self, name: str, array: NDArray[Any], key: str) -> str:
+    def write(self, name: str, array: Array, key: str) -> str:
         """Write an image made from `key`, and return the digest of its voxels."""
         digest = digest_of(array)
         path = self.path_of(name)
@@ -158,7 +158,7 @@ def _read_record(path: Path) -> dict[str, Any]:
     return record if usable else {"format": FORMAT}
 
 
-def digest_of(array: NDArray[Any]) -> str:
+def digest_of(array: Array) -> str:
     """Return the SHA-256 of the voxels of an image, whatever their order in memory."""
     plain = np.asfortranarray(array)
     plain = plain.view(np.uint8) if plain.dtype == np.bool_ else plain

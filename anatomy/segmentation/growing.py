@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.segmentation.kernels import growing as kernel
 from anatomy.segmentation.kernels import lumen_edge
 from anatomy.segmentation.thin_airways import follow_thin_airways
-
-Mask = NDArray[np.bool_]
-Int = NDArray[np.int64]
-Int16 = NDArray[np.int16]
+from anatomy.typed import Array, Float, Int, Int16, Mask, UInt8
 
 AIR_HU = -1024
 """Around the image is air, which is neither wall nor, for want of depth, lumen."""
@@ -149,7 +143,7 @@ def grow(ground: Ground, start: Mask) -> Grown:
 
 
 def _to_its_edge(
-    ground: Ground, hu: Int16, smooth: Int16, state: NDArray[np.uint8], shape: Int, grown: Int
+    ground: Ground, hu: Int16, smooth: Int16, state: UInt8, shape: Int, grown: Int
 ) -> tuple[Int, int]:
     """Bring the lumen in `state` to its edge.
 
@@ -171,7 +165,7 @@ def _to_its_edge(
 
 
 def _join_and_wall(
-    ground: Ground, hu: Int16, smooth: Int16, state: NDArray[np.uint8], shape: Int, lumen: Int, count: int
+    ground: Ground, hu: Int16, smooth: Int16, state: UInt8, shape: Int, lumen: Int, count: int
 ) -> None:
     """Join the first `count` voxels of `lumen` by faces and put the wall around them; as above."""
     count = lumen_edge.join_corners(hu, state, shape, lumen, count)
@@ -180,13 +174,13 @@ def _join_and_wall(
     lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, WALL_LEAST_HU, WALL_DIFFERENCE_HU, wall)
 
 
-def levels(least_depth: float) -> NDArray[np.int64]:
+def levels(least_depth: float) -> Int:
     """Return the falling levels of the growth, HU."""
     count = max(int(np.log(least_depth / FIRST_LEVEL_HU) / np.log(LEVEL_RATIO)), 0) + 1
     return np.asarray(FIRST_LEVEL_HU * LEVEL_RATIO ** np.arange(count)).astype(np.int64)
 
 
-def _padded(values: NDArray[Any], border: int = 0) -> NDArray[Any]:
+def _padded(values: Array, border: int = 0) -> Array:
     return np.pad(values, _MARGIN, constant_values=border)
 
 

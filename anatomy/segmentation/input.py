@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
+from anatomy.typed import Array
 
 AIR_HU, TISSUE_HU = -700.0, (-200.0, 200.0)
 LEAST_SHARE = 0.002
@@ -59,7 +57,7 @@ def require_chest_ct(ct: Volume, *, thick_slices: bool = False) -> tuple[str, ..
     return (*_require_size(ct, thick_slices), *_odd_values(ct.array))
 
 
-def _require_numbers(values: NDArray[Any]) -> None:
+def _require_numbers(values: Array) -> None:
     if values.dtype.kind not in "iuf":
         raise AnatomyError(f"The image has voxels of the type {values.dtype}", expected="numbers in HU")
     if values.dtype.kind == "f" and not np.isfinite(values).all():
@@ -71,7 +69,7 @@ def _require_numbers(values: NDArray[Any]) -> None:
         )
 
 
-def _require_hounsfield(values: NDArray[Any]) -> None:
+def _require_hounsfield(values: Array) -> None:
     least, greatest = float(values.min()), float(values.max())
     if least == greatest:
         raise AnatomyError(
@@ -129,7 +127,7 @@ def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _odd_values(values: NDArray[Any]) -> tuple[str, ...]:
+def _odd_values(values: Array) -> tuple[str, ...]:
     greatest = float(values.max())
     if greatest <= ODD_HU:
         return ()

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.segmentation.coarse import CoarseCt, bounds, window
 from anatomy.sides import grow_sides
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Array, Int32, Mask, UInt8
 
 RIGHT, LEFT = 1, 2
 _LOBES_RIGHT, _LOBES_LEFT = (3, 4, 5), (1, 2)
 """Labels of lungmask's model of lobes: 1, 2 left upper and lower; 3, 4, 5 right upper, middle, lower."""
 
 
-def lung_labels(left: Mask, right: Mask) -> NDArray[np.uint8]:
+def lung_labels(left: Mask, right: Mask) -> UInt8:
     """Return the label map of two lungs: 1 right, 2 left, as lungmask has them."""
     labels = np.zeros(left.shape, dtype=np.uint8, order="F")
     labels[right] = RIGHT
@@ -67,7 +63,7 @@ def split_sides(mask: Mask, grid: Grid) -> tuple[Mask, Mask]:
     return mask & (fine == LEFT), mask & (fine == RIGHT)
 
 
-def sides_from_right(tissue: Mask, coarse: CoarseCt) -> NDArray[np.int32] | None:
+def sides_from_right(tissue: Mask, coarse: CoarseCt) -> Int32 | None:
     """Label the right lung 1 and the left 2 over coarse voxels of lung; None if there are not two."""
     low, high = bounds(tissue)
     box = window(low, high)
@@ -80,7 +76,7 @@ def sides_from_right(tissue: Mask, coarse: CoarseCt) -> NDArray[np.int32] | None
     return sides
 
 
-def _nearest(sides: NDArray[np.int32], coarse: CoarseCt) -> NDArray[Any]:
+def _nearest(sides: Int32, coarse: CoarseCt) -> Array:
     """Give every coarse voxel the side that is nearest to it."""
     import edt
 

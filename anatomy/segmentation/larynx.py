@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Grid
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Int, Mask
 
 NARROW_SHARE = 0.6
 """Of the cross-section of the trachea; what is narrower at its upper end is larynx or a partial slice."""
@@ -15,7 +13,7 @@ TRACHEA_MM = 20.0
 """The cross-section is the median over this length above and below the seed."""
 
 
-def without_larynx(lumen: Mask, seed_ijk: NDArray[np.int64], grid: Grid) -> tuple[Mask, float]:
+def without_larynx(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]:
     """Cut the upper end of the airway off, as far as it is narrower than the trachea.
 
     Vocal cords that are closed while the breath is held taper the airway to a point, in which no scope

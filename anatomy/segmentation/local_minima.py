@@ -6,12 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.segmentation.kernels.local_minima import depth_slice, smooth_slice
-
-Int16 = NDArray[np.int16]
+from anatomy.typed import Float, Int16
 
 LARGEST_SCALE = 12
 """N: the largest structuring element of the paper reaches this many pixels."""

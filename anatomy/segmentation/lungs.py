@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, read_only
@@ -18,8 +18,8 @@ from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right
 from anatomy.segmentation.outside_air import outside_air
 from anatomy.segmentation.pleural_nodules import notches
 from anatomy.segmentation.truncation import truncation
+from anatomy.typed import Float32, Int, Int32, Mask
 
-Mask = NDArray[np.bool_]
 Progress = Callable[[str], None]
 
 FIRST_THRESHOLD_HU = -500.0
@@ -58,7 +58,7 @@ class Lungs:
 
     left: Mask
     right: Mask
-    trachea_seed_ijk: NDArray[np.int64]
+    trachea_seed_ijk: Int
     central_airway: Mask
     threshold_hu: float
     warnings: tuple[str, ...] = ()
@@ -182,7 +182,7 @@ def _on_ct(coarse: CoarseCt, mask: Mask) -> Mask:
     return whole
 
 
-def lung_threshold(hu: NDArray[np.float32], outside: Mask) -> float:
+def lung_threshold(hu: Float32, outside: Mask) -> float:
     """Return the middle between the median of the lung and that of soft tissue, in HU."""
     lung = hu[(hu < FIRST_THRESHOLD_HU) & ~outside]
     tissue = hu[(hu > TISSUE_HU[0]) & (hu < TISSUE_HU[1])]
@@ -194,7 +194,7 @@ def lung_threshold(hu: NDArray[np.float32], outside: Mask) -> float:
 
 def _coarse_sides(
     coarse: CoarseCt, outside: Mask, airway: CentralAirway, threshold: float
-) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+) -> tuple[Int32, tuple[str, ...]]:
     """Label the right lung 1 and the left lung 2 on coarse voxels."""
     walls = grown_by_one(airway.grown)
     air = (coarse.hu < threshold) & ~outside & ~walls
@@ -220,9 +220,7 @@ def _lung_pieces(coarse: CoarseCt, air: Mask) -> Mask:
     return chosen
 
 
-def _one_side(
-    coarse: CoarseCt, tissue: Mask, airway: CentralAirway
-) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+def _one_side(coarse: CoarseCt, tissue: Mask, airway: CentralAirway) -> tuple[Int32, tuple[str, ...]]:
     """Name a single lung by the side of the trachea it lies on."""
     centre = float(np.argwhere(tissue)[:, 0].mean())
     side, name = (RIGHT, "right") if centre < airway.seed[0] else (LEFT, "left")

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import FileError, GridMismatchError
-from anatomy.grid import Float, Grid
+from anatomy.grid import Grid
 from anatomy.io.files import read_text
 from anatomy.segmentation.closing import distance_mm, largest_piece
 from anatomy.segmentation.coarse import bounds, window
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Float, Int16, Mask
 
 RIM_MM = 2.0
 """A nodule blurs this far into the lung around it, and may be taken for a vessel there."""
@@ -137,7 +135,7 @@ def _inside(contour: Mapping[str, Any], grid: Grid, path: Path) -> tuple[int, Ma
     return k, inside if inside.any() else line
 
 
-def _majority(votes: NDArray[np.int16], masks: list[Mask]) -> Mask:
+def _majority(votes: Int16, masks: list[Mask]) -> Mask:
     """Keep, of each connected nodule, the voxels that half of its own annotations have inside."""
     from scipy import ndimage
 

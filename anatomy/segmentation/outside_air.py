@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Mask = NDArray[np.bool_]
+from anatomy.typed import Float32, Mask
 
 OUTSIDE_HU = -950.0
 """Air that touches the edge of a slice and has a median below this is not lung."""
 
 
-def outside_air(hu: NDArray[np.float32], air: Mask) -> Mask:
+def outside_air(hu: Float32, air: Mask) -> Mask:
     """Mark the air around the patient.
 
     In every axial slice, pieces of air that touch the edge of the image are taken, because the chest wall

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.segmentation.description import Description, description_text
@@ -19,6 +19,7 @@ from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice
 from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.request import SegmentationRequest
 from anatomy.segmentation.steps import VERSION, Parts, Steps
+from anatomy.typed import Float
 
 Progress = Callable[[str], None]
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt, bounds, window
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Int, Mask
 
 NOTCH_MM = 12.0
 """Ball of the wider closing: notches of up to about 24 mm across become lung."""
@@ -67,7 +65,7 @@ def _near_hull(lungs: Mask, ct: CoarseCt) -> Mask:
     return near
 
 
-def _clear_edge(mask: Mask, width: NDArray[np.int64]) -> None:
+def _clear_edge(mask: Mask, width: Int) -> None:
     """Empty the border of an array: near the edge of the image a closing cannot tell notch from outside."""
     for axis, n in enumerate(width):
         layers = np.moveaxis(mask, axis, 0)

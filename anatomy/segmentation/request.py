@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from anatomy.errors import FileError
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.io.files import sha256
 from anatomy.io.images import read_volume
 from anatomy.io.masks import read_masks
 from anatomy.io.totalsegmentator import mask_sources
 from anatomy.segmentation.folder import onto_grid
+from anatomy.typed import Float
 
 _ROLES = {"lumen": "airway", "wall": "airway_wall", "vessels": "vessels", "lung": "lungs"}
 """Which image of the folder a role of TotalSegmentator's output stands for."""

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.typed import Float, Float32, Int16, Mask, UInt8
 
 SIGMAS_MM = (1.0, math.sqrt(2.0), 2.0, 2.0 * math.sqrt(2.0), 4.0)
 DEEPER_THAN_MM = (0.0, 1.0, 1.0, 2.0, 2.0 * math.sqrt(2.0))
@@ -46,16 +47,16 @@ class ScaleSpace:
     """
 
     box: Box
-    spacing_mm: NDArray[np.float64]
-    hu: NDArray[np.int16] | NDArray[np.float32]
-    n_scales: NDArray[np.uint8]
+    spacing_mm: Float
+    hu: Int16 | Float32
+    n_scales: UInt8
     threads: int
 
     @classmethod
     def of(
         cls,
-        hu: NDArray[np.int16] | NDArray[np.float32],
-        lung: NDArray[np.bool_],
+        hu: Int16 | Float32,
+        lung: Mask,
         spacing_mm: ArrayLike,
         *,
         threads: int = 0,
@@ -106,7 +107,7 @@ class ScaleSpace:
             threads=threads or _processors(),
         )
 
-    def images(self) -> Iterator[tuple[float, NDArray[np.float32]]]:
+    def images(self) -> Iterator[tuple[float, Float32]]:
         """Yield each scale and the CT smoothed to it: one image, changed in place from scale to scale.
 
         Smoothing is incremental, sigma_2^2 = sigma_1^2 + d^2, by the discrete analogue of the Gaussian
@@ -123,7 +124,7 @@ class ScaleSpace:
             variance = sigma**2
             yield sigma, image
 
-    def hessian_factors(self, sigma: float) -> NDArray[np.float64]:
+    def hessian_factors(self, sigma: float) -> Float:
         """Return sigma^2 / (h_a h_b) for ii, jj, kk, ij, ik, jk [Fu2018, eq. 3 with gamma 1]."""
         h = self.spacing_mm
         pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -133,7 +134,7 @@ class ScaleSpace:
         """Call `work(first, last)` for the parts of an axis; each voxel is written by one call alone."""
         share_axis(work, self.hu.shape[axis], self.threads)
 
-    def whole(self, part: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    def whole(self, part: Float32, shape: tuple[int, ...]) -> Float32:
         """Return an image of the whole grid, `[i, j, k]`, 0 outside the box."""
         image = np.zeros(shape, dtype=part.dtype, order="F")
         image[self.box] = part.T
@@ -153,7 +154,7 @@ def share_axis(work: Callable[[int, int], None], length: int, threads: int) -> N
             done.result()
 
 
-def discrete_gaussian(variance: float) -> NDArray[np.float32]:
+def discrete_gaussian(variance: float) -> Float32:
     """Return the weights of the discrete analogue of the Gaussian, centre first: exp(-t) I_n(t).
 
     Parameters
@@ -174,9 +175,7 @@ def discrete_gaussian(variance: float) -> NDArray[np.float32]:
     return np.asarray(weights / (weights[0] + 2.0 * weights[1:].sum()), dtype=np.float32)
 
 
-def _scales_that_apply(
-    lung: NDArray[np.bool_], spacing: NDArray[np.float64], threads: int
-) -> NDArray[np.uint8]:
+def _scales_that_apply(lung: Mask, spacing: Float, threads: int) -> UInt8:
     """Return how many scales apply at each voxel of a box, `(nk, nj, ni)`.
 
     The end of the image is no surface of the lung.
@@ -190,7 +189,7 @@ def _scales_that_apply(
     return count
 
 
-def _bounds(mask: NDArray[np.bool_]) -> Box:
+def _bounds(mask: Mask) -> Box:
     """Return the box of the True voxels."""
     spans = []
     for axis in range(3):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Volume
 from anatomy.io.files import sha256
@@ -21,12 +20,12 @@ from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.segmentation.wall import wall_around
+from anatomy.typed import Array, Float32, Mask
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
 
-Mask = NDArray[np.bool_]
-Images = dict[str, NDArray[Any]]
+Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
 Progress = Callable[[str], None]
 
@@ -58,10 +57,10 @@ class Parts:
     lumen: Mask
     wall: Mask
     nodule: Mask
-    vesselness: NDArray[np.float32]
+    vesselness: Float32
     large_vessels: Mask
     all_vessels: Mask
-    cost: NDArray[np.float32]
+    cost: Float32
 
 
 class Steps:
@@ -225,7 +224,7 @@ class Steps:
 
         return self._bring_up_to_date("vessels", names, key, compute)[0]
 
-    def _cost(self, lungs: Lungs, airway: Images, nodule: Mask, vessels: Images) -> NDArray[np.float32]:
+    def _cost(self, lungs: Lungs, airway: Images, nodule: Mask, vessels: Images) -> Float32:
         made_of = ("lungs", "airway", "airway_wall", "nodule", "vesselness", "vessels", "all_vessels")
         key = self._key("cost map", of=made_of)
 
@@ -279,7 +278,7 @@ class Steps:
         self.warnings += facts.get("warnings", [])
         return images, facts
 
-    def _read(self, name: str) -> NDArray[Any]:
+    def _read(self, name: str) -> Array:
         array = self._folder.read(self._folder.path_of(name)).array
         return array if name in _NOT_MASKS else np.asfortranarray(array != 0)
 

@@ -5,16 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.segmentation.kernels import thin_airways as kernel
 from anatomy.segmentation.kernels.growing import box_offsets
-
-Mask = NDArray[np.bool_]
-Int = NDArray[np.int64]
-Int16 = NDArray[np.int16]
-UInt8 = NDArray[np.uint8]
+from anatomy.typed import Float, Int, Int16, Mask, UInt8
 
 N_DIRECTIONS = 260
 """Over the sphere: 13 degrees apart, 1.1 mm at the end of a stretch."""

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Grid
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Mask
 
 
 def truncation(lung: Mask, grid: Grid) -> tuple[str, ...]:

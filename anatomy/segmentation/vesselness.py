@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.segmentation.scale_space import ScaleSpace
+from anatomy.typed import Float, Float32, Int16, Mask
 
 ALPHA, BETA, C_HU = 0.5, 0.5, 70.0
 
 
 def vesselness(
-    hu: NDArray[np.int16] | NDArray[np.float32],
-    lung: NDArray[np.bool_],
+    hu: Int16 | Float32,
+    lung: Mask,
     spacing_mm: ArrayLike,
     *,
     alpha: float = ALPHA,
     beta: float = BETA,
     c_hu: float = C_HU,
     threads: int = 0,
-) -> NDArray[np.float32]:
+) -> Float32:
     """Return the greatest response over the scales that apply at each voxel [Fu2018, eqs. 3-5].
 
     Parameters
@@ -61,9 +62,9 @@ def add_vesselness_of(
     space: ScaleSpace,
     scale: int,
     sigma: float,
-    image: NDArray[np.float32],
-    settings: NDArray[np.float64],
-    best: NDArray[np.float32],
+    image: Float32,
+    settings: Float,
+    best: Float32,
 ) -> None:
     """Raise `best` to the response at one scale; `settings` are alpha, beta, c."""
     from anatomy.segmentation.kernels.hessian import add_vesselness

@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import GridMismatchError
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
 from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, add_vesselness_of
+from anatomy.typed import Float, Float32, Int16, Mask, UInt8
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
 
-Mask = NDArray[np.bool_]
 
 VESSEL_THRESHOLD = 0.25
 """Fixed on made cylinders and the phantom, see docs/segmentation.md."""
@@ -56,7 +55,7 @@ class Vessels:
         What was unusual.
     """
 
-    vesselness: NDArray[np.float32]
+    vesselness: Float32
     large: Mask
     mask: Mask
     threshold: float
@@ -124,7 +123,7 @@ def segment_vessels(
     return Vessels(vesselness=found, large=everywhere, mask=mask, threshold=threshold, warnings=warnings)
 
 
-def towards_blood(lung_hu: NDArray[np.int16] | NDArray[np.float32], share: float) -> float:
+def towards_blood(lung_hu: Int16 | Float32, share: float) -> float:
     """Return what lies a share of the way from the lung's median to blood without contrast medium, in HU.
 
     With contrast medium the edge of a vessel so lies a little outside the true one: the safe side.
@@ -135,7 +134,7 @@ def towards_blood(lung_hu: NDArray[np.int16] | NDArray[np.float32], share: float
 
 def _responses(
     space: ScaleSpace, solid: Mask, progress: Callable[[str], None] | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+) -> tuple[Float32, Float32, UInt8]:
     """Return vesselness, R_L of solid voxels, and the scale of the greatest R_L."""
     best = np.zeros(space.hu.shape, dtype=np.float32)
     response = np.zeros_like(best)
@@ -154,10 +153,10 @@ def _add_large(
     space: ScaleSpace,
     scale: int,
     sigma: float,
-    image: NDArray[np.float32],
-    scales: NDArray[np.uint8],
-    response: NDArray[np.float32],
-    at_scale: NDArray[np.uint8],
+    image: Float32,
+    scales: UInt8,
+    response: Float32,
+    at_scale: UInt8,
 ) -> None:
     """Raise `response` to R_L at one scale where `scales` lets it apply, and note the scale in `at_scale`."""
     from anatomy.segmentation.kernels.hessian import add_large_response
@@ -171,8 +170,8 @@ def _large(
     space: ScaleSpace,
     solid: Mask,
     airway: Mask,
-    response: NDArray[np.float32],
-    at_scale: NDArray[np.uint8],
+    response: Float32,
+    at_scale: UInt8,
     radius_mm: float,
 ) -> Mask:
     """Return the large vessels in the box: the solid voxels within `radius_mm` of what tells their inside.
@@ -203,7 +202,7 @@ def _without_small(mask: Mask, least_voxels: float) -> Mask:
     return np.asarray(keep[pieces])
 
 
-def _distance_mm(mask: Mask, sides: Float, threads: int) -> NDArray[np.float32]:
+def _distance_mm(mask: Mask, sides: Float, threads: int) -> Float32:
     """Return the distance from each voxel of `mask` to the nearest that is not; the image's end is none."""
     import edt
 
@@ -212,7 +211,7 @@ def _distance_mm(mask: Mask, sides: Float, threads: int) -> NDArray[np.float32]:
     )
 
 
-def _raised_at_edges(space: ScaleSpace, best: NDArray[np.float32], edges: Mask) -> NDArray[np.float32]:
+def _raised_at_edges(space: ScaleSpace, best: Float32, edges: Mask) -> Float32:
     """Give the voxels of `edges` the greatest vesselness of their 26 neighbours: vessels keep their width.
 
     The response fades before the vessel ends.

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Grid
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import bounds
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Mask
 
 WALL_MM = 1.5
 

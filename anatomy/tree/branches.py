@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree, TreeReport
-from anatomy.grid import Float
-
-Int = NDArray[np.int64]
+from anatomy.typed import Float, Int
 
 TANGENT_REACH_MM = 1.5
 """A tangent is the direction between the points this far before and behind on the branch."""

@@ -8,11 +8,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
-
-Int = NDArray[np.int64]
+from anatomy.typed import Float, Int
 
 MAX_TURN_COS = 0.5
 """Both sides may turn away from the gap by at most 60 degrees."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.grid import Volume
@@ -19,8 +19,7 @@ from anatomy.tree.resample import strands_along
 from anatomy.tree.skeleton import prune, spanning_tree, thin
 from anatomy.tree.trachea import find_trachea
 from anatomy.tree.warn import warnings_of
-
-Int = NDArray[np.int64]
+from anatomy.typed import Int
 
 
 def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float = 0.75) -> AirwayTree:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.tree.course import Course, course_of
 from anatomy.tree.depth import inside
 from anatomy.tree.lumen import PreparedLumen
 
-Int = NDArray[np.int64]
 Way = list[tuple[int, ...]]
 
 MARGIN_VOXELS = 6

@@ -6,16 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.tree.bridge import face_paths
 from anatomy.tree.depth import segments_inside
 from anatomy.tree.lumen import PreparedLumen
 from anatomy.tree.skeleton import SkeletonTree
-
-Bool = NDArray[np.bool_]
-Int = NDArray[np.int64]
+from anatomy.typed import Bool, Float, Float32, Int
 
 ROUNDS = 30
 """Rounds of centring and smoothing; together they reach about 4 voxels and smooth over about 2 mm."""
@@ -119,7 +115,7 @@ def _neighbour_average(parent: Int) -> Any:
     return matrix.multiply(1.0 / np.where(total > 0, total, 1.0)[:, None]).tocsr()
 
 
-def _centring_step(mm: Float, parent: Int, depth_mm: NDArray[np.float32], spacing_mm: Float) -> Float:
+def _centring_step(mm: Float, parent: Int, depth_mm: Float32, spacing_mm: Float) -> Float:
     """Return a small step up the depth, perpendicular to the course."""
     from scipy.ndimage import map_coordinates
 

@@ -8,13 +8,9 @@ it to the skeleton is added.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.tree.lumen import CONNECT_26, PreparedLumen
-
-Bool = NDArray[np.bool_]
-Int = NDArray[np.int64]
+from anatomy.typed import Bool, Float, Float32, Int
 
 SIDE_RADII = 2.0
 """A flattened airway is up to this many times as wide as its inscribed sphere."""
@@ -98,6 +94,6 @@ def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -
         margin = margin * 2
 
 
-def _cost(depth_mm: NDArray[np.float32], solid: Bool, spacing_mm: Float) -> Float:
+def _cost(depth_mm: Float32, solid: Bool, spacing_mm: Float) -> Float:
     floor = float(spacing_mm.min()) / 4
     return np.asarray(np.where(solid, 1.0 / np.maximum(depth_mm.astype(np.float64), floor) ** 2, -1.0))

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
-
-Bool = NDArray[np.bool_]
+from anatomy.typed import Bool, Float, Int
 
 TOUCH = 1e-6
 """Fraction of a voxel by which a segment must stay clear of every other voxel."""
@@ -44,7 +41,7 @@ def segments_inside(lumen: Bool, begin_ijk: Float, end_ijk: Float) -> Bool:
     return np.asarray(inside(lumen, samples[:, :, None] + _SIGNS).all(axis=(1, 2)))
 
 
-def border_voxels(lumen: Bool) -> NDArray[np.int64]:
+def border_voxels(lumen: Bool) -> Int:
     """Return the voxels `(M, 3)` outside `lumen` that share a face with it.
 
     `lumen` must have an empty layer all around.  The nearest solid box outside the lumen is always

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import LoopOpened, TreeReport
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float
 from anatomy.tree.skeleton import SkeletonTree, span
-
-Int = NDArray[np.int64]
+from anatomy.typed import Float, Int
 
 SAME_POINT_MM = 1e-3
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.airway_tree import GapBridged
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.tree.bridge import Piece, join_pieces
-
-Bool = NDArray[np.bool_]
-Int = NDArray[np.int64]
+from anatomy.typed import Bool, Float, Float32, Int, Int32
 
 CONNECT_26 = np.ones((3, 3, 3), dtype=bool)
 
@@ -42,8 +39,8 @@ class PreparedLumen:
     lumen: Bool
     solid: Bool
     bridges: Bool
-    depth_mm: NDArray[np.float32]
-    solid_depth_mm: NDArray[np.float32]
+    depth_mm: Float32
+    solid_depth_mm: Float32
     gaps: tuple[GapBridged, ...]
     components_dropped: int
     voxels_dropped: int
@@ -115,7 +112,7 @@ def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
     return mask.grid.crop(start - 1, stop + 1), box
 
 
-def depth_of_centres(mask: Bool, spacing_mm: Float) -> NDArray[np.float32]:
+def depth_of_centres(mask: Bool, spacing_mm: Float) -> Float32:
     """Return the distance of every voxel centre in `mask` to the nearest one outside it, mm."""
     import edt
 
@@ -131,7 +128,7 @@ def fill_cavities(mask: Bool) -> Bool:
     return mask.copy(order="K") if count < 2 else np.asarray(outside != outside[0, 0, 0])
 
 
-def _pieces(labels: NDArray[np.int32], sizes: Int, main: int, spacing_mm: Float) -> list[Piece]:
+def _pieces(labels: Int32, sizes: Int, main: int, spacing_mm: Float) -> list[Piece]:
     """List the other pieces that are long enough to have a direction, largest first."""
     from scipy import ndimage
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.tree.course import Course, course_of
 from anatomy.tree.depth import segments_inside
-
-Bool = NDArray[np.bool_]
-Int = NDArray[np.int64]
+from anatomy.typed import Bool
 
 
 def unite_parallel(course: Course, lumen: Bool) -> Course:

@@ -6,13 +6,10 @@ import heapq
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from anatomy.grid import Float
 from anatomy.tree.bridge import face_paths
-
-Bool = NDArray[np.bool_]
-Int = NDArray[np.int64]
+from anatomy.typed import Bool, Float, Int
 
 LOOP_EDGES = 12
 """A ring of fewer skeleton voxels is roughness of the mask, not two airways that touch."""

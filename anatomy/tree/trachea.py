@@ -11,8 +11,8 @@ from typing import NoReturn
 import numpy as np
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float
 from anatomy.tree.skeleton import SkeletonTree
+from anatomy.typed import Float
 
 MIN_RADIUS_MM = 2.0
 """Half the tracheal diameter of a newborn."""

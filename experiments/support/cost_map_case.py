@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
 from anatomy.phantom import phantom
 from anatomy.segmentation.pipeline import read_ct, segment
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
 from anatomy.tree import tree_from_mask
+from anatomy.typed import Float
 from experiments.support.results import PHANTOM, require_data
 from stages.needle.device import Needle
 from stages.needle.space import NeedleSpace, space_of_labels

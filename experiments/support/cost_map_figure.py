@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from experiments.support.cost_map_case import Case
 from experiments.support.cost_map_problems import Scenario, unit
 from experiments.support.cost_map_runs import COST_MAP, INTENSITY, SHORTEST_PATH, Run, success_and_means

@@ -10,8 +10,8 @@ from itertools import islice
 import edt
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.structures import OUTSIDE
+from anatomy.typed import Float
 from experiments.support.cost_map_case import Case
 from experiments.support.inflation import refuting_labels
 from stages.needle.costs import voxel_sum

@@ -9,7 +9,8 @@ from itertools import product
 
 import numpy as np
 
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
+from anatomy.typed import Float
 from experiments.support.cost_map_case import Case
 from experiments.support.cost_map_problems import LEAST_COST, TRIES, TRY_ITERATIONS, Scenario, candidates
 from experiments.support.inflation import inflated_space, refuting_labels

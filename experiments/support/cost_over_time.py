@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search import AtlasSearch, Step
 from lungaccess.plans.assemble import Task

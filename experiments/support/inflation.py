@@ -13,12 +13,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.grid import Volume, read_only
 from anatomy.inflation import grown_by_voxels, inflation_voxels
 from anatomy.structures import OUTSIDE
+from anatomy.typed import Int
 from stages.needle.kernels import limits as index
 from stages.needle.path import ArcPath, blocker_on_path
 from stages.needle.space import NeedleSpace
@@ -91,7 +92,7 @@ def inflated_space(space: NeedleSpace) -> NeedleSpace:
     )
 
 
-def refuting_labels(space: NeedleSpace, paths: Iterable[ArcPath], branch: int = -1) -> NDArray[np.int64]:
+def refuting_labels(space: NeedleSpace, paths: Iterable[ArcPath], branch: int = -1) -> Int:
     """Put paths to the proof: return `(P,)` 0 where a path is clear, else the label of what is too near.
 
     Parameters

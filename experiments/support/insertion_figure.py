@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
 from experiments.support.insertion.repeated import Study
 from lungaccess.report import style

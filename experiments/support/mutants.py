@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from lungaccess.checking import CheckReport
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, system_fingerprint

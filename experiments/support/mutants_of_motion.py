@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath

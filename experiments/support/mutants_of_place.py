@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, far, rotation, signed, way
 from experiments.support.mutants_of_motion import end_of
 from lungaccess.plans.plan import NeedleArc, Plan

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from anatomy import structures
-from anatomy.grid import Float
+from anatomy.typed import Float
 from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, way
 from lungaccess.plans.plan import NeedleArc, Plan
 from stages.needle.path import ArcPath, direct_path

@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.fields import CENTRES
-from anatomy.grid import Float, Grid
+from anatomy.grid import Grid
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.io.med_rad import load_med_rad
 from anatomy.patient import PatientImages
 from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
+from anatomy.typed import Float, Labels
 from stages.needle.device import Needle
 from stages.needle.path import ArcPath
 from stages.needle.space import NeedleSpace, space_of_labels
@@ -69,7 +69,7 @@ class Query:
 class Obstacles:
     """The label volume of one patient, and the distance that a needle's axis keeps from voxel centres."""
 
-    labels: NDArray[np.uint16]
+    labels: Labels
     grid: Grid
 
     @property

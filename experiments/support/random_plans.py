@@ -12,9 +12,9 @@ import numpy as np
 import lungaccess as la
 from anatomy import structures
 from anatomy.errors import SettingsError, TargetError
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.settings import override
+from anatomy.typed import Float
 from experiments.support.mutants import Rng
 from lungaccess.coupled.alternatives import alternatives
 from lungaccess.coupled.atlas import Atlas

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.settings import quantity, settings
+from anatomy.typed import Float, Int
 from experiments.support.route_sampling import grow
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve, interpolate
@@ -117,7 +116,7 @@ def sampled_route(
     return found, proved
 
 
-def _way_to_root(points: Float, parent: NDArray[np.int64], vertex: int, goal: Float) -> Float:
+def _way_to_root(points: Float, parent: Int, vertex: int, goal: Float) -> Float:
     """Return the vertices from the root to the goal, `(V, 3)`."""
     way = [goal]
     while vertex >= 0:

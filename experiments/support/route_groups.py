@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.io import read_mask
 from anatomy.io.centerlines import read_centerlines
 from anatomy.phantom import phantom
+from anatomy.typed import Float
 from experiments.support.results import PHANTOM, anatomy, data_folder, require_data
 from stages.scope.route.centreline import Centreline, from_image, from_lung, from_mask, from_tree
 from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links

@@ -7,16 +7,12 @@ from dataclasses import dataclass
 
 import edt
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid
 from anatomy.segmentation.airway import Airways
+from anatomy.typed import Float32, Int, Mask
 from experiments.support.synthetic_ct import SyntheticCt
-
-Mask = NDArray[np.bool_]
-Index = NDArray[np.int64]
-Values = NDArray[np.float32]
 
 POINTS, VESSEL_POINTS, NEAR_MM = 882, 281, 3.0
 """As many as in VESSEL12's three scans [Rudyanto2014]; half of the others lie so near to what confuses."""
@@ -45,13 +41,13 @@ class PointGroups:
     the lung.
     """
 
-    vessel: Index
-    near: Index
-    far: Index
+    vessel: Int
+    near: Int
+    far: Int
 
     def draws(
-        self, values: Values, count: int, vessel: Index | None = None
-    ) -> Iterator[tuple[Values, Values]]:
+        self, values: Float32, count: int, vessel: Int | None = None
+    ) -> Iterator[tuple[Float32, Float32]]:
         """Yield the values at 281 points in `vessel` and at 601 others, `count` times; always the same."""
         rng, n_near = np.random.default_rng(0), (POINTS - VESSEL_POINTS) // 2
         groups = (self.vessel if vessel is None else vessel, self.near, self.far)
@@ -65,7 +61,7 @@ class PointGroups:
             yield parts[0], np.concatenate(parts[1:])
 
 
-def distance_mm(mask: Mask, grid: Grid) -> Values:
+def distance_mm(mask: Mask, grid: Grid) -> Float32:
     """Return the distance from each voxel to the nearest of `mask`."""
     sides = tuple(grid.spacing_mm)
     return np.asarray(edt.edt(np.array(~mask, order="F"), anisotropy=sides, order="F", parallel=2))
@@ -93,7 +89,7 @@ def point_groups(truth: SyntheticCt, *, sure: bool) -> PointGroups:
 
 
 def point_scores(
-    groups: PointGroups, score: Values, fixed: float, draws: int, vessel: Index | None = None
+    groups: PointGroups, score: Float32, fixed: float, draws: int, vessel: Int | None = None
 ) -> F1:
     """Return F1 at `draws` sets of points; `vessel` are those to draw vessel points from, if not all."""
     best, at, held = [], [], []
@@ -110,14 +106,14 @@ def point_scores(
     )
 
 
-def f1(inside: Values, outside: Values, threshold: float) -> float:
+def f1(inside: Float32, outside: Float32, threshold: float) -> float:
     """Return 2 TP / (2 TP + FP + FN), with the points outside weighted to be 601 for 281 inside."""
     weight = (POINTS - VESSEL_POINTS) / VESSEL_POINTS * inside.size / outside.size
     hits, wrong = float((inside >= threshold).sum()), weight * float((outside >= threshold).sum())
     return 2.0 * hits / max(hits + wrong + inside.size, 1.0)
 
 
-def vessels_by_radius(truth: SyntheticCt, groups: PointGroups) -> dict[str, Index]:
+def vessels_by_radius(truth: SyntheticCt, groups: PointGroups) -> dict[str, Int]:
     """Return the voxels of vessels by radius: that of the largest ball in it within a voxel of them."""
     grid = truth.ct.grid
     sides = tuple(grid.spacing_mm)
@@ -138,7 +134,7 @@ def vessels_by_radius(truth: SyntheticCt, groups: PointGroups) -> dict[str, Inde
     return {name: groups.vessel[of_vessel == n] for n, name in enumerate(names)}
 
 
-def share_of(mask: Mask, at: Index) -> float:
+def share_of(mask: Mask, at: Int) -> float:
     """Return the share of voxels, given by flat indices in memory order, that a mask holds."""
     return float(mask.ravel(order="K")[at].mean())
 
@@ -180,14 +176,14 @@ def dice(first: Mask, second: Mask) -> float:
     return float(2.0 * (first & second).sum() / (first.sum() + second.sum()))
 
 
-def auc(inside: Values, outside: Values) -> float:
+def auc(inside: Float32, outside: Float32) -> float:
     """Return how often a value inside exceeds one outside; ties count half."""
     order = np.sort(outside)
     below, upto = np.searchsorted(order, inside, "left"), np.searchsorted(order, inside, "right")
     return float((below + upto).mean() / 2.0 / order.size)
 
 
-def sampled_voxels(truth: SyntheticCt) -> tuple[Index, Index]:
+def sampled_voxels(truth: SyntheticCt) -> tuple[Int, Int]:
     """Return 200,000 voxels of vessels and as many of the other tissue, `(N, 3)` each."""
     rng = np.random.default_rng(0)
     tissue = truth.lung & ~truth.lumen

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError, SettingsError
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
-
-Mask = NDArray[np.bool_]
+from anatomy.typed import Float, Float32, Mask
 
 AIR_HU, LUMEN_HU, FAT_HU, TISSUE_HU, WALL_HU, NODULE_HU, FISSURE_HU = (
     -1000.0,
@@ -125,7 +124,7 @@ def render_ct(images: PatientImages, look: CtLook | None = None) -> SyntheticCt:
     grid, scale, offset = _target(images, look.spacing_mm)
     rng = np.random.default_rng(look.seed)
 
-    def share(mask: Mask) -> NDArray[np.float32]:
+    def share(mask: Mask) -> Float32:
         return _resampled(mask, grid, scale, offset)
 
     lumen_mask, spacing = images.lumen.array, images.grid.spacing_mm
@@ -183,12 +182,12 @@ def _target(images: PatientImages, spacing_mm: float) -> tuple[Grid, Float, Floa
     return Grid(shape=(int(shape[0]), int(shape[1]), int(shape[2])), lps_from_ijk=matrix), scale, low
 
 
-def _resampled(mask: Mask, grid: Grid, scale: Float, offset: Float) -> NDArray[np.float32]:
+def _resampled(mask: Mask, grid: Grid, scale: Float, offset: Float) -> Float32:
     """Return the share of each voxel within `mask`: linear interpolation along each axis.
 
     Voxels larger than those of the mask take the mean of several samples.
     """
-    part: NDArray[np.float32] = mask.astype(np.float32, order="F")
+    part: Float32 = mask.astype(np.float32, order="F")
     for axis in (2, 1, 0):
         samples = max(1, int(np.ceil(scale[axis])))
         size, n = part.shape[axis], grid.shape[axis]
@@ -207,12 +206,12 @@ def _resampled(mask: Mask, grid: Grid, scale: Float, offset: Float) -> NDArray[n
     return part
 
 
-def _mix(image: NDArray[np.float32], share: NDArray[np.float32], hu: float | NDArray[np.float32]) -> None:
+def _mix(image: Float32, share: Float32, hu: float | Float32) -> None:
     """Replace a share of each voxel of `image` by `hu`, in place."""
     image += share * (np.float32(hu) - image if isinstance(hu, float) else hu - image)
 
 
-def _body(lung: Mask, spacing_mm: float) -> NDArray[np.float32]:
+def _body(lung: Mask, spacing_mm: float) -> Float32:
     """Return tissue around the lungs, fat around it, and air; between the lungs is tissue alone."""
     from scipy.ndimage import binary_fill_holes
 
@@ -238,7 +237,7 @@ def _within(mask: Mask, spacing: Float, reach_mm: float) -> Mask:
     return np.asarray(_distance_mm(~mask, spacing) <= reach_mm)
 
 
-def _distance_mm(mask: Mask, spacing_mm: ArrayLike) -> NDArray[np.float32]:
+def _distance_mm(mask: Mask, spacing_mm: ArrayLike) -> Float32:
     """Return the distance from each voxel of `mask` to the nearest that is not; the image's end is none."""
     import edt
 
@@ -255,13 +254,13 @@ def _sheet(mask: Mask, spacing: Float) -> Mask:
     return np.asarray(mask & (depth >= maximum_filter(depth.T, size=3).T - np.float32(0.25 * spacing.min())))
 
 
-def _texture(rng: np.random.Generator, shape: tuple[int, int, int], look: CtLook) -> NDArray[np.float32]:
+def _texture(rng: np.random.Generator, shape: tuple[int, int, int], look: CtLook) -> Float32:
     return _noise(rng, shape, look.texture_hu, look.texture_mm / look.spacing_mm)
 
 
 def _noise(
     rng: np.random.Generator, shape: tuple[int, int, int], deviation: float, sigma_voxels: float
-) -> NDArray[np.float32]:
+) -> Float32:
     """Return Gaussian noise of a standard deviation, correlated by a Gaussian."""
     from scipy.ndimage import gaussian_filter
 

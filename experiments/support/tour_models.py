@@ -6,8 +6,8 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.tree.branches import Strand, assemble
+from anatomy.typed import Float
 from stages.scope.tour.exits import ExitRule
 
 ORDERS = 8

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch, ReferenceSearchWithoutRejection
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from anatomy.grid import Float
 from anatomy.meshes import MeshDistance, box_surface
-from lungaccess.checking.space import Bools, Select, labels_at
+from anatomy.typed import Bool, Float
+from lungaccess.checking.space import Select, labels_at
 from lungaccess.checking.tiles import Cluster, Tiles
 
 FIRST_NEIGHBOURS = 16
@@ -33,7 +33,7 @@ class Boxes:
         self._reach_mm = reach_mm
         self._half_diagonal = 0.5 * float(np.linalg.norm(tiles.spacing_mm))
 
-    def holds(self, points_lps: Float) -> Bools:
+    def holds(self, points_lps: Float) -> Bool:
         """Tell which points lie in a voxel of the structure."""
         return self._select(labels_at(self._tiles.lung, points_lps))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from lungaccess.checking.boxes import Boxes
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.shapes import STEP_MM

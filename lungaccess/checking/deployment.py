@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import structures
-from anatomy.grid import Float
+from anatomy.typed import Bool, Float, Labels
 from lungaccess.checking import shapes
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
 from lungaccess.checking.findings import Findings
@@ -118,9 +117,7 @@ def _check_sweep(plan: Plan, found: Findings) -> float:
     return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)
 
 
-def _check_exit(
-    plan: Plan, lung: Lung, curve: Curve, labels: NDArray[np.uint16], found: Findings
-) -> Exit | None:
+def _check_exit(plan: Plan, lung: Lung, curve: Curve, labels: Labels, found: Findings) -> Exit | None:
     """Derive the exit anew and compare it with what the plan states and exempts."""
     stated, exemption = plan.tube.exit, plan.exemption
     in_lumen = (labels & structures.LUMEN) != 0
@@ -152,9 +149,7 @@ def _check_exit(
     return Exit(frame=last, arc_mm=arc_mm, branch=exemption.branch)
 
 
-def _exit_step(
-    lung: Lung, curve: Curve, in_lumen: NDArray[np.bool_], stated_mm: float
-) -> tuple[int, float, float]:
+def _exit_step(lung: Lung, curve: Curve, in_lumen: Bool, stated_mm: float) -> tuple[int, float, float]:
     """Return the last frame in the lumen, and shares of the step behind it that are in the lumen and not.
 
     Of the exit and the voxel corners that are cut on the way to it, the one nearest to what is stated; a
@@ -206,9 +201,7 @@ def wall_angle_rad(lung: Lung, point_lps: Float, tangent: Float) -> float:
     return float(np.arcsin(np.clip(outwards @ tangent / size, -1.0, 1.0))) if size > 1e-9 else 0.0
 
 
-def _check_containment(
-    plan: Plan, curve: Curve, labels: NDArray[np.uint16], way_out: Exit, found: Findings
-) -> None:
+def _check_containment(plan: Plan, curve: Curve, labels: Labels, way_out: Exit, found: Findings) -> None:
     """Behind the exit the axis meets no lumen again, no vessel, no outside, no other branch."""
     behind = labels[way_out.frame + 1 :]
     beyond_zone = curve.arc_mm[way_out.frame + 1 :] > way_out.arc_mm + WALL_ZONE_MM

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy.errors import LungaccessError
-from anatomy.grid import Float
 from anatomy.settings import to_mapping
+from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.plans.plan import SCHEMA, Plan
 from lungaccess.problem.system import System, load_system, preset_names, system_fingerprint

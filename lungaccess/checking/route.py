@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy import structures
-from anatomy.grid import Float
+from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
 from lungaccess.checking.scene import AirwayAxis, Scene

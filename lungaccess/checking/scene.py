@@ -6,10 +6,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from anatomy.grid import Float
+from anatomy.typed import Float, Int
 from lungaccess.checking.boxes import Boxes
 from lungaccess.checking.space import Select
 from lungaccess.checking.tiles import Tiles
@@ -54,7 +53,7 @@ class AirwayAxis:
         child = np.flatnonzero(tree.parent_point >= 0)
         parent = tree.parent_point[child]
         self.tree = tree
-        self._ends: tuple[NDArray[np.int64], NDArray[np.int64]] = (parent, child)
+        self._ends: tuple[Int, Int] = (parent, child)
         self._begin = tree.points_lps[parent]
         self._step = tree.points_lps[child] - self._begin
         self._square = np.maximum((self._step**2).sum(axis=1), 1e-300)
@@ -62,7 +61,7 @@ class AirwayAxis:
         self._middles = cKDTree(self._begin + 0.5 * self._step)
         self._points = cKDTree(tree.points_lps)
 
-    def nearest_points(self, points_lps: Float, count: int) -> NDArray[np.int64]:
+    def nearest_points(self, points_lps: Float, count: int) -> Int:
         """Return the indices `(N, count)` of the nearest tree points, or as many as there are."""
         count = min(count, self.tree.n_points)
         found = self._points.query(points_lps, k=np.arange(1, count + 1))[1]

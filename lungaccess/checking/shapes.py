@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.tube.device import ConcentricTubes
 
 TINY_MM = 1e-9

@@ -6,14 +6,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import structures
-from anatomy.grid import Float, Grid
-
-Labels = NDArray[np.uint16]
-Bools = NDArray[np.bool_]
-Int = NDArray[np.int64]
+from anatomy.grid import Grid
+from anatomy.typed import Bool, Float, Int, Labels
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -37,7 +33,7 @@ class Select:
     but_branch: int | None = None
     complement: bool = False
 
-    def __call__(self, labels: Labels) -> Bools:
+    def __call__(self, labels: Labels) -> Bool:
         """Return which voxels are selected."""
         found = (labels & self.bits) != 0
         if self.but_branch is not None:

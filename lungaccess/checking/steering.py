@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy import structures
-from anatomy.grid import Float
+from anatomy.typed import Float
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import (
@@ -114,7 +114,7 @@ def _in_nodule(lung: Lung, points: Float) -> bool:
 
 def forbidden_bits(plan: Plan) -> int:
     """Return the structures that the needle must stay clear of."""
-    return structures.OBSTACLES | (structures.FISSURE if plan.fissures_are_obstacles else 0)
+    return structures.obstacle_bits(plan.fissures_are_obstacles)
 
 
 def _check_exemption(plan: Plan, found: Findings) -> None:

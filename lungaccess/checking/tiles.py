@@ -9,12 +9,11 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anatomy import structures
-from anatomy.grid import Float
-from lungaccess.checking.space import Bools, Int, Labels, Select, branch_of, window_of
+from anatomy.typed import Bool, Float, Int, Labels
+from lungaccess.checking.space import Select, branch_of, window_of
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -138,7 +137,7 @@ def _keys(select: Select) -> list[int]:
     return [bit for bit in BITS if select.bits & bit]
 
 
-def _bodies(key: int, labels: Labels) -> NDArray[np.int64]:
+def _bodies(key: int, labels: Labels) -> Int:
     """Return 0 where the structure is not, else 1; of airways, the number of the branch plus 2."""
     if key == NOT_LUMEN:
         return np.asarray((labels & structures.LUMEN) == 0, dtype=np.int64)
@@ -146,7 +145,7 @@ def _bodies(key: int, labels: Labels) -> NDArray[np.int64]:
     return np.where(mask, branch_of(labels) + 2, 0) if key == structures.AIRWAY else mask.astype(np.int64)
 
 
-def on_surface(body: NDArray[np.int64]) -> Bools:
+def on_surface(body: Int) -> Bool:
     """Tell which inner voxels have a face neighbour of another body, and are not 0 themselves.
 
     The voxel nearest to a point outside of a body is one of these.

@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from lungaccess.problem.system import System
 from stages.needle import StartIndex
 from stages.scope import Sites, find_sites

@@ -7,10 +7,10 @@ import time
 from dataclasses import dataclass
 
 from anatomy.errors import SettingsError, TargetError
-from anatomy.grid import Float
 from anatomy.kernels.field import exact_distance
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT
+from anatomy.typed import Float
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import PLANNERS, ArcPath, NeedleSpace, Objective, Query, Search, needle_space

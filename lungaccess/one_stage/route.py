@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.errors import FileError, SettingsError
-from anatomy.grid import Float
 from anatomy.io.frames import Frame
+from anatomy.typed import Float
 
 if TYPE_CHECKING:
     from stages.scope.route import Centreline, Route

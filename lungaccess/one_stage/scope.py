@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from anatomy.grid import Float
 from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from lungaccess.problem.system import System
 from stages.scope.advisor import (
     Advisor,

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.errors import FileError, TargetError
-from anatomy.grid import Float
 from anatomy.io.files import read_text
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from stages.scope.tour import (
     MOST_COMBINATIONS,
     MOST_LESIONS,

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import BITS
+from anatomy.typed import Float
 from lungaccess.plans import costs
 from lungaccess.plans.plan import (
     Exemption,

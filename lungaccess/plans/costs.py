@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.lung import Lung
-from anatomy.structures import FISSURE, OBSTACLES
+from anatomy.structures import obstacle_bits
+from anatomy.typed import Float
 from lungaccess.problem.suggestion import did_you_mean
 from stages.needle import ArcPath, SpaceArrays, costs
 
@@ -53,5 +53,5 @@ def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> 
 
 def _obstacles(lung: Lung, with_fissures: bool) -> SpaceArrays:
     """Return the arrays of a lung as a `NeedleSpace` holds them."""
-    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    bits = obstacle_bits(with_fissures)
     return lung.obstacle_field(with_fissures=with_fissures).corners, lung.labels, lung.geometry, bits

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float
 from lungaccess.checking import shapes
 from lungaccess.plans.plan import Plan
 

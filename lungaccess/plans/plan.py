@@ -9,13 +9,11 @@ from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import PlanFileError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Array, Float, Int
 from lungaccess.problem.system import System
-
-Int = NDArray[np.int64]
 
 SCHEMA = "lungaccess-plan-1"
 """Name and version of the file format; a reader refuses any other."""
@@ -40,9 +38,9 @@ class _Record:
             object.__setattr__(self, item.name, value)
 
 
-def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: str) -> NDArray[Any]:
+def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: str) -> Array:
     try:
-        array: NDArray[Any] = np.array(value, dtype=dtype)
+        array: Array = np.array(value, dtype=dtype)
     except (TypeError, ValueError) as error:
         raise PlanFileError(f"{name} of a plan is not an array of numbers ({error})") from error
     if array.ndim == 1 and array.size == 0:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.errors import TargetError
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+from anatomy.typed import Float
 
 PLEURA_MM = (5.0, 25.0)
 CLEAR_MM = 3.0

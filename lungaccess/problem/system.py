@@ -16,9 +16,9 @@ from anatomy.errors import FileError, SettingsError
 from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, settings, switch, text, to_mapping
 from lungaccess.problem.suggestion import did_you_mean
-from stages.needle import Needle
-from stages.scope import Bronchoscope
-from stages.tube import ConcentricTubes
+from stages.needle.device import Needle
+from stages.scope.device import Bronchoscope
+from stages.tube.device import ConcentricTubes
 
 _PRESETS = "presets"
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import TargetError
-from anatomy.grid import Float, Volume, read_only
+from anatomy.grid import Volume, read_only
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
+from anatomy.typed import Float, Int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,7 +92,7 @@ def nodule_target(lung: Lung, number: int) -> Target:
     return Target(lps_mm=read_only(point), origin=f"nodule {number}")
 
 
-def _nodule_voxels(nodules: Volume, number: int) -> NDArray[np.int64]:
+def _nodule_voxels(nodules: Volume, number: int) -> Int:
     from scipy import ndimage
 
     voxels = np.argwhere(nodules.array)

@@ -9,20 +9,20 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, Grid
+from anatomy.grid import Grid
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
-from anatomy.structures import FISSURE, OBSTACLES
+from anatomy.structures import obstacle_bits
+from anatomy.typed import Float, Float32, Int, Mask, UInt64
 from stages.needle import Reached, ReachScan
 
 THREADS = 2
 
 
-def counted_voxels(lung: Lung, grid: Grid, with_fissures: bool) -> NDArray[np.bool_]:
+def counted_voxels(lung: Lung, grid: Grid, with_fissures: bool) -> Mask:
     """Tell which voxels of a map have their centre in lung tissue that is no obstacle."""
-    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    bits = obstacle_bits(with_fissures)
     counted = np.zeros(grid.shape, dtype=bool, order="F")
     for k in range(grid.shape[2]):
         ijk = np.floor(lung.grid.ijk(_layer_points(grid, k)) + 0.5).astype(np.int64)
@@ -43,10 +43,10 @@ def _layer_points(grid: Grid, k: int) -> Float:
 def scan_layers(
     scan: ReachScan,
     grid: Grid,
-    counted: NDArray[np.bool_],
+    counted: Mask,
     store: LayerStore | None,
     progress: Callable[[float], None] | None,
-) -> tuple[NDArray[np.float32], int]:
+) -> tuple[Float32, int]:
     """Try the points of all layers.
 
     Parameters
@@ -96,12 +96,12 @@ def scan_layers(
     return found, resumed
 
 
-def _seeds(grid: Grid, ijk: NDArray[np.int64]) -> NDArray[np.uint64]:
+def _seeds(grid: Grid, ijk: Int) -> UInt64:
     """Return a seed for each voxel: its number in the grid."""
     return np.asarray(np.ravel_multi_index(tuple(ijk.T), grid.shape), dtype=np.uint64)
 
 
-def _earlier_neighbours(counted: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _earlier_neighbours(counted: Mask) -> Int:
     """Return the indices `(N, 3)` of the neighbours before each True place of a layer, -1 for none."""
     index = np.full((counted.shape[0] + 1, counted.shape[1] + 2), -1, dtype=np.int64)
     index[1:, 1:-1][counted] = np.arange(np.count_nonzero(counted))
@@ -109,7 +109,7 @@ def _earlier_neighbours(counted: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.stack([index[i + 1, j], index[i, j + 1], index[i, j + 2]], axis=1)
 
 
-def _as_rows(reached: Reached) -> NDArray[np.float32]:
+def _as_rows(reached: Reached) -> Float32:
     return np.stack([reached.kinds, reached.cost, reached.clearance_mm]).astype(np.float32)
 
 
@@ -128,7 +128,7 @@ class LayerStore:
     def _path(self, layer: int) -> Path:
         return self._folder / f"layer-{layer:04d}.npz"
 
-    def load(self, layer: int, count: int) -> NDArray[np.float32] | None:
+    def load(self, layer: int, count: int) -> Float32 | None:
         """Return the rows `(3, count)` of a layer, None if it is not there or not whole."""
         try:
             with np.load(self._path(layer)) as stored:
@@ -137,7 +137,7 @@ class LayerStore:
             return None
         return rows if rows.shape == (3, count) else None
 
-    def save(self, layer: int, rows: NDArray[np.float32]) -> None:
+    def save(self, layer: int, rows: Float32) -> None:
         """Write a layer, whole or not at all."""
         with atomic_write(self._path(layer)) as temporary:
             np.savez_compressed(temporary, rows=rows)

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io.files import require_writable_folder
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
+from anatomy.typed import Bool
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.reachability.layers import LayerStore, counted_voxels, scan_layers
@@ -113,7 +113,7 @@ class ReachMap:
         return self._reach("total", self.kinds.array != NOT_COUNTED)
 
     @property
-    def reached(self) -> NDArray[np.bool_]:
+    def reached(self) -> Bool:
         """The voxels that are reached by an arc or a search."""
         return np.isin(self.kinds.array, (DIRECT, SEARCHED))
 
@@ -130,7 +130,7 @@ class ReachMap:
         gained = np.count_nonzero(self.reached & ~other.reached)
         return gained * ml, np.count_nonzero(other.reached & ~self.reached) * ml
 
-    def _reach(self, name: str, where: NDArray[np.bool_]) -> RegionReach:
+    def _reach(self, name: str, where: Bool) -> RegionReach:
         kinds = self.kinds.array[where]
         counts = np.array([np.count_nonzero(kinds == code) for code in KINDS.values()])
         reached = where & self.reached

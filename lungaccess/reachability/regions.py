@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES
+from anatomy.typed import Float, Mask
 
 RIGHT, LEFT = 1, 2
 NAMES: Mapping[int, str] = MappingProxyType({RIGHT: "right lung", LEFT: "left lung"})
@@ -38,7 +38,7 @@ class Regions:
     told_apart: bool
 
 
-def lung_regions(lung: Lung, grid: Grid, where: NDArray[np.bool_]) -> Regions:
+def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     """Return the side of the voxels of a grid.
 
     The lungs are the two largest parts of the free tissue between which no face is shared; smaller parts
@@ -76,5 +76,5 @@ def lung_regions(lung: Lung, grid: Grid, where: NDArray[np.bool_]) -> Regions:
     return Regions(volume=Volume(grid=grid, array=array), names=NAMES, told_apart=told_apart)
 
 
-def _mean_x(points: NDArray[np.float64]) -> float:
+def _mean_x(points: Float) -> float:
     return float(points[:, 0].mean()) if len(points) else 0.0

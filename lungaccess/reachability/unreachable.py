@@ -7,16 +7,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import TargetError
 from anatomy.fields import distance_corners
-from anatomy.grid import Float
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
-from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
+from anatomy.typed import Float, Int32, Mask
 from lungaccess.problem.system import System
 from lungaccess.reachability.kernels.deployment_boxes import BOX_COLUMNS, FIRST_KNOT, LAST_KNOT
 from lungaccess.reachability.kernels.unreachable import (
@@ -31,8 +30,6 @@ from stages.needle.kernels import GOAL_TOLERANCE, REQUIRED
 from stages.scope import LEAVING_MM, MAX_TURN_AT_TIP_RAD, find_sites
 from stages.tube import tube_constants
 from stages.tube.kernels import MAX_EXTENSION
-
-Mask = NDArray[np.bool_]
 
 KNOT_MM = 0.5
 """Greatest distance of knots on the medial axis."""
@@ -193,7 +190,7 @@ def _may_be_left(lung: Lung) -> Mask:
     return np.asarray(inside & ~lung.tree.mediastinal[np.maximum(branch, 0)])
 
 
-def _free_regions(lung: Lung, required_mm: float, loss_mm: float, with_fissures: bool) -> NDArray[np.int32]:
+def _free_regions(lung: Lung, required_mm: float, loss_mm: float, with_fissures: bool) -> Int32:
     """Return the number of the region, joined by faces, edges and corners, where a needle may be; 0 for none.
 
     A voxel is left out only if the clearance is less than required everywhere in it.
@@ -202,7 +199,7 @@ def _free_regions(lung: Lung, required_mm: float, loss_mm: float, with_fissures:
 
     corners = lung.obstacle_field(with_fissures=with_fissures).corners
     greatest = ndimage.maximum_filter(corners, size=2, origin=-1)[:-1, :-1, :-1]
-    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    bits = obstacle_bits(with_fissures)
     free = (greatest / UNITS_PER_MM + loss_mm >= required_mm) & ((lung.labels & bits) == 0)
     labels, _ = ndimage.label(free, structure=np.ones((3, 3, 3)))
     return np.asarray(labels, dtype=np.int32)

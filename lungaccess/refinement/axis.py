@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Float
+from anatomy.typed import Float
 from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM
 from stages.scope import ScopeTip, Sites, looks_ahead, tip_at
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.fields import corner_geometry, distance_corners
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN
+from anatomy.typed import Array, Float, Int
 
 BOX_VALUES = (100_000, 100_000, 40_000, 20_000, 100_000)
 """Most values of the boxes, in this order: clearance, spared, wall, lumen, map.  From a finer lattice every
@@ -35,7 +35,7 @@ class FieldBox:
     """
 
     values: Float
-    shape: NDArray[np.int64]
+    shape: Int
     lattice_from_lps: Float
 
 
@@ -117,9 +117,7 @@ def _centres(grid: Grid) -> Float:
     return geometry
 
 
-def _range(
-    geometry: Float, shape: tuple[int, ...], points: Float, margin_mm: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _range(geometry: Float, shape: tuple[int, ...], points: Float, margin_mm: float) -> tuple[Int, Int]:
     """Return the first index and the one behind the last of a lattice around points."""
     lattice = points @ geometry[:, :3].T + geometry[:, 3]
     margin = margin_mm / np.sqrt(geometry[:, 4])
@@ -129,9 +127,7 @@ def _range(
     return np.clip(low, 0, size - FEWEST), np.clip(high, FEWEST, size)
 
 
-def _cut_box(
-    kind: int, values: NDArray[np.generic], geometry: Float, low: NDArray[np.int64], unit: float
-) -> FieldBox:
+def _cut_box(kind: int, values: Array, geometry: Float, low: Int, unit: float) -> FieldBox:
     """Return the box of values that were cut out from index `low` on."""
     moved = geometry.copy()
     moved[:, 3] -= low
@@ -140,10 +136,10 @@ def _cut_box(
 
 def _box(
     kind: int,
-    values: NDArray[np.generic],
+    values: Array,
     geometry: Float,
-    low: NDArray[np.int64],
-    high: NDArray[np.int64],
+    low: Int,
+    high: Int,
     unit: float,
 ) -> FieldBox:
     """Return the values between two indices, thinned out until they are few enough."""

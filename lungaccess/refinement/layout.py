@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 
 AXIS_DEGREE = 5
 """The airway's axis near the site is a polynomial of this degree ..."""

@@ -10,8 +10,8 @@ import numpy as np
 from scipy import ndimage
 
 from anatomy import poses
-from anatomy.grid import Float
-from anatomy.structures import FISSURE, OBSTACLES
+from anatomy.structures import obstacle_bits
+from anatomy.typed import Float
 from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.plans.costs import path_cost
 from lungaccess.refinement import boxes as fields
@@ -227,7 +227,7 @@ class Problem:
     def _cut_boxes(self) -> tuple[fields.FieldBox, ...]:
         lung, fissures = self.task.lung, self.task.with_fissures
         deployment, margin = self._candidate.deployment, self.task.system.margins.total_mm
-        bits = OBSTACLES | (FISSURE if fissures else 0)
+        bits = obstacle_bits(fissures)
         leaves = deployment.exit_mm
         outside = self._tube_points(np.linspace(leaves, deployment.inner_mm, 12))
         inside = self._tube_points(np.linspace(max(leaves - WALL_WAY_MM, 0.0), leaves, 6))

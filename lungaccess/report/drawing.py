@@ -8,13 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Polygon
 from matplotlib.ticker import Formatter
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import style
 from lungaccess.report.layers import Footprint, Layers
 from lungaccess.report.views import View
-
-Float = NDArray[np.float64]
 
 BAR_LENGTHS_MM = (1, 2, 5, 10, 20, 50, 100)
 

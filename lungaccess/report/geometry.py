@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from anatomy.typed import Float
 
 if TYPE_CHECKING:
     from lungaccess.plans.plan import NeedlePath, Plan, TubeDeployment
     from stages.tube import ConcentricTubes
 
-Float = NDArray[np.float64]
 
 STEP_MM = 0.25
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anatomy.typed import Array, Bool, Float
 from lungaccess.report.views import View
 
 if TYPE_CHECKING:
     from anatomy.grid import Grid, Volume
     from anatomy.lung import Lung
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 LUNG_POINTS = 3_000_000
 
@@ -41,14 +39,14 @@ class Layers:
     def __init__(self, lung: Lung) -> None:
         self._lung = lung
         self._points: dict[str, tuple[Float, int]] = {}
-        self._masks: dict[str, NDArray[Any] | None] = {}
+        self._masks: dict[str, Array | None] = {}
 
     @property
     def grid(self) -> Grid:
         """The grid of all masks."""
         return self._lung.grid
 
-    def mask(self, name: str) -> NDArray[Any] | None:
+    def mask(self, name: str) -> Array | None:
         """Return a bool mask `[i, j, k]`, or None where the patient has none.
 
         `name` is one of `Lung.mask`, or "lung" for what is not outside.
@@ -57,7 +55,7 @@ class Layers:
             self._masks[name] = self._fetch(name)
         return self._masks[name]
 
-    def _fetch(self, name: str) -> NDArray[Any] | None:
+    def _fetch(self, name: str) -> Array | None:
         lung = self._lung
         if name == "fissure" and not lung.has_fissures:
             return None
@@ -110,11 +108,11 @@ class Layers:
         return found
 
 
-def _array(volume: Volume | None) -> NDArray[Any] | None:
+def _array(volume: Volume | None) -> Array | None:
     return None if volume is None else volume.array
 
 
-def _unfold(mask: NDArray[Any], grid: Grid) -> tuple[Float, int]:
+def _unfold(mask: Array, grid: Grid) -> tuple[Float, int]:
     """List the voxel centres of a mask, thinned out evenly where there are very many."""
     stride = max(1, int(np.ceil((np.count_nonzero(mask) / LUNG_POINTS) ** (1 / 3))))
     thin = mask[::stride, ::stride, ::stride]

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import drawing, panels, style, zoom
 from lungaccess.report.geometry import needle_polyline, tube_centreline
 from lungaccess.report.layers import Layers
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans.plan import Plan
 
-Float = NDArray[np.float64]
 
 WIDTH_IN, HEIGHT_IN = 18.0, 11.6
 # left, bottom, width, height of each panel, inches

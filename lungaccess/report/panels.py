@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.geometry import needle_polyline, tube_centreline
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans.plan import Plan
 
-Float = NDArray[np.float64]
 
 CURVES = {
     "airway": ("airway wall", "#2F7FB5", "-"),

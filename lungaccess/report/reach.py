@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import STANDARD, View
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.reachability.reach_map import ReachMap
 
-Float = NDArray[np.float64]
 
 WIDTH_IN, HEIGHT_IN = 18.0, 11.0
 LEFTS_IN, WIDTHS_IN = (0.55, 5.55, 10.55), (4.5, 4.5, 3.4)

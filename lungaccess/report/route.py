@@ -11,15 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.views import CORONAL, SAGITTAL, View
 
 if TYPE_CHECKING:
     from stages.scope.route import Centreline, Route
 
-Float = NDArray[np.float64]
 
 WIDTH_IN, HEIGHT_IN = 15.0, 9.0
 VIEWS_IN = ((0.5, 3.6, 6.9, 4.7), (7.9, 3.6, 6.6, 4.7))

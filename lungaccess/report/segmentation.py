@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.segmentation.steps import Parts
+from anatomy.typed import Array, Float, Int, Mask
 from lungaccess.report import style
 
 SLICES = 5
@@ -60,7 +60,7 @@ def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> 
     return style.save_png(figure, path)
 
 
-def _box(mask: NDArray[np.bool_], grid: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _box(mask: Mask, grid: Grid) -> tuple[Int, Int]:
     """Return `low` and `high` of the voxels around a mask, a little wider."""
     low, high = [], []
     for axis in range(3):
@@ -75,7 +75,7 @@ def _panel(
     axes: Axes,
     ct: Volume,
     parts: Parts,
-    box: tuple[NDArray[np.int64], NDArray[np.int64]],
+    box: tuple[Int, Int],
     through: int,
     level: int,
     shown: tuple[int, int],
@@ -84,10 +84,10 @@ def _panel(
     """Draw one slice; `shown` are the voxel axes across and up, `downwards` if LPS grows down the page."""
     extent = _extent(ct.grid, box, shown)
 
-    def cut(array: NDArray[Any]) -> NDArray[Any]:
+    def cut(array: Array) -> Array:
         window: list[Any] = [slice(int(a), int(b)) for a, b in zip(*box, strict=True)]
         window[through] = level
-        plane: NDArray[Any] = array[tuple(window)]
+        plane: Array = array[tuple(window)]
         return plane.T if shown[0] < shown[1] else plane
 
     axes.imshow(
@@ -113,9 +113,7 @@ def _panel(
     axes.set_axis_off()
 
 
-def _extent(
-    grid: Grid, box: tuple[NDArray[np.int64], NDArray[np.int64]], shown: tuple[int, int]
-) -> tuple[float, float, float, float]:
+def _extent(grid: Grid, box: tuple[Int, Int], shown: tuple[int, int]) -> tuple[float, float, float, float]:
     """Return left, right, bottom and top in LPS mm: reversed where voxels run against LPS."""
     first, last = grid.lps(box[0] - 0.5), grid.lps(box[1] - 0.5)
     ends: list[float] = []
@@ -125,7 +123,7 @@ def _extent(
     return ends[0], ends[1], ends[2], ends[3]
 
 
-def _fill(axes: Axes, plane: NDArray[np.bool_], colour: str, alpha: float, extent: Any) -> None:
+def _fill(axes: Axes, plane: Mask, colour: str, alpha: float, extent: Any) -> None:
     if not plane.any():
         return
     rgba: Float = np.zeros((*plane.shape, 4))

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from lungaccess.report import drawing, style
 from lungaccess.report.layers import Layers
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from lungaccess.one_stage.tour import TourAnswer
     from stages.scope.tour import Itinerary
 
-Float = NDArray[np.float64]
 
 WIDTH_IN, HEIGHT_IN = 15.0, 7.6
 PANELS_IN = ((0.5, 0.9, 6.9, 5.8), (7.9, 0.9, 6.6, 5.8))

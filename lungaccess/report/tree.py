@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import STANDARD, View
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
     from anatomy.lung import Lung
 
-Float = NDArray[np.float64]
 
 WIDTH_IN, HEIGHT_IN = 17.0, 6.6
 PANELS_IN = ((0.55, 0.6, 5.4, 5.3), (6.5, 0.6, 5.4, 5.3), (12.4, 0.6, 3.6, 5.3))

@@ -12,14 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Rectangle
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import drawing, style
 
 if TYPE_CHECKING:
     from stages.tube import DeployedSequence, Equilibrium, Tube
 
-Float = NDArray[np.float64]
 
 WIDTH_IN, HEIGHT_IN = 15.6, 8.3
 SIDE_IN, FRONT_IN, KEY_IN = (0.75, 4.3, 7.0, 3.2), (0.75, 0.65, 3.1, 2.8), (4.35, 0.65, 3.4, 2.8)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from anatomy.typed import Float
 
 LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from numpy.typing import NDArray
 
+from anatomy.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.geometry import needle_polyline, tube_centreline
 from lungaccess.report.layers import Layers
@@ -17,7 +17,6 @@ from lungaccess.report.views import View, plane_view
 if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
 
-Float = NDArray[np.float64]
 
 PIXELS = 520
 SLAB_MM = (-2.0, -1.0, 1.0, 2.0)

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import PlanFileError, SettingsError
-from anatomy.grid import Float
 from anatomy.lung import Lung
-from anatomy.structures import AIRWAY, FISSURE, OBSTACLES, OUTSIDE, VESSEL
+from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
+from anatomy.typed import Bool, Float, Int
 from experiments.support.insertion.repeated import wilson_interval
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.errors import (
@@ -80,7 +79,7 @@ class Outcomes:
         Distance of the needle's tip from the deviated target.
     """
 
-    touched: NDArray[np.int64]
+    touched: Int
     miss_mm: Float
 
 
@@ -160,7 +159,7 @@ class RiskAssessor:
         self.radius_mm, self.radius_origin = (
             goal_radius(lung, plan) if radius_mm is None else (float(radius_mm), "given")
         )
-        bits = OBSTACLES | (FISSURE if lung.has_fissures else 0)
+        bits = obstacle_bits(lung.has_fissures)
         field = lung.obstacle_field(with_fissures=True)
         self._scene = (field.corners, lung.labels, field.geometry, bits)
         self._depth = (lung.lumen_depth.corners, lung.lumen_depth.geometry)
@@ -191,7 +190,7 @@ class RiskAssessor:
         targets = self.plan.target_lps + deviations.target_mm
         return Outcomes(touched=touched, miss_mm=np.linalg.norm(ends - targets, axis=1))
 
-    def succeeded(self, outcomes: Outcomes) -> NDArray[np.bool_]:
+    def succeeded(self, outcomes: Outcomes) -> Bool:
         """Tell which `(N,)` end within the radius, leave the airway and touch nothing forbidden."""
         return np.asarray(
             (outcomes.miss_mm <= self.radius_mm) & ((outcomes.touched & self._forbidden_flags) == 0)
@@ -228,7 +227,7 @@ class RiskAssessor:
         )
 
 
-def _share(hits: NDArray[np.bool_]) -> Share:
+def _share(hits: Bool) -> Share:
     return Share(count=int(np.count_nonzero(hits)), samples=len(hits))
 
 

@@ -12,10 +12,10 @@ from typing import Annotated
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.io.files import read_text
 from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, quantity, settings
+from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel
 from stages.tube import tube_constants

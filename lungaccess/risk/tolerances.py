@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessment import RiskAssessor, Share
 from lungaccess.risk.errors import (

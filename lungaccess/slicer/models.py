@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from anatomy.errors import FileError
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
 from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, smooth_surface
+from anatomy.typed import Float
 from lungaccess.plans.curves import Course
 
 MOST_TRIANGLES = 150_000

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Volume
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
+from anatomy.typed import Mask, UInt8
 
 _LIST = "Segmentation category and type - 3D Slicer General Anatomy list"
 _STRUCTURE = "SCT^123037004^Anatomical Structure"
@@ -79,7 +79,7 @@ def write_segmentation(path: str | Path, lung: Lung) -> tuple[Segment, ...]:
     return present
 
 
-def _header(labels: NDArray[np.uint8], segments: tuple[Segment, ...]) -> Mapping[str, str]:
+def _header(labels: UInt8, segments: tuple[Segment, ...]) -> Mapping[str, str]:
     """Return the keys from which 3D Slicer restores the segments."""
     header = {
         "Segmentation_ContainedRepresentationNames": "Binary labelmap|",
@@ -102,7 +102,7 @@ def _header(labels: NDArray[np.uint8], segments: tuple[Segment, ...]) -> Mapping
     return header
 
 
-def _extent(mask: NDArray[np.bool_]) -> list[int]:
+def _extent(mask: Mask) -> list[int]:
     """Return the first and last index of a mask along i, j and k."""
     bounds = []
     for axis in range(3):

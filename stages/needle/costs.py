@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.fields import corner_geometry
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.kernels import field as field_kernel
+from anatomy.typed import Float, Int
 from stages.needle.kernels import cost as kernel
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, _kernel_arcs
@@ -57,7 +57,7 @@ def inverse_clearance(arrays: SpaceArrays, path: ArcPath) -> float:
     return float(np.trapezoid(1.0 / clearance, lengths))
 
 
-def voxels_crossed(grid: Grid, path: ArcPath) -> NDArray[np.int64]:
+def voxels_crossed(grid: Grid, path: ArcPath) -> Int:
     """Return the indices `(V, 3)` of the voxels that a path crosses, each once, the first index slowest.
 
     They are those that hold more than 1e-9 mm of an arc, or an end of one.  What lies beyond the grid is
@@ -125,7 +125,7 @@ def objective_cost(space: NeedleSpace, objective: Objective, path: ArcPath) -> f
     return total
 
 
-def _crossings(grid: Grid, path: ArcPath) -> tuple[NDArray[np.int64], Float]:
+def _crossings(grid: Grid, path: ArcPath) -> tuple[Int, Float]:
     """Return the voxels of all arcs one after the other, and the length in each, see the kernel."""
     geometry = corner_geometry(grid)
     found = [
@@ -135,7 +135,7 @@ def _crossings(grid: Grid, path: ArcPath) -> tuple[NDArray[np.int64], Float]:
     return np.concatenate([voxels for voxels, _ in found]), np.concatenate([lengths for _, lengths in found])
 
 
-def _costs_of(cost_map: Volume, voxels: NDArray[np.int64]) -> Float:
+def _costs_of(cost_map: Volume, voxels: Int) -> Float:
     """Return the costs of voxels by their numbers, infinite beyond the grid."""
     inside = voxels != kernel.OFF_GRID
     costs = np.full(len(voxels), math.inf)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float, Float32
 from stages.needle.kernels import cost as index
 
-ObjectiveArrays = tuple[Float, NDArray[np.float32]]
+ObjectiveArrays = tuple[Float, Float32]
 
 MAX_CLEARANCE_MM = 256.0
 """No clearance field holds more, so that 1 / clearance has a least value."""
@@ -66,7 +66,7 @@ class Objective:
         """Whether it weighs nothing but length."""
         return self.inverse_clearance == 0.0 and not self.weighs_map
 
-    def arrays(self, cost_map: NDArray[np.float32] | None) -> ObjectiveArrays:
+    def arrays(self, cost_map: Float32 | None) -> ObjectiveArrays:
         """Return the weights and the map for the kernels, see `stages.needle.kernels.cost`.
 
         The least cost of a mm is a proved lower bound.  The voxel sum adds nothing to it: however small the

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
 from anatomy.kernels import arcs as arc_kernels
+from anatomy.typed import Float, Int
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import least_cosine
@@ -116,7 +117,7 @@ def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
     )
 
 
-def path_from_tree(lps_from_start: Float, nodes: Float, parents: NDArray[np.int64], last: int) -> ArcPath:
+def path_from_tree(lps_from_start: Float, nodes: Float, parents: Int, last: int) -> ArcPath:
     """Return the path from the root of a search tree to its node `last`.
 
     Parameters

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
+from anatomy.typed import Float, Int, UInt8, UInt64
 from stages.needle.kernels import reach as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
@@ -40,10 +40,10 @@ class Reached:
         Its start pose; -1 where there is none.
     """
 
-    kinds: NDArray[np.uint8]
+    kinds: UInt8
     cost: Float
     clearance_mm: Float
-    entries: NDArray[np.int64]
+    entries: Int
 
 
 class ReachScan:
@@ -95,9 +95,7 @@ class ReachScan:
         self._mixed = np.ascontiguousarray(self._starts[self._order].T)
         self._objective = space.objective_arrays(Objective(length=0.0, inverse_clearance=1.0))
 
-    def reach(
-        self, points: ArrayLike, seeds: NDArray[np.uint64], near: NDArray[np.int64] | None = None
-    ) -> Reached:
+    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
         """Try all points, one after the other.
 
         Parameters

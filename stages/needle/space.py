@@ -6,20 +6,21 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.fields import CENTRES, SOLID, DistanceField, distance_field
-from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
-from anatomy.structures import FISSURE, OBSTACLES
+from anatomy.structures import OBSTACLES, obstacle_bits
+from anatomy.typed import Float, Int, Labels
 from stages.needle.device import Needle
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import scan
 from stages.needle.objective import Objective, ObjectiveArrays
 
-SpaceArrays = tuple[NDArray[np.uint16], NDArray[np.uint16], Float, int]
+SpaceArrays = tuple[Labels, Labels, Float, int]
 
 RRT_STEP_MM = 20.0
 COST_STEP_MM = 0.5
@@ -82,13 +83,13 @@ def needle_space(
         How far from the target a path may end.
     """
     clearance = lung.obstacle_field(with_fissures=with_fissures)
-    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    bits = obstacle_bits(with_fissures)
     required = needle.radius_mm + margins.total_mm
     return _space(lung.grid, needle, required, clearance, lung.labels, bits, lung.cost, goal_tolerance_mm)
 
 
 def space_of_labels(
-    labels: NDArray[np.uint16],
+    labels: Labels,
     grid: Grid,
     needle: Needle,
     *,
@@ -144,7 +145,7 @@ def _space(
     needle: Needle,
     required_mm: float,
     clearance: DistanceField,
-    labels: NDArray[np.uint16],
+    labels: Labels,
     bits: int,
     cost_map: Volume | None,
     goal_tolerance_mm: float,
@@ -201,9 +202,9 @@ def direct_arcs(
     space: NeedleSpace,
     positions: ArrayLike,
     tangents: ArrayLike,
-    branches: NDArray[np.int64],
+    branches: Int,
     target: ArrayLike,
-) -> tuple[NDArray[np.int64], Float, Float]:
+) -> tuple[Int, Float, Float]:
     """Try the single arc to a target from each start pose.
 
     Parameters

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from anatomy.grid import Float
+from anatomy.typed import Float, Int
 from stages.needle.kernels import start_index as kernel
 from stages.needle.space import NeedleSpace
 
@@ -32,7 +32,7 @@ class StartIndex:
         keys = _keys(places, directions)
         order = np.argsort(keys, kind="stable")
         changes = np.flatnonzero(np.diff(keys[order])) + 1
-        self._order: NDArray[np.int64] = order
+        self._order: Int = order
         self._begins = np.concatenate([[0], changes, [len(keys)]]).astype(np.int64)
         self._positions = np.ascontiguousarray(places[order])
         self._tangents = np.ascontiguousarray(directions[order])
@@ -47,7 +47,7 @@ class StartIndex:
         """Number of poses, E."""
         return len(self._order)
 
-    def holding(self, space: NeedleSpace, target: ArrayLike) -> tuple[NDArray[np.int64], Float]:
+    def holding(self, space: NeedleSpace, target: ArrayLike) -> tuple[Int, Float]:
         """Return the poses with a target in their workspace, the nearest first, and path lengths in mm.
 
         The same as finite entries of `stages.needle.space.workspace_lengths`; poses at the same length
@@ -76,7 +76,7 @@ class StartIndex:
         return found[:count][nearest], lengths[:count][nearest]
 
 
-def _keys(positions: Float, directions: Float) -> NDArray[np.int64]:
+def _keys(positions: Float, directions: Float) -> Int:
     """Return the number of each pose's cell, in place and on the cube of directions."""
     cell = np.floor((positions - positions.min(axis=0, initial=0.0)) / CELL_MM).astype(np.int64)
     key = np.zeros(len(cell), dtype=np.int64)

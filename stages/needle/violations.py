@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.structures import BITS
+from anatomy.typed import Float
 from stages.needle.kernels.connections import least_cosine
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.path import ArcPath, bend_direction

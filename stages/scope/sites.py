@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE
+from anatomy.typed import Bool, Float, Int, Labels
 from stages.scope.device import Bronchoscope
 from stages.scope.tips import (
     ScopeTip,
@@ -21,9 +20,6 @@ from stages.scope.tips import (
     tip_at,
     turned_aside,
 )
-
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 WALL_PROBE_MM = 2.5
 PROBE_DIRECTIONS = 8
@@ -228,7 +224,7 @@ def _in_lung_tissue(lung: Lung) -> Bool:
     return ~nowhere
 
 
-def _labels_at(lung: Lung, points: Float) -> NDArray[np.uint16]:
+def _labels_at(lung: Lung, points: Float) -> Labels:
     ijk = np.floor(lung.grid.ijk(points) + 0.5).astype(np.int64)
     inside = ((ijk >= 0) & (ijk < lung.grid.shape)).all(axis=1)
     labels = np.full(len(points), OUTSIDE, dtype=np.uint16)

@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Float
+from anatomy.typed import Bool, Float
 
 TURN_CHORD_MM = 2.0
 MAX_TURN_AT_TIP_RAD = math.radians(45.0)
@@ -170,7 +169,7 @@ class MedialAxis:
         Tree points that may be a site; a segment belongs to its distal point.
     """
 
-    def __init__(self, tree: AirwayTree, allowed: NDArray[np.bool_]) -> None:
+    def __init__(self, tree: AirwayTree, allowed: Bool) -> None:
         self._tree = tree
         self._points = np.flatnonzero(allowed & (tree.parent_point >= 0))
         lengths = [step_length_mm(tree, int(point)) for point in self._points]

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float
 from stages.tube.device import Tube
 from stages.tube.errors import ConvergenceError
 

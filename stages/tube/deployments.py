@@ -9,21 +9,19 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
-from anatomy.structures import FISSURE, OBSTACLES
+from anatomy.structures import obstacle_bits
+from anatomy.typed import Bool, Float, Int, UInt16
 from stages.tube.device import ConcentricTubes
 from stages.tube.kernels import deployment as kernels
 
-Int = NDArray[np.int64]
-Scene = tuple[
-    NDArray[np.uint16], NDArray[np.uint16], Float, int, NDArray[np.uint16], Float, NDArray[np.bool_]
-]
+Scene = tuple[UInt16, UInt16, Float, int, UInt16, Float, Bool]
 
 REASONS: dict[int, str] = {
     kernels.NO_EXIT: "the tube does not leave the airway",
@@ -118,7 +116,7 @@ class Deployment:
 def scene_of(lung: Lung, *, with_fissures: bool) -> Scene:
     """Gather the arrays that the tube kernels look at."""
     field = lung.obstacle_field(with_fissures=with_fissures)
-    bits = OBSTACLES | (FISSURE if with_fissures else 0)
+    bits = obstacle_bits(with_fissures)
     depth = lung.lumen_depth
     return (
         field.corners,

@@ -6,16 +6,14 @@ from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anatomy.errors import LungaccessError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float, Int
 from stages.tube.errors import ConvergenceError
 from stages.tube.mechanics import Equilibrium, TubeMechanics
 from stages.tube.sequences import Sequence, joint_steps
-
-Int = NDArray[np.int64]
 
 DEFAULT_STEP_MM = 1.0
 DEFAULT_STEP_RAD = 0.1

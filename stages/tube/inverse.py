@@ -12,7 +12,8 @@ from scipy.optimize import least_squares
 from scipy.stats import qmc
 
 from anatomy.errors import FrameError, SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float
 from stages.tube.mechanics import Equilibrium, TubeMechanics
 
 Match = Literal["position", "direction", "pose"]

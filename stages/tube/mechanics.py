@@ -14,11 +14,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Bool, Float
 from stages.tube.device import Tube
 from stages.tube.errors import ConvergenceError
 from stages.tube.kernels import all_equilibria, assembly, equilibrium, jacobian, pose, torsion
@@ -48,8 +49,8 @@ class Batch:
 
     tip_angles_rad: Float
     base_from_tip: Float
-    converged: NDArray[np.bool_]
-    stable: NDArray[np.bool_]
+    converged: Bool
+    stable: Bool
     least_determinant: Float
     residual_rad: Float
 
@@ -429,7 +430,7 @@ class Equilibrium:
             )
         return s
 
-    def _there(self, s: Float) -> NDArray[np.bool_]:
+    def _there(self, s: Float) -> Bool:
         ends = self.beta_mm + self.mechanics.lengths_mm
         return np.asarray((s[:, None] >= self.beta_mm - 1e-9) & (s[:, None] <= ends + 1e-9))
 

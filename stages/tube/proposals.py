@@ -11,20 +11,18 @@ from itertools import product
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.margins import Margins
 from anatomy.settings import quantity, settings
+from anatomy.typed import Float, Int
 from stages.tube.deployments import tube_constants
 from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.following import DEFAULT_STEP_MM, DEFAULT_STEP_RAD, DeployedSequence, SnapError, deploy
 from stages.tube.kernels import deployment as kernels
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.sequences import Sequence, alternating, inner_first, together
-
-Int = NDArray[np.int64]
 
 INCREMENTS_MM = (2.0, 5.0, 10.0)
 """Increments of the alternating sequences that are compared."""

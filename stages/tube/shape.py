@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.grid import Float
 from anatomy.margins import Margins
 from anatomy.poses import bending_directions
+from anatomy.typed import Float
 from stages.tube.deployments import tube_constants
 from stages.tube.device import ConcentricTubes
 from stages.tube.kernels import deployment as kernels

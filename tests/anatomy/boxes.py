@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anatomy.grid import Float, Grid
-
-Mask = NDArray[np.bool_]
+from anatomy.grid import Grid
+from anatomy.typed import Float, Mask
 
 
 def rotated_grid(shape: tuple[int, int, int], spacing_mm: Float, turn: Float, first_lps: Float) -> Grid:

@@ -9,7 +9,6 @@ from pathlib import Path
 import edt
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -19,6 +18,7 @@ from anatomy.phantom import LABELS, LOBES, Centerlines, Phantom, phantom, write_
 from anatomy.phantom.branching import Sprouts, centerlines
 from anatomy.phantom.growth import limit_turn, split_cloud
 from anatomy.tree import tree_from_mask
+from anatomy.typed import Float, Int16, UInt8
 
 FULL = np.ones((3, 3, 3))
 
@@ -38,22 +38,22 @@ def airway(small: Phantom) -> Centerlines:
     return small.centerlines["airway"]
 
 
-def _ends(lines: Centerlines) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ends(lines: Centerlines) -> tuple[Float, Float]:
     return lines.points_lps[lines.branch_start[:-1]], lines.points_lps[lines.branch_start[1:] - 1]
 
 
-def _directions(lines: Centerlines) -> NDArray[np.float64]:
+def _directions(lines: Centerlines) -> Float:
     start, end = _ends(lines)
     return np.asarray((end - start) / np.linalg.norm(end - start, axis=1, keepdims=True))
 
 
-def _turns_deg(lines: Centerlines) -> NDArray[np.float64]:
+def _turns_deg(lines: Centerlines) -> Float:
     heading = _directions(lines)
     cosine = (heading[1:] * heading[lines.branch_parent[1:]]).sum(axis=1)
     return np.asarray(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def _labels_at(patient: Phantom, points: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _labels_at(patient: Phantom, points: Float) -> UInt8:
     ijk = np.rint(patient.grid.ijk(points)).astype(int)
     inside = ((ijk >= 0) & (ijk < patient.grid.shape)).all(axis=1)
     return np.asarray(patient.labels.array[tuple(ijk[inside].T)])
@@ -296,7 +296,7 @@ def test_hounsfield_units_of_every_tissue(small: Phantom) -> None:
     ct = small.ct.array
     assert ct.dtype == np.int16
 
-    def core(*names: str, depth: int = 2) -> NDArray[np.int16]:
+    def core(*names: str, depth: int = 2) -> Int16:
         values = ct[ndimage.binary_erosion(small.mask(*names), FULL, iterations=depth)]
         assert len(values) > 20
         return np.asarray(values)

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from anatomy.grid import Float, Grid
+from anatomy.grid import Grid
 from anatomy.sides import septum
+from anatomy.typed import Float
 
 LEFT, RIGHT = (32.0, 0.0, 0.0), (-32.0, 0.0, 0.0)
 

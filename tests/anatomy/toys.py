@@ -7,10 +7,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
+from anatomy.typed import Array, Float, Mask
 from tests.anatomy.tubes import Y, distance_to_segment
 
 SPACING_MM = (2.0, 2.0, 2.0)
@@ -33,15 +33,15 @@ def grid() -> Grid:
     return _points()[0]
 
 
-def ball(centre: Any, radius_mm: float) -> NDArray[np.bool_]:
+def ball(centre: Any, radius_mm: float) -> Mask:
     return np.asarray(np.linalg.norm(_points()[1] - centre, axis=-1) <= radius_mm)
 
 
-def capsule(a: Any, b: Any, radius_mm: float) -> NDArray[np.bool_]:
+def capsule(a: Any, b: Any, radius_mm: float) -> Mask:
     return np.asarray(distance_to_segment(_points()[1], np.array(a), np.array(b)) <= radius_mm)
 
 
-def lungs() -> NDArray[np.bool_]:
+def lungs() -> Mask:
     """Two ellipsoids, 20 mm apart."""
     both = [
         (((_points()[1] - centre) / (30.0, 28.0, 44.0)) ** 2).sum(axis=-1) <= 1.0
@@ -50,7 +50,7 @@ def lungs() -> NDArray[np.bool_]:
     return np.asarray(both[0] | both[1])
 
 
-def volume(array: NDArray[Any]) -> Volume:
+def volume(array: Array) -> Volume:
     return Volume(grid=grid(), array=np.asfortranarray(array))
 
 

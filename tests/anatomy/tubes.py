@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume
+from anatomy.typed import Float
 
 Tube = tuple[ArrayLike, ArrayLike, float]
 """Both ends, LPS mm, and the radius."""
@@ -39,9 +40,7 @@ def tubes(parts: Iterable[Tube], spacing_mm: ArrayLike = (1.0, 1.0, 1.0), margin
     return Volume(grid=grid, array=array)
 
 
-def distance_to_segment(
-    points: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def distance_to_segment(points: Float, a: Float, b: Float) -> Float:
     """Distance of points `(..., 3)` to a segment."""
     along = b - a
     t = np.clip((points - a) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.lung import Lung
-from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL, obstacle_bits
+from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from tests.stages.scenes import brute_clearance
 
@@ -93,7 +93,7 @@ def labels_at(lung: Lung, points: Float) -> np.ndarray:
 
 
 def forbidden(plan: Plan) -> int:
-    return OBSTACLES | (FISSURE if plan.fissures_are_obstacles else 0)
+    return obstacle_bits(plan.fissures_are_obstacles)
 
 
 def clearance(lung: Lung, points: Float, bits: int, exempt_branch: int = -1) -> Float:

@@ -13,8 +13,9 @@ from enum import StrEnum
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
 from anatomy.kernels.field import bounds_at, exact_at
+from anatomy.typed import Float
 from experiments.support.insertion.truth import Errors, Truth, tilt
 from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc

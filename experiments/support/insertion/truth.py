@@ -7,8 +7,8 @@ from typing import Annotated
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.settings import quantity, settings
+from anatomy.typed import Float
 from stages.needle.path import arc_transform, bend_direction
 from stages.needle.search.base import Query
 

@@ -20,8 +20,8 @@ from lungaccess.cli.inputs import load_device, load_lung, require_one_target
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from anatomy.grid import Float
     from anatomy.lung import Lung
+    from anatomy.typed import Float
 
 NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 

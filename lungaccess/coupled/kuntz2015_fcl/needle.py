@@ -7,10 +7,9 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.poses import roll_towards
+from anatomy.typed import Float
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, chord_mm
 from stages.needle import RRT_STEP_MM, ArcPath, Needle, arc_transform
 from stages.needle.kernels import least_cosine
@@ -223,9 +222,7 @@ class NeedleRRT:
         return tree.arc(node, np.linspace(begin, end, count), curvature, normal)
 
 
-def sample_ahead(
-    lps_from_start: Float, goal_lps: Float, needle: Needle, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def sample_ahead(lps_from_start: Float, goal_lps: Float, needle: Needle, rng: np.random.Generator) -> Float:
     """Draw a point `(3,)` uniformly from the needle's workspace [Kuntz2015, fig. 4].
 
     The workspace of a single arc: no nearer than a circle of the least radius R lets it, at most 45 degrees

@@ -7,15 +7,11 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.meshes import MeshDistance, box_surface
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
-
-Labels = NDArray[np.uint16]
-Bools = NDArray[np.bool_]
+from anatomy.typed import Bool, Float, Int, Int32, Labels
 
 SAGITTA_MM = 0.01
 LONGEST_CHORD_MM = 2.0
@@ -43,9 +39,9 @@ class Solid:
     def __init__(
         self,
         lung: Lung,
-        holds: Callable[[Labels], Bools],
-        low: NDArray[np.int64] | None = None,
-        high: NDArray[np.int64] | None = None,
+        holds: Callable[[Labels], Bool],
+        low: Int | None = None,
+        high: Int | None = None,
     ) -> None:
         self._lung = lung
         self._holds = holds
@@ -146,6 +142,6 @@ def labels_at(lung: Lung, points_lps: Float) -> Labels:
     return labels
 
 
-def branch_of(labels: Labels) -> NDArray[np.int32]:
+def branch_of(labels: Labels) -> Int32:
     """Return the airway branch of labels, -1 where they are not airway."""
     return np.asarray(labels >> BRANCH_SHIFT, dtype=np.int32) - np.int32(1)

@@ -6,16 +6,9 @@ import math
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.structures import AIRWAY, LUMEN
-from lungaccess.coupled.kuntz2015_fcl.obstacles import (
-    SAGITTA_MM,
-    Labels,
-    Obstacles,
-    branch_of,
-    chord_mm,
-    labels_at,
-)
+from anatomy.typed import Float, Labels
+from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, branch_of, chord_mm, labels_at
 from lungaccess.problem.system import System
 from stages.needle import ArcPath, arc_transform
 from stages.tube import REASONS, Deployment, tube_constants

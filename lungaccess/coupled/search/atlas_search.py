@@ -10,10 +10,10 @@ from itertools import chain, count, islice
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float, Int
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels import direct_arcs as pricing
-from lungaccess.coupled.search.entries import Int, different, least_costs
+from lungaccess.coupled.search.entries import different, least_costs
 from lungaccess.coupled.search.evaluator import NeedleDesk, Step
 from lungaccess.coupled.search.local_sampling import MOST, Scatter, nearly_reaching
 from lungaccess.coupled.search.local_search import Climb, Climber, needle_of, objective_of

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float, Int
 from lungaccess.coupled.kernels.separation import choose_apart
 from lungaccess.coupled.search.atlas_search import AtlasSearch
-from lungaccess.coupled.search.entries import Int
 from lungaccess.plans.assemble import Candidate
 from stages.needle import direct_arcs
 

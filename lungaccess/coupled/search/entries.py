@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
+from anatomy.typed import Float, Int
 from lungaccess.coupled.kernels import direct_arcs as pricing
 from lungaccess.coupled.search.local_search import Needle
 from stages.tube import Deployments
-
-Int = NDArray[np.int64]
 
 CELL_MM = 5.0
 DIRECTIONS = 2.0

@@ -9,10 +9,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+from anatomy.typed import Float, Int
 from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.plans.costs import path_cost
 from stages.needle import CURVATURE, ArcPath, NeedleSpace, Query, needle_space, objection, workspace_lengths
@@ -90,7 +89,7 @@ class NeedleDesk:
             return Step(iteration=iteration, phase=phase)
         return Step(iteration=iteration, phase=phase, candidate=candidate, cost=self.cost(candidate.path))
 
-    def count_blockers(self, blockers: NDArray[np.int64]) -> None:
+    def count_blockers(self, blockers: Int) -> None:
         """Count what stands in the way of direct arcs."""
         labels, counts = np.unique(blockers, return_counts=True)
         for label, count in zip(labels, counts, strict=True):

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
+from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels import candidate as coupled
 from lungaccess.coupled.kernels import local_search as climbing
-from lungaccess.coupled.search.entries import Int
 from lungaccess.coupled.search.local_search import Climber
 from lungaccess.plans.assemble import Candidate
 from stages.needle import Needle, direct_path
@@ -53,7 +51,7 @@ class Scatter:
 
     def draw(self, dearest: float) -> Candidate | None:
         """Return the cheapest of TRIES deployments with an arc estimated to cost less than `dearest`."""
-        state: NDArray[np.uint64] = self._rng.integers(2**64, size=1, dtype=np.uint64)
+        state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
         best = np.zeros(coupled.N_CHOICE)
         cost = climbing.scatter(
             self._climber.tube, self._climber.needle, self._rows, self._row_of, *self._deployed, SPREADS,

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
+from anatomy.typed import Float, Float32, UInt64
 from lungaccess.coupled.kernels import candidate as coupled
 from lungaccess.coupled.kernels import local_search as climbing
 from lungaccess.coupled.search.evaluator import NeedleDesk
@@ -27,7 +26,7 @@ from stages.needle import (
 from stages.scope import Sites
 from stages.tube import Deployment, TubeJudge, scene_of, tube_constants
 
-Needle = tuple[SpaceArrays, Float, ObjectiveArrays, bool, NDArray[np.float32]]
+Needle = tuple[SpaceArrays, Float, ObjectiveArrays, bool, Float32]
 
 OBJECTIVES = {
     "inverse_clearance": Objective(inverse_clearance=1.0),
@@ -119,7 +118,7 @@ class Climber:
 
     def advance(self, climb: Climb, tries: int) -> None:
         """Spend tries on a climb."""
-        state: NDArray[np.uint64] = self._rng.integers(2**64, size=1, dtype=np.uint64)
+        state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
         climb.count, climb.cost = climbing.climb(
             self.tube, self.needle, climb.stands.rows, climb.stands.allowed, climb.x, climb.vias, climb.count,
             self.target, tries, state,

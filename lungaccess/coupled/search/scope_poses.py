@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy import poses
-from anatomy.grid import Float
 from anatomy.lung import Lung
+from anatomy.typed import Bool, Float
 from stages.scope import Bronchoscope, ScopeTip, Sites, can_stand, walk
 
 STEP_MM = 0.25
@@ -51,7 +50,7 @@ class Stands:
         self.tips = [*behind, *ahead]
         sideways = tip.lps_from_scope_tip[:3, 0]
         self.rows: Float = np.zeros((len(self.tips), 9))
-        self.allowed: NDArray[np.bool_] = np.zeros(len(self.tips), dtype=np.bool_)
+        self.allowed: Bool = np.zeros(len(self.tips), dtype=np.bool_)
         for n, each in enumerate(self.tips):
             frame = each.lps_from_scope_tip
             self.rows[n, :3], self.rows[n, 3:6] = frame[:3, 3], frame[:3, 2]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+from anatomy.typed import Bool, Float
 from lungaccess.checking import shapes
 from lungaccess.cli.terminal import objective_words
 from lungaccess.plans.costs import obstacle_clearance_mm
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans.plan import Plan
 
-Float = NDArray[np.float64]
 
 TUBE_STEP_MM = 1.0
 TUBE_POINTS = 40
@@ -169,7 +168,7 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     }
 
 
-def _clearances(plan: Plan, lung: Lung, points: Float, exempt: NDArray[np.bool_]) -> dict[str, Float]:
+def _clearances(plan: Plan, lung: Lung, points: Float, exempt: Bool) -> dict[str, Float]:
     found = {}
     for name, bits in (("airway", AIRWAY), ("vessel", VESSEL), ("pleura", OUTSIDE), ("fissure", FISSURE)):
         if name == "fissure" and not lung.has_fissures:

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.grid import Volume
+from anatomy.typed import Float, Int
 from lungaccess.report.html.pack import Packed, pack
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 STEPS = 65535
 SMOOTHINGS = 6

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.io.files import atomic_write
 from anatomy.structures import LUMEN
+from anatomy.typed import Array, Float, UInt8
 from lungaccess.report.html.deployment import arc_lengths, camera_axes
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans.plan import Plan
 
-Picture = NDArray[np.uint8]
 
 PIXELS, FRAMES, FRAME_MS, LAST_MS = 240, 72, 90, 1500
 HALF_ANGLE_RAD = np.deg2rad(48.0)
@@ -160,7 +158,7 @@ class SmoothLumen:
         return np.asarray(inwards / np.maximum(np.linalg.norm(inwards, axis=1, keepdims=True), 1e-9))
 
 
-def view(lumen: SmoothLumen, lps_from_camera: Float, pixels: int) -> Picture:
+def view(lumen: SmoothLumen, lps_from_camera: Float, pixels: int) -> UInt8:
     """Return what a camera in the lumen sees, `(pixels, pixels, 3)`; black beyond the round picture."""
     steps = (np.arange(pixels) + 0.5) / pixels * 2.0 - 1.0
     across, down = np.meshgrid(steps, steps)
@@ -173,7 +171,7 @@ def view(lumen: SmoothLumen, lps_from_camera: Float, pixels: int) -> Picture:
     straight = np.clip(-(lumen.normals(eye + away[:, None] * rays) * rays).sum(axis=1), 0.0, 1.0)
     # More light comes back from near, and from a wall seen face on.
     light = (0.25 + 0.85 * straight) / (1.0 + away**2 / FALL_OFF_MM2)
-    picture: NDArray[Any] = np.zeros((pixels, pixels, 3))
+    picture: Array = np.zeros((pixels, pixels, 3))
     share = np.clip(1.15 * light, 0.0, 1.0)[:, None]
     picture[inside] = ((1.0 - share) * DARK + share * BRIGHT) * np.clip(1.5 * light, 0.0, 1.0)[:, None]
     return np.asarray(np.rint(255.0 * picture), dtype=np.uint8)

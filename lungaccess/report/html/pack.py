@@ -8,9 +8,10 @@ import zlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
+from anatomy.typed import Array
 
 Packed = dict[str, Any]
 
@@ -50,7 +51,7 @@ def pack(values: ArrayLike, kind: str) -> Packed:
     return {"kind": kind, "shape": list(stored.shape), "data": data}
 
 
-def unpack(packed: Packed) -> NDArray[Any]:
+def unpack(packed: Packed) -> Array:
     """Return the array that `pack` stored."""
     kind = np.dtype(TYPES[packed["kind"]])
     flat = np.frombuffer(zlib.decompress(base64.b64decode(packed["data"])), dtype=np.uint8)

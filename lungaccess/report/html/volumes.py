@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
+from anatomy.typed import Array, Float, UInt8
 from lungaccess.report.html.pack import Packed, pack
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
 
-Bytes = NDArray[np.uint8]
-Float = NDArray[np.float64]
 
 CODES = {"outside": 0, "lung": 1, "airway wall": 2, "lumen": 3, "vessel": 4, "fissure": 5, "nodule": 6}
 COARSE_VOXELS, FINE_VOXELS = 3_000_000, 3_000_000
@@ -124,7 +123,7 @@ def _grid(low: Float, high: Float, spacing_mm: float, most: int) -> Grid:
     return Grid.from_spacing(shape, [spacing] * 3, low + 0.5 * spacing)
 
 
-def resampled(volume: Volume, grid: Grid, order: int, beyond: float) -> NDArray[Any]:
+def resampled(volume: Volume, grid: Grid, order: int, beyond: float) -> Array:
     """Return the values `[i, j, k]` of a volume at the voxels of another grid: nearest (0) or linear (1)."""
     from scipy.ndimage import affine_transform
 
@@ -136,7 +135,7 @@ def resampled(volume: Volume, grid: Grid, order: int, beyond: float) -> NDArray[
     return np.asarray(moved)
 
 
-def _ct_bytes(ct: Volume, grid: Grid) -> Bytes:
+def _ct_bytes(ct: Volume, grid: Grid) -> UInt8:
     from scipy.ndimage import uniform_filter
 
     corners = grid.lps(np.stack(np.meshgrid(*[(0, n - 1) for n in grid.shape]), axis=-1).reshape(-1, 3))

@@ -16,19 +16,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
+from anatomy.typed import Float, Int, UInt64
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
 from stages.needle.infeasibility.kernels import reachability_pruning as hopes
 from stages.needle.infeasibility.kernels import reachable_sets as sets
 from stages.needle.kernels import limits as index
 from stages.needle.search.base import Query
 from stages.needle.space import NeedleSpace
-
-Bits = NDArray[np.uint64]
-Window = NDArray[np.int64]
 
 CUBES_MM = (0.5, 0.25)
 FIRST_CELL_MM = 0.5
@@ -57,8 +53,8 @@ MAX_BYTES = 1 << 30
 class Plane:
     """States on one plane: bits (V, U, Y, W) and the cell numbers (v, u, y, x) of their first cell."""
 
-    bits: Bits
-    window: Window
+    bits: UInt64
+    window: Int
 
     def trimmed(self) -> Plane:
         """Return the same without empty rows and columns at the edges."""
@@ -69,10 +65,10 @@ class Plane:
         return Plane(np.ascontiguousarray(bits), self.window + np.array([v0, u0, y0, 64 * w0]))
 
     @property
-    def ends(self) -> Window:
+    def ends(self) -> Int:
         """Cell numbers of the last cell."""
         nv, nu, rows, words = self.bits.shape
-        last: Window = self.window + np.array([nv, nu, rows, 64 * words]) - 1
+        last: Int = self.window + np.array([nv, nu, rows, 64 * words]) - 1
         return last
 
 
@@ -354,7 +350,7 @@ class NoPathProof:
         self._require(8 * math.prod(int(n) for n in shape))
         return Plane(np.full(tuple(shape), bitmaps.ALL, dtype=np.uint64), low)
 
-    def _reached(self, low: Window, high: Window, way: int, number: int) -> tuple[Window, Window]:
+    def _reached(self, low: Int, high: Int, way: int, number: int) -> tuple[Int, Int]:
         """Return the first and last cell numbers on a plane that states between others may reach.
 
         `way` is 1 from the plane before and -1 from the one after.

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from ompl import base
 
-from anatomy.grid import Float
 from anatomy.kernels.field import MIN_GAP_MM
+from anatomy.typed import Float
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import states
 from stages.needle.ompl.planner import Question

@@ -9,8 +9,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from anatomy.grid import Float
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
+from anatomy.typed import Float
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective, ObjectiveArrays

@@ -10,10 +10,10 @@ from typing import Annotated
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.field import MIN_GAP_MM
 from anatomy.settings import quantity, settings
+from anatomy.typed import Float
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import length_ahead, nearest_turn, seen_from

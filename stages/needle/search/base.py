@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from anatomy.errors import FrameError, SettingsError
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.needle.kernels import tree
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.objective import SHORTEST, Objective

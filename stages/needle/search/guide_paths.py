@@ -9,7 +9,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.needle.objective import Objective
 from stages.needle.search.base import Query
 from stages.needle.search.optimal import OptimalSearch

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.objective import SHORTEST, Objective

@@ -6,15 +6,15 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float
 from anatomy.kernels import arcs as arc_kernels
 from anatomy.kernels.field import UNITS_PER_MM
+from anatomy.typed import Array, Float, Int, Int32, UInt8
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
@@ -26,10 +26,9 @@ from stages.needle.search.kernels import resolution as kernel
 from stages.needle.space import NeedleSpace
 
 T = TypeVar("T", bound=np.generic)
-Ints = NDArray[np.int64]
-Words = tuple[float, Float, Float, Ints, Ints]
-Store = tuple[Float, NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32]]
-Queue = tuple[Float, NDArray[np.int32], Float, NDArray[np.int32], NDArray[np.int32]]
+Words = tuple[float, Float, Float, Int, Int]
+Store = tuple[Float, Int32, UInt8, Int32]
+Queue = tuple[Float, Int32, Float, Int32, Int32]
 
 FIRST_NODES = 1024
 FIRST_ENTRIES = 4096
@@ -90,7 +89,7 @@ class Resolution:
         """Steps of the longest piece."""
         return round(self.coarse_mm / self.fine_mm)
 
-    def primitives(self) -> tuple[Ints, Ints]:
+    def primitives(self) -> tuple[Int, Int]:
         """Return all primitives by level, `(P, 2)` direction and steps, and the first of each level.
 
         The level counts how often length and roll are halved; the direction `fine_rolls` is straight.
@@ -289,7 +288,7 @@ class ResolutionSearch:
         self.outcome = outcome
         self.finished = True
 
-    def _may_double(self, arrays: tuple[NDArray[Any], ...]) -> bool:
+    def _may_double(self, arrays: tuple[Array, ...]) -> bool:
         """Tell whether arrays may take twice their memory; end if not."""
         fits = self.memory_mb + _megabytes(arrays) <= self.max_memory_mb
         if not fits:
@@ -338,7 +337,7 @@ def _first_queue(ranks: int) -> Queue:
     return np.zeros(FIRST_ENTRIES), entries, np.zeros(FIRST_ENTRIES), heap, lists
 
 
-def _megabytes(arrays: Iterable[NDArray[Any]]) -> float:
+def _megabytes(arrays: Iterable[Array]) -> float:
     return sum(array.nbytes for array in arrays) / 1e6
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.needle.kernels import limits as index
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath

@@ -10,7 +10,7 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.scope.advisor.best_motion import Candidates, Judgement, Motion, best_motion
 from stages.scope.advisor.collision import Scene
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, straight_state, tip_frames

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
 from anatomy.settings import impossible, quantity, settings
+from anatomy.typed import Float, Int
 from stages.scope.advisor.collision import Scene
 from stages.scope.advisor.kernels import motion as kernel
 from stages.scope.advisor.kinematics import ScopeState
@@ -97,7 +97,7 @@ class Candidates:
     best: int
     twist_rad: Float
     bend_rad: Float
-    verdict: NDArray[np.int64]
+    verdict: Int
     potential: Float
     k_nf1: Float
     k_clearance: Float

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
+from anatomy.typed import Bool, Float
 from stages.scope.advisor.kernels import collision as kernel
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen
@@ -79,7 +78,7 @@ class Scene:
             sweep_middle=0.0 if self.reproduction else 0.5 * (low + high),
         )
 
-    def fits(self, states: Float) -> NDArray[np.bool_]:
+    def fits(self, states: Float) -> Bool:
         """Tell for states (M, 14) whether the bending tip is free of collision, `(M,)`."""
         return self._measure(states)[0]
 
@@ -90,7 +89,7 @@ class Scene:
         """
         return self._measure(states)[1]
 
-    def _measure(self, states: Float) -> tuple[NDArray[np.bool_], Float]:
+    def _measure(self, states: Float) -> tuple[Bool, Float]:
         rows = np.ascontiguousarray(np.atleast_2d(states))
         fits, distances = np.zeros(len(rows), dtype=bool), np.zeros(len(rows))
         kernel.measure(self.space, self.scope, rows, fits, distances)

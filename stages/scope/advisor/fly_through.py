@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float
 from stages.scope.advisor.kinematics import tip_frames
 from stages.scope.advisor.path import ScopePath
 

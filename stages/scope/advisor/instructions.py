@@ -7,13 +7,10 @@ import math
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Float
+from anatomy.typed import Float, Int
 from stages.scope.advisor.path import ScopePath
-
-Int = NDArray[np.int64]
 
 DIRECTIONS = (
     ("to the patient's left", (1.0, 0.0, 0.0)),

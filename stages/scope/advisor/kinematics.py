@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
 from anatomy.poses import pose
 from anatomy.settings import impossible, quantity, settings
+from anatomy.typed import Float
 from stages.scope.advisor.kernels import chain
 from stages.scope.device import Bronchoscope
 
@@ -191,7 +191,7 @@ def tip_frames(model: ScopeModel, states: Float) -> Float:
 
 
 def _bodies(model: ScopeModel, states: Float) -> tuple[Float, Float]:
-    rows: NDArray[np.float64] = np.ascontiguousarray(np.atleast_2d(states))
+    rows: Float = np.ascontiguousarray(np.atleast_2d(states))
     points, frames = np.zeros((len(rows), model.links + 1, 3)), np.zeros((len(rows), 4, 4))
     chain.bodies(rows, model.link_mm, model.links, points, frames)
     return points, frames

@@ -6,19 +6,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.fields import DistanceField, corner_geometry, distance_field
-from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
 from anatomy.structures import OUTSIDE
+from anatomy.typed import Float, Int32, Labels
 from stages.scope.advisor.kernels.collision import FINE_DEPTH_MM
 from stages.scope.advisor.kernels.field import WALL, clearance_l1, number_component, widest_ways
-
-Int32 = NDArray[np.int32]
-
 
 DEPTH_UNITS_PER_MM = 256.0
 
@@ -68,7 +66,7 @@ class Lumen:
         return corner_geometry(self.grid)
 
     @cached_property
-    def solid(self) -> NDArray[np.uint16]:
+    def solid(self) -> Labels:
         """What is not lumen, as OUTSIDE labels, `(ni, nj, nk)` uint16."""
         return read_only(np.asfortranarray(np.where(self.index < 0, OUTSIDE, 0).astype(np.uint16)))
 

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import TargetError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Bool, Float
 from stages.scope.advisor.kernels.field import shortest_ways
 from stages.scope.advisor.lumen import Lumen
 
@@ -58,7 +59,7 @@ def goal_at(
     lesion_lps: ArrayLike,
     lesion_radius_mm: float = 0.0,
     *,
-    preferred: NDArray[np.bool_] | None = None,
+    preferred: Bool | None = None,
 ) -> Goal:
     """Return the goal for a lesion, a sphere: the interior voxel nearest to its centre [Rosell2012, IV-B].
 

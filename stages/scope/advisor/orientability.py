@@ -10,10 +10,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Bool, Float
 from stages.scope.advisor.collision import Scene
 from stages.scope.advisor.kernels.orientation import pointable
 from stages.scope.advisor.kinematics import ScopeState, straight_state, tool_frames
@@ -48,7 +49,7 @@ class Orientability:
     directions: Float
     twist_rad: Float
     bend_rad: Float
-    possible: NDArray[np.bool_]
+    possible: Bool
 
     @property
     def largest_bend_rad(self) -> float:

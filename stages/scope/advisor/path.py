@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float
 from stages.scope.advisor import kinematics
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState
 from stages.scope.advisor.navigation import Goal

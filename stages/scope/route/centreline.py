@@ -6,18 +6,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError, TargetError
 from anatomy.fields import CENTRES, ROUNDING_MM, SOLID, DistanceField, corner_geometry, distance_field
-from anatomy.grid import Float, Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
+from anatomy.typed import Bool, Float, Int
 from stages.scope.route.kernels import lumen as kernel
-
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 DEFAULT_SPACING_MM = 0.75
 MIN_CELL_MM = 1.0

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float
 from stages.scope.route.kernels import spline as kernel
-
-Int = NDArray[np.int64]
 
 DEGREE = 3
 

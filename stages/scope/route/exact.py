@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
 from stages.scope.route.guide_path import Way

@@ -16,10 +16,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float
 from anatomy.settings import quantity, settings
+from anatomy.typed import Bool, Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
 from stages.scope.route.settings import RouteLimits
@@ -165,7 +164,7 @@ def cut_segments(
     return points, parts
 
 
-def _around(points: Float, centreline: Centreline) -> NDArray[np.bool_]:
+def _around(points: Float, centreline: Centreline) -> Bool:
     """Tell which nodes may be nearest to a point inside the lumen near these points."""
     margin = AROUND_MM + 2.0 * float(centreline.radius_mm.max())
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin

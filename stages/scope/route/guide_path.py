@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float, Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
 
@@ -58,7 +58,7 @@ class Way:
         return interpolate(np.stack([np.interp(at, along, axis) for axis in self.points_mm.T], axis=1))
 
 
-def way_along(centreline: Centreline, nodes: NDArray[np.int64], start_mm: Float, goal_mm: Float) -> Way:
+def way_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_mm: Float) -> Way:
     """Return the way over centreline nodes.
 
     Start and goal take the place of the nodes nearest to them.

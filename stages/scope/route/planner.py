@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float, Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.exact import Problem, repair_exact
@@ -20,7 +21,6 @@ from stages.scope.route.proof import Proof
 from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.settings import RouteLimits
 
-Int = NDArray[np.int64]
 Repair = Literal["exact", "ga", "none"]
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float, Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.kernels import spline as kernel
@@ -33,7 +33,7 @@ class Proof:
         No point of the proved spans is more curved, or less deep in the lumen.  Not sharp.
     """
 
-    verdicts: NDArray[np.int64]
+    verdicts: Int
     points_mm: Float
     curvature_bound_per_mm: float
     depth_bound_mm: float
@@ -44,7 +44,7 @@ class Proof:
         return not self.verdicts.any()
 
     @property
-    def failed_spans(self) -> NDArray[np.int64]:
+    def failed_spans(self) -> Int:
         """Spans that are not proved."""
         return np.flatnonzero(self.verdicts)
 

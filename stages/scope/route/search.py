@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.grid import read_only
+from anatomy.typed import Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.kernels.search import breadth_first
-
-Int = NDArray[np.int64]
 
 DEFAULT_NEIGHBOURS = 8
 

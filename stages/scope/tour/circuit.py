@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float, Int
 from stages.scope.tour.kernels.circuit import all_resistances
 from stages.scope.tour.subtree import Ways
 
-Int = NDArray[np.int64]
 Reading = Literal["printed", "reduced"]
 
 MOST_COMBINATIONS = 5_000_000

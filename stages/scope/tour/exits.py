@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import TargetError
-from anatomy.grid import Float
 from anatomy.settings import quantity, settings
+from anatomy.typed import Float, Int
 
 Vet = Callable[[int, int], bool]
 """Tells whether a lesion, by its number, can really be reached from a point of the tree, by its index."""
@@ -160,7 +160,7 @@ def exits_of(
 
 def _exit(
     lesion: int,
-    points: NDArray[np.int64],
+    points: Int,
     distance: Float,
     angle: Float,
     weighted: Float,

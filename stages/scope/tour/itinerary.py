@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.typed import Bool, Int
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.subtree import Ways
-
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,7 +128,7 @@ def one_by_one_mm(ways: Ways, chosen: Sequence[int], *, closed: bool = False) ->
     return float(2.0 * depth.sum() - (0.0 if closed else depth.max()))
 
 
-def _order(ways: Ways, vertex: Int, last: int, on_last: NDArray[np.bool_]) -> tuple[int, ...]:
+def _order(ways: Ways, vertex: Int, last: int, on_last: Bool) -> tuple[int, ...]:
     """Walk depth first and list the lesions as they are met; the last one last, also at its own vertex."""
     lesions_at: dict[int, list[int]] = {}
     for lesion, v in enumerate(vertex.tolist()):

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from anatomy.typed import Bool, Float, Int
 from stages.scope.tour.itinerary import Itinerary, plan_itinerary
 from stages.scope.tour.kernels.steiner import solve
 from stages.scope.tour.subtree import Ways
-
-Int = NDArray[np.int64]
 
 MOST_WORK = 3e7
 """Divisions of sets up to which the dynamic program is used: about a tenth of a second."""
@@ -49,8 +47,8 @@ class _Nodes:
 
     left: Int
     right: Int
-    lift: NDArray[np.float64]
-    cost: NDArray[np.float64]
+    lift: Float
+    cost: Float
     below: Int
     open_sets: Int
     exit_of: Int
@@ -123,7 +121,7 @@ def _with_sets(
     )
 
 
-def _by_program(nodes: _Nodes, closed: bool) -> NDArray[np.bool_]:
+def _by_program(nodes: _Nodes, closed: bool) -> Bool:
     """Return which exits are taken, `(X,)`."""
     sizes = [1 << int(s).bit_count() for s in nodes.open_sets]
     offset = np.concatenate(((0,), np.cumsum(sizes)))
@@ -147,7 +145,7 @@ def _by_program(nodes: _Nodes, closed: bool) -> NDArray[np.bool_]:
     return taken
 
 
-def _by_integers(ways: Ways, closed: bool) -> NDArray[np.bool_]:
+def _by_integers(ways: Ways, closed: bool) -> Bool:
     """Return which exits are taken, by an integer program.
 
     x says which stretches are used, z which of them lead to the end of an open tour, y which exits are

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, read_only
+from anatomy.grid import read_only
+from anatomy.typed import Float, Int
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.resistance import Resistances, branch_resistances
-
-Int = NDArray[np.int64]
 
 MAIN, LEFT, RIGHT = 0, 1, 2
 MOST_LESIONS = 62

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from anatomy.errors import AnatomyError, GridMismatchError
@@ -24,6 +23,7 @@ from anatomy.segmentation.kernels.growing import box_offsets
 from anatomy.segmentation.kernels.lumen_edge import LUMEN, grow_wall, join_corners
 from anatomy.segmentation.local_minima import local_minima_map, scale_of
 from anatomy.segmentation.lungs import Lungs
+from anatomy.typed import Int16, Mask
 
 CROSS = ndimage.generate_binary_structure(2, 1)
 FACES = ndimage.generate_binary_structure(3, 1)
@@ -38,15 +38,15 @@ images = hnp.arrays(
 )
 
 
-def eroded(image: NDArray[np.int16]) -> NDArray[np.int16]:
+def eroded(image: Int16) -> Int16:
     return ndimage.minimum_filter(image, footprint=CROSS, mode="constant", cval=32767)
 
 
-def dilated(image: NDArray[np.int16]) -> NDArray[np.int16]:
+def dilated(image: Int16) -> Int16:
     return ndimage.maximum_filter(image, footprint=CROSS, mode="constant", cval=-32768)
 
 
-def reconstructed(marker: NDArray[np.int16], mask: NDArray[np.int16]) -> NDArray[np.int16]:
+def reconstructed(marker: Int16, mask: Int16) -> Int16:
     """Iterate the paper's equation to its end."""
     while True:
         lower = np.maximum(eroded(marker), mask)
@@ -55,7 +55,7 @@ def reconstructed(marker: NDArray[np.int16], mask: NDArray[np.int16]) -> NDArray
         marker = lower
 
 
-def naive_depth(image: NDArray[np.int16], scale: int) -> NDArray[np.int16]:
+def naive_depth(image: Int16, scale: int) -> Int16:
     closed = image
     for _ in range(scale):
         closed = dilated(closed)
@@ -64,7 +64,7 @@ def naive_depth(image: NDArray[np.int16], scale: int) -> NDArray[np.int16]:
     return reconstructed(closed, image) - image
 
 
-def depth(image: NDArray[np.int16], scale: int) -> NDArray[np.int16]:
+def depth(image: Int16, scale: int) -> Int16:
     out = np.zeros_like(image)
     queue = np.zeros(image.size + 1, dtype=np.int32)
     waiting = np.zeros(image.shape, dtype=bool)
@@ -75,7 +75,7 @@ def depth(image: NDArray[np.int16], scale: int) -> NDArray[np.int16]:
 
 @settings(max_examples=200, deadline=None)
 @given(images, st.data())
-def test_reconstruction_is_the_limit_of_the_iteration(image: NDArray[np.int16], data: st.DataObject) -> None:
+def test_reconstruction_is_the_limit_of_the_iteration(image: Int16, data: st.DataObject) -> None:
     above = data.draw(hnp.arrays(np.int16, image.shape, elements=st.integers(0, 2000)))
     marker = image + above
     wanted = reconstructed(marker, image)
@@ -86,13 +86,13 @@ def test_reconstruction_is_the_limit_of_the_iteration(image: NDArray[np.int16], 
 
 @settings(max_examples=150, deadline=None)
 @given(images, st.integers(1, 5))
-def test_depth_is_closing_reconstruction_difference(image: NDArray[np.int16], scale: int) -> None:
+def test_depth_is_closing_reconstruction_difference(image: Int16, scale: int) -> None:
     np.testing.assert_array_equal(depth(image, scale), naive_depth(image, scale))
 
 
 @settings(max_examples=100, deadline=None)
 @given(images, st.integers(1, 5))
-def test_the_largest_scale_is_the_maximum_over_all(image: NDArray[np.int16], largest: int) -> None:
+def test_the_largest_scale_is_the_maximum_over_all(image: Int16, largest: int) -> None:
     every = [naive_depth(image, scale) for scale in range(1, largest + 1)]
     np.testing.assert_array_equal(depth(image, largest), np.max(every, axis=0))
 
@@ -166,7 +166,7 @@ def test_wall_takes_all_neighbours_then_only_what_is_alike() -> None:
 # A made airway: a trachea that divides into two bronchi, in a block of lung.
 
 
-def made_airway(pocket: bool = False, hole: bool = False) -> tuple[Volume, Lungs, NDArray[np.bool_]]:
+def made_airway(pocket: bool = False, hole: bool = False) -> tuple[Volume, Lungs, Mask]:
     """Return a CT of 1 mm with a trachea and two tubes; beside one a pocket of lung behind a hole."""
     shape = (90, 50, 110)
     x, y, z = np.indices(shape)
@@ -207,7 +207,7 @@ def made_airway(pocket: bool = False, hole: bool = False) -> tuple[Volume, Lungs
     return Volume(grid=grid, array=np.rint(hu).astype(np.int16)), lungs, lumen
 
 
-def leak(airways: Airways, lumen: NDArray[np.bool_]) -> int:
+def leak(airways: Airways, lumen: Mask) -> int:
     return int((airways.lumen & ~ndimage.binary_dilation(lumen, FULL)).sum())
 
 

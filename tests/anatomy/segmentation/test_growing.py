@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from anatomy.segmentation.growing import AIR_HU, WALL_MM, Ground, Grown, grow
+from anatomy.typed import Mask
 
 OLD_ROOM = 128
 """So many voxels for one of the lumen once seemed enough."""
@@ -34,7 +34,7 @@ def grown_from(ground: Ground, hole: tuple[int, int, int]) -> Grown:
     return grow(ground, start)
 
 
-def box(shape: tuple[int, int, int], middle: tuple[int, int, int], reach: int) -> NDArray[np.bool_]:
+def box(shape: tuple[int, int, int], middle: tuple[int, int, int], reach: int) -> Mask:
     """Return the voxels within `reach` steps of one, without it."""
     inside = np.zeros(shape, dtype=np.bool_)
     inside[tuple(slice(max(m - reach, 0), m + reach + 1) for m in middle)] = True

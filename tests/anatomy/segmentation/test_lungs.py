@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from anatomy.errors import AnatomyError
@@ -16,8 +16,8 @@ from anatomy.phantom import LABELS, Phantom, phantom
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.lungs import CLOSING_MM, Lungs, lungs_given, segment_lungs
+from anatomy.typed import Array, Float, Mask
 
-Mask = NDArray[np.bool_]
 LEAST_DICE = 0.98
 
 
@@ -35,11 +35,11 @@ def dice(a: Mask, b: Mask) -> float:
     return float(2 * np.count_nonzero(a & b) / (np.count_nonzero(a) + np.count_nonzero(b)))
 
 
-def _with(patient: Phantom, hu: NDArray[np.generic]) -> Volume:
+def _with(patient: Phantom, hu: Array) -> Volume:
     return Volume(grid=patient.ct.grid, array=np.asarray(hu).astype(np.int16))
 
 
-def _distance_from(centre: ArrayLike, grid: Grid) -> NDArray[np.float64]:
+def _distance_from(centre: ArrayLike, grid: Grid) -> Float:
     """Distance of every voxel from a voxel, mm."""
     offsets = np.moveaxis(np.indices(grid.shape), 0, -1) - np.asarray(centre)
     return np.asarray(np.linalg.norm(offsets * grid.spacing_mm, axis=-1))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from anatomy.segmentation.kernels.thin_airways import BANNED, LUMEN
 from anatomy.segmentation.thin_airways import Tubes, follow_thin_airways
+from anatomy.typed import Float, Int16, Mask
 
 SHAPE = (96, 60, 60)
 SPACING_MM = np.full(3, 0.7)
@@ -19,16 +19,15 @@ END = 40
 VESSELS = ((10.0, 10.0), (12.0, 46.0), (50.0, 10.0), (52.0, 52.0))
 VESSEL_VOXELS = 1.8
 """There are vessels, too, as in all lungs: it is beside them that false airways are looked for."""
-Mask = NDArray[np.bool_]
 
 
-def course(k: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def course(k: Float) -> tuple[Float, Float]:
     """Return where the airway runs in each plane: straight, then in a gentle bend."""
     beyond = np.maximum(k - END, 0.0)
     return 30.0 + 0.25 * beyond - 0.004 * beyond**2, 28.0 + 0.15 * beyond
 
 
-def block(lumen_mm: float, outer_mm: float, fill_hu: float, seed: int = 0) -> NDArray[np.int16]:
+def block(lumen_mm: float, outer_mm: float, fill_hu: float, seed: int = 0) -> Int16:
     """Render lung with a wider airway, and from its end on a tube with what fills it and a wall."""
     fine = tuple(FINE * n for n in SHAPE)
     k, j, i = ((np.arange(n) + 0.5) / FINE - 0.5 for n in fine)
@@ -48,7 +47,7 @@ def block(lumen_mm: float, outer_mm: float, fill_hu: float, seed: int = 0) -> ND
     return np.rint(image + 25.0 * noise / noise.std()).astype(np.int16)
 
 
-def follow(hu: NDArray[np.int16], banned: Mask | None = None) -> tuple[Tubes, Mask]:
+def follow(hu: Int16, banned: Mask | None = None) -> tuple[Tubes, Mask]:
     """Follow from the wide airway, whose first planes are the start; return what was added too."""
     state = np.zeros(SHAPE, dtype=np.uint8)
     k, j, i = np.indices(SHAPE)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
+from anatomy.typed import Float
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, point_target

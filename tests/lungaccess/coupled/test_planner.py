@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import lungaccess as la
 from anatomy.errors import SettingsError, TargetError
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
 from anatomy.lung import Lung
+from anatomy.typed import Float, Int
 from lungaccess.coupled.kernels import direct_arcs as pricing
 from lungaccess.coupled.planner import ProgressEvent
 from lungaccess.coupled.search import AtlasSearch
@@ -300,7 +300,7 @@ def search(small_lung: Lung, target: Target, atlas: la.Atlas) -> AtlasSearch:
     return AtlasSearch(task, atlas)
 
 
-def prices(search: AtlasSearch, slack: float) -> tuple[NDArray[np.int64], Float]:
+def prices(search: AtlasSearch, slack: float) -> tuple[Int, Float]:
     """Return blockers and estimated costs of the direct arcs from all deployments in the workspace."""
     entries, near = search.atlas.deployments, search.in_workspace
     blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))

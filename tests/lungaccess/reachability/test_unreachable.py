@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 import lungaccess as la
 from anatomy.errors import TargetError
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import bending_directions
+from anatomy.typed import Float
 from lungaccess.cli.app import BAD_INPUT, main
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import point_target

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES
+from anatomy.typed import Float
 from lungaccess.plans.assemble import Candidate, Task, assemble
 from lungaccess.refinement import boxes, refine
 from lungaccess.refinement.axis import LocalAxis

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anatomy.grid import Float
 from anatomy.structures import VESSEL
+from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.search.base import Query
 from stages.needle.space import NeedleSpace, space_of_labels

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anatomy.errors import SettingsError
 from anatomy.fields import CENTRES, corner_geometry
-from anatomy.grid import Float, Grid, Volume
+from anatomy.grid import Grid, Volume
 from anatomy.structures import OBSTACLES, VESSEL
+from anatomy.typed import Float
 from stages.needle.costs import (
     inverse_clearance,
     map_integral,
@@ -175,7 +175,7 @@ def _roll_towards(frame: Float, direction: list[float]) -> float:
     return math.atan2(float(frame[:3, 1] @ direction), float(frame[:3, 0] @ direction))
 
 
-def depth_in(grid: Grid, points: Float, voxel: tuple[int, ...]) -> NDArray[np.float64]:
+def depth_in(grid: Grid, points: Float, voxel: tuple[int, ...]) -> Float:
     """How deep points lie in a voxel, in voxels; negative outside."""
     return np.asarray((0.5 - np.abs(grid.ijk(points) - np.array(voxel))).min(axis=1))
 

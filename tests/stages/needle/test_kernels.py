@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.kernels import connections, proof, rrt, tree
 from stages.needle.kernels import cost as cost_kernels

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from anatomy.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.structures import VESSEL
+from anatomy.typed import Float32
 from stages.needle.device import Needle
 from stages.needle.kernels import cost as kernel
 from stages.needle.objective import NO_MAP, SHORTEST, Objective
@@ -24,7 +24,7 @@ from tests.stages.scenes import Canvas
 NAMES = [field.name for field in fields(Objective)]
 
 
-def a_map(low: float = 0.25) -> NDArray[np.float32]:
+def a_map(low: float = 0.25) -> Float32:
     values = np.random.default_rng(0).uniform(low, 1.0, (30, 30, 30)).astype(np.float32, order="F")
     values[0, 0, 0] = low
     return np.asfortranarray(values)

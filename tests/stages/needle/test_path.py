@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from anatomy.grid import Float
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.margins import Margins
 from anatomy.structures import VESSEL
+from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.kernels import tree
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path, direct_path, path_from_tree

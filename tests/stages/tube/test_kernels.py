@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anatomy.grid import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from anatomy.typed import Float
 from stages.tube.deployments import REASONS, Deployment, TubeJudge, scene_of, tube_constants
 from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.kernels import deployment as kernels

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from scipy.special import ellipj
 
 from anatomy.errors import LungaccessError, SettingsError
-from anatomy.grid import Float
+from anatomy.typed import Float
 from stages.tube.device import BentPiece, ConcentricTubes, Tube
 from stages.tube.mechanics import Equilibrium, TubeMechanics
 from stages.tube.shape import centreline

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import OUTSIDE
+from anatomy.typed import Float, Int32, Labels
 from stages.scope.advisor.kernels.chain import circle_curvature, joints_of, move_base
 from stages.scope.advisor.kernels.inlining import inlined_kernel
 
@@ -29,17 +29,17 @@ class Space(NamedTuple):
     and potential : (N,), both as the navigation field counts; steps_to_wall : (N,) L1 distance in voxels.
     """
 
-    numbers: NDArray[np.int32]
-    geometry: NDArray[np.float64]
-    lps_from_ijk: NDArray[np.float64]
-    voxels: NDArray[np.int32]
-    depth: NDArray[np.uint16]
-    depth_geometry: NDArray[np.float64]
-    solid: NDArray[np.uint16]
-    clearance: NDArray[np.float64]
-    potential: NDArray[np.float64]
-    steps_to_wall: NDArray[np.float64]
-    centre_depth: NDArray[np.float64]
+    numbers: Int32
+    geometry: Float
+    lps_from_ijk: Float
+    voxels: Int32
+    depth: Labels
+    depth_geometry: Float
+    solid: Labels
+    clearance: Float
+    potential: Float
+    steps_to_wall: Float
+    centre_depth: Float
 
 
 class Scope(NamedTuple):

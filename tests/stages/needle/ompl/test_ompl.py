@@ -23,11 +23,11 @@ from ompl.tools import readBenchmarkLog
 from scipy.spatial.transform import Rotation
 
 from anatomy.errors import FileError, SettingsError
-from anatomy.grid import Float
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import OUTSIDE, VESSEL
+from anatomy.typed import Float
 from stages.needle import ompl as ompl_planner
 from stages.needle.device import Needle
 from stages.needle.kernels.states import proved_step

@@ -12,10 +12,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from anatomy.errors import FrameError, SettingsError
-from anatomy.grid import Float
 from anatomy.margins import Margins
 from anatomy.poses import pose, roll_towards
 from anatomy.structures import OBSTACLES, VESSEL
+from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anatomy.errors import SettingsError
-from anatomy.grid import Float, Volume
+from anatomy.grid import Volume
 from anatomy.kernels.arcs import pose_on_arc
 from anatomy.structures import OBSTACLES
+from anatomy.typed import Float
 from stages.needle.kernels import limits as index
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path

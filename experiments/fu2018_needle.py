@@ -2,7 +2,7 @@
 
     python -m experiments.fu2018_needle [--quick] [--seed 1] [--results FOLDER] [--ct NAME] [--work FOLDER]
 
-Three searches (`RacingSearch`) that differ in their objective alone, in three scenarios of rising
+Three searches (`PortfolioSearch`) that differ in their objective alone, in three scenarios of rising
 difficulty: success and cost over time.  Cost is judged by the cost map for all three: its sum over the set of
 voxels crossed [Fu2018, eq. 1], and its line integral, which does not depend on the voxel size.
 The cost map is that of `lungaccess segment`, of a CT or of the phantom's.

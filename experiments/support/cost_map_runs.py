@@ -18,7 +18,7 @@ from stages.needle.costs import map_integral, obstacle_clearance_mm, voxel_sum
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query, RestartingRRT
-from stages.needle.search.portfolio import RacingSearch
+from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.space import NeedleSpace
 
 SLICE_ITERATIONS = 100
@@ -50,7 +50,7 @@ def run(
     space: NeedleSpace, costs: Volume, query: Query, objective: Objective, seed: int, limit_s: float
 ) -> Run:
     """Search for `limit_s` seconds of processor time; judge the paths afterwards by `costs`."""
-    search = RacingSearch(space, query, seed=seed, objective=objective)
+    search = PortfolioSearch(space, query, seed=seed, objective=objective)
     times, paths = [], []
     began = time.process_time()
     while time.process_time() - began < limit_s:
@@ -78,7 +78,7 @@ def run_all(
     }
     for where, objective in searched.values():
         # What is compiled or loaded now is not counted; ways on lattices come after the first path.
-        warm = RacingSearch(where, scenario.query, objective=objective)
+        warm = PortfolioSearch(where, scenario.query, objective=objective)
         while warm.iterations < WARM_ITERATIONS:
             warm.advance(SLICE_ITERATIONS)
     return {

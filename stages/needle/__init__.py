@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from stages.needle.search.base import Search as Search
     from stages.needle.search.optimal import OptimalSearch as OptimalSearch
     from stages.needle.search.planners import PLANNERS as PLANNERS
+    from stages.needle.search.portfolio import PortfolioSearch as PortfolioSearch
+    from stages.needle.search.successive_halving import successive_halving as successive_halving
     from stages.needle.space import RRT_STEP_MM as RRT_STEP_MM
     from stages.needle.space import NeedleSpace as NeedleSpace
     from stages.needle.space import SpaceArrays as SpaceArrays

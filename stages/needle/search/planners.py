@@ -7,7 +7,7 @@ from typing import Protocol
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.search.base import Query, RestartingRRT, Search
 from stages.needle.search.decision import Decision
-from stages.needle.search.portfolio import RacingSearch
+from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.resolution import ResolutionSearch
 from stages.needle.space import NeedleSpace
 
@@ -26,7 +26,7 @@ def _rrt(space: NeedleSpace, query: Query, seed: int, objective: Objective = SHO
 
 
 def _optimal(space: NeedleSpace, query: Query, seed: int, objective: Objective = SHORTEST) -> Search:
-    return RacingSearch(space, query, seed=seed, objective=objective)
+    return PortfolioSearch(space, query, seed=seed, objective=objective)
 
 
 def _resolution(space: NeedleSpace, query: Query, seed: int, objective: Objective = SHORTEST) -> Search:

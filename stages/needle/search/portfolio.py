@@ -1,9 +1,10 @@
-"""Optimal searches that race: each finds its own way between the obstacles, and the better half goes on."""
+"""A portfolio of optimal searches, each with its own path between the obstacles, under successive halving."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterator
+from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
@@ -11,32 +12,36 @@ import numpy as np
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query
-from stages.needle.search.guide_paths import WayFinder, Work
+from stages.needle.search.guide_paths import GuidePathFinder, Work
 from stages.needle.search.optimal import OptimalSearch
+from stages.needle.search.successive_halving import successive_halving
 from stages.needle.space import NeedleSpace
 
-FIRST_RACE, LARGEST_RACE = 4, 64
-"""Searches in the first race; each race has twice as many as the one before, up to the largest."""
-FIRST_HEAT = 500
-"""Iterations of a search in the first heat of a race; twice as many in each heat that follows."""
-LOOK = 100
-"""A search without a path is looked at after so many iterations."""
-LED_SHARE = 2 / 3
-"""Share of the iterations, once there is a path, for races of searches that are led, if there are ways."""
+FIRST_SIZE, LARGEST_SIZE = 4, 64
+"""Searches in the first round of halving; each round has twice as many as the one before, up to the largest.
+Powers of two, so that halving ends with one."""
+FIRST_ITERATIONS = 500
+"""Iterations of a search on the first rung: a few times as many as most searches take to find a path."""
+SLICE = 100
+"""A search without a path goes on in slices of so many iterations, and stops when it has a path."""
+GUIDED_SHARE = 2 / 3
+"""Share of the iterations, once there is a path, for rounds of guided searches, if there are guide paths: on
+cost maps they find most cheap paths, but in narrow passages a lattice may have none (docs/needle.md)."""
 
-FREE, LED = 0, 1
+FREE, GUIDED = 0, 1
 
 
-class RacingSearch:
-    """Finds a path as `OptimalSearch` does, and cheaper ones among other ways; a `Search`.
+class PortfolioSearch:
+    """Finds a path as `OptimalSearch` does, and cheaper ones far from it; a `Search`.
 
-    A path is varied until it is the cheapest near it, and the tree seldom finds another way that is at once
-    cheaper than a path made so cheap.  So further searches begin anew with numbers of their own, and are made
-    cheaper too before they are compared.  The best path so far takes part in every race.
+    A path is varied until it is the cheapest near it, and the tree seldom finds a path elsewhere that is at
+    once cheaper than a path made so cheap.  So further searches begin anew with random numbers of their own,
+    and are refined too before they are compared, in rounds of successive halving [JamiesonTalwalkar2016].
+    The best path so far takes part in every round.
 
-    Where more than length counts, such races take turns with others, whose searches are led: they begin with
-    ways on lattices, and those that go on take the cheapest way near their own, see `search.guide_paths`.
-    Where no lattice has a way, the races without them have all the time.
+    Where more than length counts, such rounds alternate with rounds of guided searches: these begin with
+    guide paths on state lattices, and those that go on take the cheapest guide path near their own, see
+    `search.guide_paths`.  Where no lattice has a guide path, the free rounds have all the time.
 
     Parameters
     ----------
@@ -58,87 +63,90 @@ class RacingSearch:
         self._space, self._query, self._seed, self._objective = space, query, seed, objective
         self._made = [0, 0]
         self._patience = 0
-        self._free = _Turns(self._races())
-        self._led: _Turns | None = None
-        self._finder: WayFinder
+        self._free = _Turns(self._free_turns())
+        self._guided: tuple[GuidePathFinder, _Turns] | None = None
 
     def advance(self, iterations: int) -> bool:
         """Go on with the search whose turn it is; see `stages.needle.search.base.Search`."""
         left = iterations
         while left > 0:
             turns = self._next()
-            runner, used, found = turns.advance(left)
+            worker, used, found = turns.advance(left)
             self.iterations += used
             left -= used
-            if found and runner.cost < self.cost:
-                self.path, self.cost = runner.path, runner.cost
+            if found and worker.cost < self.cost:
+                self.path, self.cost = worker.path, worker.cost
                 return True
             if used == 0 and not found:
                 return False
         return False
 
     def _next(self) -> _Turns:
-        """Return the races that have had less than their share, those that are led only if there are ways."""
-        if self._led is None:
+        """Return the turns that have had less than their share, guided ones only if there are guide paths."""
+        if self._guided is None:
             # Of pure length, trees and refinement find the least as fast.
             if self.path is None or self._objective.is_length:
                 return self._free
             self._patience = self._free.spent
             self._free.spent = 0
-            self._finder = WayFinder(self._space, self._query, seed=self._seed, objective=self._objective)
-            self._led = _Turns(self._led_races())
-        is_behind = (1.0 - LED_SHARE) * self._led.spent <= LED_SHARE * self._free.spent
-        return self._led if is_behind and self._finder.has_ways else self._free
+            finder = GuidePathFinder(self._space, self._query, seed=self._seed, objective=self._objective)
+            self._guided = finder, _Turns(self._guided_turns(finder))
+        finder, guided = self._guided
+        is_behind = (1.0 - GUIDED_SHARE) * guided.spent <= GUIDED_SHARE * self._free.spent
+        return guided if is_behind and finder.has_guide_paths else self._free
 
     def _new(self, kind: int) -> OptimalSearch:
-        """Return another search, FREE or LED, with random numbers of its own."""
+        """Return another search, FREE or GUIDED, with random numbers of its own."""
         seed = self._seed
-        if kind == LED or self._made[kind]:
-            numbers = [self._seed, self._made[kind], *([LED] if kind == LED else [])]
+        if kind == GUIDED or self._made[kind]:
+            numbers = [self._seed, self._made[kind], *([GUIDED] if kind == GUIDED else [])]
             seed = int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
         self._made[kind] += 1
         return OptimalSearch(self._space, self._query, seed=seed, objective=self._objective)
 
-    def _races(self) -> Iterator[Turn]:
+    def _free_turns(self) -> Iterator[Turn]:
         """Yield whose turn it is and for how many iterations, for ever."""
-        best, size = self._new(FREE), FIRST_RACE
+        best, size = self._new(FREE), FIRST_SIZE
         while best.path is None:
-            yield best, LOOK
+            yield best, SLICE
         patience = best.iterations
         while True:
-            runners = [best, *(self._new(FREE) for _ in range(size - 1))]
-            best = yield from self._race(runners, patience)
-            size = min(2 * size, LARGEST_RACE)
+            searches = [best, *(self._new(FREE) for _ in range(size - 1))]
+            best = yield from self._round(searches, patience)
+            size = min(2 * size, LARGEST_SIZE)
 
-    def _led_races(self) -> Iterator[Turn]:
-        """Yield turns of searches that are led."""
-        best, size = self._new(LED), FIRST_RACE
+    def _guided_turns(self, finder: GuidePathFinder) -> Iterator[Turn]:
+        """Yield turns of guided searches."""
+        best, size = self._new(GUIDED), FIRST_SIZE
         while True:
             if self.path is not None and self.cost < best.cost:
                 best.adopt(self.path, self.cost)
-            runners = [best, *(self._new(LED) for _ in range(size - 1))]
-            best = yield from self._race(runners, self._patience, self._finder)
-            size = min(2 * size, LARGEST_RACE)
+            searches = [best, *(self._new(GUIDED) for _ in range(size - 1))]
+            best = yield from self._round(searches, self._patience, finder)
+            size = min(2 * size, LARGEST_SIZE)
 
-    def _race(
-        self, runners: list[OptimalSearch], patience: int, finder: WayFinder | None = None
+    def _round(
+        self, searches: list[OptimalSearch], patience: int, finder: GuidePathFinder | None = None
     ) -> Generator[Turn, None, OptimalSearch]:
-        """Yield the turns of a race, whose searches a finder leads if there is one; return the winner."""
-        heat = FIRST_HEAT
-        while len(runners) > 1:
-            for runner in runners:
-                if finder is not None and runner.path is None:
-                    yield from _done(runner, finder.begin(runner, self.cost))
-                yield from _heat(runner, heat, patience)
-            runners, heat = _better_half(runners), 2 * heat
-            if finder is not None:
-                for runner in runners:
-                    yield from _done(runner, finder.improve(runner, self.cost))
-        yield runners[0], heat
-        return runners[0]
+        """Yield the turns of a round of halving; a finder, if given, guides the searches.  Return the best.
+
+        `patience` is how many iterations a search may take at least to find its first path.
+        """
+        rung = searches
+        for rung, work in successive_halving(
+            searches, attrgetter("cost"), work=FIRST_ITERATIONS, survivors=_half_of_all
+        ):
+            if finder is not None and rung is not searches:
+                for search in rung:
+                    yield from _done(search, finder.improve(search, self.cost))
+            for search in rung:
+                if finder is not None and search.path is None:
+                    yield from _done(search, finder.begin(search, self.cost))
+                yield from _found_and_refined(search, work, patience)
+        return rung[0]
 
 
-class _Runner(Protocol):
+class _Worker(Protocol):
     """What takes turns: a search, or work that is done."""
 
     iterations: int
@@ -152,7 +160,7 @@ class _Runner(Protocol):
     def advance(self, iterations: int) -> bool: ...
 
 
-Turn = tuple[_Runner, int]
+Turn = tuple[_Worker, int]
 
 
 class _Turns:
@@ -161,26 +169,26 @@ class _Turns:
     def __init__(self, turns: Iterator[Turn]) -> None:
         self.spent = 0
         self._turns = turns
-        self._runner: _Runner
-        self._runner, self._left = next(turns)
+        self._worker: _Worker
+        self._worker, self._left = next(turns)
 
-    def advance(self, iterations: int) -> tuple[_Runner, int, bool]:
+    def advance(self, iterations: int) -> tuple[_Worker, int, bool]:
         """Go on with a turn, not beyond it; return whose it is, iterations spent, and what it returned."""
         if self._left <= 0:
-            self._runner, self._left = next(self._turns)
-        before = self._runner.iterations
-        found = self._runner.advance(min(iterations, self._left))
-        used = self._runner.iterations - before
+            self._worker, self._left = next(self._turns)
+        before = self._worker.iterations
+        found = self._worker.advance(min(iterations, self._left))
+        used = self._worker.iterations - before
         self._left -= used
         self.spent += used
-        return self._runner, used, found
+        return self._worker, used, found
 
 
 class _Done:
     """Work that was done for a search, of which the iterations that it took are still to be counted."""
 
-    def __init__(self, runner: OptimalSearch, found: bool) -> None:
-        self.path, self.cost = runner.path, runner.cost
+    def __init__(self, search: OptimalSearch, found: bool) -> None:
+        self.path, self.cost = search.path, search.cost
         self.iterations = 0
         self._found = found
 
@@ -191,22 +199,22 @@ class _Done:
         return found
 
 
-def _done(runner: OptimalSearch, work: Iterator[Work]) -> Iterator[Turn]:
+def _done(search: OptimalSearch, work: Iterator[Work]) -> Iterator[Turn]:
     """Do work for a search piece by piece."""
     for iterations, found in work:
-        yield _Done(runner, found), iterations
+        yield _Done(search, found), iterations
 
 
-def _better_half(runners: list[OptimalSearch]) -> list[OptimalSearch]:
-    arrived = sorted((each for each in runners if each.path is not None), key=lambda search: search.cost)
-    return arrived[: len(runners) // 2]
+def _half_of_all(count: int, _finite: int) -> int:
+    """Return how many searches go on: as many as half of them, if so many have a path."""
+    return count // 2
 
 
-def _heat(runner: OptimalSearch, iterations: int, patience: int) -> Iterator[Turn]:
-    """Let a search find its first path, no longer than the first one took or a heat lasts, and refine it."""
-    looked = 0
-    while runner.path is None and looked < max(patience, iterations):
-        yield runner, LOOK
-        looked += LOOK
-    if runner.path is not None:
-        yield runner, iterations
+def _found_and_refined(search: OptimalSearch, iterations: int, patience: int) -> Iterator[Turn]:
+    """Let a search find its first path, no longer than `patience` or a rung lasts, and refine it."""
+    spent = 0
+    while search.path is None and spent < max(patience, iterations):
+        yield search, SLICE
+        spent += SLICE
+    if search.path is not None:
+        yield search, iterations

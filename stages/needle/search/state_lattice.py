@@ -1,4 +1,4 @@
-"""Ways on lattices from a start pose to a target: the cheapest over all of the space, or around a way."""
+"""State lattices between a start pose and a target: the cheapest guide path anywhere, or around another."""
 
 from __future__ import annotations
 
@@ -16,33 +16,36 @@ from stages.needle.search.kernels import state_lattice as kernel
 from stages.needle.space import NeedleSpace, workspace_lengths
 
 MOST_STATES = 1 << 15
-"""States of a lattice, in 2 MB; so many are looked at in 0.1 s."""
-SLACK = 0.97
-"""Share of the greatest curvature that ways take: the arcs laid along them bend a little more than they."""
+"""States of a lattice, in 2 MB; so many are searched in 0.1 s."""
+CURVATURE_SHARE = 0.97
+"""Share of the greatest curvature that guide paths take; arcs laid along them bend a little more."""
 LEAST_COSINE = 0.3
-"""Of the angle between a start and the line to the target; steeper ones get no ways."""
+"""Least cosine of the angle between a start and the line to the target.  From steeper starts, paths may turn
+back across the layers."""
 SKEWS = 6
-"""Lattices are turned in so many ways."""
-REACH = 9
-"""How many cells from a way those around it go."""
-ANYWHERE = 1 << 14
+"""Number of turns of a lattice about the line to the target."""
+REACH_CELLS = 9
+"""How many cells from a guide path the lattice around it goes."""
+ANYWHERE_CELLS = 1 << 14
+"""More cells than any lattice over all of the space has."""
 SAMPLE_MM = 0.05
+"""Distance of the points of a path between which its controls are interpolated."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Way:
-    """The cheapest way through a lattice of L layers, if there is one.
+class GuidePath:
+    """The cheapest path through a state lattice of L layers, if there is one.
 
     Parameters
     ----------
     controls : (L + 2, 3) float64, LPS mm
-        Start, control points of a quadratic spline, and target; None if there is no way.
+        Start, control points of a quadratic spline, and target; None if there is no path.
     cost : float
-        Of the arcs along it, infinite without a way.
+        Cost of the arcs along it, infinite without a path.
     arcs : int
         Arcs that were tried, a measure of the work.
     is_whole : bool
-        False if the lattice had too many states: then there is no way.
+        False if the lattice had too many states: then there is no path.
     """
 
     controls: Float | None
@@ -51,8 +54,8 @@ class Way:
     is_whole: bool
 
 
-class Lattices:
-    """Lattices between a start pose and a target.
+class StateLatticeSearch:
+    """Finds guide paths on state lattices between a start pose and a target.
 
     Parameters
     ----------
@@ -64,7 +67,7 @@ class Lattices:
     def __init__(self, space: NeedleSpace, query: Query, objective: Objective) -> None:
         self._space, self._query = space, query
         self._objective = space.objective_arrays(objective)
-        self._kappa = SLACK * float(space.limits[index.KAPPA])
+        self._kappa = CURVATURE_SHARE * float(space.limits[index.KAPPA])
         self._start, self._tangent = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
         ahead = query.target - self._start
         self._distance = float(np.linalg.norm(ahead))
@@ -74,15 +77,15 @@ class Lattices:
         self.is_possible = bool(
             self._distance > index.MIN_ARC_MM and self._cosine > LEAST_COSINE and np.isfinite(length)
         )
-        """Whether there may be ways: the target is in the workspace, and the start not too steep."""
+        """Whether there may be guide paths: the target is in the workspace, and the start not too steep."""
         self._states = np.zeros((MOST_STATES, kernel.STATE_COLUMNS), dtype=np.int64)
         self._before = np.zeros(MOST_STATES, dtype=np.int32)
         self._costs = np.zeros(MOST_STATES)
         self._order = np.zeros(MOST_STATES, dtype=np.int32)
         self._table = np.zeros(2 * MOST_STATES, dtype=np.int32)
 
-    def everywhere(self, layers: int, *, skew: int = 0) -> Way:
-        """Return the cheapest way of all.
+    def everywhere(self, layers: int, *, skew: int = 0) -> GuidePath:
+        """Return the cheapest guide path anywhere.
 
         Parameters
         ----------
@@ -92,15 +95,15 @@ class Lattices:
             Turns the lattice, less than SKEWS.
         """
         base, axes, goal_cells = self._straight(layers, skew)
-        return self._explore(base, axes, goal_cells, ANYWHERE, math.inf)
+        return self._explore(base, axes, goal_cells, ANYWHERE_CELLS, math.inf)
 
-    def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> Way:
-        """Return the cheapest way near another one, if it costs less than `bound`.
+    def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> GuidePath:
+        """Return the cheapest guide path near another one, if it costs less than `bound`.
 
         Parameters
         ----------
         controls : (L + 2, 3) float64, LPS mm
-            As those of `Way`.
+            As those of `GuidePath`.
         cells : float
             Size of a cell, as a share of what the greatest curvature allows.
         turn_rad : float
@@ -108,7 +111,7 @@ class Lattices:
         bound : float
         """
         axes = self._axes(cells * self._largest_cell(len(controls) - 2), _beside(self._axis), turn_rad)
-        return self._explore(controls, axes, np.zeros(2, dtype=np.int64), REACH, bound)
+        return self._explore(controls, axes, np.zeros(2, dtype=np.int64), REACH_CELLS, bound)
 
     def controls_of(self, path: ArcPath, layers: int) -> Float | None:
         """Return controls `(L + 2, 3)` of a spline near a path; None if that does not always lead ahead.
@@ -165,7 +168,7 @@ class Lattices:
             [cell * (math.cos(a) * side + math.sin(a) * up) for a in (turn_rad, turn_rad + math.pi / 3)]
         )
 
-    def _explore(self, base: Float, axes: Float, goal_cells: Float, reach: int, bound: float) -> Way:
+    def _explore(self, base: Float, axes: Float, goal_cells: Float, reach: int, bound: float) -> GuidePath:
         self._table.fill(kernel.NONE)
         begins = np.zeros(len(base), dtype=np.int64)
         arrays = (begins, self._states, self._before, self._costs)
@@ -176,13 +179,13 @@ class Lattices:
         )  # fmt: skip
         controls, cost = np.zeros_like(base), math.inf
         if is_whole:
-            cost = float(kernel.cheapest_way(base, axes, goal_cells, *arrays, controls))
+            cost = float(kernel.cheapest_guide_path(base, axes, goal_cells, *arrays, controls))
         found = controls if cost < math.inf else None
-        return Way(controls=found, cost=cost, arcs=int(arcs), is_whole=bool(is_whole))
+        return GuidePath(controls=found, cost=cost, arcs=int(arcs), is_whole=bool(is_whole))
 
 
 def via_points(controls: Float) -> Float:
-    """Return the ends of the arcs `(L, 3)` along a way: the middles of its pieces, and the target."""
+    """Return the ends of the arcs `(L, 3)` along a guide path: the middles of its pieces, and the target."""
     return np.concatenate([0.5 * (controls[1:-2] + controls[2:-1]), controls[-1:]])
 
 

@@ -1,13 +1,14 @@
-"""Ways on a lattice: the cheapest smooth curve between a pose and a point, around a base.
+"""State lattices: the cheapest smooth curve between a pose and a point, around a base.
 
 The base is the control polygon of a quadratic spline: a start, a control point for each layer, and an end;
-start and end are the middles of its first and last whole piece.  A way meets each layer in a vertex, aside
-of the base by a vector of a hexagonal lattice.  From layer to layer that vector grows by a step, and at a
-vertex the step changes by one of seven moves, none or a unit of the lattice.  So a way is such a polygon too:
-an arc leads from the middle of each piece to that of the next, and how much it bends is known.
+start and end are the middles of its first and last whole piece.  A guide path meets each layer in a vertex,
+aside of the base by a vector of a hexagonal lattice.  From layer to layer that vector grows by a step, and at
+a vertex the step changes by one of seven moves, none or a unit of the lattice.  So a guide path is such a
+polygon too: an arc leads from the middle of each piece to that of the next, and how much it bends is known.
 
-All ways are in one graph without cycles: its states are vertices with steps, its edges the arcs between the
-middles of their pieces.  The cheapest way to each state is known after a pass forward.  See docs/needle.md.
+All guide paths are in one graph without cycles: its states are vertices with steps, its edges the arcs
+between the middles of their pieces.  The cheapest path to each state is known after a pass forward.  See
+docs/needle.md.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def _middle(base, axes, goal_cells, layer, a, b, at_a, at_b):
 
 
 @inner_kernel
-def _price(space, limits, objective, branch, p, along, q, kappa, behind, first, most):
+def _arc_cost(space, limits, objective, branch, p, along, q, kappa, behind, first, most):
     """Return the cost of the arc from a point to another that begins along a vector.
 
     It is infinite if the arc bends more than `kappa`, is not clear or costs `most` or more; `behind` mm of
@@ -143,7 +144,7 @@ def explore(
     space, limits, objective, branch, base, axes, goal_cells, kappa, reach, inserted, bound,
     begins, states, before, costs, table, order,
 ):  # fmt: skip
-    """Find the cheapest way to each state; return how many arcs were tried, and whether all that there are.
+    """Find the cheapest path to each state; return how many arcs were tried, and whether all states fitted.
 
     Parameters
     ----------
@@ -160,15 +161,15 @@ def explore(
     inserted : float
         Length of the needle behind the start, mm.
     bound : float
-        States to which no way leads for less are left out.
+        States to which no path leads for less are left out.
     begins : (L + 2,) int64
         Filled: the first state of each layer from 0, the start, to L, and the number of states.
     states : (N, STATE_COLUMNS) int64
         Filled.
     before : (N,) int32
-        Filled: the state before each on the cheapest way to it, NONE at the start.
+        Filled: the state before each on the cheapest path to it, NONE at the start.
     costs : (N,) float64
-        Filled: of the cheapest way from the start to the middle of the piece after the vertex.
+        Filled: cost of the cheapest path from the start to the middle of the piece after the vertex.
     table : (M,) int32
         For the hash table, all NONE; M is a power of two and at least twice N.
     order : (N,) int32
@@ -206,7 +207,7 @@ def _follow(
 ):  # fmt: skip
     """Enter the states after state `m` of a layer to which it leads cheapest, if the goal may be met.
 
-    Return `count`, -1 if there is no more room, and how many arcs were tried.
+    Return `count`, -1 if `states` is full, and how many arcs were tried.
     """
     layers_left = len(base) - 3 - layer
     step_a, step_b = states[m, STEP_A], states[m, STEP_B]
@@ -229,7 +230,7 @@ def _follow(
         if costs[m] >= least:
             continue
         q = _middle(base, axes, goal_cells, layer + 1, a, b, at_a, at_b)
-        cost = costs[m] + _price(
+        cost = costs[m] + _arc_cost(
             space, limits, objective, branch, p, along, q, kappa, behind, m == 0, least - costs[m]
         )
         tried += 1
@@ -249,10 +250,10 @@ def _follow(
 
 
 @numba.njit(cache=True, nogil=True)
-def cheapest_way(base, axes, goal_cells, begins, states, before, costs, way):
-    """Write the cheapest way to the goal into a copy of the base; return its cost, infinite if there is none.
+def cheapest_guide_path(base, axes, goal_cells, begins, states, before, costs, controls):
+    """Write the cheapest path to the goal; return its cost, infinite if there is none.
 
-    `way` (L + 2, 3) gets start, vertices, and goal.
+    `controls` (L + 2, 3) gets start, vertices, and goal.
     """
     layers = len(base) - 2
     best, least = NONE, math.inf
@@ -261,9 +262,9 @@ def cheapest_way(base, axes, goal_cells, begins, states, before, costs, way):
             best, least = n, costs[n]
     if best == NONE:
         return least
-    way[0] = base[0]
-    way[layers + 1] = _goal(base, axes, goal_cells)
+    controls[0] = base[0]
+    controls[layers + 1] = _goal(base, axes, goal_cells)
     for layer in range(layers, 0, -1):
-        way[layer] = _vertex(base, axes, layer, states[best, AT_A], states[best, AT_B])
+        controls[layer] = _vertex(base, axes, layer, states[best, AT_A], states[best, AT_B])
         best = before[best]
     return least

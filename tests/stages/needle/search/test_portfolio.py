@@ -1,4 +1,4 @@
-"""Racing searches against single ones in clutter, where many ways lead to the target."""
+"""A portfolio of searches against a single one in clutter, where many paths lead to the target."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stages.needle.device import Needle
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.search.base import Query
 from stages.needle.search.optimal import OptimalSearch
-from stages.needle.search.portfolio import FIRST_HEAT, RacingSearch
+from stages.needle.search.portfolio import FIRST_ITERATIONS, PortfolioSearch
 from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.needle.proved import assert_proved
 from tests.stages.scenes import Canvas
@@ -50,26 +50,26 @@ def query(goal: tuple[float, float, float] = (0.0, 0.0, 38.0)) -> Query:
     return Query(lps_from_start=frame, target=np.array(goal))
 
 
-def run(search: OptimalSearch | RacingSearch, iterations: int, slice_of: int = 500) -> float:
+def run(search: OptimalSearch | PortfolioSearch, iterations: int, slice_of: int = 500) -> float:
     while search.iterations < iterations:
         search.advance(slice_of)
     return search.cost
 
 
-def test_races_find_ways_for_which_a_single_search_does_not_leave_its_own() -> None:
+def test_a_portfolio_finds_paths_that_a_single_search_does_not_leave_its_own_for() -> None:
     space = two_valleys()
-    single, races = (
+    single, portfolio = (
         np.array([run(kind(space, query(), seed=seed, objective=MAP), 60_000) for seed in range(3)])
-        for kind in (OptimalSearch, RacingSearch)
+        for kind in (OptimalSearch, PortfolioSearch)
     )
-    assert races.max() < 1.001 * min(races.min(), single.min())
-    assert single.max() > 1.02 * races.max()
+    assert portfolio.max() < 1.001 * min(portfolio.min(), single.min())
+    assert single.max() > 1.02 * portfolio.max()
 
 
 @pytest.mark.parametrize("objective", [SHORTEST, INVERSE])
 def test_each_path_is_cheaper_clear_and_within_the_limits(objective: Objective) -> None:
     space, costs = clutter(1), []
-    search = RacingSearch(space, query(), seed=3, objective=objective)
+    search = PortfolioSearch(space, query(), seed=3, objective=objective)
     for _ in range(100):
         if not search.advance(300):
             continue
@@ -82,26 +82,26 @@ def test_each_path_is_cheaper_clear_and_within_the_limits(objective: Objective) 
 
 def test_the_first_path_is_that_of_the_single_search() -> None:
     space = clutter(1)
-    single, races = (kind(space, query(), seed=5) for kind in (OptimalSearch, RacingSearch))
+    single, portfolio = (kind(space, query(), seed=5) for kind in (OptimalSearch, PortfolioSearch))
     while single.path is None:
         single.advance(100)
-    while races.path is None:
-        races.advance(100)
-    assert np.array_equal(single.path.arcs, races.path.arcs)
+    while portfolio.path is None:
+        portfolio.advance(100)
+    assert np.array_equal(single.path.arcs, portfolio.path.arcs)
 
 
 def test_the_same_seed_repeats() -> None:
-    costs = [run(RacingSearch(clutter(1), query(), seed=seed), 10_000) for seed in (5, 5, 6)]
+    costs = [run(PortfolioSearch(clutter(1), query(), seed=seed), 10_000) for seed in (5, 5, 6)]
     assert costs[0] == costs[1] != costs[2]
 
 
 def test_iterations_are_those_of_all_searches() -> None:
-    search = RacingSearch(clutter(1), query(), seed=1)
+    search = PortfolioSearch(clutter(1), query(), seed=1)
     while search.path is None:
         search.advance(100)
     first = search.iterations
     spent = 0
-    while spent < 20 * FIRST_HEAT:
+    while spent < 20 * FIRST_ITERATIONS:
         before = search.iterations
         found = search.advance(250)
         assert search.iterations - before == 250 or found
@@ -110,5 +110,5 @@ def test_iterations_are_those_of_all_searches() -> None:
 
 
 def test_a_target_at_the_start_ends() -> None:
-    search = RacingSearch(clutter(1), query((0.0, 0.0, -38.0)), seed=1)
+    search = PortfolioSearch(clutter(1), query((0.0, 0.0, -38.0)), seed=1)
     assert not any(search.advance(1000) for _ in range(5))

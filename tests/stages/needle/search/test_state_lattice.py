@@ -1,4 +1,4 @@
-"""Ways on lattices: against all sequences of moves, and against what a needle can follow."""
+"""Guide paths on state lattices: against all sequences of moves, and against what a needle can follow."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from stages.needle.costs import map_integral
 from stages.needle.device import Needle
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
-from stages.needle.search import guide_paths as ways
+from stages.needle.search import guide_paths
 from stages.needle.search.base import Query
-from stages.needle.search.guide_paths import ARCS_PER_ITERATION, CELLS, LAYERS, LEAST_GAIN, WayFinder
+from stages.needle.search.guide_paths import ARCS_PER_ITERATION, CELLS, LAYERS, LEAST_GAIN, GuidePathFinder
 from stages.needle.search.optimal import OptimalSearch
-from stages.needle.search.portfolio import RacingSearch
-from stages.needle.search.state_lattice import SKEWS, SLACK, Lattices, via_points
+from stages.needle.search.portfolio import PortfolioSearch
+from stages.needle.search.state_lattice import CURVATURE_SHARE, SKEWS, StateLatticeSearch, via_points
 from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.needle.proved import assert_proved
 from tests.stages.scenes import Canvas
@@ -48,7 +48,7 @@ def random_costs(seed: int) -> np.ndarray:
 
 
 def wall_with_a_hole(aside_mm: float = 4.0, radius_mm: float = 0.8) -> np.ndarray:
-    """A thick wall of cost with a hole aside of the straight way; elsewhere tissue costs little."""
+    """A thick wall of cost with a hole aside of the straight line; elsewhere tissue costs little."""
     x, y = np.meshgrid(np.arange(50) - 24.5, np.arange(50) - 24.5, indexing="ij")
     costs = np.full((50, 50, 84), 0.01)
     costs[:, :, 30:54] = np.where(np.hypot(x - aside_mm, y) < radius_mm, 0.01, 10.0)[..., None]
@@ -98,7 +98,7 @@ def arcs_along(controls: Float) -> list[ArcPath]:
 
 
 def map_cost(space: NeedleSpace, controls: Float) -> float:
-    """Return the line integral of the cost map along the arcs of a way."""
+    """Return the line integral of the cost map along the arcs of a guide path."""
     return sum(map_integral(space.cost_map, each) for each in arcs_along(controls))
 
 
@@ -108,7 +108,7 @@ def bending(controls: Float) -> Float:
 
 
 def assert_followed(space: NeedleSpace, asked: Query, controls: Float, objective: Objective = MAP) -> float:
-    """Fail unless a needle can follow a way; return what that costs."""
+    """Fail unless a needle can follow a guide path; return what that costs."""
     search = OptimalSearch(space, asked, objective=objective)
     assert search.follow(via_points(controls))
     assert search.path is not None
@@ -117,13 +117,13 @@ def assert_followed(space: NeedleSpace, asked: Query, controls: Float, objective
 
 
 @pytest.mark.parametrize(("tilt_deg", "skew"), [(0.0, 0), (7.0, 0), (7.0, 1), (-10.0, 2)])
-def test_the_cheapest_way_is_that_of_all_sequences_of_moves(tilt_deg: float, skew: int) -> None:
+def test_the_cheapest_guide_path_is_that_of_all_sequences_of_moves(tilt_deg: float, skew: int) -> None:
     """All 7^5 sequences of moves are tried; those that end at the target are rated piece by piece."""
     layers, asked = 5, query(tilt_deg)
     space = space_with(random_costs(1))
-    lattices = Lattices(space, asked, MAP)
+    lattices = StateLatticeSearch(space, asked, MAP)
     base, axes, goal_cells = lattices._straight(layers, skew)
-    way = lattices.everywhere(layers, skew=skew)
+    guide = lattices.everywhere(layers, skew=skew)
     units = np.array([[0, 0], [1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
     moves = units[np.array(list(product(range(7), repeat=layers)))]
     steps = np.cumsum(moves, axis=1)
@@ -135,65 +135,67 @@ def test_the_cheapest_way_is_that_of_all_sequences_of_moves(tilt_deg: float, ske
     for each in cells:
         inner = base[1:-1] + each @ axes
         controls = np.concatenate([base[:1], inner, asked.target[None]])
-        if bending(controls).max() <= SLACK / RADIUS_MM:
+        if bending(controls).max() <= CURVATURE_SHARE / RADIUS_MM:
             costs.append(map_cost(space, controls))
     assert len(costs) > 10
-    assert way.is_whole and way.controls is not None
-    assert way.cost == pytest.approx(min(costs), rel=1e-6)
-    assert map_cost(space, way.controls) == pytest.approx(min(costs), rel=1e-6)
+    assert guide.is_whole and guide.controls is not None
+    assert guide.cost == pytest.approx(min(costs), rel=1e-6)
+    assert map_cost(space, guide.controls) == pytest.approx(min(costs), rel=1e-6)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 10.0, -15.0])
-def test_a_needle_can_follow_the_ways_around_a_ball(tilt_deg: float) -> None:
+def test_a_needle_can_follow_the_guide_paths_around_a_ball(tilt_deg: float) -> None:
     asked, objective = query(tilt_deg), Objective(length=1.0, inverse_clearance=1.0)
     space = space_with(None, ([0.0, 0.0, 0.0], 3.0))
-    lattices = Lattices(space, asked, objective)
+    lattices = StateLatticeSearch(space, asked, objective)
     middles = []
     for skew in range(SKEWS):
-        way = lattices.everywhere(12, skew=skew)
-        assert way.controls is not None
-        assert bending(way.controls).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
-        assert way.controls[-1] == pytest.approx(asked.target, abs=1e-9)
-        assert assert_followed(space, asked, way.controls, objective) == pytest.approx(way.cost, rel=0.002)
-        middles.append(way.controls[6])
+        guide = lattices.everywhere(12, skew=skew)
+        assert guide.controls is not None
+        assert bending(guide.controls).max() <= CURVATURE_SHARE / RADIUS_MM * (1 + 1e-9)
+        assert guide.controls[-1] == pytest.approx(asked.target, abs=1e-9)
+        assert assert_followed(space, asked, guide.controls, objective) == pytest.approx(
+            guide.cost, rel=0.002
+        )
+        middles.append(guide.controls[6])
     assert max(np.linalg.norm(each - middles[0]) for each in middles) > 0.05
 
 
 @pytest.mark.parametrize("tilt_deg", [4.0, 8.0, -6.0])
-def test_a_needle_can_follow_ways_that_touch_what_they_pass(tilt_deg: float) -> None:
-    """The shortest way bends around the ball: the arcs lie nearer to it than the vertices."""
+def test_a_needle_can_follow_guide_paths_that_touch_what_they_pass(tilt_deg: float) -> None:
+    """The shortest path bends around the ball: the arcs lie nearer to it than the vertices."""
     asked = query(tilt_deg)
     space = space_with(None, ([1.0, 0.0, 0.0], 5.0))
-    lattices = Lattices(space, asked, SHORTEST)
-    way = lattices.everywhere(10)
+    lattices = StateLatticeSearch(space, asked, SHORTEST)
+    guide = lattices.everywhere(10)
     for cells, turn_rad in ((1 / 3, 0.1), (1 / 6, 0.4), (1 / 6, 0.8), (1 / 12, 0.2)):
-        assert way.controls is not None
-        assert assert_followed(space, asked, way.controls, SHORTEST) == pytest.approx(way.cost, rel=1e-4)
-        way = lattices.around(way.controls, cells, turn_rad, way.cost * (1 + 1e-9))
+        assert guide.controls is not None
+        assert assert_followed(space, asked, guide.controls, SHORTEST) == pytest.approx(guide.cost, rel=1e-4)
+        guide = lattices.around(guide.controls, cells, turn_rad, guide.cost * (1 + 1e-9))
 
 
-def test_ways_around_a_way_are_cheaper_and_meet_the_target() -> None:
+def test_guide_paths_around_another_are_cheaper_and_meet_the_target() -> None:
     space, asked = space_with(random_costs(2)), query(10.0)
-    lattices = Lattices(space, asked, MAP)
-    way = lattices.everywhere(10)
-    costs = [way.cost]
+    lattices = StateLatticeSearch(space, asked, MAP)
+    guide = lattices.everywhere(10)
+    costs = [guide.cost]
     for cells in (0.5, 0.25, 0.125):
-        assert way.controls is not None
-        way = lattices.around(way.controls, cells, 0.3, costs[-1] * (1 + 1e-9))
-        costs.append(way.cost)
-        assert way.controls is not None
-        assert bending(way.controls).max() <= SLACK / RADIUS_MM * (1 + 1e-9)
-        assert way.controls[-1] == pytest.approx(asked.target, abs=1e-9)
-        assert map_cost(space, way.controls) == pytest.approx(way.cost, rel=1e-9)
+        assert guide.controls is not None
+        guide = lattices.around(guide.controls, cells, 0.3, costs[-1] * (1 + 1e-9))
+        costs.append(guide.cost)
+        assert guide.controls is not None
+        assert bending(guide.controls).max() <= CURVATURE_SHARE / RADIUS_MM * (1 + 1e-9)
+        assert guide.controls[-1] == pytest.approx(asked.target, abs=1e-9)
+        assert map_cost(space, guide.controls) == pytest.approx(guide.cost, rel=1e-9)
     assert (np.diff(costs) <= 1e-9).all()
     assert costs[-1] < 0.97 * costs[0]
-    dearer = lattices.around(way.controls, 0.125, 0.3, 0.5 * costs[-1])
+    dearer = lattices.around(guide.controls, 0.125, 0.3, 0.5 * costs[-1])
     assert dearer.controls is None and dearer.cost == math.inf
 
 
 def test_controls_of_a_path_lead_along_it() -> None:
     space, asked = space_with(random_costs(3)), query(10.0)
-    lattices = Lattices(space, asked, MAP)
+    lattices = StateLatticeSearch(space, asked, MAP)
     controls = lattices.everywhere(12).controls
     assert controls is not None
     search = OptimalSearch(space, asked, objective=MAP)
@@ -206,7 +208,7 @@ def test_controls_of_a_path_lead_along_it() -> None:
 def test_a_path_that_turns_back_has_no_controls() -> None:
     frame = query().lps_from_start
     back = ArcPath(lps_from_start=frame, arcs=np.array([[120.0, 0.0, 1 / RADIUS_MM]]))
-    assert Lattices(space_with(random_costs(1)), query(), MAP).controls_of(back, 12) is None
+    assert StateLatticeSearch(space_with(random_costs(1)), query(), MAP).controls_of(back, 12) is None
 
 
 @pytest.mark.parametrize(
@@ -217,28 +219,28 @@ def test_a_path_that_turns_back_has_no_controls() -> None:
         (query(70.0, (-6.0, 0.0, -28.0)), "out of the workspace"),
     ],
 )
-def test_there_are_no_ways_where_none_can_be(asked: Query, why: str) -> None:
+def test_there_are_no_guide_paths_where_none_can_be(asked: Query, why: str) -> None:
     space = space_with(random_costs(1))
-    assert not Lattices(space, asked, MAP).is_possible, why
-    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    assert not StateLatticeSearch(space, asked, MAP).is_possible, why
+    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
     search = OptimalSearch(space, asked, objective=MAP)
-    assert not finder.has_ways
+    assert not finder.has_guide_paths
     assert not list(finder.begin(search, math.inf)) and search.path is None
 
 
-def test_a_lattice_without_room_has_no_ways() -> None:
-    way = Lattices(space_with(random_costs(1)), query(10.0), MAP).everywhere(40)
-    assert not way.is_whole and way.controls is None
+def test_a_lattice_with_too_many_states_has_no_guide_path() -> None:
+    guide = StateLatticeSearch(space_with(random_costs(1)), query(10.0), MAP).everywhere(40)
+    assert not guide.is_whole and guide.controls is None
 
 
-def test_a_blocked_start_has_no_ways() -> None:
+def test_a_blocked_start_has_no_guide_path() -> None:
     space = space_with(random_costs(1), ([0.0, 0.0, -36.0], 3.0))
-    assert Lattices(space, query(), MAP).everywhere(10).controls is None
+    assert StateLatticeSearch(space, query(), MAP).everywhere(10).controls is None
 
 
 def test_searches_follow_only_what_is_cheaper_and_can_be_followed() -> None:
     space, asked = space_with(random_costs(1)), query()
-    controls = Lattices(space, asked, MAP).everywhere(10).controls
+    controls = StateLatticeSearch(space, asked, MAP).everywhere(10).controls
     assert controls is not None
     search = OptimalSearch(space, asked, objective=MAP)
     assert not search.follow(np.array([[15.0, 0.0, -30.0], asked.target])), "bends too much"
@@ -253,56 +255,58 @@ def test_searches_follow_only_what_is_cheaper_and_can_be_followed() -> None:
     assert search.cost < cost
 
 
-def test_a_lattice_holds_the_way_through_a_hole_in_a_wall_of_cost() -> None:
-    """Searches that are led by ways alone go through the hole: they are not refined, and no tree grows."""
+def test_a_lattice_holds_the_path_through_a_hole_in_a_wall_of_cost() -> None:
+    """Searches led by guide paths alone go through the hole: they are not refined, and no tree grows."""
     space, asked = space_with(wall_with_a_hole()), query()
-    assert Lattices(space, asked, MAP).everywhere(10).cost < 1.0
+    assert StateLatticeSearch(space, asked, MAP).everywhere(10).cost < 1.0
     search = OptimalSearch(space, asked, objective=MAP)
-    work = list(WayFinder(space, asked, seed=1, objective=MAP).begin(search, math.inf))
+    work = list(GuidePathFinder(space, asked, seed=1, objective=MAP).begin(search, math.inf))
     assert search.cost < 1.0
     assert search.iterations == 0 < sum(iterations for iterations, _ in work) < 20_000
     assert map_integral(space.cost_map, straight(asked.lps_from_start[:3, 3], asked.target)) > 200.0
-    races = RacingSearch(space, asked, seed=3, objective=MAP)
-    while races.iterations < 6_000:
-        races.advance(500)
-    assert races.cost < 1.0
+    portfolio = PortfolioSearch(space, asked, seed=3, objective=MAP)
+    while portfolio.iterations < 6_000:
+        portfolio.advance(500)
+    assert portfolio.cost < 1.0
 
 
 @pytest.mark.parametrize("look_arcs", [1, 1 << 30])
-def test_searches_begin_with_the_cheapest_ways(monkeypatch: pytest.MonkeyPatch, look_arcs: int) -> None:
+def test_searches_begin_with_the_cheapest_guide_paths(
+    monkeypatch: pytest.MonkeyPatch, look_arcs: int
+) -> None:
     """Of one more lattice each time, or of all from the second on; no lattice is looked at twice."""
-    monkeypatch.setattr(ways, "LOOK_ARCS", look_arcs)
-    monkeypatch.setattr(ways, "LAYERS", (8, 10))
-    monkeypatch.setattr(ways, "CELLS", ())
+    monkeypatch.setattr(guide_paths, "ARCS_PER_BEGINNING", look_arcs)
+    monkeypatch.setattr(guide_paths, "LAYERS", (8, 10))
+    monkeypatch.setattr(guide_paths, "CELLS", ())
     space, asked = space_with(random_costs(5)), query(5.0)
-    lattices = Lattices(space, asked, MAP)
+    lattices = StateLatticeSearch(space, asked, MAP)
     every = [lattices.everywhere(layers, skew=skew) for skew in range(SKEWS) for layers in (8, 10)]
-    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
     unseen, seen, begun = list(every), [], []
     for _ in range(len(every) + 2):
         search = OptimalSearch(space, asked, objective=MAP)
         work = list(finder.begin(search, math.inf))
         looks = 1 if look_arcs == 1 or not begun else len(unseen)
         looked, unseen = unseen[:looks], unseen[looks:]
-        assert [done for done, _ in work] == [1 + way.arcs // ARCS_PER_ITERATION for way in looked]
+        assert [done for done, _ in work] == [1 + guide.arcs // ARCS_PER_ITERATION for guide in looked]
         seen += looked
         if not seen:
             seen, begun = begun, []
-        seen.sort(key=lambda way: way.cost)
+        seen.sort(key=lambda guide: guide.cost)
         begun.append(seen.pop(0))
         expected = OptimalSearch(space, asked, objective=MAP)
         assert begun[-1].controls is not None and expected.follow(via_points(begun[-1].controls))
         assert search.cost == expected.cost
-    assert len(begun) == 2 and finder.has_ways
+    assert len(begun) == 2 and finder.has_guide_paths
 
 
 def test_layers_of_which_there_are_too_many_states_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ways, "LAYERS", (8, 40))
+    monkeypatch.setattr(guide_paths, "LAYERS", (8, 40))
     space, asked = space_with(random_costs(5)), query(5.0)
-    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
     search = OptimalSearch(space, asked, objective=MAP)
     list(finder.begin(search, math.inf))
-    assert search.path is not None and finder.has_ways
+    assert search.path is not None and finder.has_guide_paths
     list(finder.begin(OptimalSearch(space, asked, objective=MAP), math.inf))
     assert finder._layers == (8,)
     cost = search.cost
@@ -311,9 +315,9 @@ def test_layers_of_which_there_are_too_many_states_are_left(monkeypatch: pytest.
     assert search.cost < cost
 
 
-def test_a_way_is_made_cheaper_as_long_as_that_gains() -> None:
+def test_a_guide_path_is_refined_as_long_as_that_gains() -> None:
     space, asked = space_with(random_costs(2)), query(10.0)
-    finder = WayFinder(space, asked, seed=1, objective=MAP)
+    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
     search, costs = OptimalSearch(space, asked, objective=MAP), []
     for _ in finder.begin(search, math.inf):
         if search.path is not None:
@@ -324,25 +328,25 @@ def test_a_way_is_made_cheaper_as_long_as_that_gains() -> None:
     assert (gains[:-1] > 0.9 * LEAST_GAIN).all() and gains[-1] < 1.1 * LEAST_GAIN
 
 
-def test_where_no_lattice_has_a_way_all_time_goes_to_searches_without() -> None:
-    """The target takes more than the share of the curvature that ways take."""
+def test_where_no_lattice_has_a_guide_path_all_time_goes_to_free_searches() -> None:
+    """The target takes more than the share of the curvature that guide paths take."""
     space, asked = space_with(random_costs(1)), query(0.0, (15.0, 0.0, 2.0))
-    lattices = Lattices(space, asked, MAP)
+    lattices = StateLatticeSearch(space, asked, MAP)
     assert lattices.is_possible
     assert all(lattices.everywhere(layers).controls is None for layers in LAYERS)
-    races = RacingSearch(space, asked, objective=MAP)
+    portfolio = PortfolioSearch(space, asked, objective=MAP)
     spent = []
     for iterations in (3_000, 10_000):
-        while races.path is None or races.iterations < iterations:
-            races.advance(100)
-        assert races._led is not None
-        spent.append(races._led.spent)
+        while portfolio.path is None or portfolio.iterations < iterations:
+            portfolio.advance(100)
+        assert portfolio._guided is not None
+        spent.append(portfolio._guided[1].spent)
     assert spent[0] == spent[1] < 1000
 
 
 def test_the_same_iterations_give_the_same_path() -> None:
     def run(seed: int) -> np.ndarray:
-        search = RacingSearch(space_with(random_costs(1)), query(5.0), seed=seed, objective=MAP)
+        search = PortfolioSearch(space_with(random_costs(1)), query(5.0), seed=seed, objective=MAP)
         while search.iterations < 20_000:
             before = search.iterations
             assert search.advance(250) or search.iterations - before == 250
@@ -354,21 +358,21 @@ def test_the_same_iterations_give_the_same_path() -> None:
 
 
 def test_the_target_may_lie_straight_ahead() -> None:
-    lattices = Lattices(space_with(random_costs(4)), query(), MAP)
+    lattices = StateLatticeSearch(space_with(random_costs(4)), query(), MAP)
     controls = lattices.everywhere(10).controls
     assert controls is not None
     assert controls[-1] == pytest.approx(query().target, abs=1e-12)
     assert_followed(space_with(random_costs(4)), query(), controls)
 
 
-def test_pure_length_needs_no_ways() -> None:
-    """Iteration by iteration the races are those without ways."""
+def test_pure_length_needs_no_guide_paths() -> None:
+    """Of pure length, no search of a portfolio is guided."""
     assert SHORTEST.is_length and Objective(length=2.0).is_length
     assert not MAP.is_length and not Objective(length=1.0, inverse_clearance=0.1).is_length
-    led = []
+    guided = []
     for objective in (SHORTEST, MAP):
-        search = RacingSearch(space_with(random_costs(1)), query(5.0), objective=objective)
+        search = PortfolioSearch(space_with(random_costs(1)), query(5.0), objective=objective)
         while search.iterations < 2000:
             search.advance(500)
-        led.append(search._led is not None)
-    assert led == [False, True]
+        guided.append(search._guided is not None)
+    assert guided == [False, True]

@@ -127,7 +127,7 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
     try:
         if kind < 0.5:
             menu = alternatives(
-                lung, system, target, objective=objective, count=MENU, apart_mm=3.0, atlas=atlas
+                lung, system, target, objective=objective, count=MENU, separation_mm=3.0, atlas=atlas
             )
             yield from (each.plan for each in menu)
             return

@@ -1,4 +1,4 @@
-"""A menu of plans to one target that are really different, and which of them no other beats."""
+"""A diverse plan set: plans to one target that are separated, and which of them are Pareto-optimal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
 
 COUNT = 15
-APART_MM = 5.0
+SEPARATION_MM = 5.0
 
 SMALL_IS_GOOD = ("inverse_clearance", "cost_map", "length_in_tissue_mm")
 LARGE_IS_GOOD = ("clearance_mm", "pleura_mm")
@@ -28,7 +28,7 @@ LARGE_IS_GOOD = ("clearance_mm", "pleura_mm")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Alternative:
-    """One way to a target.
+    """One plan of a diverse plan set.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Alternative:
         "clearance_mm" and "pleura_mm", least distance of tube and needle from any obstacle and from the
         pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" of the needle.
     on_front : bool
-        Whether no other one of the menu is at least as good in all criteria and better in one.
+        Whether no other plan of the set is at least as good in all criteria and better in one.
     """
 
     plan: Plan
@@ -52,13 +52,14 @@ def alternatives(
     *,
     objective: str = "inverse_clearance",
     count: int = COUNT,
-    apart_mm: float = APART_MM,
+    separation_mm: float = SEPARATION_MM,
     atlas: Atlas | None = None,
 ) -> tuple[Alternative, ...]:
-    """Return up to `count` plans of which the needles of every two lie at least `apart_mm` apart somewhere.
+    """Return a diverse plan set: the needles of every two of its plans are separated by `separation_mm`.
 
-    Direct arcs from the atlas are taken, the cheapest first, the cheapest through each airway branch before
-    others; each is proved and complete as any plan.
+    Two needles are separated if some point of either is at least so far from all points of the other.  The
+    plans are direct arcs from the atlas.  The cheapest through each airway branch comes first, then the
+    others by their cost.  Each plan is proved and complete as any other.
 
     Parameters
     ----------
@@ -68,8 +69,9 @@ def alternatives(
     objective : str
         What "cheap" means; see `lungaccess.coupled.planner.plan`.
     count : int
-    apart_mm : float
-        Somewhere a point of the needle of one plan is so far from all of the other's.
+        The most plans that are returned.
+    separation_mm : float
+        The least separation of the needles of two plans.
     atlas : Atlas, optional
         Made with `build_atlas` beforehand.
 
@@ -83,8 +85,10 @@ def alternatives(
         If the target lies outside the lung or inside an obstacle.
     """
     require_objective(objective)
-    if count < 1 or not apart_mm > 0.0:
-        raise SettingsError(f"{count} plans {apart_mm:g} mm apart are asked for", expected="both above 0")
+    if count < 1 or not separation_mm > 0.0:
+        raise SettingsError(
+            f"{count} plans {separation_mm:g} mm apart are asked for", expected="both above 0"
+        )
     require_free(lung, target.lps_mm)
     if atlas is not None:
         require_same(atlas, lung, system)
@@ -95,7 +99,7 @@ def alternatives(
     )  # fmt: skip
     began = time.perf_counter()
     search = AtlasSearch(task, atlas)
-    chosen = list(different_candidates(search, count, apart_mm))
+    chosen = list(different_candidates(search, count, separation_mm))
     if not chosen:
         raise explain(search, 0)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}

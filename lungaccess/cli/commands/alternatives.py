@@ -1,4 +1,4 @@
-"""The command `lungaccess alternatives`: a menu of plans that are really different."""
+"""The command `lungaccess alternatives`: a diverse set of plans to one target."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def alternatives(
     nodule: int | None = None,
     system: str = "lung-default",
     count: int = 15,
-    apart: float = 5.0,
+    separation: float = 5.0,
     objective: str = "inverse_clearance",
     allow_fissures: bool | None = None,
     out: Path = Path("lungaccess-alternatives"),
@@ -47,8 +47,8 @@ def alternatives(
         Preset or TOML file.
     count : int
         How many plans at most.
-    apart : float
-        Every two differ somewhere by at least so many mm.
+    separation : float
+        The needles of every two plans lie somewhere at least so many mm from each other.
     objective : str
         By what the cheapest come first: inverse_clearance, cost_map, voxel_sum or length_mm.
     allow_fissures : bool
@@ -61,7 +61,7 @@ def alternatives(
         Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.checking import check
-    from lungaccess.coupled.alternatives import alternatives as find
+    from lungaccess.coupled.alternatives import alternatives as find_alternatives
     from lungaccess.coupled.atlas_store import open_atlas
     from lungaccess.problem.target import resolve_target
 
@@ -73,23 +73,25 @@ def alternatives(
     with progress("enumerating what scope and tubes can do") as shown:
         atlas = open_atlas(lung, device, cache=cache, progress=shown.share)
     with progress("searching"):
-        menu = find(lung, device, aim, objective=objective, count=count, apart_mm=apart, atlas=atlas)
+        found = find_alternatives(
+            lung, device, aim, objective=objective, count=count, separation_mm=separation, atlas=atlas
+        )
     accepted = []
     with progress("checking") as shown:
-        for number, each in enumerate(menu, start=1):
+        for number, each in enumerate(found, start=1):
             each.plan.save(out / f"plan-{number:02d}.json")
             accepted.append(check(each.plan, lung).accepted)
-            shown.share(number / len(menu))
+            shown.share(number / len(found))
     refused = accepted.count(False)
     if json:
-        terminal.show_json(_records(menu, accepted, out))
+        terminal.show_json(_records(found, accepted, out))
         return REFUSED if refused else ACCEPTED
-    terminal.show([terminal.table(f"Ways to the target in {lung.name}", COLUMNS, _rows(menu))])
-    terminal.console.print(terminal.escaped(f"Written to {out}; the check refuses {refused} of {len(menu)}"))
+    terminal.show([terminal.table(f"Ways to the target in {lung.name}", COLUMNS, _rows(found))])
+    terminal.console.print(terminal.escaped(f"Written to {out}; the check refuses {refused} of {len(found)}"))
     return REFUSED if refused else ACCEPTED
 
 
-def _records(menu: tuple[Alternative, ...], accepted: list[bool], out: Path) -> list[dict[str, object]]:
+def _records(found: tuple[Alternative, ...], accepted: list[bool], out: Path) -> list[dict[str, object]]:
     """Return each plan's file, verdict and criteria as plain values."""
     return [
         {
@@ -100,11 +102,11 @@ def _records(menu: tuple[Alternative, ...], accepted: list[bool], out: Path) -> 
             "generation": int(each.plan.scope.generation),
             "criteria": {name: float(value) for name, value in each.criteria.items()},
         }
-        for number, (each, verdict) in enumerate(zip(menu, accepted, strict=True), start=1)
+        for number, (each, verdict) in enumerate(zip(found, accepted, strict=True), start=1)
     ]
 
 
-def _rows(menu: tuple[Alternative, ...]) -> list[tuple[str, ...]]:
+def _rows(found: tuple[Alternative, ...]) -> list[tuple[str, ...]]:
     return [
         (
             f"{number:02d}",
@@ -117,5 +119,5 @@ def _rows(menu: tuple[Alternative, ...]) -> list[tuple[str, ...]]:
             f"{each.criteria['cost_map']:.2f}",
             "yes" if each.on_front else "",
         )
-        for number, each in enumerate(menu, start=1)
+        for number, each in enumerate(found, start=1)
     ]

@@ -1,11 +1,11 @@
-"""Compiled kernels of the coupled search: tubes and needle together, varied and judged as one.
+"""Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
 `tube` is the tuple (scene, constants) of `stages.tube.kernels.deployment`.  `needle` is the tuple (space,
 limits, objective, whether voxels of infinite cost exist that the objective does not see, a cost map) of
-`stages.needle.kernels`.  A choice is `x`, the place of the scope's
-tip as a row of `stands`, the rotation in rad, and the insertions of outer and inner tube in mm; and `vias`,
-points (LPS mm) through which single arcs lead from the tube to the target.  A row of `stands` is a scope tip:
-point, unit tangent, and a unit vector across from which the rotation counts.
+`stages.needle.kernels`.  A choice has two parts.  `x` holds a row of `scope_poses`, the rotation in rad, and
+the insertions of outer and inner tube in mm.  `vias` are points (LPS mm) through which single arcs lead from
+the tube to the target.  A row of `scope_poses` (9,) is a scope tip: point, unit tangent, and the unit vector
+across the tangent from which the rotation counts.
 """
 
 from __future__ import annotations
@@ -38,20 +38,21 @@ from stages.tube.kernels import (
     deploy,
 )
 
-STAND = 0
+SCOPE_POSE = 0
 ROTATION = 1
 OUTER = 2
 INNER = 3
 N_CHOICE = 4
 
 ROUNDING = 1e-9
-"""Share of each limit that is left, so that the numbers of a plan keep it whatever is rounded."""
+"""Share of each limit that stays unused, so that rounding does not carry a plan beyond the limit."""
 SHORTEST_ARC_MM = 0.5
+"""Shorter arcs are refused.  The value is a free choice, well below the length of any useful arc."""
 
 
 @inner_kernel
 def _tube_tip(constants, base, normal, outer, inner):
-    """Return the pose at the tip of the inner tube, as `deploy` does but without looking at anything."""
+    """Return the pose at the tip of the inner tube, as `deploy` does but without testing anything."""
     straight = max(inner - constants[CURVED_LENGTH], 0.0)
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])
     towards = (normal[0], normal[1], normal[2])
@@ -73,8 +74,8 @@ def _tube_tip(constants, base, normal, outer, inner):
 
 
 @inner_kernel
-def _needle_cost(needle, pose, vias, count, target, dearest):
-    """Return the cost of the arcs through `count` vias; infinite beyond a limit or above `dearest`."""
+def _needle_cost(needle, pose, vias, count, target, cost_limit):
+    """Return the cost of the arcs through `count` vias; infinite beyond a limit or from `cost_limit` on."""
     space, limits, objective, sees_walls, walls = needle
     length = 0.0
     turn = 0.0
@@ -100,7 +101,7 @@ def _needle_cost(needle, pose, vias, count, target, dearest):
         if least_cosine(forward, aside, angle) < cosine:
             return math.inf
         cost += cost_of_arc(space, objective, limits[COST_STEP], pose, bend, arc, m == 0)
-        if not cost < dearest:
+        if not cost < cost_limit:
             return math.inf
         if sees_walls and map_costs_on_arc(walls, space[2], pose, bend, arc, m == 0)[0] == math.inf:
             return math.inf
@@ -127,21 +128,21 @@ def _needle_clear(needle, pose, vias, count, target, branch):
 
 
 @inner_kernel
-def judged_cost(tube, needle, stands, allowed, x, vias, count, target, dearest, trace, tip):
-    """Return the cost of a choice if it is below `dearest` and all of it is proved; else infinity.
+def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, cost_limit, trace, tip):
+    """Return the cost of a choice if it is below `cost_limit` and all of it is proved; else infinity.
 
-    What is fast comes first.
+    The fast tests come first: limits and cost of the needle, the deployment, the needle's clearance.
     """
     scene, constants = tube
-    row = int(x[STAND])
+    row = int(x[SCOPE_POSE])
     outer, inner = x[OUTER], x[INNER]
-    if row < 0 or row >= stands.shape[0] or not allowed[row]:
+    if row < 0 or row >= scope_poses.shape[0] or not allowed[row]:
         return math.inf
     if outer < 0.0 or outer > inner or inner > constants[MAX_EXTENSION]:
         return math.inf
     if inner - outer > constants[MAX_PROTRUSION]:
         return math.inf
-    base = stands[row]
+    base = scope_poses[row]
     c, s = math.cos(x[ROTATION]), math.sin(x[ROTATION])
     normal = (
         c * base[6] + s * (base[4] * base[8] - base[5] * base[7]),
@@ -149,7 +150,7 @@ def judged_cost(tube, needle, stands, allowed, x, vias, count, target, dearest, 
         c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
     )
     pose = _tube_tip(constants, base, normal, outer, inner)
-    cost = _needle_cost(needle, pose, vias, count, target, dearest)
+    cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
     if cost == math.inf:
         return math.inf
     if deploy(scene, constants, base[:6], np.array(normal), outer, inner, trace, tip) != ACCEPTED:

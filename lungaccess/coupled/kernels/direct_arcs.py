@@ -1,4 +1,4 @@
-"""Compiled kernels of the coupled search: lower bounds of the cost, and the price of many direct arcs.
+"""Compiled kernels of the coupled search: lower bounds of the cost, and the cost of many direct arcs.
 
 `needle` is that of `lungaccess.coupled.kernels.candidate`.
 """
@@ -26,12 +26,12 @@ from stages.needle.kernels import (
     cost_of_arc,
 )
 
-TOO_DEAR = -2
-"""Stands for the label of what blocks an arc that was not looked at because of its cost."""
+PRUNED_BY_BOUND = -2
+"""The label of an arc that was not tested for obstacles, because its cost or its lower bound is too high."""
 
 
 @inner_kernel
-def _room(needle, x, y, z):
+def _clearance_bound(needle, x, y, z):
     """Return a distance in mm that the clearance at a point does not exceed."""
     space, _limits, _objective, _sees_walls, _walls = needle
     geometry = space[2]
@@ -40,7 +40,7 @@ def _room(needle, x, y, z):
 
 
 @inner_kernel
-def _least_cost(needle, begin_mm, end_mm, length):
+def _cost_bound(needle, begin_mm, end_mm, length):
     """Return what any path of `length` mm or more costs at least.
 
     Clearance is 1-Lipschitz: `s` mm from an end of the path it is at most that at the end and `s` more.
@@ -60,17 +60,20 @@ def _least_cost(needle, begin_mm, end_mm, length):
 
 
 @numba.njit(cache=True, nogil=True)
-def least_costs(needle, positions, lengths, target, bounds):
-    """Fill `bounds` (N,) with what any path of `lengths` (N,) mm or more from `positions` (N, 3) costs."""
-    end = _room(needle, target[0], target[1], target[2])
+def cost_bounds(needle, positions, lengths, target, bounds):
+    """Fill `bounds` (N,) with the least cost of any path from `positions` (N, 3) to the target.
+
+    The paths are `lengths` (N,) mm long or longer.
+    """
+    end = _clearance_bound(needle, target[0], target[1], target[2])
     for n in range(positions.shape[0]):
-        begin = _room(needle, positions[n, 0], positions[n, 1], positions[n, 2])
-        bounds[n] = _least_cost(needle, begin, end, lengths[n])
+        begin = _clearance_bound(needle, positions[n, 0], positions[n, 1], positions[n, 2])
+        bounds[n] = _cost_bound(needle, begin, end, lengths[n])
 
 
 @numba.njit(cache=True, nogil=True)
-def priced_arcs(needle, positions, tangents, branches, target, slack, best, blockers, costs):
-    """Price the single arc from each pose to the target, and prove those that may be worth it.
+def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, blockers, costs):
+    """Evaluate the single arc from each pose to the target, and prove those whose cost is low enough.
 
     Parameters
     ----------
@@ -78,20 +81,20 @@ def priced_arcs(needle, positions, tangents, branches, target, slack, best, bloc
     branches : (N,) int64
     target : tuple of 3 floats
     slack, best : float
-        Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not looked at.
+        Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not tested.
     blockers : (N,) int64
         Receives 0 for arcs that are proved clear, the label that blocks, -1 where no arc keeps the
-        needle's limits, or TOO_DEAR.
+        needle's limits, or PRUNED_BY_BOUND.
     costs : (N,) float64
         Receives estimated costs, infinite where a lower bound was enough.
 
     Returns
     -------
     float
-        The cheapest clear one.
+        The cost of the cheapest clear arc, or `best`.
     """
     space, limits, objective, _sees_walls, _walls = needle
-    end = _room(needle, target[0], target[1], target[2])
+    end = _clearance_bound(needle, target[0], target[1], target[2])
     for n in range(positions.shape[0]):
         x, y, z = positions[n]
         tx, ty, tz = tangents[n]
@@ -105,12 +108,12 @@ def priced_arcs(needle, positions, tangents, branches, target, slack, best, bloc
         ):
             blockers[n] = -1
             continue
-        if _least_cost(needle, _room(needle, x, y, z), end, length) > slack * best:
-            blockers[n] = TOO_DEAR
+        if _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length) > slack * best:
+            blockers[n] = PRUNED_BY_BOUND
             continue
         costs[n] = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, True)
         if costs[n] > slack * best:
-            blockers[n] = TOO_DEAR
+            blockers[n] = PRUNED_BY_BOUND
             continue
         blockers[n] = blocker_on_arc(space, limits, pose, bend, length, 0.0, branches[n])
         if blockers[n] == 0 and costs[n] < best:

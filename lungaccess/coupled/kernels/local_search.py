@@ -1,6 +1,6 @@
-"""Compiled kernels of the coupled search: random choices and changes, of which what is cheaper is kept.
+"""Compiled kernels of the coupled search: local search from one choice, and local sampling around many.
 
-Arguments are those of `lungaccess.coupled.kernels.candidate`.
+The arguments are those of `lungaccess.coupled.kernels.candidate`.
 """
 
 from __future__ import annotations
@@ -12,25 +12,26 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
-from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, ROTATION, STAND, judged_cost
+from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, ROTATION, SCOPE_POSE, validated_cost
 from stages.tube.kernels import N_TRACE
 
 MAX_VIAS = 5
-STAND_SPREAD = 8.0
+"""Size of the arrays of via points: a path of the local search has at most one arc more."""
+SCOPE_POSE_SPREAD = 8.0
 ROTATION_SPREAD_RAD = 0.14
 INSERTION_SPREAD_MM = 1.5
 VIA_SPREAD_MM = 3.0
-"""Largest spreads of what is changed."""
+"""The largest standard deviations of a change.  Poses of a scope that is not turned lie 0.25 mm apart."""
 SMALLEST_SPREAD = 0.005
-"""Smallest, as a share of them."""
+"""The smallest standard deviation as a share of the largest: a change of about 0.01 mm."""
 ADD_SHARE = 0.12
 DROP_SHARE = 0.16
-"""Up to these shares of all changes a via point is added, or left out."""
+"""Below the first share of all changes a via point is added, between both one is left out."""
 TUBES_ONLY = 0.3
 NEEDLE_ONLY = 0.6
-"""Below and between these shares of the other changes only tubes or needle are changed."""
+"""Below the first share of the other changes only the tubes are changed, between both only the needle."""
 EACH_SHARE = 0.6
-"""Share of the numbers that are changed at a time."""
+"""The probability with which each number is changed, so that most changes leave some numbers as they are."""
 
 
 @inner_kernel
@@ -56,7 +57,7 @@ def _add_via(vias, count, start, target, spread, state):
 
 @inner_kernel
 def _vary(x, vias, count, start, target, state):
-    """Change a choice at random, a little or much; return how many vias it has."""
+    """Change a choice at random, by spreads from small to large; return how many vias it then has."""
     spread = math.exp(math.log(SMALLEST_SPREAD) * uniform(state))
     change = uniform(state)
     if change < ADD_SHARE and count < MAX_VIAS:
@@ -69,7 +70,7 @@ def _vary(x, vias, count, start, target, state):
     which = uniform(state) if count > 0 else 0.0
     if not TUBES_ONLY <= which < NEEDLE_ONLY:
         if uniform(state) < EACH_SHARE:
-            x[STAND] = round(x[STAND] + STAND_SPREAD * spread * _normal(state))
+            x[SCOPE_POSE] = round(x[SCOPE_POSE] + SCOPE_POSE_SPREAD * spread * _normal(state))
         if uniform(state) < EACH_SHARE:
             x[ROTATION] += ROTATION_SPREAD_RAD * spread * _normal(state)
         if uniform(state) < EACH_SHARE:
@@ -86,16 +87,16 @@ def _vary(x, vias, count, start, target, state):
 
 
 @numba.njit(cache=True, nogil=True)
-def climb(tube, needle, stands, allowed, x, vias, count, target, tries, state):
-    """Vary a choice at random and keep what is cheaper.
+def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, state):
+    """Improve a choice by a stochastic local search: vary it at random and keep what is cheaper.
 
-    Only what is proved is kept: the tubes by `deploy`, the needle by `blocker_on_arc`, both as in any plan.
+    A choice is kept only if it is proved: the tubes by `deploy`, the needle by `blocker_on_arc`.
 
     Parameters
     ----------
-    stands : (K, 9) float64
+    scope_poses : (K, 9) float64
     allowed : (K,) bool
-        Where the scope can stand.
+        Which of these poses the scope can take.
     x : (4,) float64
     vias : (MAX_VIAS, 3) float64
         Both receive the best choice.
@@ -103,19 +104,21 @@ def climb(tube, needle, stands, allowed, x, vias, count, target, tries, state):
         Number of vias in use.
     target : tuple of 3 floats
     tries : int
+        How many variations are evaluated.
     state : (1,) uint64
-        Of the random numbers.
+        State of the random numbers.
 
     Returns
     -------
     count : int
+        Number of vias of the best choice.
     cost : float
-        Estimated; infinite if the choice given was refused, and all others too.
+        Its estimated cost; infinite if the choice given was refused, and all others too.
     """
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
     start = np.zeros(3)
-    cost = judged_cost(tube, needle, stands, allowed, x, vias, count, target, math.inf, trace, tip)
+    cost = validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, math.inf, trace, tip)
     start[:] = tip[:3]
     new_x = x.copy()
     new_vias = vias.copy()
@@ -125,8 +128,8 @@ def climb(tube, needle, stands, allowed, x, vias, count, target, tries, state):
         for m in range(count):
             new_vias[m] = vias[m]
         new_count = _vary(new_x, new_vias, count, start, target, state)
-        new_cost = judged_cost(
-            tube, needle, stands, allowed, new_x, new_vias, new_count, target, cost, trace, tip
+        new_cost = validated_cost(
+            tube, needle, scope_poses, allowed, new_x, new_vias, new_count, target, cost, trace, tip
         )
         if new_cost < cost:
             cost = new_cost
@@ -140,50 +143,64 @@ def climb(tube, needle, stands, allowed, x, vias, count, target, tries, state):
 
 
 @numba.njit(cache=True, nogil=True)
-def scatter(
-    tube, needle, rows, row_of, rotations, outers, inners, spreads, target, tries, dearest, state, best
+def sample_deployments(
+    tube,
+    needle,
+    scope_poses,
+    pose_of,
+    rotations,
+    outers,
+    inners,
+    spreads,
+    target,
+    tries,
+    cost_limit,
+    state,
+    best,
 ):
-    """Vary random deployments a little, each with a single arc to the target, and keep the cheapest.
+    """Sample deployments near given ones, each with a single arc to the target, and keep the cheapest.
 
     Parameters
     ----------
-    rows : (K, 9) float64
-        Where the scope can stand.
-    row_of : (N,) int64
-        The place of each deployment among them.
+    scope_poses : (K, 9) float64
+        Poses that the scope can take.
+    pose_of : (N,) int64
+        The row of `scope_poses` of each deployment.
     rotations, outers, inners : (N,) float64
         The deployments: rad, mm, mm.
     spreads : (2,) float64
-        They are varied by up to so much, in rad and mm.
+        The largest change of rotation in rad and of insertions in mm.
     target : tuple of 3 floats
     tries : int
-    dearest : float
-        What costs as much or more is of no interest.
+    cost_limit : float
+        Choices that cost as much or more are dropped.
     state : (1,) uint64
-        Of the random numbers.
+        State of the random numbers.
     best : (4,) float64
         Receives the cheapest choice.
 
     Returns
     -------
     float
-        Its estimated cost, or `dearest` if there is none.
+        Its estimated cost, or `cost_limit` if there is none.
     """
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
     x = np.zeros(N_CHOICE)
     vias = np.zeros((MAX_VIAS, 3))
-    allowed = np.ones(rows.shape[0], dtype=np.bool_)
+    allowed = np.ones(scope_poses.shape[0], dtype=np.bool_)
     none = np.int64(0)
     for _ in range(tries):
-        n = min(int(uniform(state) * row_of.shape[0]), row_of.shape[0] - 1)
-        x[STAND] = row_of[n]
+        n = min(int(uniform(state) * pose_of.shape[0]), pose_of.shape[0] - 1)
+        x[SCOPE_POSE] = pose_of[n]
         x[ROTATION] = rotations[n] + spreads[0] * (2.0 * uniform(state) - 1.0)
         x[OUTER] = max(outers[n] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
         x[INNER] = max(inners[n] + spreads[1] * (2.0 * uniform(state) - 1.0), x[OUTER])
-        cost = judged_cost(tube, needle, rows, allowed, x, vias, none, target, dearest, trace, tip)
-        if cost < dearest:
-            dearest = cost
+        cost = validated_cost(
+            tube, needle, scope_poses, allowed, x, vias, none, target, cost_limit, trace, tip
+        )
+        if cost < cost_limit:
+            cost_limit = cost
             for m in range(N_CHOICE):
                 best[m] = x[m]
-    return dearest
+    return cost_limit

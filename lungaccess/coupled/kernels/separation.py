@@ -1,4 +1,4 @@
-"""Compiled kernel of the menus of plans: lines of which every two differ."""
+"""Compiled kernel of diverse plan sets: it chooses lines of which every two are separated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from anatomy.kernels.compiling import inner_kernel
 
 @inner_kernel
 def _strays(one, other, square):
-    """Tell whether some point of a line is so far from all points of another; `square` in mm^2."""
+    """Tell whether some point of a line is `square` mm^2 or more, squared, from all points of another."""
     for m in range(one.shape[0]):
         near = False
         for n in range(other.shape[0]):
@@ -25,17 +25,17 @@ def _strays(one, other, square):
 
 
 @numba.njit(cache=True, nogil=True)
-def choose_apart(lines, order, apart_mm, chosen):
-    """Choose lines one after the other, each that differs from all chosen before.
+def choose_separated(lines, order, separation_mm, chosen):
+    """Choose lines one after the other, each separated from all chosen before.
 
-    Two differ where some point of either is `apart_mm` or more from all points of the other.
+    Two lines are separated if some point of either is `separation_mm` or more from all points of the other.
 
     Parameters
     ----------
     lines : (N, M, 3) float64, mm
     order : (K,) int64
         Which lines to look at, the best first.
-    apart_mm : float
+    separation_mm : float
     chosen : (C,) int64
         Receives at most C of them.
 
@@ -44,18 +44,18 @@ def choose_apart(lines, order, apart_mm, chosen):
     int
         How many were chosen.
     """
-    square = apart_mm * apart_mm
+    square = separation_mm * separation_mm
     count = 0
     for n in order:
         if count == chosen.shape[0]:
             break
-        differs = True
+        separated = True
         for m in range(count):
             one, other = lines[n], lines[chosen[m]]
             if not (_strays(one, other, square) or _strays(other, one, square)):
-                differs = False
+                separated = False
                 break
-        if differs:
+        if separated:
             chosen[count] = n
             count += 1
     return count

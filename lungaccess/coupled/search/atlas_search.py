@@ -12,8 +12,8 @@ import numpy as np
 
 from anatomy.typed import Float, Int
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kernels import direct_arcs as pricing
-from lungaccess.coupled.search.entries import different, least_costs
+from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, evaluate_arcs
+from lungaccess.coupled.search.entries import cost_bounds, different
 from lungaccess.coupled.search.evaluator import NeedleDesk, Step
 from lungaccess.coupled.search.local_sampling import MOST, Scatter, nearly_reaching
 from lungaccess.coupled.search.local_search import Climb, Climber, needle_of, objective_of
@@ -125,11 +125,11 @@ class AtlasSearch:
         for begin in range(0, len(self.in_workspace), CHUNK):
             chunk = self.in_workspace[begin : begin + CHUNK]
             blockers, costs = np.zeros(len(chunk), dtype=np.int64), np.zeros(len(chunk))
-            cheapest = pricing.priced_arcs(
+            cheapest = evaluate_arcs(
                 self._needle, entries.positions[chunk], entries.tangents[chunk],
                 entries.branch[chunk], (x, y, z), KEPT_SLACK, cheapest, blockers, costs,
             )  # fmt: skip
-            self.desk.count_blockers(blockers[blockers != pricing.TOO_DEAR])
+            self.desk.count_blockers(blockers[blockers != PRUNED_BY_BOUND])
             clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
             found.append(chunk[clear])
             prices.append(costs[clear])
@@ -273,7 +273,7 @@ class AtlasSearch:
         And the bounds `(E,)` by deployment, 0 for all others.
         """
         target, entries = self.task.target.lps_mm, self.atlas.deployments
-        bounds = least_costs(self._needle, entries, self.in_workspace, self._lengths, target)
+        bounds = cost_bounds(self._needle, entries, self.in_workspace, self._lengths, target)
         least = np.zeros(entries.count)
         least[self.in_workspace] = bounds
         return self.in_workspace[np.argsort(bounds, kind="stable")], least

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy.typed import Float, Int
-from lungaccess.coupled.kernels.separation import choose_apart
+from lungaccess.coupled.kernels.separation import choose_separated
 from lungaccess.coupled.search.atlas_search import AtlasSearch
 from lungaccess.plans.assemble import Candidate
 from stages.needle import direct_arcs
@@ -19,7 +19,7 @@ NEAREST, SAMPLED, LEAST_OF_BRANCH = 1000, 2000, 100
 of every branch."""
 
 
-def different_candidates(search: AtlasSearch, count: int, apart_mm: float) -> Iterator[Candidate]:
+def different_candidates(search: AtlasSearch, count: int, separation_mm: float) -> Iterator[Candidate]:
     """Yield proved direct arcs that differ, the cheapest of each branch first, then the others.
 
     The nearest deployments are looked at, and an even sample of the others; of these all, sample by sample,
@@ -43,7 +43,7 @@ def different_candidates(search: AtlasSearch, count: int, apart_mm: float) -> It
         clear = np.flatnonzero(blockers == 0)
         price = {"length_mm": lengths, "inverse_clearance": inverse}.get(search.task.objective, lengths)
         pool, prices = np.append(pool, looked[clear]), np.append(prices, price[clear])
-        chosen = _chosen(search, pool[np.argsort(prices, kind="stable")], count, apart_mm, proved)
+        chosen = _chosen(search, pool[np.argsort(prices, kind="stable")], count, separation_mm, proved)
         if len(chosen) == count:
             break
     for entry in chosen:
@@ -71,7 +71,7 @@ def _samples(branch: Int) -> Iterator[Int]:
 
 
 def _chosen(
-    search: AtlasSearch, ordered: Int, count: int, apart_mm: float, proved: dict[int, Candidate | None]
+    search: AtlasSearch, ordered: Int, count: int, separation_mm: float, proved: dict[int, Candidate | None]
 ) -> list[int]:
     """Return the deployments of a menu, chosen from clear ones by rising cost; `proved` keeps the proofs."""
     lines = _lines(search, ordered)
@@ -79,7 +79,7 @@ def _chosen(
     while True:
         refused = [n for n, entry in enumerate(ordered.tolist()) if proved.get(entry, True) is None]
         places = np.zeros(count, dtype=np.int64)
-        found = choose_apart(lines, order[~np.isin(order, refused)], float(apart_mm), places)
+        found = choose_separated(lines, order[~np.isin(order, refused)], float(separation_mm), places)
         chosen: list[int] = ordered[places[:found]].tolist()
         unproved = [entry for entry in chosen if entry not in proved]
         for entry in unproved:

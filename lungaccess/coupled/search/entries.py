@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.typed import Float, Int
-from lungaccess.coupled.kernels import direct_arcs as pricing
+from lungaccess.coupled.kernels import direct_arcs
 from lungaccess.coupled.search.local_search import Needle
 from stages.tube import Deployments
 
@@ -33,7 +33,7 @@ def different(entries: Deployments, ordered: Int) -> Int:
     return ordered[np.sort(first)]
 
 
-def least_costs(needle: Needle, entries: Deployments, chosen: Int, lengths: Float, target: Float) -> Float:
+def cost_bounds(needle: Needle, entries: Deployments, chosen: Int, lengths: Float, target: Float) -> Float:
     """Return lower bounds `(N,)` of the cost of any path from deployments to the target.
 
     Parameters
@@ -49,5 +49,5 @@ def least_costs(needle: Needle, entries: Deployments, chosen: Int, lengths: Floa
     x, y, z = target.tolist()
     bounds = np.zeros(len(chosen))
     positions = np.ascontiguousarray(entries.positions[chosen])
-    pricing.least_costs(needle, positions, np.array(lengths), (x, y, z), bounds)
+    direct_arcs.cost_bounds(needle, positions, np.array(lengths), (x, y, z), bounds)
     return bounds

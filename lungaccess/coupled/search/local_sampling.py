@@ -8,8 +8,8 @@ import numpy as np
 
 from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kernels import candidate as coupled
-from lungaccess.coupled.kernels import local_search as climbing
+from lungaccess.coupled.kernels.candidate import N_CHOICE, SCOPE_POSE
+from lungaccess.coupled.kernels.local_search import sample_deployments
 from lungaccess.coupled.search.local_search import Climber
 from lungaccess.plans.assemble import Candidate
 from stages.needle import Needle, direct_path
@@ -52,14 +52,14 @@ class Scatter:
     def draw(self, dearest: float) -> Candidate | None:
         """Return the cheapest of TRIES deployments with an arc estimated to cost less than `dearest`."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
-        best = np.zeros(coupled.N_CHOICE)
-        cost = climbing.scatter(
+        best = np.zeros(N_CHOICE)
+        cost = sample_deployments(
             self._climber.tube, self._climber.needle, self._rows, self._row_of, *self._deployed, SPREADS,
             self._climber.target, TRIES, dearest, state, best,
         )  # fmt: skip
         if not cost < dearest:
             return None
-        tip, (rotation, outer, inner) = self._tips[int(best[coupled.STAND])], best[1:].tolist()
+        tip, (rotation, outer, inner) = self._tips[int(best[SCOPE_POSE])], best[1:].tolist()
         deployment = self._judge.judge(tip.lps_from_scope_tip, rotation % (2.0 * math.pi), outer, inner)
         if isinstance(deployment, str):
             return None

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from anatomy.typed import Float, Float32, UInt64
-from lungaccess.coupled.kernels import candidate as coupled
-from lungaccess.coupled.kernels import local_search as climbing
+from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, SCOPE_POSE
+from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.coupled.search.evaluator import NeedleDesk
 from lungaccess.coupled.search.scope_poses import Stands
 from lungaccess.plans.assemble import Candidate, Task
@@ -108,10 +108,10 @@ class Climber:
         """Return where a candidate stands; None if its needle has too many arcs."""
         task, deployment = self._desk.task, candidate.deployment
         points = candidate.path.frames()[1:-1, :3, 3]
-        if len(points) > climbing.MAX_VIAS:
+        if len(points) > MAX_VIAS:
             return None
         stands = Stands(task.lung, task.system.scope, self._places, candidate.tip, self._rng)
-        vias = np.zeros((climbing.MAX_VIAS, 3))
+        vias = np.zeros((MAX_VIAS, 3))
         vias[: len(points)] = points
         x = np.array([stands.home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
         return Climb(stands=stands, x=x, vias=vias, count=len(points))
@@ -119,7 +119,7 @@ class Climber:
     def advance(self, climb: Climb, tries: int) -> None:
         """Spend tries on a climb."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
-        climb.count, climb.cost = climbing.climb(
+        climb.count, climb.cost = improve(
             self.tube, self.needle, climb.stands.rows, climb.stands.allowed, climb.x, climb.vias, climb.count,
             self.target, tries, state,
         )  # fmt: skip
@@ -127,18 +127,18 @@ class Climber:
 
     def kick(self, climb: Climb) -> None:
         """Move a climb some way off at random, and let its needle go straight for the target or nearly so."""
-        x, drawn = climb.x, self._rng.standard_normal(coupled.N_CHOICE)
+        x, drawn = climb.x, self._rng.standard_normal(N_CHOICE)
         x[:] = x + drawn * KICK
-        x[coupled.STAND] = min(max(round(x[coupled.STAND]), 0), len(climb.stands.tips) - 1)
-        x[coupled.OUTER] = max(x[coupled.OUTER], 0.0)
-        x[coupled.INNER] = max(x[coupled.INNER], x[coupled.OUTER])
-        climb.count = min(climb.count, int(self._rng.integers(climbing.MAX_VIAS)))
+        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(climb.stands.tips) - 1)
+        x[OUTER] = max(x[OUTER], 0.0)
+        x[INNER] = max(x[INNER], x[OUTER])
+        climb.count = min(climb.count, int(self._rng.integers(MAX_VIAS)))
         climb.vias[: climb.count] += VIA_KICK_MM * self._rng.standard_normal((climb.count, 3))
         climb.cost = climb.priced = math.inf
 
     def candidate(self, climb: Climb) -> Candidate | None:
         """Return the candidate at which a climb stands, in the numbers of a plan."""
-        stand = int(climb.x[coupled.STAND])
+        stand = int(climb.x[SCOPE_POSE])
         tip, (rotation, outer, inner) = climb.stands.tips[stand], climb.x[1:].tolist()
         rotation = climb.stands.rotation_rad(stand, rotation)
         deployment = self._judge.judge(tip.lps_from_scope_tip, rotation, outer, inner)

@@ -16,7 +16,7 @@ from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
 from lungaccess.coupled.alternatives import Alternative, alternatives, judged
-from lungaccess.coupled.kernels.separation import choose_apart
+from lungaccess.coupled.kernels.separation import choose_separated
 from lungaccess.coupled.search.diverse import _branches_first, _lines, _samples
 from stages.needle.path import direct_path
 from tests.lungaccess.resample import needle_walk
@@ -32,7 +32,7 @@ def atlas(small_lung: Lung) -> la.Atlas:
 @pytest.fixture(scope="module")
 def menu(small_lung: Lung, atlas: la.Atlas) -> tuple[Alternative, ...]:
     target = la.resolve_target(small_lung)
-    return alternatives(small_lung, SYSTEM, target, atlas=atlas, count=8, apart_mm=3.0)
+    return alternatives(small_lung, SYSTEM, target, atlas=atlas, count=8, separation_mm=3.0)
 
 
 def test_plans_differ_and_pass_the_check(menu: tuple[Alternative, ...], small_lung: Lung) -> None:
@@ -68,9 +68,9 @@ def test_lines_are_apart_if_a_point_strays() -> None:
     bowed, near, longer = straight.copy(), straight.copy(), straight.copy()
     bowed[4, 0], near[4, 0], longer[-1, 2] = 6.0, 3.0, 45.5
     lines, chosen = np.stack([straight, near, bowed, straight, longer]), np.zeros(5, dtype=np.int64)
-    count = choose_apart(lines, np.arange(5), 5.0, chosen)
+    count = choose_separated(lines, np.arange(5), 5.0, chosen)
     assert chosen[:count].tolist() == [0, 2, 4]
-    assert choose_apart(lines, np.arange(5), 5.0, chosen[:2]) == 2
+    assert choose_separated(lines, np.arange(5), 5.0, chosen[:2]) == 2
 
 
 def test_criteria_are_those_of_the_plan(menu: tuple[Alternative, ...]) -> None:
@@ -116,7 +116,7 @@ def test_lines_are_the_arcs() -> None:
 
 def test_bad_input(small_lung: Lung, atlas: la.Atlas) -> None:
     target = la.resolve_target(small_lung)
-    for wrong in ({"count": 0}, {"apart_mm": 0.0}, {"objective": "beauty"}):
+    for wrong in ({"count": 0}, {"separation_mm": 0.0}, {"objective": "beauty"}):
         with pytest.raises(SettingsError):
             alternatives(small_lung, SYSTEM, target, atlas=atlas, **wrong)
     other = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=2.9))

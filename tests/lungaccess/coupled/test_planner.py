@@ -15,10 +15,10 @@ from anatomy.errors import SettingsError, TargetError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.typed import Float, Int
-from lungaccess.coupled.kernels import direct_arcs as pricing
+from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, evaluate_arcs
 from lungaccess.coupled.planner import ProgressEvent
 from lungaccess.coupled.search import AtlasSearch
-from lungaccess.coupled.search.entries import different, least_costs
+from lungaccess.coupled.search.entries import cost_bounds, different
 from lungaccess.coupled.search.local_search import Climber, needle_of, path_through
 from lungaccess.coupled.search.scope_poses import Stands
 from lungaccess.plans.assemble import Task
@@ -305,7 +305,7 @@ def prices(search: AtlasSearch, slack: float) -> tuple[Int, Float]:
     entries, near = search.atlas.deployments, search.in_workspace
     blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
     x, y, z = search.task.target.lps_mm.tolist()
-    pricing.priced_arcs(
+    evaluate_arcs(
         needle_of(search.desk.space, search.task), entries.positions[near], entries.tangents[near],
         entries.branch[near], (x, y, z), slack, math.inf, blockers, costs,
     )  # fmt: skip
@@ -324,7 +324,7 @@ class TestPrices:
         blockers, costs = prices(search, math.inf)
         assert (blockers == labels).all() and (costs[labels == 0] == inverse[labels == 0]).all()
         blockers, costs = prices(search, 1.0)
-        dear = blockers == pricing.TOO_DEAR
+        dear = blockers == PRUNED_BY_BOUND
         assert 0 < dear.sum() < len(near) and (blockers[~dear] == labels[~dear]).all()
         best = inverse[labels == 0].min()
         assert costs[blockers == 0].min() == best
@@ -336,7 +336,7 @@ class TestPrices:
         lengths = workspace_lengths(
             search.desk.space, entries.positions[near], entries.tangents[near], target
         )
-        bounds = least_costs(needle, entries, near, lengths, target)
+        bounds = cost_bounds(needle, entries, near, lengths, target)
         clear = np.flatnonzero(prices(search, math.inf)[0] == 0)
         for n in clear[:: max(len(clear) // 60, 1)].tolist():
             candidate = search.finished(int(near[n]))

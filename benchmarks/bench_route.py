@@ -14,7 +14,7 @@ from stages.scope.route.settings import RouteLimits
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
 from stages.scope.tour.shortest import shortest_tour
-from stages.scope.tour.subtree import ways_to
+from stages.scope.tour.subtree import subtree_to
 
 COLD_RUN = """
 from benchmarks.bench_route import Routes, Tours
@@ -75,17 +75,17 @@ class Tours:
     def setup(self, lesions: int) -> None:
         """Make an airway with lesions."""
         tree = random_airway(2)
-        self.ways = ways_to(tree, find_exits(tree, random_lesions(tree, lesions, 2)))
-        shortest_tour(self.ways)
+        self.subtree = subtree_to(tree, find_exits(tree, random_lesions(tree, lesions, 2)))
+        shortest_tour(self.subtree)
 
     def time_shortest(self, lesions: int) -> None:
         """The shortest tour over all choices of exits."""
-        shortest_tour(self.ways)
+        shortest_tour(self.subtree)
 
     def time_circuits(self, lesions: int) -> None:
         """All circuits, up to nine lesions."""
         if lesions <= 9:
-            circuits(self.ways)
+            circuits(self.subtree)
 
 
 class Compile(FreshProcess):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas
     from lungaccess.coupled.search import AtlasSearch
     from stages.needle.space import NeedleSpace
-    from stages.scope.tour.subtree import Ways
+    from stages.scope.tour.subtree import Subtree
     from stages.tube.mechanics import TubeMechanics
 
 
@@ -173,14 +173,14 @@ def configurations(made: TubeMechanics, count: int, seed: int = 0) -> tuple[Floa
     return rng.uniform(-math.pi, math.pi, beta.shape), beta
 
 
-def tours(lesions: int) -> list[Ways]:
-    """Return the ways to random lesions in `TOUR_MODELS` random airways."""
+def tours(lesions: int) -> list[Subtree]:
+    """Return the subtrees to random lesions in `TOUR_MODELS` random airways."""
     from experiments.support.tour_models import random_airway, random_lesions
     from stages.scope.tour.exits import find_exits
-    from stages.scope.tour.subtree import ways_to
+    from stages.scope.tour.subtree import subtree_to
 
     made = []
     for seed in range(TOUR_MODELS):
         tree = random_airway(seed)
-        made.append(ways_to(tree, find_exits(tree, random_lesions(tree, lesions, seed))))
+        made.append(subtree_to(tree, find_exits(tree, random_lesions(tree, lesions, seed))))
     return made

@@ -131,7 +131,7 @@ def _tour(lesions: int) -> Work:
     from stages.scope.tour.shortest import shortest_tour
 
     models = scenes.tours(lesions)
-    return lambda: [shortest_tour(ways) for ways in models]
+    return lambda: [shortest_tour(subtree) for subtree in models]
 
 
 EDGES = (64, 128, 192, 256, 384, 512)

@@ -4,8 +4,8 @@
 
 The groups: see `experiments.support.route_groups`.  Ends have Gaussian noise.  A trial succeeds if the final
 curve is proved on its whole length: curvature, and inside the lumen; beside it is what the method's own test
-at path points says, which for RRT and RRT* is that there is a way.  These go on sampling until a curve is
-proved or 4048 samples are taken; "first" is their first way, whatever its curve.
+at path points says, which for RRT and RRT* is that there is a path.  These go on sampling until a curve is
+proved or 4048 samples are taken; "first" is their first path, whatever its curve.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ PAPER_SAVED_G4 = 0.41
 OWN_TEST = {
     "exact": "tested at path points",
     "ga": "tested at path points",
-    "rrt": "a way was found",
-    "rrt*": "a way was found",
+    "rrt": "a path was found",
+    "rrt*": "a path was found",
 }
 QUICK_TRIALS = 12
 PARALLEL, QUICK_PARALLEL = 10, 3
@@ -54,7 +54,7 @@ QUANTITIES = ("time_ms", "normalised_length", "mean_wall_mm", "mean_curvature_pe
 WORDS = ("CPU time, ms", "length over distance", "mean distance to wall, mm", "mean curvature, 1/mm")
 NOT_REPRODUCED = [
     "The success rates of RRT and RRT*: the paper does not say whether their curves had to keep the "
-    "curvature.  Here both are reported: that there is a way, and that its curve is proved.",
+    "curvature.  Here both are reported: that there is a path, and that its curve is proved.",
     "Success 1 of BFS-GA: its final curves break the curvature limit between path points 1 mm apart and "
     "where a refitted segment meets the rest.  `exact` repairs that.",
     "Times: the text that we have lost the paper's numbers.",

@@ -3,7 +3,7 @@
     python -m experiments.pan2025_tour [--quick] [--seed 1] [--results FOLDER] [--patient NAME]
 
 Random bronchial models of eight orders with random lesions, and the airway of a patient with five lesions.
-Distances are from the top of the trachea; at constant speed they are times.  Three ways of working are
+Distances are from the top of the trachea; at constant speed they are times.  Three workflows are
 compared: one lesion at a time with a return to the root in between (the paper's baseline), the best open tour
 over the exits of least resistance, and the shortest tour over all choices of exits.
 """
@@ -32,7 +32,7 @@ from stages.scope.tour.circuit import SAME_RESISTANCE, circuits
 from stages.scope.tour.exits import Exit, find_exits
 from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary
 from stages.scope.tour.shortest import shortest_tour
-from stages.scope.tour.subtree import Ways, ways_to
+from stages.scope.tour.subtree import Subtree, subtree_to
 
 LESIONS = (3, 4, 5, 6, 7, 8, 9)
 MODELS, DRAWS = 100, 20
@@ -53,13 +53,13 @@ NOT_REPRODUCED = [
 Rows = list[dict[str, float]]
 
 
-def compare(ways: Ways) -> dict[str, float]:
-    """Return the lengths of all ways of working, and what they took to plan."""
+def compare(subtree: Subtree) -> dict[str, float]:
+    """Return the lengths of the tours of all workflows, and what they took to plan."""
     began = time.process_time()
-    best = shortest_tour(ways)
+    best = shortest_tour(subtree)
     exact_s = time.process_time() - began
     began = time.process_time()
-    found = circuits(ways)
+    found = circuits(subtree)
     circuits_s = time.process_time() - began
     row: dict[str, float] = {
         "exact_mm": best.length_mm,
@@ -67,20 +67,20 @@ def compare(ways: Ways) -> dict[str, float]:
         "circuits_ms": 1e3 * circuits_s,
         "circuits": found.count,
         "distinct": found.distinct(),
-        "exact_one_by_one_mm": one_by_one_mm(ways, best.chosen),
+        "exact_one_by_one_mm": one_by_one_mm(subtree, best.chosen),
         "most_passes": int(best.passes.max()),
         "most_loops": int(best.loops.max()),
     }
     for reading in ("printed", "reduced"):
-        tour = plan_itinerary(ways, found.choice(reading))  # type: ignore[arg-type]
+        tour = plan_itinerary(subtree, found.choice(reading))  # type: ignore[arg-type]
         row[f"{reading}_mm"] = tour.length_mm
-        row[f"{reading}_one_by_one_mm"] = one_by_one_mm(ways, tour.chosen)
-    depth = ways.depth_mm[ways.exit_vertex]
+        row[f"{reading}_one_by_one_mm"] = one_by_one_mm(subtree, tour.chosen)
+    depth = subtree.depth_mm[subtree.exit_vertex]
     nearest = [
-        next(x for x in range(len(ways.exits)) if _is_nearest(ways.exits[x], m))
-        for m in range(ways.n_lesions)
+        next(x for x in range(len(subtree.exits)) if _is_nearest(subtree.exits[x], m))
+        for m in range(subtree.n_lesions)
     ]
-    row["nearest_mm"] = plan_itinerary(ways, nearest).length_mm
+    row["nearest_mm"] = plan_itinerary(subtree, nearest).length_mm
     row["nearest_one_by_one_mm"] = float(2 * depth[nearest].sum() - depth[nearest].max())
     return row
 
@@ -91,12 +91,12 @@ def _is_nearest(each: Exit, lesion: int) -> bool:
 
 def model_study(seeds: list[int]) -> dict[int, Rows]:
     """Plan tours to all numbers of lesions on all models."""
-    compare(_ways(random_airway(0), random_lesions(random_airway(0), 3, 0)))
+    compare(_subtree(random_airway(0), random_lesions(random_airway(0), 3, 0)))
     rows: dict[int, Rows] = {count: [] for count in LESIONS}
     for seed in seeds:
         tree = random_airway(seed)
         for count, of_count in rows.items():
-            of_count.append(compare(_ways(tree, random_lesions(tree, count, seed))))
+            of_count.append(compare(_subtree(tree, random_lesions(tree, count, seed))))
     return rows
 
 
@@ -106,12 +106,12 @@ def example_resistances(seed: int) -> Float:
     ends = [int(tree.branch_points(int(branch))[-1]) for branch in tree.leaf_branches]
     inside = tree.points_lps[np.random.default_rng(seed).choice(ends)]
     lesions = np.concatenate([random_lesions(tree, 4, seed), inside[None]])
-    values = np.sort(circuits(_ways(tree, lesions)).values("printed"))
+    values = np.sort(circuits(_subtree(tree, lesions)).values("printed"))
     return values[np.append(True, np.diff(values) > SAME_RESISTANCE * values[:-1])]
 
 
-def _ways(tree: AirwayTree, lesions: Float) -> Ways:
-    return ways_to(tree, find_exits(tree, lesions))
+def _subtree(tree: AirwayTree, lesions: Float) -> Subtree:
+    return subtree_to(tree, find_exits(tree, lesions))
 
 
 def _saved(rows: Rows, name: str) -> Float:
@@ -183,7 +183,7 @@ def patient_lesions(lung: Lung, seed: int) -> Float:
 
 def add_patient(result: Result, lung: Lung, seeds: list[int]) -> None:
     """Add what tours to five lesions of a patient save, over several draws of the lesions."""
-    rows = [compare(_ways(lung.tree, patient_lesions(lung, seed))) for seed in seeds]
+    rows = [compare(_subtree(lung.tree, patient_lesions(lung, seed))) for seed in seeds]
     result.add(
         f"{lung.name}, {PATIENT_LESIONS} lesions: distance saved", float(_saved(rows, "printed").mean()),
         PAPER_SAVED_CT, "%", f'{len(rows)} draws; {_gap_note(rows)}; paper: "over 60 %", one CT, fig. 10',

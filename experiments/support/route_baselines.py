@@ -59,7 +59,7 @@ def sampled_route(
 ) -> tuple[Curve, bool]:
     """Return the first curve found by RRT, or by RRT* if `star`, that is proved to keep the limits.
 
-    The trees know nothing of curvature: each way to the goal becomes a cubic spline through its vertices,
+    The trees know nothing of curvature: each path to the goal becomes a cubic spline through its vertices,
     which keeps the limits more often than one through points every 3 mm; if it breaks one, sampling goes on.
 
     Parameters
@@ -71,7 +71,7 @@ def sampled_route(
     seed : int
     settings : SamplingSettings, optional
     any_curve : bool
-        Take the first way that is found, whether its curve keeps the limits or not.
+        Take the first path that is found, whether its curve keeps the limits or not.
 
     Returns
     -------
@@ -118,8 +118,8 @@ def sampled_route(
 
 def _way_to_root(points: Float, parent: Int, vertex: int, goal: Float) -> Float:
     """Return the vertices from the root to the goal, `(V, 3)`."""
-    way = [goal]
+    path = [goal]
     while vertex >= 0:
-        way.append(points[vertex])
+        path.append(points[vertex])
         vertex = int(parent[vertex])
-    return np.array(way[::-1])
+    return np.array(path[::-1])

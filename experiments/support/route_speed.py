@@ -97,5 +97,5 @@ def _quickest_s(
 
 
 def _halves(times: list[float]) -> list[tuple[float, ...]]:
-    """Return the ways to give some of the segments to the first of two processes."""
+    """Return the choices which give some of the segments to the first of two processes."""
     return [half for n in range(len(times) + 1) for half in itertools.combinations(times, n)]

@@ -20,18 +20,18 @@ from stages.scope.tour import (
     Circuits,
     Exit,
     ExitRule,
+    ExitTest,
     Itinerary,
     Reading,
     Resistances,
-    Vet,
-    Ways,
+    Subtree,
     circuits,
     combinations,
     exits_of,
     one_by_one_mm,
     plan_itinerary,
     shortest_tour,
-    ways_to,
+    subtree_to,
 )
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class TourAnswer:
         Their numbers, from 1, in the order in which the user gave them.
     left_out : mapping of int to str
         Numbers of lesions that cannot be reached, and why.
-    ways : Ways
+    subtree : Subtree
     shortest : Itinerary
         The shortest tour over all choices of exits.
     least_resistance : Itinerary or None
@@ -61,21 +61,21 @@ class TourAnswer:
         are too many combinations.
     circuits : Circuits or None
     one_by_one_mm : float
-        Length of the way if the scope returns to the root between any two lesions, over the exits of
+        Length of a tour in which the scope returns to the root between any two lesions, over the exits of
         `shortest`.
-    vetted : bool
+    plan_required : bool
         Whether an exit counted only if a coupled plan from there exists.
     """
 
     lesions_lps: Float
     numbers: tuple[int, ...]
     left_out: Mapping[int, str]
-    ways: Ways
+    subtree: Subtree
     shortest: Itinerary
     least_resistance: Itinerary | None
     circuits: Circuits | None
     one_by_one_mm: float
-    vetted: bool
+    plan_required: bool
 
 
 def read_lesions(path: str | Path) -> Float:
@@ -126,7 +126,7 @@ def plan_tour(
     closed : bool
         Whether the tour returns to the root.
     tissue_weight : float
-        How many mm of the scope's way a mm between exit and lesion is worth; 0 for the shortest way.
+        How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the shortest tour.
     atlas : Atlas, optional
         If given, an exit counts only if a coupled plan from there exists: scope, tubes, and a direct arc
         of the needle, all proved.
@@ -152,32 +152,32 @@ def plan_tour(
     left_out: dict[int, str] = {}
     for number, lesion in enumerate(lesions, 1):
         try:
-            vet = None if atlas is None else coupled_vet(atlas, lesion)
-            exits.append(exits_of(lung.tree, len(exits), lesion, chosen, vet))
+            accepts = None if atlas is None else coupled_plan_test(atlas, lesion)
+            exits.append(exits_of(lung.tree, len(exits), lesion, chosen, accepts))
             numbers.append(number)
         except TargetError as error:
             left_out[number] = error.found
     if not exits:
         raise TargetError(
             "No lesion can be reached: " + "; ".join(f"{n}: {why}" for n, why in left_out.items()),
-            remedy="Name other lesions, or use --no-vet to see a tour without the tubes and the needle",
+            remedy="Name other lesions, or plan a tour of the scope alone with --no-require-plan",
         )
     cost = [[tissue_weight * each.distance_mm for each in of_one] for of_one in exits]
-    ways = ways_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)
-    best = shortest_tour(ways, closed=closed)
-    found = circuits(ways) if combinations(ways) <= MOST_COMBINATIONS else None
+    subtree = subtree_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)
+    best = shortest_tour(subtree, closed=closed)
+    found = circuits(subtree) if combinations(subtree) <= MOST_COMBINATIONS else None
     return TourAnswer(
         lesions_lps=lesions[np.array(numbers) - 1],
         numbers=tuple(numbers),
         left_out=left_out,
-        ways=ways,
+        subtree=subtree,
         shortest=best,
         least_resistance=None
         if found is None
-        else plan_itinerary(ways, found.choice(reading), closed=closed),
+        else plan_itinerary(subtree, found.choice(reading), closed=closed),
         circuits=found,
-        one_by_one_mm=one_by_one_mm(ways, best.chosen, closed=closed),
-        vetted=atlas is not None,
+        one_by_one_mm=one_by_one_mm(subtree, best.chosen, closed=closed),
+        plan_required=atlas is not None,
     )
 
 
@@ -189,7 +189,7 @@ def _rule_of(atlas: Atlas | None) -> ExitRule:
     return ExitRule(reach_mm=min(reach, FARTHEST_MM))
 
 
-def coupled_vet(atlas: Atlas, lesion_lps: Float) -> Vet:
+def coupled_plan_test(atlas: Atlas, lesion_lps: Float) -> ExitTest:
     """Return the test whether a coupled plan leads from a tree point to a lesion, `(3,)` LPS mm.
 
     All deployments of the atlas whose workspace holds the lesion are tried with the direct arc; a site counts
@@ -251,7 +251,7 @@ def record(answer: TourAnswer) -> dict[str, Any]:
             for number, place in zip(answer.numbers, answer.lesions_lps.tolist(), strict=True)
         ],
         "left_out": {str(number): why for number, why in answer.left_out.items()},
-        "exits_vetted_by_coupled_plans": answer.vetted,
+        "exits_require_coupled_plans": answer.plan_required,
         "shortest": _itinerary_record(answer.shortest, answer.numbers),
         "least_resistance": None if least is None else _itinerary_record(least, answer.numbers),
         "circuits": None if answer.circuits is None else answer.circuits.count,
@@ -260,8 +260,8 @@ def record(answer: TourAnswer) -> dict[str, Any]:
 
 
 def _itinerary_record(tour: Itinerary, numbers: Sequence[int]) -> dict[str, Any]:
-    ways = tour.ways
-    used = [v for v in range(1, ways.n_vertices) if tour.passes[v] > 0]
+    subtree = tour.subtree
+    used = [v for v in range(1, subtree.n_vertices) if tour.passes[v] > 0]
     return {
         "closed": tour.closed,
         "length_mm": tour.length_mm,
@@ -276,12 +276,12 @@ def _itinerary_record(tour: Itinerary, numbers: Sequence[int]) -> dict[str, Any]
             }
             for visit in tour.visits
         ],
-        "tree_points_in_order": [int(ways.tree_point[v]) for v in tour.vertices()],
+        "tree_points_in_order": [int(subtree.tree_point[v]) for v in tour.vertices()],
         "stretches": [
             {
-                "from_tree_point": int(ways.tree_point[ways.parent[v]]),
-                "to_tree_point": int(ways.tree_point[v]),
-                "length_mm": float(ways.length_mm[v]),
+                "from_tree_point": int(subtree.tree_point[subtree.parent[v]]),
+                "to_tree_point": int(subtree.tree_point[v]),
+                "length_mm": float(subtree.length_mm[v]),
                 "passes": int(tour.passes[v]),
                 "loops": int(tour.loops[v]),
             }

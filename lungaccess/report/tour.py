@@ -79,9 +79,9 @@ def _panel(axes: Axes, answer: TourAnswer, tree: AirwayTree, layers: Layers, vie
 
 
 def _stretches(axes: Axes, tour: Itinerary, tree: AirwayTree, view: View) -> None:
-    ways = tour.ways
+    subtree = tour.subtree
     for v in np.flatnonzero(tour.passes > 0).tolist():
-        point, end = int(ways.tree_point[v]), int(ways.tree_point[ways.parent[v]])
+        point, end = int(subtree.tree_point[v]), int(subtree.tree_point[subtree.parent[v]])
         line = [point]
         while line[-1] != end:
             line.append(int(tree.parent_point[line[-1]]))
@@ -92,7 +92,7 @@ def _stretches(axes: Axes, tour: Itinerary, tree: AirwayTree, view: View) -> Non
 def _legend() -> list[Line2D]:
     return [
         Line2D([], [], color=PASS_COLOURS[2], lw=3, label="passed twice"),
-        Line2D([], [], color=PASS_COLOURS[1], lw=3, label="passed once: the way to the last lesion"),
+        Line2D([], [], color=PASS_COLOURS[1], lw=3, label="passed once: the path to the last lesion"),
         Line2D([], [], marker="o", mfc="white", mec=style.NEEDLE, ls="none", label="exit"),
         Line2D([], [], marker="o", ms=12, mfc=style.NODULE, mec="white", ls="none",
                label="lesion, by the order of visits"),

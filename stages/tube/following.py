@@ -32,7 +32,7 @@ HALVINGS = 12
 
 
 class SnapError(LungaccessError):
-    """The tubes would snap: on the way they lose stability, or their branch of equilibria ends.
+    """The tubes would snap: during the motion they lose stability, or their branch of equilibria ends.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class SnapError(LungaccessError):
         super().__init__(
             f"The tubes snap during the move {move!r}: {why} at rotations of {turned} deg and insertions of "
             f"{out} mm, innermost tube first",
-            expected="stable equilibria all the way, each next to the one before",
+            expected="stable equilibria during the whole motion, each next to the one before",
             remedy="Turn the tubes less against each other, insert them less far, or take less precurvature",
         )
 
@@ -126,7 +126,7 @@ def deploy(
     Raises
     ------
     SnapError
-        If the tubes snap on the way.
+        If the tubes snap during the motion.
     SettingsError
         If the sequence does not fit the tubes.
 

@@ -32,7 +32,7 @@ class Sequence:
     ----------
     name : str
     moves : tuple of str
-        What happens on the way to each waypoint after the first, W - 1 of them.
+        What happens during the motion to each waypoint after the first, W - 1 of them.
     base_angles_rad, beta_mm : (W, n) float64
         Rotations of the tubes' bases and arc lengths of these bases from the scope tip (never above 0),
         innermost tube first.
@@ -196,7 +196,7 @@ def joint_steps(
     Raises
     ------
     SettingsError
-        If a step is not above 0, the tubes are others, or they get out of order on the way.
+        If a step is not above 0, the tubes are others, or they get out of order during the motion.
     """
     if not (0.0 < step_mm < np.inf and 0.0 < step_rad < np.inf):
         raise SettingsError(f"The steps are {step_mm:g} mm, {step_rad:g} rad", expected="finite, above 0")
@@ -235,7 +235,7 @@ def _landmarks(tubes: collections.abc.Sequence[Tube]) -> list[tuple[int, float]]
 
 
 def _crossings(landmarks: list[tuple[int, float]], a: Float, b: Float) -> Float:
-    """Return the shares of the way from `a` to `b` where a landmark passes the scope tip or another."""
+    """Return the shares of the motion from `a` to `b` at which a landmark passes the scope tip or another."""
     n = len(a) // 2
     start = np.array([a[n + tube] + border for tube, border in landmarks] + [0.0])
     end = np.array([b[n + tube] + border for tube, border in landmarks] + [0.0])

@@ -1,4 +1,4 @@
-"""The command `lungaccess route`: a way along airways or vessels for a device of limited curvature."""
+"""The command `lungaccess route`: a route along airways or vessels for a device of limited curvature."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def tour(
     *,
     targets: Path,
     system: str = "lung-default",
-    vet: bool = True,
+    require_plan: bool = True,
     closed: bool = False,
     reading: Literal["printed", "reduced"] = "printed",
     beta: float = 0.2,
@@ -45,7 +45,7 @@ def tour(
         Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm.
     system : str
         Preset or TOML file whose devices reach the lesions from the airway.
-    vet : bool
+    require_plan : bool
         Count an exit only if a coupled plan of scope, tubes and needle from there exists.
     closed : bool
         Return to the root of the airway after the last lesion.
@@ -54,7 +54,7 @@ def tour(
     beta : float
         Weight of the angle in the resistance; the paper's worked example needs 2.5.
     tissue_weight : float
-        How many mm of the scope's way a mm between exit and lesion is worth, for the shortest tour.
+        How many mm of the scope's travel a mm between exit and lesion is worth, for the shortest tour.
     speed : float
         Speed of the scope, mm/s, for the times.
     per_lesion : float
@@ -82,7 +82,7 @@ def tour(
     require_writable_folder(out)
     device = load_system(system)
     lung, atlas = load_lung(patient, cache), None
-    if vet:
+    if require_plan:
         with progress("enumerating what scope and tubes can do") as shown:
             atlas = open_atlas(lung, device, cache=cache, progress=shown.share)
     with progress("planning the tour"):
@@ -135,10 +135,10 @@ def _show(answer: TourAnswer, speed: float, per_lesion: float) -> None:
         )
         for number, visit in enumerate(answer.shortest.visits, 1)
     ]
-    vetted = "each exit has a coupled plan" if answer.vetted else "exits not vetted"
+    exits = "each exit has a coupled plan" if answer.plan_required else "exits without plans"
     terminal.show(
         [
-            terminal.table(f"Tours to {count} lesions ({vetted})", headings, rows),
+            terminal.table(f"Tours to {count} lesions ({exits})", headings, rows),
             terminal.table(
                 "Visits of the shortest tour",
                 ("visit", "lesion", "exit", "from the lesion, mm", "angle, deg"),

@@ -310,7 +310,7 @@ def _proved(nodes: Float, edges: Int, walls: _Walls) -> Centreline:
     """Give every node the largest radius with which the cones are proved to lie in the lumen.
 
     The depth is 1-Lipschitz, so it is at least its value at the nearest of the places tried, less half of
-    their spacing.  Where the interpolated radius is larger, both ends of the edge give way.
+    their spacing.  Where the interpolated radius is larger, the radii at both ends are reduced.
     """
     radius = walls.depth_mm(nodes)
     begin, end = nodes[edges[:, 0]], nodes[edges[:, 1]]

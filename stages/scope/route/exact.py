@@ -12,14 +12,14 @@ import numpy as np
 from anatomy.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
-from stages.scope.route.guide_path import Way
+from stages.scope.route.guide_path import GuidePath
 from stages.scope.route.kernels.repair import repair
 from stages.scope.route.kernels.spline import take_samples
 from stages.scope.route.proof import Proof, prove
 from stages.scope.route.settings import RouteLimits
 
 CENTRING = 0.02
-"""Weight of the squared distance from the way, in radii; small against the limits."""
+"""Weight of the squared distance from the guide path, in radii; small against the limits."""
 BENDING = 0.02
 """Weight of the squared curvature, in limits."""
 ROUNDS, STEPS = 12, 30
@@ -48,7 +48,7 @@ AS_IT_IS: tuple[Stage, ...] = ()
 TIGHTENED: tuple[Stage, ...] = tuple((BENDING, times, 4, STEPS) for times in (8.0, 4.0, 2.0, 1.4, 1.15))
 """The program is not convex: what is solved before its last stage decides where it ends."""
 
-OTHER_WAYS: tuple[tuple[float, tuple[Stage, ...]], ...] = (
+FURTHER_STARTS: tuple[tuple[float, tuple[Stage, ...]], ...] = (
     (6.0, SMOOTH),
     (4.5, AS_IT_IS),
     (2.0, SMOOTH_WITHIN),
@@ -99,13 +99,13 @@ class Problem:
 
     Parameters
     ----------
-    way : Way
+    guide : GuidePath
         What it follows; its ends are the wanted ones.
     centreline : Centreline
     limits : RouteLimits
     """
 
-    way: Way
+    guide: GuidePath
     centreline: Centreline
     limits: RouteLimits
 
@@ -145,11 +145,11 @@ def repaired(
         or of the local radius.
     """
     low, high = free
-    way, lumen, limits = problem.way, problem.centreline, problem.limits
+    guide, lumen, limits = problem.guide, problem.centreline, problem.limits
     begin, end = max(low - DEGREE, 0), min(high, curve.n_spans)
     count = level.per_span * (end - begin) + 1
     first, rows, samples = np.zeros(count, dtype=np.int64), np.zeros((count, 3, 4)), np.zeros((count, 7))
-    along, with_radius = way.along_mm, np.column_stack((way.points_mm, way.radius_mm))
+    along, with_radius = guide.along_mm, np.column_stack((guide.points_mm, guide.radius_mm))
     control = np.array(curve.control_mm)
     take_samples(control, curve.knots, begin, end, level.per_span, along, with_radius, first, rows, samples)
     limit, worst = limits.max_curvature_per_mm, np.inf
@@ -159,8 +159,8 @@ def repaired(
             level.spare_mm, limits.end_tolerance_mm,
         ))  # fmt: skip
         worst, _taken = repair(
-            control, low, high, first, rows, samples, lumen.cones, *lumen.cells, way.cones, weights,
-            way.points_mm[[0, -1]], rounds, steps, SOLVED,
+            control, low, high, first, rows, samples, lumen.cones, *lumen.cells, guide.cones, weights,
+            guide.points_mm[[0, -1]], rounds, steps, SOLVED,
         )  # fmt: skip
     return Curve(control_mm=control, knots=curve.knots), float(worst)
 
@@ -194,7 +194,7 @@ def repair_exact(tentative: Curve, problem: Problem, executor: Executor | None =
     Parameters
     ----------
     tentative : Curve
-        Spline through points of the way.
+        Spline through points of the guide path.
     problem : Problem
     executor : concurrent.futures.Executor, optional
         Repairs the segments of a round side by side; threads are enough, the program runs without the lock.
@@ -205,10 +205,10 @@ def repair_exact(tentative: Curve, problem: Problem, executor: Executor | None =
         If nothing worked, the curve with the fewest spans that fail.
     """
     curve, proof = _by_segments(tentative, problem, MARGIN_SHARE, SMOOTH, executor)
-    for spacing, start in OTHER_WAYS:
+    for spacing, start in FURTHER_STARTS:
         if proof.holds:
             break
-        whole = _by_segments(problem.way.curve(spacing), problem, 1.0, start, None)
+        whole = _by_segments(problem.guide.curve(spacing), problem, 1.0, start, None)
         if _failed_share(whole[1]) < _failed_share(proof):
             curve, proof = whole
     return curve, proof

@@ -1,4 +1,4 @@
-"""The way that a route follows: centreline nodes with start and goal."""
+"""The guide path of a route: the centreline nodes that the search found, with start and goal."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
 
 SAME_PLACE_MM = 1e-6
+"""Points nearer than this coincide: rounding, far below a voxel."""
+
 WAYPOINT_SPACING_MM = 3.0
+"""Denser points hand the kinks of a voxel skeleton on to the spline; sparser ones cut the bends of airways."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Way:
+class GuidePath:
     """Points from start to goal with the radius of the lumen; P points.
 
     Parameters
@@ -38,17 +41,17 @@ class Way:
 
     @property
     def cones(self) -> Float:
-        """Round cones along the way, `(P - 1, 8)`; they lead, but are no part of the lumen."""
+        """Round cones along the guide path, `(P - 1, 8)`; they lead, but are no part of the lumen."""
         with_radius = np.column_stack((self.points_mm, self.radius_mm))
         return np.hstack((with_radius[:-1], with_radius[1:]))
 
     def curve(self, spacing_mm: float = WAYPOINT_SPACING_MM) -> Curve:
-        """Return the tentative curve: the cubic B-spline through points of the way.
+        """Return the tentative curve: the cubic B-spline through points of the guide path.
 
         Parameters
         ----------
         spacing_mm : float
-            Distance of the points along the way, about; 0 for every point, as in [Li2021].
+            Distance of the points along the guide path, about; 0 for every point, as in [Li2021].
         """
         along = self.along_mm
         if spacing_mm <= 0.0:
@@ -58,8 +61,10 @@ class Way:
         return interpolate(np.stack([np.interp(at, along, axis) for axis in self.points_mm.T], axis=1))
 
 
-def way_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_mm: Float) -> Way:
-    """Return the way over centreline nodes.
+def guide_path_along(
+    centreline: Centreline, nodes: Int, start_mm: Float, goal_mm: Float
+) -> GuidePath:
+    """Return the guide path over centreline nodes.
 
     Start and goal take the place of the nodes nearest to them.
 
@@ -80,4 +85,4 @@ def way_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_mm: Floa
     if not apart[-1]:
         kept[np.flatnonzero(kept)[-1]] = False
         kept[-1] = True
-    return Way(points_mm=read_only(points[kept]), radius_mm=read_only(radius[kept]))
+    return GuidePath(points_mm=read_only(points[kept]), radius_mm=read_only(radius[kept]))

@@ -16,7 +16,7 @@ from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.exact import Problem, repair_exact
 from stages.scope.route.genetic import GeneticSettings, repair_genetic
-from stages.scope.route.guide_path import WAYPOINT_SPACING_MM, Way, way_along
+from stages.scope.route.guide_path import WAYPOINT_SPACING_MM, GuidePath, guide_path_along
 from stages.scope.route.proof import Proof
 from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.settings import RouteLimits
@@ -36,10 +36,10 @@ class Route:
     ----------
     nodes : (K,) int64
         Nodes of the centreline that the search found.
-    way : Way
-        They, with start and goal.
+    guide : GuidePath
+        These nodes, with start and goal.
     tentative : Curve
-        The spline through points of the way.
+        The spline through points of the guide path.
     curve : Curve
         The route.
     proof : Proof
@@ -52,7 +52,7 @@ class Route:
     """
 
     nodes: Int
-    way: Way
+    guide: GuidePath
     tentative: Curve
     curve: Curve
     proof: Proof
@@ -68,7 +68,7 @@ class Route:
     @property
     def end_error_mm(self) -> float:
         """How far the ends lie from the wanted start and goal, the larger of both."""
-        off = self.curve.control_mm[[0, -1]] - self.way.points_mm[[0, -1]]
+        off = self.curve.control_mm[[0, -1]] - self.guide.points_mm[[0, -1]]
         return float(np.linalg.norm(off, axis=1).max())
 
 
@@ -93,9 +93,9 @@ def try_route(
     centreline.require_inside(goal, limits.needed_mm, "goal")
     links = nearest_links(centreline) if links is None else links
     nodes = fewest_hops(links, centreline.nearest_node(start), centreline.nearest_node(goal))
-    way = way_along(centreline, nodes, start, goal)
-    tentative = way.curve(waypoint_spacing_mm)
-    return _route(centreline, nodes, way, tentative, limits, repair, seed, genetic, executor)
+    guide = guide_path_along(centreline, nodes, start, goal)
+    tentative = guide.curve(waypoint_spacing_mm)
+    return _route(centreline, nodes, guide, tentative, limits, repair, seed, genetic, executor)
 
 
 def plan_route(
@@ -113,8 +113,8 @@ def plan_route(
 ) -> Route:
     """Plan a route that is proved to keep its limits on the whole curve.
 
-    Breadth-first search over centreline nodes, a cubic B-spline through points of the way, and a repair of
-    the segments that bend too much or come too near to the wall [Li2021].
+    Breadth-first search over centreline nodes, a cubic B-spline through points of the guide path, and a
+    repair of the segments that bend too much or come too near to the wall [Li2021].
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def require_proved(route: Route) -> None:
 def _route(
     centreline: Centreline,
     nodes: Int,
-    way: Way,
+    guide: GuidePath,
     tentative: Curve,
     limits: RouteLimits,
     repair: Repair,
@@ -196,7 +196,7 @@ def _route(
     genetic: GeneticSettings | None,
     executor: Executor | None,
 ) -> Route:
-    problem = Problem(way=way, centreline=centreline, limits=limits)
+    problem = Problem(guide=guide, centreline=centreline, limits=limits)
     curve, claimed = tentative, True
     if repair == "exact":
         curve, proof = repair_exact(tentative, problem, executor)
@@ -209,7 +209,7 @@ def _route(
         proof = problem.prove(curve)
     return Route(
         nodes=read_only(nodes),
-        way=way,
+        guide=guide,
         tentative=tentative,
         curve=curve,
         proof=proof,
@@ -283,14 +283,14 @@ class Replanner:
         limits = self._route.limits
         for point, name in zip(ends, ("start", "goal"), strict=True):
             here.require_inside(point, limits.needed_mm, name)
-        way = way_along(here, self._nodes, *ends)
-        route = _route(here, self._nodes, way, way.curve(), limits, "exact", 0, None, None)
+        guide = guide_path_along(here, self._nodes, *ends)
+        route = _route(here, self._nodes, guide, guide.curve(), limits, "exact", 0, None, None)
         require_proved(route)
         return route
 
     def _carried(self, end: int, moved: Float) -> Float:
         node = self._route.nodes[end]
-        point: Float = self._route.way.points_mm[end] + moved[node] - self._centreline.nodes_mm[node]
+        point: Float = self._route.guide.points_mm[end] + moved[node] - self._centreline.nodes_mm[node]
         return point
 
 

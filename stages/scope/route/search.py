@@ -1,4 +1,4 @@
-"""The global planner: a way along the nodes of a centreline."""
+"""The global planner of [Li2021]: breadth-first search (BFS) along the nodes of a centreline."""
 
 from __future__ import annotations
 
@@ -75,7 +75,9 @@ def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) 
 
 
 def fewest_hops(links: Links, source: int, goal: int) -> Int:
-    """Return the nodes from `source` to `goal` with the fewest hops; not always the shortest way.
+    """Return the nodes from `source` to `goal` with the fewest hops, by the BFS of [Li2021].
+
+    The path with the fewest hops is not always the shortest.
 
     Raises
     ------

@@ -14,15 +14,16 @@ if TYPE_CHECKING:
     from stages.scope.tour.circuit import combinations as combinations
     from stages.scope.tour.exits import Exit as Exit
     from stages.scope.tour.exits import ExitRule as ExitRule
-    from stages.scope.tour.exits import Vet as Vet
+    from stages.scope.tour.exits import ExitTest as ExitTest
     from stages.scope.tour.exits import exits_of as exits_of
+    from stages.scope.tour.exits import find_exits as find_exits
     from stages.scope.tour.itinerary import Itinerary as Itinerary
     from stages.scope.tour.itinerary import one_by_one_mm as one_by_one_mm
     from stages.scope.tour.itinerary import plan_itinerary as plan_itinerary
     from stages.scope.tour.resistance import Resistances as Resistances
     from stages.scope.tour.shortest import shortest_tour as shortest_tour
     from stages.scope.tour.subtree import MOST_LESIONS as MOST_LESIONS
-    from stages.scope.tour.subtree import Ways as Ways
-    from stages.scope.tour.subtree import ways_to as ways_to
+    from stages.scope.tour.subtree import Subtree as Subtree
+    from stages.scope.tour.subtree import subtree_to as subtree_to
 
 __getattr__, __dir__ = facade(__name__, __file__)

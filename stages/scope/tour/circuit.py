@@ -12,12 +12,15 @@ from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.typed import Float, Int
 from stages.scope.tour.kernels.circuit import all_resistances
-from stages.scope.tour.subtree import Ways
+from stages.scope.tour.subtree import Subtree
 
 Reading = Literal["printed", "reduced"]
 
 MOST_COMBINATIONS = 5_000_000
+"""Every combination is computed and stored in two arrays: this many take seconds and 80 MB."""
+
 SAME_RESISTANCE = 1e-9
+"""Relative difference up to which two resistances count as equal; sums in another order differ by less."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,17 +70,17 @@ class Circuits:
         return tuple(chosen[::-1])
 
 
-def combinations(ways: Ways) -> int:
+def combinations(subtree: Subtree) -> int:
     """Return the number of choices of one exit a lesion."""
-    return math.prod(np.bincount(ways.exit_lesion).tolist())
+    return math.prod(np.bincount(subtree.exit_lesion).tolist())
 
 
-def circuits(ways: Ways) -> Circuits:
+def circuits(subtree: Subtree) -> Circuits:
     """Compute the resistances of all combinations of exits.
 
     Parameters
     ----------
-    ways : Ways
+    subtree : Subtree
 
     Raises
     ------
@@ -88,22 +91,22 @@ def circuits(ways: Ways) -> Circuits:
     ----------
     .. [Pan2025] docs/bibliography.md
     """
-    sizes = np.bincount(ways.exit_lesion, minlength=ways.n_lesions)
-    count = combinations(ways)
+    sizes = np.bincount(subtree.exit_lesion, minlength=subtree.n_lesions)
+    count = combinations(subtree)
     if count > MOST_COMBINATIONS:
         raise SettingsError(
-            f"{ways.n_lesions} lesions have {count} combinations of exits",
+            f"{subtree.n_lesions} lesions have {count} combinations of exits",
             expected=f"at most {MOST_COMBINATIONS} for the method of least resistance",
             remedy="Use the exact tour alone",
         )
     first = np.concatenate(((0,), np.cumsum(sizes)))
     printed, reduced = np.zeros(count), np.zeros(count)
     all_resistances(
-        ways.parent,
-        ways.resistance,
-        ways.side,
-        ways.exit_vertex,
-        ways.exit_resistance,
+        subtree.parent,
+        subtree.resistance,
+        subtree.side,
+        subtree.exit_vertex,
+        subtree.exit_resistance,
         first,
         printed,
         reduced,

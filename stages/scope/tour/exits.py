@@ -1,4 +1,4 @@
-"""Where a lesion can be reached from: the target positions P1, P2 and P3 of [Pan2025]."""
+"""The exits of a lesion: the target positions P1, P2 and P3 of [Pan2025], with eqs. 1 and 2."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from anatomy.errors import TargetError
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float, Int
 
-Vet = Callable[[int, int], bool]
-"""Tells whether a lesion, by its number, can really be reached from a point of the tree, by its index."""
+ExitTest = Callable[[int, int], bool]
+"""Tells whether a lesion, given by its number, can be reached from a tree point, given by its index."""
 
 
 @settings
@@ -82,9 +82,9 @@ def find_exits(
     lesions_lps: ArrayLike,
     *,
     rule: ExitRule | None = None,
-    vet: Vet | None = None,
+    accepts: ExitTest | None = None,
 ) -> tuple[tuple[Exit, ...], ...]:
-    """Return up to three exits for each lesion.
+    """Return up to three exits for each lesion: the target positions P1, P2 and P3 of [Pan2025].
 
     P1 has the smallest angle, P2 the smallest distance, P3 the smallest weighted sum of both; the paper
     says largest, which would be the worst point.  Where two are the same point, it is listed once.  A lesion
@@ -95,8 +95,8 @@ def find_exits(
     tree : AirwayTree
     lesions_lps : (M, 3) float64, LPS mm
     rule : ExitRule, optional
-    vet : callable, optional
-        Points that it refuses are no candidates.
+    accepts : callable, optional
+        Tree points that it refuses are no candidates.
 
     Raises
     ------
@@ -109,11 +109,11 @@ def find_exits(
     """
     chosen = rule or ExitRule()
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
-    return tuple(exits_of(tree, number, lesion, chosen, vet) for number, lesion in enumerate(lesions))
+    return tuple(exits_of(tree, number, lesion, chosen, accepts) for number, lesion in enumerate(lesions))
 
 
 def exits_of(
-    tree: AirwayTree, number: int, lesion: Float, rule: ExitRule, vet: Vet | None
+    tree: AirwayTree, number: int, lesion: Float, rule: ExitRule, accepts: ExitTest | None
 ) -> tuple[Exit, ...]:
     """Return the exits of one lesion, `(3,)` LPS mm, which is given a number; see `find_exits`."""
     offset = lesion - tree.points_lps
@@ -126,18 +126,18 @@ def exits_of(
         # The sphere that first reaches a point; points met in the same step are equally far.
         grown = np.ceil(distance / rule.step_mm) * rule.step_mm
         points = np.flatnonzero(grown <= rule.reach_mm)
-    if vet is not None:
-        points = np.array([point for point in points.tolist() if vet(number, point)], dtype=np.int64)
+    if accepts is not None:
+        points = np.array([point for point in points.tolist() if accepts(number, point)], dtype=np.int64)
     if not len(points):
         raise TargetError(
             f"The lesion at LPS ({', '.join(f'{x:.1f}' for x in lesion)}) cannot be reached from the airway: "
             + (
                 f"the nearest point is {distance[nearest]:.1f} mm away"
-                if vet is None
+                if accepts is None
                 else "no coupled plan leads there"
             ),
             expected=f"a point of the airway within {rule.reach_mm:g} mm"
-            + ("" if vet is None else " from where a coupled plan exists"),
+            + ("" if accepts is None else " from where a coupled plan exists"),
             remedy="Leave the lesion out, or allow a longer reach",
         )
     line = offset[points] / np.maximum(distance[points], 1e-12)[:, None]
@@ -146,11 +146,11 @@ def exits_of(
         return (_exit(number, points, distance, angle, np.zeros(1), 0, ("inside",)),)
     weight = rule.angle_weight
     weighted = (1.0 - weight) * distance[points] / rule.reach_mm + weight * angle / np.pi
-    way = tree.distance_from_root_mm[points]
+    depth = tree.distance_from_root_mm[points]
     best = {
-        "P1": int(np.lexsort((way, angle))[0]),
-        "P2": int(np.lexsort((way, grown[points]))[0]),
-        "P3": int(np.lexsort((way, weighted))[0]),
+        "P1": int(np.lexsort((depth, angle))[0]),
+        "P2": int(np.lexsort((depth, grown[points]))[0]),
+        "P3": int(np.lexsort((depth, weighted))[0]),
     }
     roles: dict[int, tuple[str, ...]] = {}
     for role, at in best.items():

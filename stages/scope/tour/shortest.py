@@ -9,36 +9,36 @@ import numpy as np
 from anatomy.typed import Bool, Float, Int
 from stages.scope.tour.itinerary import Itinerary, plan_itinerary
 from stages.scope.tour.kernels.steiner import solve
-from stages.scope.tour.subtree import Ways
+from stages.scope.tour.subtree import Subtree
 
 MOST_WORK = 3e7
 """Divisions of sets up to which the dynamic program is used: about a tenth of a second."""
 
 
-def shortest_tour(ways: Ways, *, closed: bool = False) -> Itinerary:
+def shortest_tour(subtree: Subtree, *, closed: bool = False) -> Itinerary:
     """Return the tour of least cost over all choices of one exit a lesion.
 
     A closed tour costs twice the length of the stretches that it uses; an open one may end at any exit and
-    saves the way back from there.  What the chosen exits cost is added.
+    saves the return from there.  The costs of the chosen exits are added.
 
     The dynamic program is exact.  Its work grows with the number of lesions that have exits on both sides
     of a fork; where that is large, an integer program takes its place, which is exact too.
 
     Parameters
     ----------
-    ways : Ways
+    subtree : Subtree
     closed : bool
         Whether the tour returns to the root.
     """
-    nodes = _binary(ways)
-    taken = _by_program(nodes, closed) if nodes.work <= MOST_WORK else _by_integers(ways, closed)
-    depth, lesion = ways.depth_mm[ways.exit_vertex], ways.exit_lesion
+    nodes = _binary(subtree)
+    taken = _by_program(nodes, closed) if nodes.work <= MOST_WORK else _by_integers(subtree, closed)
+    depth, lesion = subtree.depth_mm[subtree.exit_vertex], subtree.exit_lesion
     # Of two exits of a lesion that both lie on the tour at no cost, the deeper one may be its end.
     chosen = [
         max(np.flatnonzero(taken & (lesion == m)).tolist(), key=lambda x: float(depth[x]))
-        for m in range(ways.n_lesions)
+        for m in range(subtree.n_lesions)
     ]
-    return plan_itinerary(ways, chosen, closed=closed)
+    return plan_itinerary(subtree, chosen, closed=closed)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,7 +55,7 @@ class _Nodes:
     work: float
 
 
-def _binary(ways: Ways) -> _Nodes:
+def _binary(subtree: Subtree) -> _Nodes:
     """Make exits the leaves, and merge what meets at a vertex two by two."""
     left: list[int] = []
     right: list[int] = []
@@ -69,11 +69,11 @@ def _binary(ways: Ways) -> _Nodes:
         exit_of.append(x)
         return len(left) - 1
 
-    at: list[list[int]] = [[] for _ in range(ways.n_vertices)]
-    for x, v in enumerate(ways.exit_vertex.tolist()):
+    at: list[list[int]] = [[] for _ in range(subtree.n_vertices)]
+    for x, v in enumerate(subtree.exit_vertex.tolist()):
         at[v].append(x)
-    top: list[list[int]] = [[] for _ in range(ways.n_vertices)]
-    for v in range(ways.n_vertices - 1, -1, -1):
+    top: list[list[int]] = [[] for _ in range(subtree.n_vertices)]
+    for v in range(subtree.n_vertices - 1, -1, -1):
         meeting = [add(-1, -1, x) for x in at[v]] + top[v]
         if not meeting:
             continue
@@ -81,17 +81,17 @@ def _binary(ways: Ways) -> _Nodes:
         for other in meeting[1:]:
             node = add(node, other, -1)
         if v > 0:
-            lift[node] += float(ways.length_mm[v])
-            top[int(ways.parent[v])].append(node)
-    return _with_sets(ways, left, right, lift, exit_of)
+            lift[node] += float(subtree.length_mm[v])
+            top[int(subtree.parent[v])].append(node)
+    return _with_sets(subtree, left, right, lift, exit_of)
 
 
 def _with_sets(
-    ways: Ways, left: list[int], right: list[int], lift: list[float], exit_of: list[int]
+    subtree: Subtree, left: list[int], right: list[int], lift: list[float], exit_of: list[int]
 ) -> _Nodes:
     """Add which lesions lie below each node, which of them are open, and how much work the program is."""
-    lesion = ways.exit_lesion.tolist()
-    total = np.bincount(ways.exit_lesion).tolist()
+    lesion = subtree.exit_lesion.tolist()
+    total = np.bincount(subtree.exit_lesion).tolist()
     below, open_sets, work = [0] * len(left), [0] * len(left), 0.0
     inside: list[dict[int, int]] = [{} for _ in left]
     for t in range(len(left)):
@@ -113,7 +113,7 @@ def _with_sets(
         left=np.array(left, dtype=np.int64),
         right=np.array(right, dtype=np.int64),
         lift=np.array(lift),
-        cost=np.where(leaf, ways.exit_cost_mm[exits], 0.0),
+        cost=np.where(leaf, subtree.exit_cost_mm[exits], 0.0),
         below=np.array(below, dtype=np.int64),
         open_sets=np.array(open_sets, dtype=np.int64),
         exit_of=exits,
@@ -145,7 +145,7 @@ def _by_program(nodes: _Nodes, closed: bool) -> Bool:
     return taken
 
 
-def _by_integers(ways: Ways, closed: bool) -> Bool:
+def _by_integers(subtree: Subtree, closed: bool) -> Bool:
     """Return which exits are taken, by an integer program.
 
     x says which stretches are used, z which of them lead to the end of an open tour, y which exits are
@@ -154,7 +154,7 @@ def _by_integers(ways: Ways, closed: bool) -> Bool:
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import coo_array
 
-    n, count = ways.n_vertices, len(ways.exits)
+    n, count = subtree.n_vertices, len(subtree.exits)
     rows: list[tuple[int, int, float]] = []
     low: list[float] = []
 
@@ -163,22 +163,22 @@ def _by_integers(ways: Ways, closed: bool) -> Bool:
         low.append(least)
 
     for v in range(1, n):
-        if ways.parent[v] > 0:
-            require([(int(ways.parent[v]), 1.0), (v, -1.0)], 0.0)
+        if subtree.parent[v] > 0:
+            require([(int(subtree.parent[v]), 1.0), (v, -1.0)], 0.0)
         require([(v, 1.0), (n + v, -1.0)], 0.0)
     for v in range(n):
-        onward = [(n + int(c), -1.0) for c in np.flatnonzero(ways.parent == v)]
+        onward = [(n + int(c), -1.0) for c in np.flatnonzero(subtree.parent == v)]
         if onward:
             require([(n + v, 1.0), *onward], 0.0)
-    for x, v in enumerate(ways.exit_vertex.tolist()):
+    for x, v in enumerate(subtree.exit_vertex.tolist()):
         require([(v, 1.0), (2 * n + x, -1.0)], 0.0)
-    for m in range(ways.n_lesions):
-        require([(2 * n + int(x), 1.0) for x in np.flatnonzero(ways.exit_lesion == m)], 1.0)
+    for m in range(subtree.n_lesions):
+        require([(2 * n + int(x), 1.0) for x in np.flatnonzero(subtree.exit_lesion == m)], 1.0)
     row, column, factor = zip(*rows, strict=True)
     matrix = coo_array((factor, (row, column)), shape=(len(low), 2 * n + count))
-    saved = np.zeros(n) if closed else -ways.length_mm
+    saved = np.zeros(n) if closed else -subtree.length_mm
     found = milp(
-        np.concatenate((2.0 * ways.length_mm, saved, ways.exit_cost_mm)),
+        np.concatenate((2.0 * subtree.length_mm, saved, subtree.exit_cost_mm)),
         constraints=LinearConstraint(matrix.tocsr(), lb=np.array(low)),
         bounds=Bounds(0, 1),
         integrality=np.ones(2 * n + count),

@@ -15,15 +15,18 @@ from stages.scope.tour.exits import Exit
 from stages.scope.tour.resistance import Resistances, branch_resistances
 
 MAIN, LEFT, RIGHT = 0, 1, 2
+"""Sides of a stretch: above the carina, of the left lung, of the right lung."""
+
 MOST_LESIONS = 62
+"""A set of lesions is an int64 with one bit a lesion, and the next larger power of two must fit as well."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ways:
+class Subtree:
     """The stretches from the root to all exits; K vertices, parents first, and X exits of M lesions.
 
-    A vertex is the root, a fork of ways to different exits, an exit, or the carina.  Where more than two
-    ways part, the vertex has more than two children; that is the same as a chain of binary forks with
+    A vertex is the root, a fork of paths to different exits, an exit, or the carina.  Where more than two
+    paths part, the vertex has more than two children; that is the same as a chain of binary forks with
     stretches of no length and no resistance between them.
 
     Parameters
@@ -42,7 +45,7 @@ class Ways:
     exit_resistance : (X,) float64
         Of lesion and needle: eta inside the airway, eta and the weighted sum outside.
     exit_cost_mm : (X,) float64
-        What taking this exit costs besides the way, as a length.
+        What taking this exit costs besides the length of the tour, as a length.
     """
 
     tree_point: Int
@@ -72,21 +75,21 @@ class Ways:
 
     @property
     def depth_mm(self) -> Float:
-        """Way from the root to each vertex, `(K,)`."""
+        """Distance from the root to each vertex along the tree, `(K,)`."""
         depth = np.zeros(self.n_vertices)
         for v in range(1, self.n_vertices):
             depth[v] = depth[self.parent[v]] + self.length_mm[v]
         return depth
 
 
-def ways_to(
+def subtree_to(
     tree: AirwayTree,
     exits: Sequence[Sequence[Exit]],
     *,
     weights: Resistances | None = None,
     exit_cost_mm: Sequence[Sequence[float]] | None = None,
-) -> Ways:
-    """Take the ways to all exits out of a tree.
+) -> Subtree:
+    """Return the part of a tree that leads from the root to all exits.
 
     Parameters
     ----------
@@ -121,7 +124,7 @@ def ways_to(
     )
     if cost.shape != (len(flat),) or not (cost >= 0).all():
         raise SettingsError("The costs of the exits do not fit", expected="one number of at least 0 for each")
-    return Ways(
+    return Subtree(
         tree_point=read_only(vertices),
         parent=read_only(parent),
         length_mm=read_only(length),

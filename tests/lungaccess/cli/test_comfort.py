@@ -355,7 +355,7 @@ def test_info_and_tour_as_json(patient: Path, tmp_path: Path, capsys: pytest.Cap
     assert found["kind"] and found["tree"]["branches"] > 10 and len(found["targets_lps"]) > 0
     lesion = "lps:" + ",".join(f"{c:.3f}" for c in found["targets_lps"][0])
     (tmp_path / "lesions.txt").write_text(lesion + "\n")
-    words = ["tour", str(patient), "--targets", str(tmp_path / "lesions.txt"), "--no-vet", *cache]
+    words = ["tour", str(patient), "--targets", str(tmp_path / "lesions.txt"), "--no-require-plan", *cache]
     tour = answer_of([*words, "--out", str(tmp_path / "tour")], capsys)
     assert tour == json.loads((tmp_path / "tour" / "tour.json").read_text())
 

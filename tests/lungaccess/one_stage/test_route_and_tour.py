@@ -16,7 +16,7 @@ from anatomy.phantom import Phantom, write_phantom
 from experiments.support.tour_models import random_airway
 from lungaccess.cli.app import main
 from lungaccess.one_stage.route import open_source, read_drawing, widest_end
-from lungaccess.one_stage.tour import coupled_vet, plan_tour, read_lesions, record
+from lungaccess.one_stage.tour import coupled_plan_test, plan_tour, read_lesions, record
 
 
 @pytest.fixture(scope="module")
@@ -141,21 +141,21 @@ def test_a_lesion_out_of_reach_is_left_out_and_named(small_lung: Lung) -> None:
         plan_tour(small_lung, np.array([[9e3, 0.0, 0.0]]))
 
 
-def test_vetted_exits_have_a_coupled_plan(small_lung: Lung) -> None:
-    """Each exit of a vetted tour is a site from where a proved plan leads to the lesion."""
+def test_exits_of_a_tour_with_required_plans_have_a_coupled_plan(small_lung: Lung) -> None:
+    """Each exit of a tour with required plans is a site from where a proved plan leads to the lesion."""
     atlas = la.build_atlas(small_lung, la.load_system("lung-default"), rotations=12, site_spacing_mm=3.0)
     candidates = places(small_lung, 40)
     for lesion in candidates:
-        vet = coupled_vet(atlas, lesion)
-        good = [p for p in np.unique(atlas.sites.tree_point).tolist() if vet(0, p)]
+        accepts = coupled_plan_test(atlas, lesion)
+        good = [p for p in np.unique(atlas.sites.tree_point).tolist() if accepts(0, p)]
         if good:
             break
     else:
         pytest.fail("no lesion can be reached")
     answer = plan_tour(small_lung, lesion, atlas=atlas)
-    assert answer.vetted
-    assert {e.tree_point for e in answer.ways.exits} <= set(good)
-    assert not vet(0, 0)
+    assert answer.plan_required
+    assert {e.tree_point for e in answer.subtree.exits} <= set(good)
+    assert not accepts(0, 0)
 
 
 def test_tour_command_writes_its_files(small_phantom: Phantom, small_lung: Lung, tmp_path: Path) -> None:
@@ -163,7 +163,15 @@ def test_tour_command_writes_its_files(small_phantom: Phantom, small_lung: Lung,
     write_phantom(small_phantom, folder)
     file = tmp_path / "lesions.txt"
     file.write_text("\n".join("lps:" + ",".join(f"{x:.2f}" for x in p) for p in places(small_lung, 3)))
-    words = ["tour", str(folder), "--targets", str(file), "--no-vet", "--cache", str(tmp_path / "cache")]
+    words = [
+        "tour",
+        str(folder),
+        "--targets",
+        str(file),
+        "--no-require-plan",
+        "--cache",
+        str(tmp_path / "cache"),
+    ]
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
     assert json.loads((tmp_path / "out" / "tour.json").read_text())["one_by_one_mm"] > 0
     assert (tmp_path / "out" / "tour.png").read_bytes()[:4] == b"\x89PNG"

@@ -123,7 +123,7 @@ def _residuals(control, lo, hi, first, rows, samples, scene, path_cones, weights
             cones, index, cell_start, cell_cones, hints[s], enough, v[0, 0], v[0, 1], v[0, 2]
         )
         if depth < 0.0:
-            # Outside, what lies along the way leads back.
+            # Outside, what lies along the guide path leads back.
             for e in range(int(samples[s, 5]), int(samples[s, 6])):
                 found, px, py, pz = cone_depth(path_cones, e, v[0, 0], v[0, 1], v[0, 2])
                 if found > depth:

@@ -8,7 +8,7 @@ import numpy as np
 
 @numba.njit(cache=True)
 def breadth_first(start, links, source, goal):
-    """Return the nodes from `source` to `goal` with the fewest hops, empty if there is no way.
+    """Return the nodes from `source` to `goal` with the fewest hops, empty if there is none.
 
     `links[start[n]:start[n + 1]]` are the neighbours of node n, nearest first.
     """

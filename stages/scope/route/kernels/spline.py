@@ -18,7 +18,7 @@ ROUNDING = 1e-9
 LEAST_RADIUS_MM = 0.2
 """Violations of the wall are measured in radii, but never in smaller ones."""
 GUIDED_MM = 6.0
-"""So far along the way the cones reach that lead a sample back into the lumen."""
+"""So far along the guide path the cones reach that lead a sample back into the lumen."""
 
 PROVED, BENDS, LEAVES, UNDECIDED = 0, 1, 2, 3
 
@@ -253,10 +253,10 @@ def evaluate(control, knots, parameters, out):
 
 
 @numba.njit(cache=True)
-def take_samples(control, knots, begin, end, per_span, along, way, first, rows, samples):
+def take_samples(control, knots, begin, end, per_span, along, guide, first, rows, samples):
     """Prepare the samples of the spans `begin` to `end - 1` for `repair`.
 
-    `way` (P, 4) holds the points and radii of the centreline that the reference `control` follows, `along`
+    `guide` (P, 4) holds the points and radii of the centreline that the reference `control` follows, `along`
     (P,) their lengths along it, which are about the parameter of the spline.  Fills `first` (S,), `rows`
     (S, 3, 4) and `samples` (S, 7).
     """
@@ -277,7 +277,7 @@ def take_samples(control, knots, begin, end, per_span, along, way, first, rows, 
             for c in range(4):
                 total += rows[s, 0, c] * control[f + c, axis]
             samples[s, 1 + axis] = total
-        samples[s, 4] = max(way[near, 3] * (1.0 - share) + way[near + 1, 3] * share, LEAST_RADIUS_MM)
+        samples[s, 4] = max(guide[near, 3] * (1.0 - share) + guide[near + 1, 3] * share, LEAST_RADIUS_MM)
         low = near
         while low > 0 and u - along[low] < GUIDED_MM:
             low -= 1

@@ -28,7 +28,7 @@ def assert_kept(route: object, tube: Centreline, limits: RouteLimits) -> None:
     assert route.curve.curvature_per_mm(u).max() <= limits.max_curvature_per_mm
     assert tube.depth_mm(route.curve.at(u)[0]).min() >= limits.needed_mm - 1e-9
     ends = route.curve.at(route.curve.breaks[[0, -1]])[0]
-    off = np.linalg.norm(ends - route.way.points_mm[[0, -1]], axis=1)
+    off = np.linalg.norm(ends - route.guide.points_mm[[0, -1]], axis=1)
     assert off.max() <= limits.end_tolerance_mm + 1e-9
 
 

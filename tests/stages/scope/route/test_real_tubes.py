@@ -19,7 +19,7 @@ LIMITS = RouteLimits(max_curvature_per_mm=0.1, end_tolerance_mm=1.0)
 
 
 def trials(line: Centreline, links: Links, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Noisy ends, 20 mm apart or more, joined by a way that is nowhere thinner than 0.45 mm."""
+    """Noisy ends, 20 mm apart or more, joined by a path that is nowhere thinner than 0.45 mm."""
     rng = np.random.default_rng(0)
     ends = np.flatnonzero(np.bincount(line.edges.ravel()) == 1)
     root = ends[int(np.argmax(line.radius_mm[ends]))]

@@ -60,15 +60,15 @@ def test_vetting_takes_points_away() -> None:
     refused = {e.tree_point for e in free}
     asked: list[int] = []
 
-    def vet(number: int, point: int) -> bool:
+    def accepts(number: int, point: int) -> bool:
         asked.append(number)
         return point not in refused
 
-    (vetted,) = find_exits(tree, lesion, vet=vet)
+    (found,) = find_exits(tree, lesion, accepts=accepts)
     assert set(asked) == {0}
-    assert not refused & {e.tree_point for e in vetted}
+    assert not refused & {e.tree_point for e in found}
     with pytest.raises(TargetError, match="coupled plan"):
-        find_exits(tree, lesion, vet=lambda _number, _point: False)
+        find_exits(tree, lesion, accepts=lambda _number, _point: False)
 
 
 def test_random_models_are_as_the_paper_describes() -> None:

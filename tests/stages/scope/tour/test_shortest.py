@@ -15,7 +15,7 @@ from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
 from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary
 from stages.scope.tour.shortest import shortest_tour
-from stages.scope.tour.subtree import Ways, ways_to
+from stages.scope.tour.subtree import Subtree, subtree_to
 from tests.stages.scope.tour.trees import (
     by_trying_everything,
     ends_of,
@@ -31,44 +31,44 @@ def airway(seed: int, orders: int) -> AirwayTree:
     return random_airway(seed, orders=orders)
 
 
-def random_ways(rng: np.random.Generator, lesions: int, exits: int = 3, *, orders: int = 5) -> Ways:
+def random_subtree(rng: np.random.Generator, lesions: int, exits: int = 3, *, orders: int = 5) -> Subtree:
     tree = airway(int(rng.integers(20)), orders)
     chosen = [
         [exit_at(m, p) for p in rng.integers(0, tree.n_points, int(rng.integers(1, exits + 1)))]
         for m in range(lesions)
     ]
     cost = [[float(rng.choice((0.0, rng.uniform(0.0, 40.0)))) for _ in of_one] for of_one in chosen]
-    return ways_to(tree, chosen, exit_cost_mm=cost)
+    return subtree_to(tree, chosen, exit_cost_mm=cost)
 
 
 def test_figure_1_is_walked_as_the_paper_writes_it() -> None:
     """A B C D C E C B F G F H."""
     tree = figure_1()
-    ways = ways_to(tree, [[exit_at(m, p)] for m, p in enumerate(ends_of(tree, [3, 4, 6, 7]))])
-    tour = plan_itinerary(ways, (0, 1, 2, 3))
+    subtree = subtree_to(tree, [[exit_at(m, p)] for m, p in enumerate(ends_of(tree, [3, 4, 6, 7]))])
+    tour = plan_itinerary(subtree, (0, 1, 2, 3))
     assert tour.order == (0, 1, 2, 3)
-    points = [int(ways.tree_point[v]) for v in tour.vertices()]
+    points = [int(subtree.tree_point[v]) for v in tour.vertices()]
     a, b, c, d, e, f, g, h = ends_of(tree, [0, 1, 2, 3, 4, 5, 6, 7])
     assert points == [0, a, b, c, d, c, e, c, b, f, g, f, h]
-    loops = dict(zip(ways.tree_point.tolist(), tour.loops.tolist(), strict=True))
+    loops = dict(zip(subtree.tree_point.tolist(), tour.loops.tolist(), strict=True))
     assert (loops[b], loops[c], loops[f], loops[h]) == (4, 2, 2, 1)
 
 
 def test_passes_are_those_of_the_walk() -> None:
     rng = np.random.default_rng(1)
     for _ in range(30):
-        ways = random_ways(rng, 4)
-        tour = shortest_tour(ways, closed=bool(rng.integers(2)))
+        subtree = random_subtree(rng, 4)
+        tour = shortest_tour(subtree, closed=bool(rng.integers(2)))
         walk = tour.vertices()
-        counted = np.zeros(ways.n_vertices, dtype=int)
+        counted = np.zeros(subtree.n_vertices, dtype=int)
         for a, b in zip(walk[:-1], walk[1:], strict=True):
-            assert ways.parent[a] == b or ways.parent[b] == a
-            counted[a if ways.parent[a] == b else b] += 1
+            assert subtree.parent[a] == b or subtree.parent[b] == a
+            counted[a if subtree.parent[a] == b else b] += 1
         np.testing.assert_array_equal(counted, tour.passes)
         assert counted.max() <= 2
-        assert tour.length_mm == pytest.approx((counted * ways.length_mm).sum())
+        assert tour.length_mm == pytest.approx((counted * subtree.length_mm).sum())
         for lesion in tour.order:
-            assert int(ways.exit_vertex[tour.chosen[lesion]]) in walk
+            assert int(subtree.exit_vertex[tour.chosen[lesion]]) in walk
         assert sorted(tour.order) == list(range(4))
 
 
@@ -76,17 +76,19 @@ def test_passes_are_those_of_the_walk() -> None:
 def test_order_is_the_best_of_all_orders(closed: bool) -> None:
     rng = np.random.default_rng(2)
     for _ in range(25):
-        ways = random_ways(rng, 5, exits=1)
-        tour = plan_itinerary(ways, range(5), closed=closed)
-        assert tour.length_mm == pytest.approx(shortest_by_permutations(ways, tuple(range(5)), closed=closed))
+        subtree = random_subtree(rng, 5, exits=1)
+        tour = plan_itinerary(subtree, range(5), closed=closed)
+        assert tour.length_mm == pytest.approx(
+            shortest_by_permutations(subtree, tuple(range(5)), closed=closed)
+        )
 
 
 def test_open_tour_is_twice_the_union_less_the_deepest_way() -> None:
     rng = np.random.default_rng(3)
-    ways = random_ways(rng, 6, exits=1)
-    tour = plan_itinerary(ways, range(6))
-    union = float(ways.length_mm[tour.loops > 0].sum())
-    assert tour.length_mm == pytest.approx(2 * union - ways.depth_mm[ways.exit_vertex].max())
+    subtree = random_subtree(rng, 6, exits=1)
+    tour = plan_itinerary(subtree, range(6))
+    union = float(subtree.length_mm[tour.loops > 0].sum())
+    assert tour.length_mm == pytest.approx(2 * union - subtree.depth_mm[subtree.exit_vertex].max())
 
 
 @pytest.mark.parametrize("block", range(5))
@@ -94,65 +96,65 @@ def test_program_equals_trying_everything(block: int) -> None:
     """500 small random cases, open and closed, with exits that cost something and exits that do not."""
     rng = np.random.default_rng((4, block))
     for _ in range(100):
-        ways = random_ways(rng, int(rng.integers(1, 5)))
+        subtree = random_subtree(rng, int(rng.integers(1, 5)))
         for closed in (False, True):
-            best = by_trying_everything(ways, closed=closed)
-            assert shortest_tour(ways, closed=closed).cost_mm == pytest.approx(best, abs=1e-9)
+            best = by_trying_everything(subtree, closed=closed)
+            assert shortest_tour(subtree, closed=closed).cost_mm == pytest.approx(best, abs=1e-9)
 
 
 def test_integer_program_equals_the_dynamic_program(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     for _ in range(20):
-        ways = random_ways(rng, 9, orders=7)
+        subtree = random_subtree(rng, 9, orders=7)
         for closed in (False, True):
-            by_program = shortest_tour(ways, closed=closed).cost_mm
+            by_program = shortest_tour(subtree, closed=closed).cost_mm
             with monkeypatch.context() as patch:
                 patch.setattr(shortest, "MOST_WORK", 0.0)
-                by_integers = shortest_tour(ways, closed=closed).cost_mm
+                by_integers = shortest_tour(subtree, closed=closed).cost_mm
             assert by_integers == pytest.approx(by_program, abs=1e-6)
 
 
 def test_exact_tour_is_never_longer_than_that_of_least_resistance() -> None:
     for seed in range(10):
         tree = random_airway(seed)
-        ways = ways_to(tree, find_exits(tree, random_lesions(tree, 6, seed)))
-        best = shortest_tour(ways).length_mm
+        subtree = subtree_to(tree, find_exits(tree, random_lesions(tree, 6, seed)))
+        best = shortest_tour(subtree).length_mm
         for reading in ("printed", "reduced"):
-            chosen = plan_itinerary(ways, circuits(ways).choice(reading))
+            chosen = plan_itinerary(subtree, circuits(subtree).choice(reading))
             assert best <= chosen.length_mm + 1e-9
-            assert chosen.length_mm <= one_by_one_mm(ways, chosen.chosen) + 1e-9
+            assert chosen.length_mm <= one_by_one_mm(subtree, chosen.chosen) + 1e-9
 
 
 def test_an_exit_that_costs_more_than_the_detour_is_not_taken() -> None:
     tree = straight_branches([(-1, (0.0, 0.0, -50.0)), (0, (30.0, 0.0, -50.0)), (0, (-30.0, 0.0, -50.0))])
     left, right = ends_of(tree, [1, 2])
     exits = [[exit_at(0, left)], [exit_at(1, left - 1), exit_at(1, right)]]
-    cheap = shortest_tour(ways_to(tree, exits, exit_cost_mm=[[0.0], [10.0, 0.0]]))
-    assert cheap.chosen == (0, 1)
-    dear = shortest_tour(ways_to(tree, exits, exit_cost_mm=[[0.0], [100.0, 0.0]]))
-    assert dear.chosen == (0, 2)
+    free = shortest_tour(subtree_to(tree, exits, exit_cost_mm=[[0.0], [10.0, 0.0]]))
+    assert free.chosen == (0, 1)
+    costly = shortest_tour(subtree_to(tree, exits, exit_cost_mm=[[0.0], [100.0, 0.0]]))
+    assert costly.chosen == (0, 2)
 
 
 def test_one_by_one_returns_each_time() -> None:
     tree = figure_1()
-    ways = ways_to(tree, [[exit_at(m, p)] for m, p in enumerate(ends_of(tree, [3, 7]))])
-    depth = ways.depth_mm[ways.exit_vertex]
-    assert one_by_one_mm(ways, (0, 1)) == pytest.approx(2 * depth.sum() - depth.max())
-    assert one_by_one_mm(ways, (0, 1), closed=True) == pytest.approx(2 * depth.sum())
-    assert plan_itinerary(ways, (0, 1)).seconds(10.0, 60.0) == pytest.approx(
-        plan_itinerary(ways, (0, 1)).length_mm / 10.0 + 120.0
+    subtree = subtree_to(tree, [[exit_at(m, p)] for m, p in enumerate(ends_of(tree, [3, 7]))])
+    depth = subtree.depth_mm[subtree.exit_vertex]
+    assert one_by_one_mm(subtree, (0, 1)) == pytest.approx(2 * depth.sum() - depth.max())
+    assert one_by_one_mm(subtree, (0, 1), closed=True) == pytest.approx(2 * depth.sum())
+    assert plan_itinerary(subtree, (0, 1)).seconds(10.0, 60.0) == pytest.approx(
+        plan_itinerary(subtree, (0, 1)).length_mm / 10.0 + 120.0
     )
 
 
 def test_wrong_exits_are_refused() -> None:
     tree = figure_1()
-    ways = ways_to(tree, [[exit_at(0, 10)], [exit_at(1, 20)]])
+    subtree = subtree_to(tree, [[exit_at(0, 10)], [exit_at(1, 20)]])
     with pytest.raises(SettingsError):
-        plan_itinerary(ways, (1, 0))
+        plan_itinerary(subtree, (1, 0))
     with pytest.raises(SettingsError):
-        ways_to(tree, [])
+        subtree_to(tree, [])
     with pytest.raises(SettingsError):
-        ways_to(tree, [[exit_at(0, 10)]], exit_cost_mm=[[-1.0]])
+        subtree_to(tree, [[exit_at(0, 10)]], exit_cost_mm=[[-1.0]])
 
 
 def test_thirty_lesions_with_scattered_exits_are_solved_by_integers() -> None:
@@ -160,16 +162,16 @@ def test_thirty_lesions_with_scattered_exits_are_solved_by_integers() -> None:
     rng = np.random.default_rng(6)
     tree = airway(3, 8)
     exits = [[exit_at(m, p) for p in rng.integers(0, tree.n_points, 3)] for m in range(30)]
-    ways = ways_to(tree, exits)
-    assert shortest._binary(ways).work > shortest.MOST_WORK
-    best = shortest_tour(ways, closed=True)
-    fewer = shortest_tour(ways_to(tree, exits[:15]), closed=True)
-    assert shortest._binary(ways_to(tree, exits[:15])).work < shortest.MOST_WORK
+    subtree = subtree_to(tree, exits)
+    assert shortest._binary(subtree).work > shortest.MOST_WORK
+    best = shortest_tour(subtree, closed=True)
+    fewer = shortest_tour(subtree_to(tree, exits[:15]), closed=True)
+    assert shortest._binary(subtree_to(tree, exits[:15])).work < shortest.MOST_WORK
     assert fewer.length_mm <= best.length_mm + 1e-6
     for _ in range(300):
-        guess = [int(rng.choice(np.flatnonzero(ways.exit_lesion == m))) for m in range(30)]
-        assert best.length_mm <= plan_itinerary(ways, guess, closed=True).length_mm + 1e-6
+        guess = [int(rng.choice(np.flatnonzero(subtree.exit_lesion == m))) for m in range(30)]
+        assert best.length_mm <= plan_itinerary(subtree, guess, closed=True).length_mm + 1e-6
     for m in range(30):
-        for other in np.flatnonzero(ways.exit_lesion == m).tolist():
+        for other in np.flatnonzero(subtree.exit_lesion == m).tolist():
             changed = [*best.chosen[:m], other, *best.chosen[m + 1 :]]
-            assert best.length_mm <= plan_itinerary(ways, changed, closed=True).length_mm + 1e-6
+            assert best.length_mm <= plan_itinerary(subtree, changed, closed=True).length_mm + 1e-6

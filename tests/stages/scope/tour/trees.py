@@ -10,7 +10,7 @@ from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.tree.branches import Strand, assemble
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.itinerary import plan_itinerary
-from stages.scope.tour.subtree import Ways
+from stages.scope.tour.subtree import Subtree
 
 
 def straight_branches(ends: list[tuple[int, tuple[float, float, float]]], radius: float = 2.0) -> AirwayTree:
@@ -56,26 +56,26 @@ def ends_of(tree: AirwayTree, branches: list[int]) -> list[int]:
     return [int(tree.branch_start[b + 1]) - 1 for b in branches]
 
 
-def by_trying_everything(ways: Ways, *, closed: bool) -> float:
+def by_trying_everything(subtree: Subtree, *, closed: bool) -> float:
     """Return the least cost over all choices of exits."""
-    of_lesion = [np.flatnonzero(ways.exit_lesion == m) for m in range(ways.n_lesions)]
-    return min(plan_itinerary(ways, c, closed=closed).cost_mm for c in itertools.product(*of_lesion))
+    of_lesion = [np.flatnonzero(subtree.exit_lesion == m) for m in range(subtree.n_lesions)]
+    return min(plan_itinerary(subtree, c, closed=closed).cost_mm for c in itertools.product(*of_lesion))
 
 
-def shortest_by_permutations(ways: Ways, chosen: tuple[int, ...], *, closed: bool) -> float:
+def shortest_by_permutations(subtree: Subtree, chosen: tuple[int, ...], *, closed: bool) -> float:
     """Return the length of the best order of visits, by walking all of them."""
-    vertex = [0, *(int(ways.exit_vertex[x]) for x in chosen)]
-    depth = ways.depth_mm
+    vertex = [0, *(int(subtree.exit_vertex[x]) for x in chosen)]
+    depth = subtree.depth_mm
 
     def distance(a: int, b: int) -> float:
         above = set()
         v = a
         while v >= 0:
             above.add(v)
-            v = int(ways.parent[v])
+            v = int(subtree.parent[v])
         v = b
         while v not in above:
-            v = int(ways.parent[v])
+            v = int(subtree.parent[v])
         return float(depth[a] + depth[b] - 2 * depth[v])
 
     best = np.inf

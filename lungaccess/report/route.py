@@ -70,7 +70,7 @@ def _view(axes: Axes, centreline: Centreline, route: Route, view: View) -> None:
     _lumen(axes, centreline, nodes)
     axes.plot(*tentative.T, color=style.TUBE, lw=1.2, zorder=5)
     drawing.curve(axes, curve, style.SCOPE, 2.2, 6)
-    for point, mark in ((route.guide.points_mm[0], "s"), (route.way.points_mm[-1], "*")):
+    for point, mark in ((route.guide.points_mm[0], "s"), (route.guide.points_mm[-1], "*")):
         axes.plot(
             *view.project(point), marker=mark, ms=11, mfc=style.NODULE, mec="white", ls="none", zorder=8
         )

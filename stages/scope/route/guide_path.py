@@ -16,7 +16,7 @@ SAME_PLACE_MM = 1e-6
 """Points nearer than this coincide: rounding, far below a voxel."""
 
 WAYPOINT_SPACING_MM = 3.0
-"""Denser points hand the kinks of a voxel skeleton on to the spline; sparser ones cut the bends of airways."""
+"""Denser points give the spline the kinks of a voxel skeleton; sparser ones cut the bends of airways."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -61,9 +61,7 @@ class GuidePath:
         return interpolate(np.stack([np.interp(at, along, axis) for axis in self.points_mm.T], axis=1))
 
 
-def guide_path_along(
-    centreline: Centreline, nodes: Int, start_mm: Float, goal_mm: Float
-) -> GuidePath:
+def guide_path_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_mm: Float) -> GuidePath:
     """Return the guide path over centreline nodes.
 
     Start and goal take the place of the nodes nearest to them.

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import read_only
+from anatomy.tree_report import TreeReport
 from anatomy.typed import Bool, Float, Int
 
 LEAST_CONTINUED_RADIUS = 0.85
@@ -18,84 +19,6 @@ MOST_SIDE_RADIUS = 0.6
 
 Real forks divide: main bronchi have 0.6 to 0.85 of the trachea's radius, lobar bronchi less of theirs.
 """
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GapBridged:
-    """A break of the lumen across which the tree was continued.
-
-    Parameters
-    ----------
-    position_lps : (3,) float64
-        Middle of the gap, LPS mm.
-    length_mm : float
-        Distance between the two facing voxels, as solid boxes; 0 where they touch by an edge or corner alone.
-    voxels_joined : int
-        Voxels of the piece that was joined (0 where the pieces touch).
-    """
-
-    position_lps: Float
-    length_mm: float
-    voxels_joined: int
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SpurPruned:
-    """A twig that was taken off because it barely leaves the branch it grows from.
-
-    Parameters
-    ----------
-    position_lps : (3,) float64
-        Its tip, LPS mm.
-    length_mm : float
-        Length from the centreline of the parent to the tip.
-    """
-
-    position_lps: Float
-    length_mm: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LoopOpened:
-    """A ring of the lumen (two airways that touch, a hole in a wall) that was cut where it is thinnest.
-
-    Parameters
-    ----------
-    position_lps : (3,) float64
-        The cut, LPS mm.
-    length_mm : float
-        Length once around.
-    """
-
-    position_lps: Float
-    length_mm: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TreeReport:
-    """What was changed or left out while the tree was made.
-
-    Parameters
-    ----------
-    gaps_bridged, spurs_pruned, loops_opened : tuple of records
-        Each with `position_lps` and `length_mm`.
-    components_dropped : int
-        Separate pieces of the mask that were left out.
-    voxels_dropped : int
-        Voxels in these pieces.
-    cavity_voxels : int
-        Voxels of holes enclosed in the lumen; the tree runs around them.
-    warnings : tuple of str
-        What a user should look at before trusting the tree.
-    """
-
-    gaps_bridged: tuple[GapBridged, ...] = ()
-    spurs_pruned: tuple[SpurPruned, ...] = ()
-    loops_opened: tuple[LoopOpened, ...] = ()
-    components_dropped: int = 0
-    voxels_dropped: int = 0
-    cavity_voxels: int = 0
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,10 +119,34 @@ class AirwayTree:
         return ""
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
-        from anatomy.display import tree_html
+        """Return the tree as HTML: its figures, and a drawing from the front."""
+        from anatomy.display import side_by_side, table
 
-        return tree_html(self)
+        return side_by_side(table(self.figures(), "Airway tree"), self.drawing())
+
+    def drawing(self) -> str:
+        """Return an SVG of the tree from the front: branches coloured by generation, true to their width."""
+        from anatomy.display import CORONAL, GENERATION_COLOURS, Drawing
+
+        drawing = Drawing(CORONAL)
+        for branch in range(self.n_branches):
+            nodes = self.branch_points(branch)
+            hangs_on = int(self.parent_point[nodes[0]])
+            points = self.points_lps[nodes if hangs_on < 0 else np.append(hangs_on, nodes)]
+            colour = GENERATION_COLOURS[min(int(self.generation[branch]), len(GENERATION_COLOURS) - 1)]
+            drawing.line(points, colour, max(2.0 * float(self.branch_mean_radius_mm[branch]), 0.6))
+        return drawing.svg()
+
+    def figures(self) -> list[tuple[str, str]]:
+        """Return names and values of what is worth knowing of the tree: size, carina, repairs."""
+        from anatomy.display import point
+
+        return [
+            ("branches", f"{self.n_branches}, to generation {int(self.generation.max())}"),
+            ("length", f"{float(self.branch_length_mm.sum()):.0f} mm"),
+            ("carina, LPS mm", point(self.carina_lps)),
+            *((name, str(count)) for name, count in self.report.repairs() if count),
+        ]
 
     @property
     def n_points(self) -> int:

@@ -1,25 +1,21 @@
-"""How a lung and its airway tree look in a notebook: small HTML tables and drawings, everything escaped."""
+"""Small HTML tables and drawings for notebooks, made of plain values; every text is escaped."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.typed import Float
 
-if TYPE_CHECKING:
-    from anatomy.airway_tree import AirwayTree
-    from anatomy.lung import Lung
-
 CORONAL, AXIAL = "coronal, from the front", "axial, from the feet"
 GENERATION_COLOURS = ("#08306b", "#2171b5", "#4eb3d3", "#41ab5d", "#fe9929", "#cc4c02", "#7f0000")
 DRAWING_PX = 260
-FEWEST_MM = 1.5
-"""Points of a drawing are at least so far apart, ends excepted."""
+"""Side of a drawing: two of them and a table stand side by side in a notebook."""
+LEAST_STEP_MM = 1.5
+"""Points of a drawn line are at least this far apart, its ends excepted: half a pixel of a whole lung."""
 
 
 def table(rows: Iterable[tuple[str, str]], heading: str = "") -> str:
@@ -97,65 +93,12 @@ class Drawing:
 def _polyline(points: Float, colour: str, width_mm: float) -> str:
     kept = [0]
     for n in range(1, len(points)):
-        if n == len(points) - 1 or np.linalg.norm(points[n] - points[kept[-1]]) >= FEWEST_MM:
+        if n == len(points) - 1 or np.linalg.norm(points[n] - points[kept[-1]]) >= LEAST_STEP_MM:
             kept.append(n)
     places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points[kept])
     return (
         f'<polyline points="{places}" fill="none" stroke="{colour}" stroke-width="{width_mm:.1f}" '
         'stroke-linecap="round" stroke-linejoin="round"/>'
-    )
-
-
-def tree_drawing(tree: AirwayTree) -> Drawing:
-    """Return an airway tree from the front: branches coloured by generation, true to their width."""
-    drawing = Drawing(CORONAL)
-    for branch in range(tree.n_branches):
-        nodes = tree.branch_points(branch)
-        hangs_on = int(tree.parent_point[nodes[0]])
-        points = tree.points_lps[nodes if hangs_on < 0 else np.append(hangs_on, nodes)]
-        colour = GENERATION_COLOURS[min(int(tree.generation[branch]), len(GENERATION_COLOURS) - 1)]
-        drawing.line(points, colour, max(2.0 * float(tree.branch_mean_radius_mm[branch]), 0.6))
-    return drawing
-
-
-def tree_rows(tree: AirwayTree) -> list[tuple[str, str]]:
-    """Return the figures of an airway tree."""
-    report = tree.report
-    repairs = (
-        ("gaps bridged", len(report.gaps_bridged)),
-        ("loops opened", len(report.loops_opened)),
-        ("spurs pruned", len(report.spurs_pruned)),
-        ("pieces left out", report.components_dropped),
-    )
-    return [
-        ("branches", f"{tree.n_branches}, to generation {int(tree.generation.max())}"),
-        ("length", f"{float(tree.branch_length_mm.sum()):.0f} mm"),
-        ("carina, LPS mm", point(tree.carina_lps)),
-        *((name, str(count)) for name, count in repairs if count),
-    ]
-
-
-def tree_html(tree: AirwayTree) -> str:
-    """Return an airway tree as HTML."""
-    return side_by_side(table(tree_rows(tree), "Airway tree"), tree_drawing(tree).svg())
-
-
-def lung_html(lung: Lung) -> str:
-    """Return a lung as HTML: what it is, its tree, and the warnings that came with it."""
-    rows = [
-        ("kind", lung.kind),
-        ("grid", lung.grid.describe()),
-        ("breath hold", lung.breath_hold or "not stated"),
-        ("fissures", "given" if lung.has_fissures else "not given"),
-        ("nodule mask", "not given" if lung.nodules is None else "given"),
-        ("cost map", "not given" if lung.cost is None else "given"),
-        ("start poses, targets", f"{len(lung.starts)}, {len(lung.targets_lps)}"),
-        *tree_rows(lung.tree),
-        ("content", lung.key[:16]),
-    ]
-    return side_by_side(
-        table(rows, f"Lung of {lung.name}") + bullets("Warnings", lung.warnings),
-        tree_drawing(lung.tree).svg(),
     )
 
 

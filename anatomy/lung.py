@@ -88,10 +88,22 @@ class Lung:
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
-        from anatomy.display import lung_html
+        """Return the lung as HTML: what it is, its tree, and the warnings that came with it."""
+        from anatomy.display import bullets, side_by_side, table
 
-        return lung_html(self)
+        rows = [
+            ("kind", self.kind),
+            ("grid", self.grid.describe()),
+            ("breath hold", self.breath_hold or "not stated"),
+            ("fissures", "given" if self.has_fissures else "not given"),
+            ("nodule mask", "not given" if self.nodules is None else "given"),
+            ("cost map", "not given" if self.cost is None else "given"),
+            ("start poses, targets", f"{len(self.starts)}, {len(self.targets_lps)}"),
+            *self.tree.figures(),
+            ("content", self.key[:16]),
+        ]
+        facts = table(rows, f"Lung of {self.name}") + bullets("Warnings", self.warnings)
+        return side_by_side(facts, self.tree.drawing())
 
     @property
     def has_fissures(self) -> bool:

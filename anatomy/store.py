@@ -16,7 +16,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
+from anatomy.airway_tree import AirwayTree
 from anatomy.build import FORMAT, build_lung, lung_key
 from anatomy.cache import default_cache
 from anatomy.errors import FileError, LungaccessError
@@ -24,6 +24,7 @@ from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
+from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.typed import Array, Float
 
 META = "lung.json"

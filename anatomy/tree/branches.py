@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree, TreeReport
+from anatomy.airway_tree import AirwayTree
+from anatomy.tree_report import TreeReport
 from anatomy.typed import Float, Int
 
 TANGENT_REACH_MM = 1.5

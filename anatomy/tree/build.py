@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
+from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Volume
 from anatomy.tree.branches import Strand, assemble, divide
 from anatomy.tree.cavities import around_cavities
@@ -19,6 +19,7 @@ from anatomy.tree.resample import strands_along
 from anatomy.tree.skeleton import prune, spanning_tree, thin
 from anatomy.tree.trachea import find_trachea
 from anatomy.tree.warn import warnings_of
+from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.typed import Int
 
 

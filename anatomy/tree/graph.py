@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.airway_tree import LoopOpened, TreeReport
 from anatomy.errors import AnatomyError
 from anatomy.tree.skeleton import SkeletonTree, span
+from anatomy.tree_report import LoopOpened, TreeReport
 from anatomy.typed import Float, Int
 
 SAME_POINT_MM = 1e-3

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.airway_tree import GapBridged
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.tree.bridge import Piece, join_pieces
+from anatomy.tree_report import GapBridged
 from anatomy.typed import Bool, Float, Float32, Int, Int32
 
 CONNECT_26 = np.ones((3, 3, 3), dtype=bool)

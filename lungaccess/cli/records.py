@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from anatomy.airway_tree import GapBridged, LoopOpened, SpurPruned
     from anatomy.lung import Lung
+    from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
     from lungaccess.checking import CheckReport
     from lungaccess.one_stage.needle import NeedleAnswer
     from lungaccess.plans.no_plan import NoPlan

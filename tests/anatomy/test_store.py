@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 
 from anatomy import store
-from anatomy.airway_tree import GapBridged, LoopOpened, SpurPruned
 from anatomy.build import build_lung, lung_key
 from anatomy.cache import default_cache
 from anatomy.errors import AnatomyError, FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.store import META, open_lung
+from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
 from tests.anatomy import toys
 from tests.anatomy.toys import toy
 

@@ -1,0 +1,94 @@
+"""What was changed or left out while an airway tree was made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from anatomy.typed import Float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GapBridged:
+    """A break of the lumen across which the tree was continued.
+
+    Parameters
+    ----------
+    position_lps : (3,) float64
+        Middle of the gap, LPS mm.
+    length_mm : float
+        Distance between the two facing voxels, as solid boxes; 0 where they touch by an edge or corner alone.
+    voxels_joined : int
+        Voxels of the piece that was joined (0 where the pieces touch).
+    """
+
+    position_lps: Float
+    length_mm: float
+    voxels_joined: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpurPruned:
+    """A twig that was taken off because it barely leaves the branch it grows from.
+
+    Parameters
+    ----------
+    position_lps : (3,) float64
+        Its tip, LPS mm.
+    length_mm : float
+        Length from the centreline of the parent to the tip.
+    """
+
+    position_lps: Float
+    length_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoopOpened:
+    """A ring of the lumen (two airways that touch, a hole in a wall) that was cut where it is thinnest.
+
+    Parameters
+    ----------
+    position_lps : (3,) float64
+        The cut, LPS mm.
+    length_mm : float
+        Length once around.
+    """
+
+    position_lps: Float
+    length_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TreeReport:
+    """What was changed or left out while the tree was made.
+
+    Parameters
+    ----------
+    gaps_bridged, spurs_pruned, loops_opened : tuple of records
+        Each with `position_lps` and `length_mm`.
+    components_dropped : int
+        Separate pieces of the mask that were left out.
+    voxels_dropped : int
+        Voxels in these pieces.
+    cavity_voxels : int
+        Voxels of holes enclosed in the lumen; the tree runs around them.
+    warnings : tuple of str
+        What a user should look at before trusting the tree.
+    """
+
+    gaps_bridged: tuple[GapBridged, ...] = ()
+    spurs_pruned: tuple[SpurPruned, ...] = ()
+    loops_opened: tuple[LoopOpened, ...] = ()
+    components_dropped: int = 0
+    voxels_dropped: int = 0
+    cavity_voxels: int = 0
+    warnings: tuple[str, ...] = ()
+
+    def repairs(self) -> tuple[tuple[str, int], ...]:
+        """Return what was done to the mask, and how often."""
+        return (
+            ("gaps bridged", len(self.gaps_bridged)),
+            ("loops opened", len(self.loops_opened)),
+            ("spurs pruned", len(self.spurs_pruned)),
+            ("pieces left out", self.components_dropped),
+        )

@@ -1,8 +1,8 @@
 """Package facades: a package names its public API once, and imports a name when it is first used.
 
 The `__init__` of a package imports its public names for type checkers alone, under `if TYPE_CHECKING:`, each
-as itself.  `facade` reads that block when a name is first asked for, so that importing the package costs
-nothing and the names stand in one place.
+as itself.  `lazy_exports` reads that block when a name is first asked for.  Importing the package therefore
+costs nothing, and the names stand in one place.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def public_names(file: str) -> dict[str, str]:
     return {}
 
 
-def facade(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and the `__dir__` of a package whose names are imported when they are used.
 
     Parameters

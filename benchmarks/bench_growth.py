@@ -10,7 +10,7 @@ from typing import Any
 
 import lungaccess as la
 from anatomy.build import build_lung
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from benchmarks.workloads import WORKLOADS
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
@@ -137,4 +137,4 @@ class CostByIterations:
 
     @staticmethod
     def _lung() -> la.Lung:
-        return build_lung(phantom(seed=1, size="small").images)
+        return build_lung(make_phantom(seed=1, size="small").images)

@@ -13,9 +13,9 @@ POINTS = 100_000
 COLD_RUN = """
 import lungaccess as la
 from anatomy.build import build_lung
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from lungaccess.problem.target import nodule_target
-lung = build_lung(phantom(seed=3, size="small").images)
+lung = build_lung(make_phantom(seed=3, size="small").images)
 next(la.plan(lung, la.load_system("ultrathin"), nodule_target(lung, 1)))
 """
 

@@ -11,7 +11,7 @@ import numpy as np
 
 import lungaccess as la
 from anatomy.build import build_lung
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.store import open_lung
 from lungaccess.problem.target import point_target
 from stages.needle.space import needle_space, workspace_lengths
@@ -29,7 +29,7 @@ class Anatomy:
 
     def setup(self, size: str) -> None:
         """Make the patient once and fill a cache."""
-        self.images = phantom(seed=SEED, size=size).images
+        self.images = make_phantom(seed=SEED, size=size).images
         self.cache = Path(tempfile.mkdtemp())
         open_lung(dict(self.images.sources), lambda: self.images, cache=self.cache)
 
@@ -39,7 +39,7 @@ class Anatomy:
 
     def time_phantom(self, size: str) -> None:
         """Synthetic patient."""
-        phantom(seed=SEED, size=size)
+        make_phantom(seed=SEED, size=size)
 
     def time_build(self, size: str) -> None:
         """Tree, labels, septum and clearance fields."""
@@ -61,12 +61,12 @@ class Planning:
 
     def setup_cache(self) -> Any:
         """Find a target that can be reached."""
-        lung = build_lung(phantom(seed=SEED, size="small").images)
+        lung = build_lung(make_phantom(seed=SEED, size="small").images)
         return lung.targets_lps[0].tolist()
 
     def setup(self, target: list[float]) -> None:
         """Make lung, atlas and plan."""
-        self.lung = build_lung(phantom(seed=SEED, size="small").images)
+        self.lung = build_lung(make_phantom(seed=SEED, size="small").images)
         self.system = la.load_system(SYSTEM)
         self.atlas = la.build_atlas(self.lung, self.system)
         self.target = point_target(self.lung, np.array(target))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.lungs import segment_lungs
 from anatomy.segmentation.vessels import segment_vessels
@@ -25,7 +25,7 @@ class Segmentation:
 
     def setup(self) -> None:
         """Make the CT, and compile."""
-        self.ct = phantom(seed=3, size="small").ct
+        self.ct = make_phantom(seed=3, size="small").ct
         self.lungs = segment_lungs(self.ct)
         self.airways = segment_airway(self.ct, self.lungs)
         self.time_vessels()

@@ -55,9 +55,9 @@ class Chest:
 
 def chest(edge: int) -> Chest:
     """Return a synthetic chest resampled to a cube of `edge` voxels a side, the same chest at all sizes."""
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
 
-    made = phantom(seed=PHANTOM_SEED, size="small")
+    made = make_phantom(seed=PHANTOM_SEED, size="small")
     at = [np.arange(edge) * n // edge for n in made.grid.shape]
 
     def resampled(array: Array) -> Array:
@@ -79,12 +79,12 @@ def chest(edge: int) -> Chest:
 
 def images(edge: int) -> PatientImages:
     """Return the masks of a synthetic patient, drawn in voxels so fine that they number about `edge`^3."""
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
 
-    coarse = phantom(seed=PHANTOM_SEED, size="small", spacing_mm=COARSEST_MM).grid
+    coarse = make_phantom(seed=PHANTOM_SEED, size="small", spacing_mm=COARSEST_MM).grid
     volume = float(np.prod(np.array(coarse.shape, dtype=float) * coarse.spacing_mm))
     spacing = math.cbrt(volume) / edge
-    return phantom(seed=PHANTOM_SEED, size="small", spacing_mm=float(spacing)).images
+    return make_phantom(seed=PHANTOM_SEED, size="small", spacing_mm=float(spacing)).images
 
 
 def direct_search(targets: int) -> tuple[Callable[[Float], AtlasSearch], Float]:
@@ -111,9 +111,9 @@ def direct_search(targets: int) -> tuple[Callable[[Float], AtlasSearch], Float]:
 def _small_atlas() -> tuple[Lung, Atlas]:
     import lungaccess as la
     from anatomy.build import build_lung
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
 
-    lung = build_lung(phantom(seed=PHANTOM_SEED, size="small").images)
+    lung = build_lung(make_phantom(seed=PHANTOM_SEED, size="small").images)
     return lung, la.build_atlas(lung, la.load_system("ultrathin"))
 
 

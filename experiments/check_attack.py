@@ -28,7 +28,7 @@ import numpy as np
 import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.lung import Lung
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.typed import Float
 from experiments.support.mutants import Case, Mutant
 from experiments.support.plan_mutations import mutate
@@ -186,7 +186,7 @@ def main() -> None:
     if words.patient is None:
         parser.error("name a patient's folder, or phantom")
     if words.patient == "phantom":
-        name, lung = "phantom", build_lung(phantom(seed=PHANTOM_SEED).images)
+        name, lung = "phantom", build_lung(make_phantom(seed=PHANTOM_SEED).images)
     else:
         name, lung = Path(words.patient).name, la.load_patient(words.patient)
     words.keep.mkdir(parents=True, exist_ok=True)

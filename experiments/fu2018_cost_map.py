@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from anatomy.grid import Volume
 from anatomy.io import load_patient
 from anatomy.patient import PatientImages
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.lungs import segment_lungs
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
@@ -76,7 +76,7 @@ class Curve:
 def images_of(name: str, spacing_mm: float) -> PatientImages:
     """Return the masks of a patient, or of the phantom."""
     if name == PHANTOM:
-        return phantom(seed=3, size="small", spacing_mm=spacing_mm).images
+        return make_phantom(seed=3, size="small", spacing_mm=spacing_mm).images
     return load_patient(name if Path(name).exists() else require_data(f"med-rad/{name}"))
 
 

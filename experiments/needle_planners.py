@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from anatomy.build import build_lung
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from experiments.support.needle_queries import (
     Judge,
     Obstacles,
@@ -67,7 +67,7 @@ Rows = list[dict[str, Any]]
 def problems(query_set: str, every: int, seed: int) -> Iterator[Problem]:
     """Make the space of each query, one patient in memory at a time."""
     if data_folder() is None:
-        images = phantom(seed=3, size="small").images
+        images = make_phantom(seed=3, size="small").images
         obstacles = obstacles_of(images)
         for query in generated_queries(obstacles, build_lung(images).tree, GENERATED // every, seed):
             yield _problem(obstacles, query)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree as AirwayTree
@@ -36,4 +36,4 @@ if TYPE_CHECKING:
     from lungaccess.problem.target import Target as Target
     from lungaccess.problem.target import resolve_target as resolve_target
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

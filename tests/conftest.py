@@ -35,9 +35,9 @@ def data_dir() -> Path:
 @pytest.fixture(scope="session")
 def small_phantom() -> Phantom:
     """Return a synthetic patient with known truth, at a child's size in coarse voxels."""
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
 
-    return phantom(seed=3, size="small")
+    return make_phantom(seed=3, size="small")
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ import pytest
 
 import lungaccess as la
 from anatomy.io.frames import LPS_FROM_RAS
-from anatomy.phantom import phantom, write_phantom
+from anatomy.phantom import make_phantom, write_phantom
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/tutorial.md")
@@ -43,7 +43,7 @@ def commands(text: str) -> list[list[str]]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all that the pages' commands name."""
     here = tmp_path_factory.mktemp("pages")
-    patient = phantom(seed=2)
+    patient = make_phantom(seed=2)
     write_phantom(patient, here / "PATIENT")
     lung = la.load_patient(here / "PATIENT", cache=here / "cache")
     system = la.load_system("lung-default")

@@ -72,7 +72,7 @@ class Phantom:
         return np.asarray(table[self.labels.array])
 
 
-def phantom(
+def make_phantom(
     seed: int = 0, spacing_mm: float | None = None, size: Size = "adult", *, noise_hu: float = 18.0
 ) -> Phantom:
     """Make a synthetic patient.
@@ -108,7 +108,7 @@ def phantom(
 
     Examples
     --------
-    >>> patient = phantom(seed=1, size="small")
+    >>> patient = make_phantom(seed=1, size="small")
     >>> patient.images.kind
     'phantom'
     """

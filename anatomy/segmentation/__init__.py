@@ -1,1 +1,16 @@
 """From a CT of the chest to the masks and the cost map of a patient."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from anatomy.segmentation.pipeline import Segmentation as Segmentation
+    from anatomy.segmentation.pipeline import read_ct as read_ct
+    from anatomy.segmentation.pipeline import segment as segment
+    from anatomy.segmentation.request import Given as Given
+    from anatomy.segmentation.request import SegmentationRequest as SegmentationRequest
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

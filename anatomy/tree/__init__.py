@@ -1,7 +1,13 @@
-"""Make airway trees from lumen masks and from centreline graphs."""
+"""Airway trees made from lumen masks and from centreline graphs."""
 
 from __future__ import annotations
 
-from anatomy.tree.build import tree_from_graph, tree_from_mask
+from typing import TYPE_CHECKING
 
-__all__ = ["tree_from_graph", "tree_from_mask"]
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from anatomy.tree.build import tree_from_graph as tree_from_graph
+    from anatomy.tree.build import tree_from_mask as tree_from_mask
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

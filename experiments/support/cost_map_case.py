@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from anatomy.grid import Volume
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.segmentation.pipeline import read_ct, segment
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
@@ -102,7 +102,7 @@ def case_of(name: str, work: Path, seed: int) -> Case:
 def _input_of(name: str, seed: int) -> tuple[str, Volume, Given]:
     """Return the title of a CT, the CT, and the contours of a nodule if they lie beside it."""
     if name == PHANTOM:
-        return f"{PHANTOM}-{seed}", phantom(seed=seed, size="small").ct, Given()
+        return f"{PHANTOM}-{seed}", make_phantom(seed=seed, size="small").ct, Given()
     path = Path(name) if Path(name).exists() else require_data(f"ct/{name}/ct.nii.gz")
     ct, _ = read_ct(path)
     if path.is_dir():

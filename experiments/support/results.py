@@ -198,11 +198,11 @@ def anatomy(name: str) -> Lung:
         If there is no such patient.
     """
     from anatomy.build import build_lung
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
     from lungaccess.problem.patients import load_patient
 
     if name == PHANTOM:
-        return build_lung(phantom(seed=3, size="small").images)
+        return build_lung(make_phantom(seed=3, size="small").images)
     return load_patient(name if Path(name).exists() else require_data(f"med-rad/{name}"))
 
 

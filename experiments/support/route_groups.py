@@ -18,7 +18,7 @@ import numpy as np
 
 from anatomy.io import read_mask
 from anatomy.io.centerlines import read_centerlines
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.typed import Float
 from experiments.support.results import PHANTOM, anatomy, data_folder, require_data
 from stages.scope.route.centreline import Centreline, from_image, from_lung, from_mask, from_tree
@@ -105,7 +105,7 @@ def load_group(name: str) -> list[Tubes]:
 
 
 def _synthetic_child(seed: int) -> Tubes:
-    lumen = phantom(seed=seed, size="small").images.lumen
+    lumen = make_phantom(seed=seed, size="small").images.lumen
     return tubes(f"synthetic child {seed}", from_mask(lumen, rounded=True))
 
 

@@ -170,8 +170,8 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
 
     An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
     """
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
     from anatomy.store import open_lung
 
-    images = phantom(seed=seed, size="adult", spacing_mm=DEMO_SPACING_MM).images
+    images = make_phantom(seed=seed, size="adult", spacing_mm=DEMO_SPACING_MM).images
     return open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)

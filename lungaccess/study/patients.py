@@ -107,6 +107,6 @@ def _phantom_sources(made: PhantomPatient) -> dict[str, str]:
 
 
 def _phantom_images(made: PhantomPatient) -> PatientImages:
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
 
-    return phantom(seed=made.seed, spacing_mm=made.spacing_mm, size=made.size).images
+    return make_phantom(seed=made.seed, spacing_mm=made.spacing_mm, size=made.size).images

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.needle.costs import path_costs as path_costs
@@ -40,4 +40,4 @@ if TYPE_CHECKING:
     from stages.needle.start_index import StartIndex as StartIndex
     from stages.needle.violations import objection as objection
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.scope.device import Bronchoscope as Bronchoscope
@@ -22,4 +22,4 @@ if TYPE_CHECKING:
     from stages.scope.tips import tip_at as tip_at
     from stages.scope.tips import walk as walk
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

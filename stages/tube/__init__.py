@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.tube.deployments import DEFAULT_ROTATIONS as DEFAULT_ROTATIONS
@@ -35,4 +35,4 @@ if TYPE_CHECKING:
     from stages.tube.sequences import kuntz2015 as kuntz2015
     from stages.tube.shape import centreline as centreline
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from anatomy.errors import FileError, SettingsError
 from anatomy.io import load_patient, read_volume
-from anatomy.phantom import LABELS, LOBES, Centerlines, Phantom, phantom, write_phantom
+from anatomy.phantom import LABELS, LOBES, Centerlines, Phantom, make_phantom, write_phantom
 from anatomy.phantom.branching import Sprouts, centerlines
 from anatomy.phantom.growth import limit_turn, split_cloud
 from anatomy.tree import tree_from_mask
@@ -25,12 +25,12 @@ FULL = np.ones((3, 3, 3))
 
 @pytest.fixture(scope="module")
 def small() -> Phantom:
-    return phantom(seed=0, size="small")
+    return make_phantom(seed=0, size="small")
 
 
 @pytest.fixture(scope="module")
 def adult() -> Phantom:
-    return phantom(seed=0, spacing_mm=1.0)
+    return make_phantom(seed=0, spacing_mm=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -62,17 +62,17 @@ def _labels_at(patient: Phantom, points: Float) -> UInt8:
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: phantom(spacing_mm=0.0),
-        lambda: phantom(spacing_mm=-1.0),
-        lambda: phantom(spacing_mm=float("nan")),
-        lambda: phantom(spacing_mm=float("inf")),
-        lambda: phantom(spacing_mm=6.0),
-        lambda: phantom(spacing_mm=2.5, size="small"),
-        lambda: phantom(seed=-1),
-        lambda: phantom(seed=1.5),  # type: ignore[arg-type]
-        lambda: phantom(size="giant"),  # type: ignore[arg-type]
-        lambda: phantom(noise_hu=-1.0),
-        lambda: phantom(noise_hu=float("nan")),
+        lambda: make_phantom(spacing_mm=0.0),
+        lambda: make_phantom(spacing_mm=-1.0),
+        lambda: make_phantom(spacing_mm=float("nan")),
+        lambda: make_phantom(spacing_mm=float("inf")),
+        lambda: make_phantom(spacing_mm=6.0),
+        lambda: make_phantom(spacing_mm=2.5, size="small"),
+        lambda: make_phantom(seed=-1),
+        lambda: make_phantom(seed=1.5),  # type: ignore[arg-type]
+        lambda: make_phantom(size="giant"),  # type: ignore[arg-type]
+        lambda: make_phantom(noise_hu=-1.0),
+        lambda: make_phantom(noise_hu=float("nan")),
     ],
 )
 def test_impossible_settings_are_refused(make: Callable[[], Phantom]) -> None:
@@ -81,7 +81,7 @@ def test_impossible_settings_are_refused(make: Callable[[], Phantom]) -> None:
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
-    one, same, other = (phantom(seed=s, size="small", spacing_mm=1.75) for s in (3, 3, 4))
+    one, same, other = (make_phantom(seed=s, size="small", spacing_mm=1.75) for s in (3, 3, 4))
     for name in ("ct", "labels", "lobes"):
         assert getattr(one, name).array.tobytes("F") == getattr(same, name).array.tobytes("F")
     for kind, lines in one.centerlines.items():
@@ -95,7 +95,7 @@ def test_making_a_phantom_leaves_the_global_random_state_alone() -> None:
     np.random.seed(7)  # noqa: NPY002
     undisturbed = np.random.random(3)  # noqa: NPY002
     np.random.seed(7)  # noqa: NPY002
-    phantom(size="small", spacing_mm=1.75)
+    make_phantom(size="small", spacing_mm=1.75)
     assert (np.random.random(3) == undisturbed).all()  # noqa: NPY002
 
 
@@ -318,7 +318,7 @@ def test_the_lung_is_denser_at_the_back(small: Phantom) -> None:
 
 
 def test_a_written_phantom_is_read_back(tmp_path: Path) -> None:
-    patient = phantom(seed=5, size="small", spacing_mm=1.75)
+    patient = make_phantom(seed=5, size="small", spacing_mm=1.75)
     folder = write_phantom(patient, tmp_path / "new" / "patient")
     images = load_patient(folder)
     assert images.name == patient.images.name
@@ -336,7 +336,7 @@ def test_a_written_phantom_is_read_back(tmp_path: Path) -> None:
 def test_an_unwritable_folder_is_a_typed_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError):
-        write_phantom(phantom(size="small", spacing_mm=1.75), tmp_path / "file" / "patient")
+        write_phantom(make_phantom(size="small", spacing_mm=1.75), tmp_path / "file" / "patient")
 
 
 def test_the_adult_has_eight_generations_of_adult_size(adult: Phantom) -> None:
@@ -355,7 +355,7 @@ def test_the_adult_has_eight_generations_of_adult_size(adult: Phantom) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(1, 9))
 def test_other_seeds_are_whole_too(seed: int) -> None:
-    patient = phantom(seed=seed, size="small")
+    patient = make_phantom(seed=seed, size="small")
     assert ndimage.label(patient.images.lumen.array)[1] == 1
     assert ndimage.label(patient.images.lung.array, FULL)[1] == 2
     assert patient.centerlines["airway"].generation.max() >= 7

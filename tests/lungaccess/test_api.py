@@ -18,6 +18,11 @@ from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 
 FACADES = (
+    "anatomy",
+    "anatomy.io",
+    "anatomy.phantom",
+    "anatomy.segmentation",
+    "anatomy.tree",
     "lungaccess",
     "stages.needle",
     "stages.needle.kernels",

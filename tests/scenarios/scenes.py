@@ -12,7 +12,7 @@ from typing import Any
 import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.lung import Lung
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from lungaccess.checking import Checker
 from lungaccess.problem.system import System
 from tests.scenarios.cases import Anatomy, Case
@@ -48,7 +48,7 @@ class Scenes:
 
     def _lung(self, anatomy: Anatomy) -> Lung:
         if anatomy.seed is not None:
-            made = phantom(seed=anatomy.seed, size="small", spacing_mm=anatomy.spacing_mm)
+            made = make_phantom(seed=anatomy.seed, size="small", spacing_mm=anatomy.spacing_mm)
             return build_lung(made.images)
         if self.data is None:
             raise FileNotFoundError(f"{anatomy.name} needs the folder of real anatomy")

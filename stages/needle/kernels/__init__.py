@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.needle.kernels.connections import least_cosine as least_cosine
@@ -24,4 +24,4 @@ if TYPE_CHECKING:
     from stages.needle.kernels.limits import REQUIRED as REQUIRED
     from stages.needle.kernels.proof import blocker_on_arc as blocker_on_arc
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.scope.advisor.advisor import Advisor as Advisor
@@ -23,4 +23,4 @@ if TYPE_CHECKING:
     from stages.scope.advisor.orientability import measure_orientability as measure_orientability
     from stages.scope.advisor.path import ScopePath as ScopePath
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.scope.route.centreline import Centreline as Centreline
@@ -19,4 +19,4 @@ if TYPE_CHECKING:
     from stages.scope.route.search import NoRouteError as NoRouteError
     from stages.scope.route.settings import RouteLimits as RouteLimits
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

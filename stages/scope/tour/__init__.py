@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.scope.tour.circuit import MOST_COMBINATIONS as MOST_COMBINATIONS
@@ -26,4 +26,4 @@ if TYPE_CHECKING:
     from stages.scope.tour.subtree import Subtree as Subtree
     from stages.scope.tour.subtree import subtree_to as subtree_to
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import facade
+from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.tube.kernels.deployment import ACCEPTED as ACCEPTED
@@ -23,4 +23,4 @@ if TYPE_CHECKING:
     from stages.tube.kernels.deployment import lateral_sweep as lateral_sweep
     from stages.tube.kernels.deployment import planar_point as planar_point
 
-__getattr__, __dir__ = facade(__name__, __file__)
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

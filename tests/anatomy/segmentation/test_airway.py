@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Grid, Volume
-from anatomy.phantom import Phantom, phantom
+from anatomy.phantom import Phantom, make_phantom
 from anatomy.segmentation import growing
 from anatomy.segmentation.airway import Airways, segment_airway
 from anatomy.segmentation.airway_warnings import airway_warnings
@@ -269,7 +269,7 @@ def test_lungs_of_another_grid_are_refused() -> None:
 
 @pytest.fixture(scope="module")
 def patient() -> Phantom:
-    return phantom(seed=2, spacing_mm=0.8, size="small", noise_hu=25.0)
+    return make_phantom(seed=2, spacing_mm=0.8, size="small", noise_hu=25.0)
 
 
 def stand_in_lungs(patient: Phantom) -> Lungs:

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 from anatomy.errors import GridMismatchError
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import grown_by_one
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.vessels import Vessels, segment_vessels
 
@@ -148,7 +148,7 @@ def test_the_fixed_threshold_serves_the_phantom() -> None:
 
     Of those less than a fifth is taken for vessel.
     """
-    patient = phantom(seed=3, size="small")
+    patient = make_phantom(seed=3, size="small")
     truth, lung = patient.images.vessels.array, patient.images.lung.array
     tubes = airways(truth.shape, patient.mask("lumen"), patient.mask("wall"))
     found = segment_vessels(patient.ct, lung, tubes)

@@ -9,7 +9,7 @@ import pytest
 
 import lungaccess as la
 from anatomy.build import build_lung
-from anatomy.phantom import phantom
+from anatomy.phantom import make_phantom
 from anatomy.settings import override
 from lungaccess.coupled.search import AtlasSearch
 from lungaccess.coupled.search.local_sampling import SPREADS, Scatter, nearly_reaching
@@ -25,7 +25,7 @@ MOST = 200
 @pytest.fixture(scope="module")
 def searches() -> list[AtlasSearch]:
     """Searches in an atlas with wide gaps."""
-    lung = build_lung(phantom(seed=1, size="small").images)
+    lung = build_lung(make_phantom(seed=1, size="small").images)
     atlas = la.build_atlas(lung, SYSTEM, rotations=3, stop_spacing_mm=12.0, site_spacing_mm=8.0)
     return [
         AtlasSearch(

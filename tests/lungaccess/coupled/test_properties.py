@@ -141,9 +141,9 @@ def test_a_stage_moved_by_a_voxel_is_noticed(
 def test_every_preset_plans_on_an_adult(preset: str) -> None:
     """Many targets in one synthetic adult; plans are checked, the others are explained."""
     from anatomy.build import build_lung
-    from anatomy.phantom import phantom
+    from anatomy.phantom import make_phantom
 
-    lung = build_lung(phantom(seed=2, spacing_mm=1.25).images)
+    lung = build_lung(make_phantom(seed=2, spacing_mm=1.25).images)
     system = la.load_system(preset)
     made = la.build_atlas(lung, system)
     found = 0

@@ -12,6 +12,7 @@ import numpy as np
 
 from anatomy.grid import Grid
 from anatomy.typed import Array, Float, Int16, Mask
+from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -98,8 +99,9 @@ def direct_search(targets: int) -> tuple[Callable[[Float], AtlasSearch], Float]:
 
     def search_for(point: Float) -> AtlasSearch:
         task = Task(
-            lung=lung, system=atlas.system, target=point_target(lung, point), objective="inverse_clearance",
-            with_fissures=atlas.with_fissures, method="atlas", seed=0,
+            lung=lung, system=atlas.system, target=point_target(lung, point),
+            objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
+            method="atlas", seed=0,
         )  # fmt: skip
         return AtlasSearch(task, atlas)
 

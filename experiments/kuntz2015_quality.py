@@ -38,6 +38,7 @@ from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from lungaccess.report import style
 from lungaccess.report.geometry import needle_polyline
+from stages.needle import Objective
 
 NOT_REPRODUCED = [
     "The goals and the costs of fig. 9: the paper prints no numbers for them, and its lung cannot be had.",
@@ -111,7 +112,8 @@ def task_to(atlas: Atlas, point: Float, seed: int) -> Task:
     """Return the task of reference mode to a point."""
     return Task(
         lung=atlas.lung, system=atlas.system, target=point_target(atlas.lung, point),
-        objective="inverse_clearance", with_fissures=atlas.with_fissures, method="reference", seed=seed,
+        objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
+        method="reference", seed=seed,
     )  # fmt: skip
 
 

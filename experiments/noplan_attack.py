@@ -35,6 +35,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.target import point_target
+from stages.needle import Objective
 
 RRT_TIME_S = 0.05
 MISSED, REFUSED = "missed", "refused"
@@ -76,7 +77,7 @@ class Attack:
             lung=self.atlas.lung,
             system=system,
             target=target,
-            objective="inverse_clearance",
+            objective=Objective(inverse_clearance=1.0),
             with_fissures=self.atlas.with_fissures,
             method="reference",
             seed=self.seed,

@@ -7,7 +7,7 @@ lung = la.load_patient("path/to/patient")
 system = la.load_system("lung-default")
 target = la.resolve_target(lung, "ras:64.9,201.1,1211.9")
 for plan in la.plan(lung, system, target, time_s=10.0):
-    print(plan.costs["inverse_clearance"])
+    print(plan.cost)
 plan.save("plan.json")
 print(la.check(plan, lung).accepted)
 ```
@@ -35,5 +35,6 @@ if TYPE_CHECKING:
     from lungaccess.problem.system import preset_names as preset_names
     from lungaccess.problem.target import Target as Target
     from lungaccess.problem.target import resolve_target as resolve_target
+    from stages.needle import Objective as Objective
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -20,6 +20,7 @@ from lungaccess.plans.assemble import Task
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from lungaccess.refinement import refine
+from stages.needle import Objective
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +35,8 @@ def search_for(atlas: Atlas, point: Float, seed: int) -> AtlasSearch:
     """Return a search for a plan to a point."""
     task = Task(
         lung=atlas.lung, system=atlas.system, target=point_target(atlas.lung, point),
-        objective="inverse_clearance", with_fissures=atlas.with_fissures, method="atlas", seed=seed,
+        objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
+        method="atlas", seed=seed,
     )  # fmt: skip
     return AtlasSearch(task, atlas)
 

@@ -20,11 +20,10 @@ from lungaccess.coupled.alternatives import alternatives
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search import AtlasSearch
 from lungaccess.plans.assemble import Task, assemble
-from lungaccess.plans.costs import OBJECTIVES
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, nodule_target, point_target
-from stages.needle.path import ArcPath
+from stages.needle import TERMS, ArcPath
 
 TARGETS = 100
 PLANS_A_BATCH = 60
@@ -108,7 +107,11 @@ def free_point(lung: Lung, rng: Rng, *, beside_obstacle: bool) -> Float:
 
 def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng) -> Iterator[Plan]:
     """Yield plans by one of the ways to make them; none if there is none."""
-    objective, seed, kind = str(rng.choice(OBJECTIVES)), int(rng.integers(2**31)), rng.random()
+    objective, seed, kind = (
+        str(rng.choice([term.key for term in TERMS])),
+        int(rng.integers(2**31)),
+        rng.random(),
+    )
     if kind > 0.75:
         yield from bent_plans(
             Task(

@@ -36,6 +36,9 @@ CLEARANCE_FLOOR_MM = 0.1
 GREATEST_VOXEL_COST = 1.0
 """Of one voxel: so much may two sums differ because one grazes a voxel that the other does not."""
 GRAZED_MM = 1e-9
+COSTS = ("inverse_clearance", "cost_map", "voxel_sum", "length_mm")
+ROUNDING = 1e-12
+"""Sums of four numbers agree to this share of them, whatever the order."""
 
 
 def check_needle(plan: Plan, scene: Scene, tube_end: Float | None, found: Findings) -> None:
@@ -185,10 +188,16 @@ def _stretch(where: np.ndarray) -> tuple[int, int]:
 def _check_costs(plan: Plan, scene: Scene, curve: Curve, found: Findings) -> None:
     """The stated costs are those of the re-integrated needle."""
     stated: Mapping[str, float] = plan.costs
-    names = {"inverse_clearance", "cost_map", "length_mm"}
-    if not found.true("costs.names", names <= set(stated) <= names | {"voxel_sum"}, ", ".join(stated)):
+    required = set(COSTS) - {"voxel_sum"}
+    named = required <= set(stated) <= {*COSTS, plan.objective}
+    if not found.true("costs.names", named, ", ".join(stated)):
         return
-    found.true("costs.objective", plan.objective in stated, plan.objective)
+    weights = objective_weights(plan.objective)
+    known = plan.objective in stated and weights is not None and set(weights) <= set(stated)
+    if found.true("costs.objective", known, plan.objective) and weights is not None:
+        total = sum(weight * stated[name] for name, weight in weights.items())
+        tolerance = ROUNDING * abs(total)
+        found.agrees("costs.objective.sum", stated[plan.objective], total, tolerance, "")
     found.agrees("costs.length_mm", stated["length_mm"], curve.arc_mm[-1], LENGTH_TOLERANCE_MM, "mm")
     recomputed = inverse_clearance(plan, scene, curve)
     tolerance = COST_TOLERANCE * recomputed
@@ -198,6 +207,22 @@ def _check_costs(plan: Plan, scene: Scene, curve: Curve, found: Findings) -> Non
     if "voxel_sum" in stated:
         tolerance = COST_TOLERANCE * summed + GREATEST_VOXEL_COST
         found.agrees("costs.voxel_sum", stated["voxel_sum"], summed, tolerance, "")
+
+
+def objective_weights(objective: str) -> dict[str, float] | None:
+    """Return the weights of an objective by the names of costs; None if its text is not one.
+
+    The text is the name of a cost, or a sum such as "cost_map=0.5,length_mm=1".
+    """
+    weights: dict[str, float] = {}
+    for part in objective.split(","):
+        name, equals, weight = part.partition("=")
+        try:
+            weights[name] = float(weight) if equals else 1.0
+        except ValueError:
+            return None
+    in_range = all(0.0 < weight < np.inf for weight in weights.values())
+    return weights if in_range and set(weights) <= set(COSTS) else None
 
 
 def inverse_clearance(plan: Plan, scene: Scene, curve: Curve) -> float:

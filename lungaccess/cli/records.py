@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
     from lungaccess.checking import CheckReport
-    from lungaccess.one_stage.needle import NeedleAnswer
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
 
@@ -26,6 +25,7 @@ def plan_record(plan: Plan, report: CheckReport, folder: Path, files: tuple[str,
         "files": list(files),
         "digest": plan.digest,
         "objective": plan.objective,
+        "cost": plan.cost,
         "costs": dict(plan.costs),
         "clearance_mm": {device: dict(values) for device, values in plan.clearance_mm.items()},
         "iterations": plan.iterations,
@@ -42,33 +42,6 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
         "reasons": dict(failure.reasons),
         "advice": failure.advice,
     }
-
-
-def needle_record(answer: NeedleAnswer) -> dict[str, Any]:
-    """Return what a needle planner found; poses in LPS mm, angles in rad."""
-    from stages.needle import path_costs
-
-    path = answer.path
-    record: dict[str, Any] = {
-        "outcome": answer.outcome,
-        "pierced_branch": answer.branch if answer.branch >= 0 else None,
-        "path": None,
-    }
-    if path is None:
-        return record
-    record["path"] = {
-        "first_path_s": answer.first_path_s,
-        "length_mm": path.length_mm,
-        "max_angle_from_start_rad": path.max_angle_from_start_rad(),
-        "accumulated_turn_rad": path.accumulated_turn_rad,
-        "costs": {name: float(cost) for name, cost in path_costs(answer.space, path).items()},
-        "lps_from_start": path.lps_from_start.tolist(),
-        "arcs": [
-            {"length_mm": length, "roll_rad": roll, "curvature_per_mm": curvature}
-            for length, roll, curvature in path.arcs.tolist()
-        ],
-    }
-    return record
 
 
 def lung_record(lung: Lung) -> dict[str, Any]:

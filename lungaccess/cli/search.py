@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from stages.needle import Objective
+
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.coupled.atlas import Atlas
@@ -44,8 +46,7 @@ class SearchRequest:
         A point with its frame, ``ras:x,y,z`` or ``lps:x,y,z``; None for a nodule.
     nodule : int or None
         Number of a nodule, from 1.
-    objective : str
-        "inverse_clearance", "cost_map", "voxel_sum" or "length_mm".
+    objective : Objective
     method : str
         One of `lungaccess.coupled.planner.METHODS`.
     seed : int
@@ -61,7 +62,7 @@ class SearchRequest:
     system: System
     target: str | None = None
     nodule: int | None = None
-    objective: str = "inverse_clearance"
+    objective: Objective = Objective(inverse_clearance=1.0)
     method: str = "atlas"
     seed: int = 0
     time_s: float | None = None
@@ -90,7 +91,7 @@ class CostHistory:
 
     def on_plan(self, plan: Plan) -> None:
         """Take over a better plan."""
-        self._best = float(plan.costs[plan.objective])
+        self._best = plan.cost
         self._iteration = plan.iterations
         elapsed_s = float(plan.timing["planning_s"])
         self._append(elapsed_s)

@@ -105,8 +105,6 @@ def needle_tables(answer: NeedleAnswer) -> list[Table]:
     rows = [("outcome", words.get(answer.outcome, answer.outcome))]
     if answer.branch >= 0:
         rows.append(("taken to have pierced", f"branch {answer.branch}"))
-    from stages.needle import path_costs
-
     path = answer.path
     if path is None:
         return [table("needle", ("", ""), rows)]
@@ -117,7 +115,7 @@ def needle_tables(answer: NeedleAnswer) -> list[Table]:
         ("largest angle from the start", f"{np.degrees(path.max_angle_from_start_rad()):.1f} deg"),
         ("turning in all", f"{np.degrees(path.accumulated_turn_rad):.1f} deg"),
     ]
-    rows += [(f"cost: {name}", f"{cost:.3f}") for name, cost in path_costs(answer.space, path).items()]
+    rows += [(f"cost: {name}", f"{cost:.3f}") for name, cost in answer.costs.items()]
     arcs = [
         (
             f"{n}",
@@ -313,16 +311,6 @@ def preset_table(systems: Mapping[str, System]) -> Table:
     ]
     headings = ("name", "scope, mm", "tubes, mm", "needle, mm", "least turning radius, mm", "what it is")
     return table("Systems that ship with lungaccess (diameters)", headings, rows)
-
-
-def objective_words(objective: str) -> str:
-    """Return the words for a cost, with its unit."""
-    words = {
-        "inverse_clearance": "integral of 1/clearance along the needle",
-        "cost_map": "integral of the cost map along the needle (mm)",
-        "length_mm": "length of the needle (mm)",
-    }
-    return words.get(objective, objective)
 
 
 def what_to_look_at(out: Path) -> Panel:

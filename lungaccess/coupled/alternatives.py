@@ -14,10 +14,10 @@ from lungaccess.coupled.explain import explain
 from lungaccess.coupled.search import AtlasSearch
 from lungaccess.coupled.search.diverse import different_candidates
 from lungaccess.plans.assemble import Task, assemble
-from lungaccess.plans.costs import require_objective
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
+from stages.needle import Objective
 
 COUNT = 15
 SEPARATION_MM = 5.0
@@ -50,7 +50,7 @@ def alternatives(
     system: System,
     target: Target,
     *,
-    objective: str = "inverse_clearance",
+    objective: str | Objective = "inverse_clearance",
     count: int = COUNT,
     separation_mm: float = SEPARATION_MM,
     atlas: Atlas | None = None,
@@ -66,7 +66,7 @@ def alternatives(
     lung : Lung
     system : System
     target : Target
-    objective : str
+    objective : str or Objective
         What "cheap" means; see `lungaccess.coupled.planner.plan`.
     count : int
         The most plans that are returned.
@@ -84,7 +84,7 @@ def alternatives(
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
-    require_objective(objective)
+    weighed = Objective.of(objective)
     if count < 1 or not separation_mm > 0.0:
         raise SettingsError(
             f"{count} plans {separation_mm:g} mm apart are asked for", expected="both above 0"
@@ -94,7 +94,7 @@ def alternatives(
         require_same(atlas, lung, system)
     atlas = atlas or build_atlas(lung, system)
     task = Task(
-        lung=lung, system=system, target=target, objective=objective, with_fissures=atlas.with_fissures,
+        lung=lung, system=system, target=target, objective=weighed, with_fissures=atlas.with_fissures,
         method="alternatives", seed=0,
     )  # fmt: skip
     began = time.perf_counter()

@@ -13,10 +13,10 @@ from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch, ReferenceSearchWithoutRejection
 from lungaccess.coupled.search import AtlasSearch, KuntzSearch, KuntzSearchWithoutRejection, Step
 from lungaccess.plans.assemble import Task, assemble
-from lungaccess.plans.costs import require_objective
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
+from stages.needle import Objective
 
 METHODS = {
     "atlas": AtlasSearch,
@@ -54,7 +54,7 @@ def plan(
     system: System,
     target: Target,
     *,
-    objective: str = "inverse_clearance",
+    objective: str | Objective = "inverse_clearance",
     method: str = "atlas",
     seed: int = 0,
     iterations: int | None = None,
@@ -70,8 +70,9 @@ def plan(
     lung : Lung
     system : System
     target : Target
-    objective : str
-        "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1] or "length_mm".
+    objective : str or Objective
+        "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1], "length_mm", or a
+        weighted sum of them such as "length=1,cost-map=0.5".
     method : str
         "atlas": direct arcs from every deployment of the atlas, then climbs from the best of them, draws of
         deployments between, the optimal needle planner from others, and joint refinement.
@@ -103,7 +104,7 @@ def plan(
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
-    require_objective(objective)
+    weighed = Objective.of(objective)
     if method not in METHODS:
         raise SettingsError(f"There is no method {method!r}", expected=f"one of {', '.join(METHODS)}")
     tell = on_progress or (lambda _event: None)
@@ -115,7 +116,7 @@ def plan(
         lung=lung,
         system=system,
         target=target,
-        objective=objective,
+        objective=weighed,
         with_fissures=atlas.with_fissures,
         method=method,
         seed=seed,

@@ -5,15 +5,26 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from typing import Any
 
 from anatomy.errors import SettingsError, TargetError
 from anatomy.kernels.field import exact_distance
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT
+from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from stages.needle import PLANNERS, ArcPath, NeedleSpace, Objective, Query, Search, needle_space
+from stages.needle import (
+    PLANNERS,
+    ArcPath,
+    NeedleSpace,
+    Objective,
+    Query,
+    Search,
+    needle_space,
+    path_costs,
+)
 
 SLICE = 500
 OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
@@ -21,13 +32,6 @@ OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
 OMPL_TOLERANCE_MM = 1.0
 WALL_MM = 3.0
 """A start so near to an airway is taken to have pierced its wall."""
-
-OBJECTIVES = {
-    "inverse-clearance": Objective(inverse_clearance=1.0),
-    "cost-map": Objective(cost_map=1.0),
-    "voxel-sum": Objective(voxel_sum=1.0),
-    "length": Objective(length=1.0),
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,6 +50,8 @@ class NeedleAnswer:
         Branch of the airway tree whose wall the start is taken to have pierced, -1 for none.
     space : NeedleSpace
         What the planner looked at.
+    objective : Objective
+        What it was asked to make small; planners of OMPL look at none.
     first_path_s : float or None
         Time to the first path.
     """
@@ -55,7 +61,42 @@ class NeedleAnswer:
     cost: float
     branch: int
     space: NeedleSpace
+    objective: Objective
     first_path_s: float | None
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """Every cost of the path by its key, and that under the objective by its text; empty without a path.
+
+        Exact, and evaluated at every call.
+        """
+        if self.path is None:
+            return {}
+        return self.objective.stated(path_costs(self.space.arrays, self.space.cost_map, self.path))
+
+    def record(self) -> dict[str, Any]:
+        """Return plain JSON values; poses in LPS mm, angles in rad."""
+        path = self.path
+        record: dict[str, Any] = {
+            "outcome": self.outcome,
+            "pierced_branch": self.branch if self.branch >= 0 else None,
+            "path": None,
+        }
+        if path is None:
+            return record
+        record["path"] = {
+            "first_path_s": self.first_path_s,
+            "length_mm": path.length_mm,
+            "max_angle_from_start_rad": path.max_angle_from_start_rad(),
+            "accumulated_turn_rad": path.accumulated_turn_rad,
+            "costs": {name: float(cost) for name, cost in self.costs.items()},
+            "lps_from_start": path.lps_from_start.tolist(),
+            "arcs": [
+                {"length_mm": length, "roll_rad": roll, "curvature_per_mm": curvature}
+                for length, roll, curvature in path.arcs.tolist()
+            ],
+        }
+        return record
 
 
 def plan_needle(
@@ -65,7 +106,7 @@ def plan_needle(
     target: Target,
     *,
     planner: str = "decide",
-    objective: str = "length",
+    objective: str | Objective = "length",
     seed: int = 0,
     iterations: int | None = None,
     time_s: float | None = None,
@@ -83,8 +124,8 @@ def plan_needle(
     planner : str
         One of `search.planners.PLANNERS`, or of `OMPL_PLANNERS`: those look at no objective, end by time
         alone, and can be seeded once in a process, so each call needs a process of its own.
-    objective : str
-        One of `OBJECTIVES`.
+    objective : str or Objective
+        What is made small; see `stages.needle.objective.Objective.of`.
     seed : int
     iterations : int, optional
     time_s : float, optional
@@ -99,10 +140,12 @@ def plan_needle(
         If the start lies outside the images.
     """
     known = (*PLANNERS, *OMPL_PLANNERS)
-    if planner not in known or objective not in OBJECTIVES:
+    weighed = Objective.of(objective)
+    if planner not in known:
         raise SettingsError(
-            f"There is no needle planner {planner!r} with objective {objective!r}",
-            expected=f"a planner of {', '.join(known)}; an objective of {', '.join(OBJECTIVES)}",
+            f"There is no needle planner {planner!r}",
+            expected=f"one of {', '.join(known)}",
+            remedy=did_you_mean(planner, known),
         )
     if time_s is None and (iterations is None or planner in OMPL_PLANNERS):
         raise SettingsError(
@@ -119,8 +162,8 @@ def plan_needle(
     branch = pierced_branch(lung, lps_from_start[:3, 3])
     query = Query(lps_from_start=lps_from_start, target=target.lps_mm, branch=branch)
     if planner in OMPL_PLANNERS:
-        return _by_ompl(space, query, planner, seed, time_s or 0.0)
-    search = PLANNERS[planner](space, query, seed, OBJECTIVES[objective])
+        return _by_ompl(space, query, planner, weighed, seed, time_s or 0.0)
+    search = PLANNERS[planner](space, query, seed, weighed)
     first_path_s = None
     began = time.perf_counter()
     left = iterations
@@ -138,11 +181,14 @@ def plan_needle(
         cost=search.cost,
         branch=branch,
         space=space,
+        objective=weighed,
         first_path_s=first_path_s,
     )
 
 
-def _by_ompl(space: NeedleSpace, query: Query, planner: str, seed: int, time_s: float) -> NeedleAnswer:
+def _by_ompl(
+    space: NeedleSpace, query: Query, planner: str, objective: Objective, seed: int, time_s: float
+) -> NeedleAnswer:
     """Let a planner of OMPL search; its cost is the length of the path."""
     from stages.needle.ompl import NeedleProblem, seed_ompl
 
@@ -160,6 +206,7 @@ def _by_ompl(space: NeedleSpace, query: Query, planner: str, seed: int, time_s: 
         cost=math.inf if path is None else path.length_mm,
         branch=query.branch,
         space=space,
+        objective=objective,
         first_path_s=None if path is None else first_path_s,
     )
 

@@ -210,13 +210,13 @@ def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
     from lungaccess.coupled.search import AtlasSearch
     from lungaccess.plans.assemble import Task
     from lungaccess.problem.target import point_target
-    from stages.needle import direct_arcs
+    from stages.needle import SHORTEST, direct_arcs
 
     task = Task(
         lung=atlas.lung,
         system=atlas.system,
         target=point_target(atlas.lung, lesion),
-        objective="length_mm",
+        objective=SHORTEST,
         with_fissures=atlas.with_fissures,
         method="atlas",
         seed=0,

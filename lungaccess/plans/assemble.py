@@ -26,7 +26,7 @@ from lungaccess.plans.plan import (
 )
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.target import Target
-from stages.needle import ArcPath
+from stages.needle import ArcPath, Objective
 from stages.scope import ScopeTip, Sites, approach, approach_depth_mm, leaving_point
 from stages.tube import Deployment, centreline
 
@@ -50,7 +50,7 @@ class Task:
     lung: Lung
     system: System
     target: Target
-    objective: str
+    objective: Objective
     with_fissures: bool
     method: str
     seed: int
@@ -73,7 +73,7 @@ def assemble(
         target_lps=task.target.lps_mm,
         target_origin=task.target.origin,
         fissures_are_obstacles=task.with_fissures,
-        objective=task.objective,
+        objective=str(task.objective),
         scope=_scope_route(task, sites, candidate.tip),
         tube=_tube(task, candidate),
         needle=_needle(candidate.path),
@@ -88,10 +88,7 @@ def assemble(
             "needle": system.needle.radius_mm + margin,
         },
         clearance_mm={"tube": _tube_clearance(task, candidate), "needle": _needle_clearance(task, candidate)},
-        costs={
-            name: costs.path_cost(lung, candidate.path, name, with_fissures=task.with_fissures)
-            for name in costs.OBJECTIVES
-        },
+        costs=task.objective.stated(costs.path_costs(lung, candidate.path, with_fissures=task.with_fissures)),
         method=task.method,
         seed=task.seed,
         iterations=iteration,

@@ -216,7 +216,7 @@ class Plan(_Record):
         Where the target came from; starts with "nodule" if it is the nodule mask.
     fissures_are_obstacles : bool
     objective : str
-        What was minimised: a key of `costs`.
+        What was minimised: a key of `costs`; see `stages.needle.objective.Objective`.
     scope, tube, needle
         The three stages.
     exemption : Exemption
@@ -226,8 +226,8 @@ class Plan(_Record):
         For "tube" and "needle": smallest distance of the axis from each structure ("airway", "vessel",
         "outside", "fissure"; voxels as solid boxes) where it must be kept.  A structure may be left out.
     costs : mapping of str to float
-        "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle; a plan of an earlier
-        version may lack "voxel_sum".
+        "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, and the cost under the
+        objective where that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
     method : str
     seed, iterations : int
     timing : mapping of str to float
@@ -263,6 +263,11 @@ class Plan(_Record):
         from lungaccess.plans.display import plan_html
 
         return plan_html(self)
+
+    @property
+    def cost(self) -> float:
+        """Cost under the plan's own objective."""
+        return float(self.costs[self.objective])
 
     @property
     def digest(self) -> str:

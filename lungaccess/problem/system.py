@@ -15,7 +15,7 @@ from pydantic import Field
 from anatomy.errors import FileError, SettingsError
 from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, settings, switch, text, to_mapping
-from lungaccess.problem.suggestion import did_you_mean
+from anatomy.suggestion import did_you_mean
 from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes

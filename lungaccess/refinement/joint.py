@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lungaccess.plans.assemble import Candidate, Task
-from lungaccess.refinement.problem import ARC_COUNTS, WEIGHTS, Court, Problem
+from lungaccess.refinement.problem import ARC_COUNTS, Court, Problem, program_weights
 from stages.scope import Sites
 
 ITERATIONS = 40
@@ -35,23 +35,22 @@ def refine(
     Returns
     -------
     Candidate or None
-        Cheaper than the one given by BETTER or more, or None.
+        Cheaper than the one given by BETTER or more, or None; always None for an objective that the program
+        cannot express, see `lungaccess.refinement.problem.program_weights`.
     """
-    if len(candidate.path.arcs) > ARC_COUNTS[-1] or _costs_nothing(task):
+    weights = program_weights(task)
+    if len(candidate.path.arcs) > ARC_COUNTS[-1] or weights is None:
         return None
-    return _refined(Court(task), atlas_sites, candidate, iterations)
+    return _refined(Court(task), atlas_sites, candidate, weights, iterations)
 
 
-def _costs_nothing(task: Task) -> bool:
-    """Tell whether every path is free, because the objective weighs a map and there is none."""
-    return WEIGHTS[task.objective][2] > 0.0 and task.lung.cost is None
-
-
-def _refined(court: Court, sites: Sites, candidate: Candidate, iterations: int) -> Candidate | None:
+def _refined(
+    court: Court, sites: Sites, candidate: Candidate, weights: tuple[float, float, float], iterations: int
+) -> Candidate | None:
     """Solve for everything, then for the needle alone from tubes that the discrete test accepts."""
     from lungaccess.refinement.program import program
 
-    problem, limit = Problem(court, sites, candidate), court.cost(candidate) * (1.0 - BETTER)
+    problem, limit = Problem(court, sites, candidate, weights), court.cost(candidate) * (1.0 - BETTER)
     solver = program(problem.layout, iterations)
     _objective, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
     found = solver.solve(problem.start, problem.eased(values), problem.boxes)

@@ -18,7 +18,7 @@ from lungaccess.refinement import boxes as fields
 from lungaccess.refinement.axis import axis_of, standing_still
 from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_WAY_MM, Layout, Numbers
-from stages.needle import CURVATURE, Query, needle_space, objection
+from stages.needle import CURVATURE, Query, map_integral, needle_space, objection
 from stages.scope import ScopeTip, Sites
 from stages.tube import Deployment, TubeJudge, centreline, tracking_length_mm, tube_constants
 from stages.tube.kernels import deployment as index
@@ -38,13 +38,25 @@ EASED = ("zone", "needle", "tube", "wall", "slope")
 EASE = 1e-4
 SHARES = (1.0, 0.85, 0.7, 0.5, 0.35, 0.2, 0.1)
 MOVED_STANDS = 2
-WEIGHTS = {
-    "inverse_clearance": (1.0, 0.0, 0.0),
-    "length_mm": (0.0, 1.0, 0.0),
-    "cost_map": (0.0, 0.0, 1.0),
-    "voxel_sum": (0.0, 0.0, 1.0),
-}
-"""Weights of 1 / clearance, length and cost map; the sum over voxels follows the map's line integral."""
+
+
+def program_weights(task: Task) -> tuple[float, float, float] | None:
+    """Return the weights of 1 / clearance, length and cost map in the program of a task.
+
+    The program has no sum over voxels.  Where nothing else is weighed, the map's line integral stands for
+    it.  Where it is one cost of several, the program cannot express the objective; where only a map is
+    weighed and there is none, there is nothing to improve: then None is returned.
+    """
+    weighed = task.objective
+    if weighed.voxel_sum > 0.0:
+        if len(weighed.weighed) > 1:
+            return None
+        weights = (0.0, 0.0, weighed.voxel_sum)
+    else:
+        weights = (weighed.inverse_clearance, weighed.length, weighed.cost_map)
+    if task.lung.cost is None:
+        weights = (*weights[:2], 0.0)
+    return weights if any(weights) else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,7 +90,8 @@ class Court:
 
     def cost(self, candidate: Candidate) -> float:
         """Return the cost under the task's objective."""
-        return self._cost(candidate, self.task.objective)
+        task = self.task
+        return path_cost(task.lung, candidate.path, task.objective, with_fissures=task.with_fissures)
 
     def accepts(self, candidate: Candidate) -> bool:
         """Tell whether the needle keeps all limits, is proved clear and enters no voxel of infinite cost."""
@@ -91,11 +104,7 @@ class Court:
             return False
         if objection(self._space, query, candidate.path):
             return False
-        return math.isfinite(self._cost(candidate, "cost_map"))
-
-    def _cost(self, candidate: Candidate, objective: str) -> float:
-        task = self.task
-        return path_cost(task.lung, candidate.path, objective, with_fissures=task.with_fissures)
+        return math.isfinite(map_integral(self.task.lung.cost, candidate.path))
 
 
 class Problem:
@@ -107,6 +116,8 @@ class Problem:
     sites : Sites
     candidate : Candidate
         With at most as many arcs as the last of ARC_COUNTS.
+    weights : tuple of 3 float
+        See `program_weights`.
 
     Attributes
     ----------
@@ -118,15 +129,17 @@ class Problem:
     axis : LocalAxis or StillAxis
     """
 
-    def __init__(self, court: Court, sites: Sites, candidate: Candidate) -> None:
+    def __init__(
+        self, court: Court, sites: Sites, candidate: Candidate, weights: tuple[float, float, float]
+    ) -> None:
         self.task = court.task
-        self._court, self._candidate = court, candidate
+        self._court, self._candidate, self._weights = court, candidate, weights
         needle, deployment = self.task.system.needle, candidate.deployment
         rows = rows_of(candidate.path)
         arcs = next(count for count in ARC_COUNTS if count >= len(rows))
         self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
         rows = split(rows, arcs, self._exempt_mm)
-        self.layout = Layout(arcs=arcs, with_map=WEIGHTS[self.task.objective][2] > 0.0)
+        self.layout = Layout(arcs=arcs, with_map=weights[2] > 0.0)
         self.axis = axis_of(self.task.lung.tree, sites, candidate.tip, deployment.branch)
         tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
         bends = rows[:, 1:].T / needle.max_curvature_per_mm
@@ -268,7 +281,7 @@ class Problem:
         """Return the parameters for an axis of the scope's tip given by coefficients."""
         tubes = self.task.system.tubes
         constants = tube_constants(tubes, self.task.system.margins)
-        clear, length, mapped = WEIGHTS[self.task.objective]
+        clear, length, mapped = self._weights
         values: dict[str, object] = {
             "axis_points": points,
             "axis_tangents": tangents,

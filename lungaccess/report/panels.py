@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from anatomy.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.geometry import needle_polyline, tube_centreline
+from stages.needle import TERMS, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -89,7 +90,7 @@ def key_numbers(plan: Plan) -> list[tuple[str, list[Row]]]:
         ("Tube", _tube_rows(plan)),
         ("Needle", _needle_rows(plan)),
         ("Least distance found / required", _clearance_rows(plan)),
-        ("Cost", [(_plain(name), f"{value:.4g}") for name, value in plan.costs.items()]),
+        ("Cost", _cost_rows(plan)),
     ]
 
 
@@ -153,13 +154,12 @@ def _least(plan: Plan, device: str, structure: str) -> str:
     return f"{plan.required_clearance_mm[{'tube': 'inner_tube'}.get(device, device)]:.2f} mm"
 
 
-def _plain(name: str) -> str:
-    words = {
-        "inverse_clearance": "integral of 1/clearance",
-        "cost_map": "cost map integral",
-        "length_mm": "needle length, mm",
-    }
-    return words.get(name, name)
+def _cost_rows(plan: Plan) -> list[Row]:
+    """Return every cost of a plan in the words of its kind, and that under its objective if that is a sum."""
+    words = {term.key: term.words_with_unit for term in TERMS}
+    return [
+        (words.get(name) or Objective.of(name).words, f"{value:.4g}") for name, value in plan.costs.items()
+    ]
 
 
 def text_panel(axes: Axes, plan: Plan) -> None:

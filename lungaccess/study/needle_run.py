@@ -9,20 +9,11 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
-from lungaccess.cli.records import needle_record
 from lungaccess.one_stage.needle import OMPL_TOLERANCE_MM, plan_needle
 from lungaccess.problem.target import point_target
 from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
 from lungaccess.study.runs import Run
 from stages.needle import Query, objection
-
-OBJECTIVES = {
-    "inverse_clearance": "inverse-clearance",
-    "cost_map": "cost-map",
-    "voxel_sum": "voxel-sum",
-    "length_mm": "length",
-}
-"""The objective of a plan, as the needle stage calls it."""
 
 
 def needle_answer(run: Run, lung: Lung) -> Answer:
@@ -46,17 +37,16 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
         pose,
         target,
         planner=run.planner.method,
-        objective=OBJECTIVES[problem.objective],
+        objective=problem.objective,
         seed=run.seed,
         iterations=run.iterations,
         time_s=problem.time_s,
     )
     if found.path is None:
         return Answer(key=run.key, outcome=NO_PLAN, status=TIMEOUT, message=found.outcome)
-    record = needle_record(found)
+    record = found.record()
     first_s = record["path"].pop("first_path_s")
-    costs = dict(record["path"]["costs"])
-    costs["length_mm"] = costs.pop("length")
+    costs = record["path"]["costs"]
     text = json.dumps(record, sort_keys=True)
     query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
     tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.space.goal_tolerance_mm

@@ -131,9 +131,8 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
         time_s=problem.time_s,
         atlas=atlas,
     ):
-        cost = best.costs[problem.objective]
         improvements.append(
-            Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=cost)
+            Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=best.cost)
         )
         if problem.first_plan:
             break

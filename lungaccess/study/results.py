@@ -18,10 +18,12 @@ from lungaccess.plans.assemble import software_version
 from lungaccess.study.answers import Answer
 from lungaccess.study.runs import Problem, Run
 from lungaccess.study.schema import APPLICATION_ID, FORMAT, statements
+from stages.needle import TERMS
 
 BUSY_S = 60.0
 BATCH = 1000
-COSTS = ("inverse_clearance", "cost_map", "voxel_sum")
+COST_COLUMNS = {term.key: term.key for term in TERMS} | {"length_mm": "solution_length"}
+"""The column of each cost; OMPL's benchmarks have one for the length."""
 
 
 class ResultsFile:
@@ -248,13 +250,12 @@ def _run_row(run: Run, answer: Answer, experiment: int, planner: int) -> tuple[s
         "solved": answer.solved,
         "correct_solution": answer.accepted,
         "status": answer.status,
-        "solution_length": answer.costs.get("length_mm"),
         "cpu_time": answer.cpu_s,
         "first_solution_time": first,
         "solutions": len(answer.improvements),
         "seed": run.seed,
         "cost": answer.costs.get(run.problem.objective),
-        **{name: answer.costs.get(name) for name in COSTS},
+        **{column: answer.costs.get(key) for key, column in COST_COLUMNS.items()},
         "key": run.key,
     }
     return _insert("runs", row, "INSERT OR IGNORE")

@@ -21,6 +21,7 @@ from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.target import nodule_target
 from lungaccess.study.patients import Patient, open_patient, patient_of
 from lungaccess.study.settings import Case, PlannerChoice, Study
+from stages.needle import Objective
 
 RUN_FORMAT = 1
 """Raise it when what a run does changes: stored runs of another format are run anew."""
@@ -182,7 +183,7 @@ def _runs_to(
                 case=case.name,
                 patient=patient,
                 system=system,
-                objective=case.objective,
+                objective=str(Objective.of(case.objective)),
                 target=number,
                 target_lps=point,
                 origin=origin,

@@ -13,12 +13,12 @@ from pydantic import Field
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.io.files import read_text
 from anatomy.settings import impossible, parse, quantity, settings, switch, text
+from stages.needle import Objective
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
 PHANTOM = "phantom"
 _REMEDY = "docs/studies.md explains every key"
-Objective = Literal["inverse_clearance", "cost_map", "voxel_sum", "length_mm"]
 Seed = Annotated[int, Field(strict=True, ge=0)]
 Iterations = Annotated[int, Field(strict=True, ge=0, description="iterations beyond the direct arcs")]
 
@@ -60,7 +60,7 @@ class Case:
     fissures_allowed : bool or None
         Whether fissures may be crossed; None for what the system says.
     objective : str
-        What is minimised.
+        What is minimised; see `stages.needle.objective.Objective.of`.
     targets : tuple of str
         "ras:x,y,z", "lps:x,y,z", "nodule" or "nodule N".
     peripheral : Peripheral
@@ -74,7 +74,7 @@ class Case:
     phantom: PhantomPatient = PhantomPatient()
     system: Annotated[str, text("preset or TOML file")] = "lung-default"
     fissures_allowed: Annotated[bool | None, switch("whether a fissure may be crossed")] = None
-    objective: Annotated[Objective, Field(description="what is minimised")] = "inverse_clearance"
+    objective: Annotated[str, text("what is minimised")] = "inverse_clearance"
     targets: Annotated[tuple[str, ...], Field(description="points with their frame, or nodules")] = ()
     peripheral: Peripheral = Peripheral()
     starts: Annotated[tuple[Seed, ...], Field(description="start poses of the needle, from 1")] = ()
@@ -82,6 +82,10 @@ class Case:
     def __post_init__(self) -> None:
         if not self.targets and not self.peripheral.per_lung:
             raise impossible("targets", self.targets, "at least one target, or [case.peripheral]")
+        try:
+            Objective.of(self.objective)
+        except SettingsError as error:
+            raise impossible("objective", self.objective, error.expected) from None
 
 
 @settings

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from stages.needle.costs import map_integral as map_integral
     from stages.needle.costs import path_costs as path_costs
     from stages.needle.device import Needle as Needle
     from stages.needle.objective import NO_MAP as NO_MAP
     from stages.needle.objective import SHORTEST as SHORTEST
+    from stages.needle.objective import TERMS as TERMS
     from stages.needle.objective import Objective as Objective
     from stages.needle.objective import ObjectiveArrays as ObjectiveArrays
     from stages.needle.path import CURVATURE as CURVATURE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -11,9 +12,9 @@ from anatomy.grid import Grid, Volume
 from anatomy.kernels import field as field_kernel
 from anatomy.typed import Float, Int
 from stages.needle.kernels import cost as kernel
-from stages.needle.objective import Objective
+from stages.needle.objective import TERMS, Term
 from stages.needle.path import ArcPath, _kernel_arcs
-from stages.needle.space import NeedleSpace, SpaceArrays
+from stages.needle.space import SpaceArrays
 
 SAMPLE_MM = 0.1
 EXACT_BELOW_VOXELS = 8.0
@@ -93,36 +94,30 @@ def voxel_sum(cost_map: Volume | None, path: ArcPath) -> float:
     return float(_costs_of(cost_map, np.unique(voxels)).sum())
 
 
-def path_costs(space: NeedleSpace, path: ArcPath) -> dict[str, float]:
-    """Return every cost of a path by its name, which is that of its weight in `Objective`.
+_EVALUATED: dict[str, Callable[[SpaceArrays, Volume | None, ArcPath], float]] = {
+    "inverse_clearance": lambda arrays, _map, path: inverse_clearance(arrays, path),
+    "cost_map": lambda _arrays, cost_map, path: map_integral(cost_map, path),
+    "voxel_sum": lambda _arrays, cost_map, path: voxel_sum(cost_map, path),
+    "length_mm": lambda _arrays, _map, path: path.length_mm,
+}
 
-    Lengths in mm, "inverse_clearance" a number, "voxel_sum" in units of the map.
+
+def path_costs(
+    arrays: SpaceArrays, cost_map: Volume | None, path: ArcPath, terms: Iterable[Term] = TERMS
+) -> dict[str, float]:
+    """Return costs of a path by their keys, exactly; see `stages.needle.objective.TERMS`.
+
+    Parameters
+    ----------
+    arrays : tuple
+        See `NeedleSpace`.
+    cost_map : Volume or None
+        Without a map its costs are 0.
+    path : ArcPath
+    terms : iterable of Term
+        Which costs.
     """
-    return {
-        "inverse_clearance": inverse_clearance(space.arrays, path),
-        "cost_map": map_integral(space.cost_map, path),
-        "length": path.length_mm,
-        "voxel_sum": voxel_sum(space.cost_map, path),
-    }
-
-
-def objective_cost(space: NeedleSpace, objective: Objective, path: ArcPath) -> float:
-    """Return the weighted sum of costs that `objective` asks for, exactly.
-
-    Raises
-    ------
-    SettingsError
-        If the objective weighs a cost map, and the space has none.
-    """
-    space.objective_arrays(objective)
-    total = objective.length * path.length_mm
-    if objective.inverse_clearance > 0.0:
-        total += objective.inverse_clearance * inverse_clearance(space.arrays, path)
-    if objective.cost_map > 0.0:
-        total += objective.cost_map * map_integral(space.cost_map, path)
-    if objective.voxel_sum > 0.0:
-        total += objective.voxel_sum * voxel_sum(space.cost_map, path)
-    return total
+    return {term.key: _EVALUATED[term.key](arrays, cost_map, path) for term in terms}
 
 
 def _crossings(grid: Grid, path: ArcPath) -> tuple[Int, Float]:

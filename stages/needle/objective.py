@@ -1,15 +1,16 @@
-"""What a needle path is to keep small, as the searches take it."""
+"""What a needle path is to keep small: the costs that there are, and their weighted sum."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float, Float32
-from stages.needle.kernels import cost as index
 
 ObjectiveArrays = tuple[Float, Float32]
 
@@ -21,8 +22,57 @@ NO_MAP = read_only(np.zeros((2, 2, 2), dtype=np.float32, order="F"))
 
 
 @dataclass(frozen=True, kw_only=True)
+class Term:
+    """One cost of a needle path, which an objective can weigh.
+
+    Parameters
+    ----------
+    key : str
+        What plans, results and files call it.
+    weight : str
+        The field of `Objective` that weighs it.
+    words : str
+        What people call it.
+    unit : str
+        "" for a pure number, or the unit of the cost map.
+    of_map : bool
+        Whether it is a cost of the map.
+    """
+
+    key: str
+    weight: str
+    words: str
+    unit: str = ""
+    of_map: bool = False
+
+    @property
+    def option(self) -> str:
+        """What the command line calls it."""
+        return self.weight.replace("_", "-")
+
+    @property
+    def words_with_unit(self) -> str:
+        """The words for figures and tables."""
+        return f"{self.words} ({self.unit})" if self.unit else self.words
+
+
+TERMS = (
+    Term(key="inverse_clearance", weight="inverse_clearance", words="integral of 1/clearance"),
+    Term(key="cost_map", weight="cost_map", words="integral of the cost map", unit="mm", of_map=True),
+    Term(key="voxel_sum", weight="voxel_sum", words="sum of the cost map over voxels", of_map=True),
+    Term(key="length_mm", weight="length", words="length of the needle", unit="mm"),
+)
+"""Every cost of a needle path."""
+
+_BY_NAME = {name: term for term in TERMS for name in (term.key, term.option, term.weight)}
+
+
+@dataclass(frozen=True, kw_only=True)
 class Objective:
     """A weighted sum of costs of a path.
+
+    The text of an objective is the key of a cost, or a sum such as ``cost_map=0.5,length_mm=1``; `of` reads
+    it and `str` writes it.
 
     Parameters
     ----------
@@ -41,6 +91,13 @@ class Objective:
     ------
     SettingsError
         If a weight is negative or not finite, or all are 0.
+
+    Examples
+    --------
+    >>> str(Objective(length=1.0))
+    'length_mm'
+    >>> str(Objective.of("length=1, cost-map=0.5"))
+    'cost_map=0.5,length_mm=1'
     """
 
     inverse_clearance: float = 0.0
@@ -56,15 +113,80 @@ class Objective:
                 expected="weights of 0 or more, one of them more than 0",
             )
 
+    @classmethod
+    def of(cls, stated: str | Objective) -> Objective:
+        """Return the objective that a text states, or the objective itself.
+
+        Parameters
+        ----------
+        stated : str or Objective
+            The names of costs, each with its weight after "=", separated by commas.  A cost is named by its
+            key (``length_mm``) or as on the command line (``length``); a name alone has the weight 1.
+
+        Raises
+        ------
+        SettingsError
+            If there is no such cost, one is named twice, or a weight is not a number of 0 or more.
+        """
+        if isinstance(stated, Objective):
+            return stated
+        weights: dict[str, float] = {}
+        for part in stated.split(","):
+            name, equals, weight = (word.strip() for word in part.partition("="))
+            term = _term(name)
+            if term.weight in weights:
+                raise SettingsError(f"The objective {stated!r} names {name} twice", expected="each cost once")
+            weights[term.weight] = _number(weight, stated) if equals else 1.0
+        return cls(**weights)
+
+    def __str__(self) -> str:
+        """Return the text from which `of` restores the objective without loss."""
+        weighed = self.weighed
+        if len(weighed) == 1 and weighed[0][1] == 1.0:
+            return weighed[0][0].key
+        return ",".join(f"{term.key}={weight!r}".removesuffix(".0") for term, weight in weighed)
+
+    @property
+    def weighed(self) -> tuple[tuple[Term, float], ...]:
+        """The costs that it weighs, with their weights."""
+        pairs = ((term, float(getattr(self, term.weight))) for term in TERMS)
+        return tuple((term, weight) for term, weight in pairs if weight > 0.0)
+
+    @property
+    def words(self) -> str:
+        """What figures and tables call its cost, with the unit of a single one."""
+        weighed = self.weighed
+        if len(weighed) == 1 and weighed[0][1] == 1.0:
+            return weighed[0][0].words_with_unit
+        return "weighted sum " + " + ".join(f"{weight:g} {term.option}" for term, weight in weighed)
+
     @property
     def weighs_map(self) -> bool:
         """Whether it needs a cost map."""
-        return self.cost_map > 0.0 or self.voxel_sum > 0.0
+        return any(term.of_map for term, _weight in self.weighed)
 
     @property
     def is_length(self) -> bool:
         """Whether it weighs nothing but length."""
         return self.inverse_clearance == 0.0 and not self.weighs_map
+
+    @property
+    def without_map(self) -> Objective:
+        """The objective where there is no cost map: every cost of a map is 0, so that none is weighed.
+
+        One that weighs nothing else becomes the length.
+        """
+        if self.inverse_clearance == 0.0 and self.length == 0.0:
+            return SHORTEST
+        return replace(self, cost_map=0.0, voxel_sum=0.0)
+
+    def total(self, costs: Mapping[str, float]) -> float:
+        """Return the weighted sum of the costs of a path, given by their keys."""
+        return sum(weight * costs[term.key] for term, weight in self.weighed)
+
+    def stated(self, costs: Mapping[str, float]) -> dict[str, float]:
+        """Return the costs of a path by their keys, and their weighted sum by the text of the objective."""
+        return {**costs, str(self): self.total(costs)}
 
     def arrays(self, cost_map: Float32 | None) -> ObjectiveArrays:
         """Return the weights and the map for the kernels, see `stages.needle.kernels.cost`.
@@ -83,6 +205,8 @@ class Objective:
             If the objective weighs a map, and there is none, or one with negative costs, NaN, or no finite
             cost.
         """
+        from stages.needle.kernels import cost as index
+
         least_of_map = 0.0
         if not self.weighs_map:
             cost_map = NO_MAP
@@ -108,6 +232,27 @@ class Objective:
             self.inverse_clearance / MAX_CLEARANCE_MM + self.cost_map * least_of_map + self.length
         )
         return weights, cost_map
+
+
+def _term(name: str) -> Term:
+    """Return the cost of a name."""
+    if name in _BY_NAME:
+        return _BY_NAME[name]
+    options = [term.option for term in TERMS]
+    raise SettingsError(
+        f"There is no objective {name!r}",
+        expected=f"one of {', '.join(options)}, or a weighted sum such as length=1,cost-map=0.5",
+        remedy=did_you_mean(name, options),
+    )
+
+
+def _number(weight: str, stated: str) -> float:
+    try:
+        return float(weight)
+    except ValueError:
+        raise SettingsError(
+            f"{weight!r} in the objective {stated!r} is not a number", expected="a weight of 0 or more"
+        ) from None
 
 
 SHORTEST = Objective(length=1.0)

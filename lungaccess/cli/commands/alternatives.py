@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
+from lungaccess.cli.commands.common import ObjectiveText, require_map
 from lungaccess.cli.inputs import load_device, load_lung, require_one_target
 from lungaccess.cli.progress import progress
+from stages.needle import Objective
 
 if TYPE_CHECKING:
     from lungaccess.coupled.alternatives import Alternative
@@ -27,7 +29,7 @@ def alternatives(
     system: str = "lung-default",
     count: int = 15,
     separation: float = 5.0,
-    objective: str = "inverse_clearance",
+    objective: ObjectiveText = "inverse-clearance",
     allow_fissures: bool | None = None,
     out: Path = Path("lungaccess-alternatives"),
     json: bool = False,
@@ -50,7 +52,7 @@ def alternatives(
     separation : float
         The needles of every two plans lie somewhere at least so many mm from each other.
     objective : str
-        By what the cheapest come first: inverse_clearance, cost_map, voxel_sum or length_mm.
+        By what the cheapest come first, as for `plan`.
     allow_fissures : bool
         Whether fissures may be crossed; as the system says if not given.
     out : Path
@@ -67,14 +69,16 @@ def alternatives(
 
     require_one_target(target, nodule)
     require_writable_folder(out)
+    weighed = Objective.of(objective)
     device = load_device(system, allow_fissures)
     lung = load_lung(patient, cache)
+    require_map(lung, weighed)
     aim = resolve_target(lung, target, nodule)
     with progress("enumerating what scope and tubes can do") as shown:
         atlas = open_atlas(lung, device, cache=cache, progress=shown.share)
     with progress("searching"):
         found = find_alternatives(
-            lung, device, aim, objective=objective, count=count, separation_mm=separation, atlas=atlas
+            lung, device, aim, objective=weighed, count=count, separation_mm=separation, atlas=atlas
         )
     accepted = []
     with progress("checking") as shown:

@@ -9,6 +9,7 @@ from rich.panel import Panel
 from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.terminal import console
+from stages.needle import TERMS, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -18,7 +19,11 @@ OK, NO_PLAN, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 DEFAULT_SYSTEM = "lung-default"
 DEFAULT_BUDGET_S = 10.0
 
-Objective = Literal["inverse-clearance", "cost-map", "voxel-sum", "length"]
+if TYPE_CHECKING:
+    ObjectiveText = str
+else:
+    ObjectiveText = Literal[tuple(term.option for term in TERMS)] | str
+"""The costs by name, for help and completion, or a weighted sum; `Objective.of` reads it."""
 
 
 def verdict(accepted: bool) -> int:
@@ -40,3 +45,13 @@ def require_budget(budget: float | None, iterations: int | None) -> None:
         raise SettingsError(f"--budget is {budget:g} s", expected="a finite time above 0")
     if iterations is not None and iterations < 1:
         raise SettingsError(f"--iterations is {iterations}", expected="at least 1")
+
+
+def require_map(lung: Lung, objective: Objective) -> None:
+    """Raise SettingsError if an objective weighs a cost map that the patient does not have."""
+    if objective.weighs_map and lung.cost is None:
+        raise SettingsError(
+            f"Patient {lung.name} has no cost map",
+            expected=f"a cost map among the patient's files for --objective {objective}",
+            remedy="Choose inverse-clearance or length",
+        )

@@ -13,11 +13,12 @@ from lungaccess.cli.commands.common import (
     DEFAULT_SYSTEM,
     NO_PLAN,
     OK,
-    Objective,
+    ObjectiveText,
     require_budget,
 )
 from lungaccess.cli.inputs import load_device, load_lung, require_one_target
 from lungaccess.cli.progress import progress
+from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -35,7 +36,7 @@ def needle(
     nodule: int | None = None,
     system: str = DEFAULT_SYSTEM,
     planner: NeedlePlanner = "decide",
-    objective: Objective = "length",
+    objective: ObjectiveText = "length",
     budget: float | None = None,
     iterations: int | None = None,
     seed: int = 0,
@@ -64,7 +65,8 @@ def needle(
         decide: a path, or a proof that there is none; rrt; optimal: better and better paths; resolution:
         the best path of pieces at a resolution, or the statement that it has none.
     objective : str
-        What to make small: length, integral of 1/clearance, integral of the cost map, or its sum over voxels.
+        What to make small: length, integral of 1/clearance, integral of the cost map, its sum over voxels, or
+        a weighted sum such as length=1,cost-map=0.5.
     budget : float
         Planning time in seconds; 10 if neither this nor --iterations is given.
     iterations : int
@@ -83,6 +85,7 @@ def needle(
 
     require_one_target(target, nodule)
     require_budget(budget, iterations)
+    weighed = Objective.of(objective)
     device = load_device(system, allow_fissures)
     lung = load_lung(patient, cache)
     limit_s = DEFAULT_BUDGET_S if budget is None and iterations is None else budget
@@ -94,15 +97,13 @@ def needle(
             pose,
             aim,
             planner=planner,
-            objective=objective,
+            objective=weighed,
             seed=seed,
             iterations=iterations,
             time_s=limit_s,
         )
     if json:
-        from lungaccess.cli.records import needle_record
-
-        terminal.show_json(needle_record(answer))
+        terminal.show_json(answer.record())
     else:
         terminal.show(terminal.needle_tables(answer))
     return NO_PLAN if answer.path is None else OK

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.commands.common import (
@@ -13,14 +12,16 @@ from lungaccess.cli.commands.common import (
     DEFAULT_SYSTEM,
     NO_PLAN,
     OK,
-    Objective,
+    ObjectiveText,
     print_warnings,
     require_budget,
+    require_map,
     verdict,
 )  # fmt: skip
 from lungaccess.cli.inputs import load_device, load_lung, require_one_target
 from lungaccess.cli.progress import SearchDisplay, progress
 from lungaccess.cli.terminal import console
+from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -29,13 +30,6 @@ if TYPE_CHECKING:
 Method = Literal[
     "atlas", "kuntz2015", "kuntz2015-without-rejection", "reference", "reference-without-rejection"
 ]
-
-OBJECTIVES = {
-    "inverse-clearance": "inverse_clearance",
-    "cost-map": "cost_map",
-    "voxel-sum": "voxel_sum",
-    "length": "length_mm",
-}
 
 
 def plan(
@@ -47,7 +41,7 @@ def plan(
     budget: float | None = None,
     iterations: int | None = None,
     seed: int = 0,
-    objective: Objective = "inverse-clearance",
+    objective: ObjectiveText = "inverse-clearance",
     method: Method = "atlas",
     allow_fissures: bool | None = None,
     processes: int = 1,
@@ -76,7 +70,7 @@ def plan(
         Seed of the random numbers.
     objective : str
         What to make small: integral of 1/clearance, integral of the patient's cost map, its sum over the
-        voxels crossed, or length.
+        voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5.
     method : str
         Search over the deployment atlas; Algorithm 1 of Kuntz et al. 2015; or reference: the same as
         printed, with collisions of surface meshes, slow.
@@ -99,20 +93,16 @@ def plan(
     require_budget(budget, iterations)
     require_writable_folder(out)
     device = load_device(system, allow_fissures)
+    weighed = Objective.of(objective)
     lung = load_lung(patient, cache, thick_slices=thick_slices)
-    if objective in ("cost-map", "voxel-sum") and lung.cost is None:
-        raise SettingsError(
-            f"Patient {lung.name} has no cost map",
-            expected=f"a cost map among the patient's files for --objective {objective}",
-            remedy="Choose inverse-clearance or length",
-        )
+    require_map(lung, weighed)
     if budget is None and iterations is None:
         budget = DEFAULT_BUDGET_S
     request = SearchRequest(
         system=device,
         target=target,
         nodule=nodule,
-        objective=OBJECTIVES[objective],
+        objective=weighed,
         method=method,
         seed=seed,
         time_s=budget,
@@ -153,7 +143,7 @@ def search_and_report(lung: Lung, request: SearchRequest, out: Path, json: bool)
         overview_png(found, lung, out / "overview.png")
         tree_png(lung, out / "tree.png")
         cost_over_time_csv(history, out / "cost_over_time.csv")
-        cost_over_time_png(history, out / "cost_over_time.png", terminal.objective_words(found.objective))
+        cost_over_time_png(history, out / "cost_over_time.png", request.objective.words)
     written = ("plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv")
     if json:
         terminal.show_json(plan_record(found, report, out, written))

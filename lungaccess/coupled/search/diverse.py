@@ -41,7 +41,7 @@ def different_candidates(search: AtlasSearch, count: int, separation_mm: float) 
         )
         search.desk.count_blockers(blockers)
         clear = np.flatnonzero(blockers == 0)
-        price = {"length_mm": lengths, "inverse_clearance": inverse}.get(search.task.objective, lengths)
+        price = {"length_mm": lengths, "inverse_clearance": inverse}.get(str(search.task.objective), lengths)
         pool, prices = np.append(pool, looked[clear]), np.append(prices, price[clear])
         chosen = _chosen(search, pool[np.argsort(prices, kind="stable")], count, separation_mm, proved)
         if len(chosen) == count:

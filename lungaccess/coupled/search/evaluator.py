@@ -14,7 +14,16 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Float, Int
 from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.plans.costs import path_cost
-from stages.needle import CURVATURE, ArcPath, NeedleSpace, Query, needle_space, objection, workspace_lengths
+from stages.needle import (
+    CURVATURE,
+    ArcPath,
+    NeedleSpace,
+    Query,
+    map_integral,
+    needle_space,
+    objection,
+    workspace_lengths,
+)
 from stages.tube import Deployment
 
 if TYPE_CHECKING:
@@ -74,8 +83,7 @@ class NeedleDesk:
             return False
         if objection(self.space, self.query(deployment), path):
             return False
-        mapped = path_cost(self.task.lung, path, "cost_map", with_fissures=self.task.with_fissures)
-        return math.isfinite(mapped)
+        return math.isfinite(map_integral(self.task.lung.cost, path))
 
     def query(self, deployment: Deployment) -> Query:
         """Return what is asked of the needle's searches from the tip of the tubes."""

@@ -15,7 +15,6 @@ from lungaccess.coupled.search.scope_poses import Stands
 from lungaccess.plans.assemble import Candidate, Task
 from stages.needle import (
     NO_MAP,
-    SHORTEST,
     ArcPath,
     NeedleSpace,
     Objective,
@@ -28,22 +27,14 @@ from stages.tube import Deployment, TubeJudge, scene_of, tube_constants
 
 Needle = tuple[SpaceArrays, Float, ObjectiveArrays, bool, Float32]
 
-OBJECTIVES = {
-    "inverse_clearance": Objective(inverse_clearance=1.0),
-    "cost_map": Objective(cost_map=1.0),
-    "voxel_sum": Objective(voxel_sum=1.0),
-    "length_mm": SHORTEST,
-}
-
 KICK = np.array([4.0, math.radians(15.0), 2.0, 2.0])
 """Spread of stand (rows), rotation, and insertions in mm."""
 VIA_KICK_MM = 3.0
 
 
 def objective_of(task: Task) -> Objective:
-    """Return a task's objective for the kernels; without a map, objectives that weigh one are of no use."""
-    objective = OBJECTIVES[task.objective]
-    return SHORTEST if objective.weighs_map and task.lung.cost is None else objective
+    """Return a task's objective for the kernels, which weigh a cost map only where there is one."""
+    return task.objective.without_map if task.lung.cost is None else task.objective
 
 
 @dataclass(kw_only=True, eq=False)

@@ -9,10 +9,10 @@ import numpy as np
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
 from lungaccess.checking import shapes
-from lungaccess.cli.terminal import objective_words
 from lungaccess.plans.costs import obstacle_clearance_mm
 from lungaccess.report.geometry import needle_polyline, tube_centreline
 from lungaccess.report.html.pack import Packed, pack
+from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -48,7 +48,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
         "profile": profile(plan, lung),
         "costs": {key: float(value) for key, value in plan.costs.items()},
         "objective": plan.objective,
-        "objective_words": objective_words(plan.objective),
+        "objective_words": Objective.of(plan.objective).words,
     }
 
 

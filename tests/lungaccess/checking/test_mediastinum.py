@@ -15,6 +15,7 @@ from lungaccess.coupled.search import AtlasSearch
 from lungaccess.plans.assemble import Task, assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target
+from stages.needle import SHORTEST
 
 AHEAD_MM = 15.0
 WANTED = 3
@@ -29,7 +30,7 @@ def plans_through(lung: Lung, branches: np.ndarray) -> list[Plan]:
         with contextlib.suppress(LungaccessError):
             point = entries.positions[entry] + AHEAD_MM * entries.tangents[entry]
             task = Task(
-                lung=lung, system=atlas.system, target=point_target(lung, point), objective="length_mm",
+                lung=lung, system=atlas.system, target=point_target(lung, point), objective=SHORTEST,
                 with_fissures=atlas.with_fissures, method="atlas", seed=0,
             )  # fmt: skip
             found = AtlasSearch(task, atlas).finished(entry)

@@ -12,6 +12,7 @@ from anatomy.lung import Lung
 from lungaccess.coupled.search import AtlasSearch
 from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.problem.target import point_target, require_free
+from stages.needle import Objective
 from stages.needle.space import direct_arcs
 
 AHEAD_MM = 25.0
@@ -31,7 +32,7 @@ def turned_candidates(lung: Lung, atlas: la.Atlas) -> Iterator[tuple[AtlasSearch
         except TargetError:
             continue
         task = Task(
-            lung=lung, system=atlas.system, target=target, objective="inverse_clearance",
+            lung=lung, system=atlas.system, target=target, objective=Objective(inverse_clearance=1.0),
             with_fissures=atlas.with_fissures, method="atlas", seed=0,
         )  # fmt: skip
         search, one = AtlasSearch(task, atlas), slice(int(entry), int(entry) + 1)

@@ -22,14 +22,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.phantom import Phantom, write_phantom
+from anatomy.suggestion import did_you_mean
 from lungaccess.cli import app as cli
 from lungaccess.cli import doctor, progress, records, terminal
 from lungaccess.cli.inputs import STEP_SHARES
-from lungaccess.plans.costs import require_objective
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.suggestion import did_you_mean
 from lungaccess.problem.system import load_system, preset_names
 from tests.lungaccess.loading import load_with
 
@@ -203,8 +203,8 @@ def test_what_was_meant_is_guessed(
 
 
 def test_objectives_of_the_library_are_guessed() -> None:
-    with pytest.raises(SettingsError, match="Did you mean 'cost_map'"):
-        require_objective("cost-map")
+    with pytest.raises(SettingsError, match="Did you mean 'cost-map'"):
+        la.Objective.of("cost-mpa")
     with pytest.raises(SettingsError) as caught:
         load_system("zzzz")
     assert "Did you mean" not in str(caught.value)

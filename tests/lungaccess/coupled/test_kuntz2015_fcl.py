@@ -28,6 +28,7 @@ from lungaccess.coupled.kuntz2015_fcl.tubes import TubeTrial, frame_at, line_bet
 from lungaccess.plans.assemble import Task
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
+from stages.needle import Objective
 from stages.needle.device import Needle
 from stages.scope.tips import MedialAxis
 from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
@@ -55,7 +56,7 @@ def task_for(atlas: la.Atlas, target: Target, seed: int = 1) -> Task:
         lung=atlas.lung,
         system=atlas.system,
         target=target,
-        objective="inverse_clearance",
+        objective=Objective(inverse_clearance=1.0),
         with_fissures=atlas.with_fissures,
         method="reference",
         seed=seed,

@@ -17,6 +17,7 @@ from lungaccess.coupled.search.local_search import Climber
 from lungaccess.plans.assemble import Task
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
+from stages.needle import Objective
 
 SYSTEM = override(la.load_system("ultrathin"), {"name": "own", "fissures_allowed": True})
 MOST = 200
@@ -31,7 +32,8 @@ def searches() -> list[AtlasSearch]:
         AtlasSearch(
             Task(
                 lung=lung, system=SYSTEM, target=point_target(lung, point),
-                objective="inverse_clearance", with_fissures=atlas.with_fissures, method="atlas", seed=seed,
+                objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
+                method="atlas", seed=seed,
             ),
             atlas,
         )

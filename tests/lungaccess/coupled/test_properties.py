@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN, VESSEL
-from lungaccess.plans.costs import OBJECTIVES
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target
+from stages.needle import TERMS
 from tests.lungaccess.resample import needle_walk, problems, put_vessel, tube_walk
 from tests.stages.scenes import lung_of
 
@@ -45,7 +45,7 @@ def some_plans(lung: Lung, atlas: la.Atlas, seed: int, **options: Any) -> list[P
 
 @given(
     seed=st.integers(0, 10**6),
-    objective=st.sampled_from(OBJECTIVES),
+    objective=st.sampled_from([term.key for term in TERMS]),
     iterations=st.sampled_from([0, 40]),
 )
 @ANY

@@ -14,6 +14,7 @@ from lungaccess.coupled.search import AtlasSearch
 from lungaccess.plans.assemble import Task, assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target, require_free
+from stages.needle import SHORTEST
 from stages.needle.space import direct_arcs
 
 SYSTEM = la.load_system("ultrathin")
@@ -35,7 +36,7 @@ def plans(small_lung: Lung) -> list[Plan]:
         except TargetError:
             continue
         task = Task(
-            lung=small_lung, system=SYSTEM, target=target, objective="length_mm",
+            lung=small_lung, system=SYSTEM, target=target, objective=SHORTEST,
             with_fissures=atlas.with_fissures, method="atlas", seed=0,
         )  # fmt: skip
         search = AtlasSearch(task, atlas)

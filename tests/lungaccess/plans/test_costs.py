@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import FISSURE, OUTSIDE, VESSEL
-from lungaccess.plans.costs import OBJECTIVES, obstacle_clearance_mm, path_cost, require_objective
+from lungaccess.plans.costs import obstacle_clearance_mm, path_cost, path_costs
 from stages.needle.device import Needle
 from stages.needle.path import ArcPath, estimated_inverse_clearance
 from stages.needle.space import needle_space
@@ -135,8 +134,11 @@ def test_without_a_cost_map_it_costs_nothing(lung: Lung, name: str) -> None:
     assert path_cost(lung, straight(20.0), name, with_fissures=False) == 0.0
 
 
-def test_objectives() -> None:
-    for name in OBJECTIVES:
-        require_objective(name)
-    with pytest.raises(SettingsError, match="inverse_clearance, cost_map, voxel_sum, length_mm"):
-        require_objective("length")
+@pytest.mark.parametrize("with_fissures", [False, True])
+def test_the_cost_under_an_objective_is_the_weighted_sum(lung: Lung, with_fissures: bool) -> None:
+    path = straight(20.0)
+    costs = path_costs(lung, path, with_fissures=with_fissures)
+    for name, cost in costs.items():
+        assert path_cost(lung, path, name, with_fissures=with_fissures) == cost
+    found = path_cost(lung, path, "inverse-clearance=2,length=0.5", with_fissures=with_fissures)
+    assert found == 2.0 * costs["inverse_clearance"] + 0.5 * 20.0

@@ -22,6 +22,7 @@ from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.geometry import Geometry
 from lungaccess.refinement.problem import Court, Problem
 from lungaccess.refinement.program import Program, program
+from stages.needle import SHORTEST, Objective
 from stages.needle.path import ArcPath, direct_path
 from stages.needle.space import direct_arcs, needle_space
 from stages.scope.sites import Sites, find_sites
@@ -52,7 +53,7 @@ def case(small_lung: Lung) -> Case:
         lung=lung,
         system=system,
         target=target,
-        objective="inverse_clearance",
+        objective=Objective(inverse_clearance=1.0),
         with_fissures=lung.has_fissures,
         method="atlas",
         seed=0,
@@ -127,7 +128,7 @@ class TestRefine:
         assert again.deployment.lps_from_tip.tobytes() == refined[0].deployment.lps_from_tip.tobytes()
 
     def test_length_is_reduced_under_its_own_objective(self, case: Case) -> None:
-        task, old = replace(case.task, objective="length_mm"), case.candidates[0]
+        task, old = replace(case.task, objective=SHORTEST), case.candidates[0]
         new = refine(task, case.sites, old, iterations=ITERATIONS)
         assert new is not None and new.path.length_mm < old.path.length_mm - 0.5
 
@@ -136,13 +137,13 @@ class TestRefine:
         share = np.linspace(0.2, 1.0, grid.shape[1], dtype=np.float32)
         values = np.asfortranarray(np.broadcast_to(share[None, :, None], grid.shape))
         lung = replace(case.task.lung, cost=Volume(grid=grid, array=values))
-        task, old = replace(case.task, lung=lung, objective="cost_map"), case.candidates[0]
+        task, old = replace(case.task, lung=lung, objective=Objective(cost_map=1.0)), case.candidates[0]
         new = refine(task, case.sites, old, iterations=ITERATIONS)
         assert new is not None
         assert Court(task).cost(new) < 0.99 * Court(task).cost(old)
 
     def test_without_a_map_nothing_is_cheaper_than_free(self, case: Case) -> None:
-        task = replace(case.task, objective="cost_map")
+        task = replace(case.task, objective=Objective(cost_map=1.0))
         assert refine(task, case.sites, case.candidates[0], iterations=ITERATIONS) is None
 
     def test_too_many_arcs_are_left_alone(self, case: Case) -> None:
@@ -152,7 +153,7 @@ class TestRefine:
 
 
 def set_up(case: Case) -> tuple[Problem, Program]:
-    problem = Problem(Court(case.task), case.sites, case.candidates[1])
+    problem = Problem(Court(case.task), case.sites, case.candidates[1], (1.0, 0.0, 0.0))
     return problem, program(problem.layout, ITERATIONS)
 
 

@@ -17,7 +17,7 @@ from anatomy.structures import VESSEL
 from anatomy.typed import Float32
 from stages.needle.device import Needle
 from stages.needle.kernels import cost as kernel
-from stages.needle.objective import NO_MAP, SHORTEST, Objective
+from stages.needle.objective import NO_MAP, SHORTEST, TERMS, Objective, Term
 from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 
@@ -53,6 +53,70 @@ def test_a_weight_is_a_finite_number_of_0_or_more(name: str, weight: float) -> N
 def test_an_objective_weighs_something() -> None:
     with pytest.raises(SettingsError, match="one of them more than 0"):
         Objective()
+
+
+@pytest.mark.parametrize("term", TERMS, ids=lambda term: term.key)
+def test_a_single_cost_is_named_by_its_key(term: Term) -> None:
+    for name in (term.key, term.option, term.weight, f"{term.option} = 1"):
+        objective = Objective.of(name)
+        assert objective == Objective(**{term.weight: 1.0})
+        assert str(objective) == term.key
+        assert objective.words == term.words_with_unit
+
+
+def test_every_weight_has_a_cost() -> None:
+    assert sorted(term.weight for term in TERMS) == sorted(NAMES)
+
+
+def test_a_sum_is_written_with_its_weights() -> None:
+    objective = Objective.of("length=1,cost-map=0.5")
+    assert objective == Objective(length=1.0, cost_map=0.5)
+    assert str(objective) == "cost_map=0.5,length_mm=1"
+    assert objective.words == "weighted sum 0.5 cost-map + 1 length"
+    assert Objective.of(objective) is objective
+
+
+@given(
+    st.lists(st.just(0.0) | st.floats(0.0, 1e9, allow_subnormal=False), min_size=4, max_size=4).filter(any)
+)
+def test_a_text_restores_every_weight(weights: list[float]) -> None:
+    objective = Objective(**dict(zip(NAMES, weights, strict=True)))
+    assert Objective.of(str(objective)) == objective
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("lenght", "Did you mean 'length'"),
+        ("beauty", "a weighted sum such as length=1,cost-map=0.5"),
+        ("", "There is no objective ''"),
+        ("length=1,,cost-map=1", "There is no objective ''"),
+        ("length,length_mm=2", "names length_mm twice"),
+        ("length=much", "'much' in the objective 'length=much' is not a number"),
+        ("length=", "is not a number"),
+        ("length=-1", "weights of 0 or more"),
+        ("length=inf", "weights of 0 or more"),
+        ("length=0", "one of them more than 0"),
+    ],
+)
+def test_a_wrong_text_is_explained(text: str, said: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        Objective.of(text)
+    assert said in str(caught.value)
+
+
+def test_the_total_is_the_weighted_sum() -> None:
+    costs = {"inverse_clearance": 2.0, "cost_map": math.inf, "voxel_sum": 7.0, "length_mm": 30.0}
+    assert Objective(inverse_clearance=3.0, length=0.5).total(costs) == 21.0
+    assert Objective(cost_map=1.0).total(costs) == math.inf
+    stated = Objective(inverse_clearance=3.0, length=0.5).stated(costs)
+    assert stated == {**costs, "inverse_clearance=3,length_mm=0.5": 21.0}
+    assert SHORTEST.stated(costs) == costs
+
+
+def test_without_a_map_only_the_other_costs_are_weighed() -> None:
+    assert Objective(cost_map=1.0, voxel_sum=2.0).without_map == SHORTEST
+    assert Objective(cost_map=1.0, length=2.0).without_map == Objective(length=2.0)
 
 
 @pytest.mark.parametrize("name", ["cost_map", "voxel_sum"])

@@ -8,11 +8,11 @@ from anatomy.grid import Grid
 from anatomy.structures import VESSEL
 from benchmarks.fresh import FreshProcess
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.search.base import Query, RestartingRRT
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
-from stages.needle.space import NeedleSpace, space_of_labels
 
 RADIUS_MM = 60.0
 SIDE = 96
@@ -23,16 +23,16 @@ from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
 from stages.needle.search.base import RestartingRRT
-space = scene(0)
+environment = scene(0)
 for kind in (RestartingRRT, OptimalSearch, ResolutionSearch):
-    kind(space, query()).advance(500)
-proof = NoPathProof(space, query())
+    kind(environment, query()).advance(500)
+proof = NoPathProof(environment, query())
 for _ in range(4):
     proof.advance()
 """
 
 
-def scene(seed: int, balls: int = BALLS) -> NeedleSpace:
+def scene(seed: int, balls: int = BALLS) -> NeedleEnvironment:
     """Return a cube of tissue with balls of vessel, none at start and target."""
     rng = np.random.default_rng(seed)
     labels = np.zeros((SIDE, SIDE, SIDE), dtype=np.uint16, order="F")
@@ -43,7 +43,7 @@ def scene(seed: int, balls: int = BALLS) -> NeedleSpace:
         labels[((index - (SIDE / 2, SIDE / 2, end)) ** 2).sum(axis=-1) < 8**2] = 0
     grid = Grid.from_spacing(labels.shape, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1.0 / RADIUS_MM)
-    return space_of_labels(labels, grid, needle, required_clearance_mm=0.5)
+    return environment_of_labels(labels, grid, needle, required_clearance_mm=0.5)
 
 
 def query() -> Query:
@@ -67,8 +67,8 @@ class Searches:
 
     def time_first_paths(self) -> None:
         """The RRT's first path in eight scenes, at most 20,000 iterations each."""
-        for space in self.scenes:
-            RestartingRRT(space, self.query).advance(20_000)
+        for environment in self.scenes:
+            RestartingRRT(environment, self.query).advance(20_000)
 
     def time_refine(self) -> None:
         """20,000 iterations of the optimal search."""

@@ -14,7 +14,7 @@ from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from anatomy.store import open_lung
 from lungaccess.problem.target import point_target
-from stages.needle.space import needle_space, workspace_lengths
+from stages.needle.environment import needle_environment, workspace_lengths
 
 SYSTEM = "ultrathin"
 SEED = 3
@@ -71,7 +71,7 @@ class Planning:
         self.atlas = la.build_atlas(self.lung, self.system)
         self.target = point_target(self.lung, np.array(target))
         self.found = next(self._plans())
-        self.space = needle_space(
+        self.environment = needle_environment(
             self.lung, self.system.needle, self.system.margins, with_fissures=self.atlas.with_fissures
         )
 
@@ -98,7 +98,7 @@ class Planning:
     def time_workspace_scan(self, target: list[float]) -> None:
         """Test every deployment for the target."""
         entries = self.atlas.deployments
-        workspace_lengths(self.space, entries.positions, entries.tangents, self.target.lps_mm)
+        workspace_lengths(self.environment, entries.positions, entries.tangents, self.target.lps_mm)
 
     def time_check(self, target: list[float]) -> None:
         """Judge a plan."""

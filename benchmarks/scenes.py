@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from anatomy.patient import PatientImages
     from lungaccess.coupled.atlas import Atlas
     from lungaccess.coupled.search import AtlasSearch
-    from stages.needle.space import NeedleSpace
+    from stages.needle.environment import NeedleEnvironment
     from stages.scope.tour.subtree import Subtree
     from stages.tube.mechanics import TubeMechanics
 
@@ -140,14 +140,16 @@ def index_targets() -> Float:
     return peripheral_targets(_small_atlas()[0], INDEX_TARGETS // 2, 0)
 
 
-def free_space() -> NeedleSpace:
-    """Return a space without obstacles for the needle of the default system."""
+def free_environment() -> NeedleEnvironment:
+    """Return an environment without obstacles for the needle of the default system."""
     import lungaccess as la
-    from stages.needle.space import space_of_labels
+    from stages.needle.environment import environment_of_labels
 
     labels = np.zeros((8, 8, 8), dtype=np.uint16, order="F")
     grid = Grid.from_spacing(labels.shape, (BOX_MM / 8,) * 3, (0.0, 0.0, 0.0))
-    return space_of_labels(labels, grid, la.load_system("lung-default").needle, required_clearance_mm=1.0)
+    return environment_of_labels(
+        labels, grid, la.load_system("lung-default").needle, required_clearance_mm=1.0
+    )
 
 
 def mechanics(count: int) -> TubeMechanics:

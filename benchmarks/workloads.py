@@ -116,9 +116,9 @@ def _build_index(entries: int) -> Work:
 def _query_index(entries: int) -> Work:
     from stages.needle.start_index import StartIndex
 
-    space, targets = scenes.free_space(), scenes.index_targets()
+    environment, targets = scenes.free_environment(), scenes.index_targets()
     index = StartIndex(*scenes.starts(entries))
-    return lambda: [index.holding(space, target) for target in targets]
+    return lambda: [index.holding(environment, target) for target in targets]
 
 
 def _tubes(tubes: int) -> Work:

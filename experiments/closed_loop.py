@@ -35,11 +35,11 @@ from experiments.support.results import (
 )
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
+from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform
 from stages.needle.replanning.replanner import ITERATIONS, Replanner, ReplanSettings, with_reserve
 from stages.needle.search.base import Query, RestartingRRT
-from stages.needle.space import NeedleSpace, needle_space
 
 OBJECTIVE = Objective(inverse_clearance=1.0)
 PLANNING_ITERATIONS = 3000
@@ -80,7 +80,9 @@ class Case:
     plans: dict[float, ArcPath]
 
 
-def cases_of(lung: Lung, system: la.System, space: NeedleSpace, count: int, seed: int) -> list[Case]:
+def cases_of(
+    lung: Lung, system: la.System, environment: NeedleEnvironment, count: int, seed: int
+) -> list[Case]:
     """Plan to random targets until `count` have a needle plan with every reserve."""
     curvature = (1.0 - max(RESERVES)) * system.needle.max_curvature_per_mm
     needle = replace(system.needle, max_curvature_per_mm=curvature)
@@ -96,7 +98,7 @@ def cases_of(lung: Lung, system: la.System, space: NeedleSpace, count: int, seed
             continue
         start = found.needle.lps_from_start
         query = Query(lps_from_start=start, target=point, branch=found.exemption.branch)
-        plans = {reserve: needle_plan(with_reserve(space, reserve), query) for reserve in RESERVES}
+        plans = {reserve: needle_plan(with_reserve(environment, reserve), query) for reserve in RESERVES}
         if all(plan is not None for plan in plans.values()):
             cases.append(Case(query=query, plans={r: p for r, p in plans.items() if p is not None}))
         if len(cases) == count:
@@ -104,9 +106,9 @@ def cases_of(lung: Lung, system: la.System, space: NeedleSpace, count: int, seed
     return cases
 
 
-def needle_plan(space: NeedleSpace, query: Query) -> ArcPath | None:
+def needle_plan(environment: NeedleEnvironment, query: Query) -> ArcPath | None:
     """Return the best path of a fixed number of iterations."""
-    search = RestartingRRT(space, query, objective=OBJECTIVE)
+    search = RestartingRRT(environment, query, objective=OBJECTIVE)
     for _ in range(100):
         if search.iterations >= PLANNING_ITERATIONS:
             break
@@ -114,11 +116,13 @@ def needle_plan(space: NeedleSpace, query: Query) -> ArcPath | None:
     return search.path
 
 
-def inserted(space: NeedleSpace, cases: Sequence[Case], errors: Errors, reserve: float, runs: int) -> Study:
+def inserted(
+    environment: NeedleEnvironment, cases: Sequence[Case], errors: Errors, reserve: float, runs: int
+) -> Study:
     """Insert needles to all targets."""
     studies = [
         study(
-            space, case.query, case.plans[reserve], errors, seeds=range(runs * n, runs * (n + 1)),
+            environment, case.query, case.plans[reserve], errors, seeds=range(runs * n, runs * (n + 1)),
             objective=OBJECTIVE, replanning=ReplanSettings(curvature_reserve=reserve),
         )
         for n, case in enumerate(cases)
@@ -150,7 +154,7 @@ def _note(found: Summary) -> str:
     )
 
 
-def replan_times_ms(space: NeedleSpace, cases: Sequence[Case], poses: int, seed: int) -> Float:
+def replan_times_ms(environment: NeedleEnvironment, cases: Sequence[Case], poses: int, seed: int) -> Float:
     """Return the CPU time of replans from poses beside the plans, the first of each kind left out.
 
     Each pose is off the plan by 0.5 mm in each coordinate and by 1 degree about two axes, the target by
@@ -166,7 +170,7 @@ def replan_times_ms(space: NeedleSpace, cases: Sequence[Case], poses: int, seed:
         tip[:3, 3] += rng.normal(0.0, 0.5, 3)
         target = case.query.target + rng.normal(0.0, 0.5, 3)
         replanner = Replanner(
-            space, case.query, plan, objective=OBJECTIVE, seed=number + 20,
+            environment, case.query, plan, objective=OBJECTIVE, seed=number + 20,
             settings=ReplanSettings(curvature_reserve=RESERVE),
         )  # fmt: skip
         began = time.process_time()
@@ -197,14 +201,16 @@ def add_replans(result: Result, times_ms: Float) -> None:
     )  # fmt: skip
 
 
-def insert_all(result: Result, space: NeedleSpace, cases: list[Case], runs: int) -> dict[str, Study]:
+def insert_all(
+    result: Result, environment: NeedleEnvironment, cases: list[Case], runs: int
+) -> dict[str, Study]:
     """Add the rows by size of the errors and by reserve; return the studies of all sizes above 0."""
     by_level = {}
     for name, size in LEVELS.items():
-        by_level[name] = inserted(space, cases, errors_of_size(size), RESERVE, runs)
+        by_level[name] = inserted(environment, cases, errors_of_size(size), RESERVE, runs)
         add_study(result, f"{name} errors", by_level[name])
     for reserve in RESERVES:
-        made = inserted(space, cases, WEAK, reserve, runs)
+        made = inserted(environment, cases, WEAK, reserve, runs)
         add_study(result, f"needle that bends 15 % too little, reserve {reserve:g}", made)
     return {name: made for name, made in by_level.items() if LEVELS[name] > 0.0}
 
@@ -223,8 +229,8 @@ def main() -> None:
     lung = anatomy(options.patient)
     system = la.load_system(options.system or SYSTEMS.get(options.patient, "lung-default"))
     fissures = lung.has_fissures and not system.fissures_allowed
-    space = needle_space(lung, system.needle, system.margins, with_fissures=fissures)
-    cases = cases_of(lung, system, space, n_targets, options.seed)
+    environment = needle_environment(lung, system.needle, system.margins, with_fissures=fissures)
+    cases = cases_of(lung, system, environment, n_targets, options.seed)
     if not cases:
         raise TargetError(
             f"{lung.name}: no target was found that the needle can be planned to with every reserve",
@@ -238,10 +244,10 @@ def main() -> None:
         "errors": "full: curvature 8 % constant and 5 % along the way, roll 5 degrees and 10 degrees of "
         "walk, tracker 0.4 mm and 0.6 degrees, target drift 2 mm and walk 1 mm; an assumption, not measured",
     }
-    by_level = insert_all(result, space, cases, runs)
-    add_replans(result, replan_times_ms(space, cases, poses, options.seed))
+    by_level = insert_all(result, environment, cases, runs)
+    add_replans(result, replan_times_ms(environment, cases, poses, options.seed))
     longest = cases[int(np.argmax(lengths))]
-    at_target = inserted(space, [longest], errors_of_size(1.0), RESERVE, min(runs, DRAWN_RUNS))
+    at_target = inserted(environment, [longest], errors_of_size(1.0), RESERVE, min(runs, DRAWN_RUNS))
     result.figure = draw_insertions(lung, longest.query, longest.plans[RESERVE], at_target, by_level)
     write_result(result, options.results)
 

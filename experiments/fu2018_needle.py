@@ -89,18 +89,20 @@ def add_others(
     note += f"quartiles {low:+.0f} and {high:+.0f} %; "
     note += f"at least 50 % less in {100 * np.mean(changes <= PAPER_CHANGE):.0f} % of them"
     result.add("cost on the map against shortest path, median", float(middle), PAPER_CHANGE, "%", note)
-    ours = proofs(case.space, [path for group in results.values() for run in group for path in run.paths])
+    ours = proofs(
+        case.environment, [path for group in results.values() for run in group for path in run.paths]
+    )
     result.add(
         "paths of all runs that the proof refutes",
         ours.refuted,
         note=f"of {ours.paths}, least distance {ours.least_mm:.2f} mm",
     )
     theirs = paper_mode(case, scenarios, result.seeds)
-    step = largest_step_mm(case.space.grid.spacing_mm, case.space.required_clearance_mm)
+    step = largest_step_mm(case.environment.grid.spacing_mm, case.environment.required_clearance_mm)
     note = "no search found a path; "
     if theirs.paths:
         note = f"of {theirs.paths}, least distance {theirs.least_mm:.2f} mm "
-        note += f"where {case.space.required_clearance_mm:g} mm is asked; "
+        note += f"where {case.environment.required_clearance_mm:g} mm is asked; "
     note += f"lookups every {step:.3f} mm, {PAPER_MODE_ITERATIONS} iterations a run"
     refuted = theirs.refuted if theirs.paths else None
     result.add("paths of the paper's inflation that the proof refutes", refuted, note=note)
@@ -111,7 +113,7 @@ def study(result: Result, name: str, work: Path, numbers: dict[str, float]) -> N
     case = case_of(name, work, result.seeds[0])
     runs, limit_s, problems = int(numbers["runs"]), numbers["limit_s"], int(numbers["problems"])
     result.conditions |= {
-        "CT": f"{case.name}, {case.space.grid.describe()}",
+        "CT": f"{case.name}, {case.environment.grid.describe()}",
         "needle": f"{NEEDLE.diameter_mm:g} mm, margin {SAFETY_MM:g} mm, curvature 1/121 mm",
         "time": f"{runs} runs of {limit_s:g} s of CPU for each scenario and objective, one core",
     }

@@ -65,7 +65,7 @@ Rows = list[dict[str, Any]]
 
 
 def problems(query_set: str, every: int, seed: int) -> Iterator[Problem]:
-    """Make the space of each query, one patient in memory at a time."""
+    """Make the environment of each query, one patient in memory at a time."""
     if data_folder() is None:
         images = make_phantom(seed=3, size="small").images
         obstacles = obstacles_of(images)
@@ -82,16 +82,16 @@ def problems(query_set: str, every: int, seed: int) -> Iterator[Problem]:
 
 
 def _problem(obstacles: Obstacles, query: Query) -> Problem:
-    space = obstacles.space(query)
-    return query, space, Judge(space, query)
+    environment = obstacles.environment(query)
+    return query, environment, Judge(environment, query)
 
 
 def run_all_planners(found: Problem, numbers: dict[str, Any], seed: int) -> dict[str, Any]:
     """Run all planners on one query, and decide it."""
-    query, space, judge = found
+    query, environment, judge = found
     runs = {
         name: [
-            run(PLANNERS[name], space, query, each, numbers["time_s"], judge)
+            run(PLANNERS[name], environment, query, each, numbers["time_s"], judge)
             for each in range(seed, seed + (1 if name == "resolution" else numbers["seeds"]))
         ]
         for name in NAMES
@@ -100,7 +100,7 @@ def run_all_planners(found: Problem, numbers: dict[str, Any], seed: int) -> dict
         "query": query,
         "solved": any(each["first_s"] is not None for of_name in runs.values() for each in of_name),
         "runs": runs,
-        "decision": decide(space, query, seed, numbers["decide_s"], judge),
+        "decision": decide(environment, query, seed, numbers["decide_s"], judge),
     }
 
 

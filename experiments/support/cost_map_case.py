@@ -18,7 +18,7 @@ from anatomy.tree import tree_from_mask
 from anatomy.typed import Float
 from experiments.support.results import PHANTOM, require_data
 from stages.needle.device import Needle
-from stages.needle.space import NeedleSpace, space_of_labels
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 
 NEEDLE = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 121)
 SAFETY_MM = 0.4
@@ -36,7 +36,7 @@ class Case:
     Parameters
     ----------
     name : str
-    space : NeedleSpace
+    environment : NeedleEnvironment
         Its cost map is that of [Fu2018]: vesselness, infinite in obstacles.
     intensity : Volume
         The CT as a map: HU + 1024, infinite in obstacles.
@@ -45,16 +45,16 @@ class Case:
     """
 
     name: str
-    space: NeedleSpace
+    environment: NeedleEnvironment
     intensity: Volume
     inner_lps: Float
 
     @property
     def costs(self) -> Volume:
         """The cost map."""
-        if self.space.cost_map is None:
-            raise TypeError("The space of a case always has a cost map")
-        return self.space.cost_map
+        if self.environment.cost_map is None:
+            raise TypeError("The environment of a case always has a cost map")
+        return self.environment.cost_map
 
 
 def case_of(name: str, work: Path, seed: int) -> Case:
@@ -95,8 +95,12 @@ def case_of(name: str, work: Path, seed: int) -> Case:
         for values in (parts.cost[box], raw)
     )
     clearance_mm = NEEDLE.radius_mm + SAFETY_MM
-    space = space_of_labels(labels, grid, NEEDLE, required_clearance_mm=clearance_mm, cost_map=costs)
-    return Case(name=title, space=space, intensity=intensity, inner_lps=inner[grid.contains(inner)])
+    environment = environment_of_labels(
+        labels, grid, NEEDLE, required_clearance_mm=clearance_mm, cost_map=costs
+    )
+    return Case(
+        name=title, environment=environment, intensity=intensity, inner_lps=inner[grid.contains(inner)]
+    )
 
 
 def _input_of(name: str, seed: int) -> tuple[str, Volume, Given]:

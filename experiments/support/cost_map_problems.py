@@ -15,10 +15,10 @@ from anatomy.typed import Float
 from experiments.support.cost_map_case import Case
 from experiments.support.inflation import refuting_labels
 from stages.needle.costs import voxel_sum
+from stages.needle.environment import NeedleEnvironment, direct_arcs, workspace_lengths
 from stages.needle.objective import SHORTEST
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query, RestartingRRT
-from stages.needle.space import NeedleSpace, direct_arcs, workspace_lengths
 
 EXIT_MM = (5.0, 9.0)
 MAX_EXIT_ANGLE_DEG = 60.0
@@ -56,14 +56,14 @@ def candidates(case: Case, rng: np.random.Generator) -> Iterator[Query]:
     Both are as clear of obstacles as the needle must be, the goal lies in the needle's workspace and
     5 mm or more below the pleura, and no single arc leads to it.
     """
-    space, inner = case.space, case.inner_lps
-    lung = np.asfortranarray((space.arrays[1] & OUTSIDE) == 0)
-    depth = edt.edt(lung, anisotropy=tuple(space.grid.spacing_mm), order="F")
+    environment, inner = case.environment, case.inner_lps
+    lung = np.asfortranarray((environment.obstacles[1] & OUTSIDE) == 0)
+    depth = edt.edt(lung, anisotropy=tuple(environment.grid.spacing_mm), order="F")
     tissue = np.argwhere(depth > PLEURA_MM)
     while True:
         way = unit(rng.normal(size=3))
         start = inner[rng.integers(len(inner))] + rng.uniform(*EXIT_MM) * way
-        goal = space.grid.lps(tissue[rng.integers(len(tissue))] + rng.uniform(-0.5, 0.5, 3))
+        goal = environment.grid.lps(tissue[rng.integers(len(tissue))] + rng.uniform(-0.5, 0.5, 3))
         ahead = goal - start
         distance = float(np.linalg.norm(ahead))
         tangent = unit(way + rng.normal(scale=0.3, size=3))
@@ -73,7 +73,7 @@ def candidates(case: Case, rng: np.random.Generator) -> Iterator[Query]:
         ):
             continue
         query = Query(lps_from_start=_pose(start, tangent), target=goal)
-        if _is_problem(space, query):
+        if _is_problem(environment, query):
             yield query
 
 
@@ -90,17 +90,17 @@ def _pose(position: Float, tangent: Float) -> Float:
     return pose
 
 
-def _is_problem(space: NeedleSpace, query: Query) -> bool:
+def _is_problem(environment: NeedleEnvironment, query: Query) -> bool:
     """Tell whether both ends are clear, the goal is in the workspace and no single arc leads there."""
     place, tangent = query.lps_from_start[None, :3, 3], query.lps_from_start[None, :3, 2]
-    if not np.isfinite(workspace_lengths(space, place, tangent, query.target)[0]):
+    if not np.isfinite(workspace_lengths(environment, place, tangent, query.target)[0]):
         return False
     here = [
         ArcPath(lps_from_start=_pose(p, tangent[0]), arcs=np.zeros((1, 3))) for p in (place[0], query.target)
     ]
-    if refuting_labels(space, here).any():
+    if refuting_labels(environment, here).any():
         return False
-    return bool(direct_arcs(space, place, tangent, np.array([-1]), query.target)[0][0] != 0)
+    return bool(direct_arcs(environment, place, tangent, np.array([-1]), query.target)[0][0] != 0)
 
 
 def choose_scenarios(case: Case, seed: int) -> list[Scenario]:
@@ -114,7 +114,7 @@ def choose_scenarios(case: Case, seed: int) -> list[Scenario]:
     for query in islice(candidates(case, np.random.default_rng(seed)), MOST_CANDIDATES):
         paths = []
         for n in range(TRIES):
-            search = RestartingRRT(case.space, query, seed=n + 1, objective=SHORTEST)
+            search = RestartingRRT(case.environment, query, seed=n + 1, objective=SHORTEST)
             if search.advance(TRY_ITERATIONS) and search.path is not None:
                 paths.append(search.path)
         share = len(paths) / TRIES

@@ -13,13 +13,13 @@ from anatomy.grid import Volume
 from anatomy.typed import Float
 from experiments.support.cost_map_case import Case
 from experiments.support.cost_map_problems import LEAST_COST, TRIES, TRY_ITERATIONS, Scenario, candidates
-from experiments.support.inflation import inflated_space, refuting_labels
+from experiments.support.inflation import inflated_environment, refuting_labels
 from stages.needle.costs import map_integral, obstacle_clearance_mm, voxel_sum
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query, RestartingRRT
 from stages.needle.search.portfolio import PortfolioSearch
-from stages.needle.space import NeedleSpace
 
 SLICE_ITERATIONS = 100
 WARM_ITERATIONS = 10_000
@@ -47,10 +47,15 @@ class Run:
 
 
 def run(
-    space: NeedleSpace, costs: Volume, query: Query, objective: Objective, seed: int, limit_s: float
+    environment: NeedleEnvironment,
+    costs: Volume,
+    query: Query,
+    objective: Objective,
+    seed: int,
+    limit_s: float,
 ) -> Run:
     """Search for `limit_s` seconds of processor time; judge the paths afterwards by `costs`."""
-    search = PortfolioSearch(space, query, seed=seed, objective=objective)
+    search = PortfolioSearch(environment, query, seed=seed, objective=objective)
     times, paths = [], []
     began = time.process_time()
     while time.process_time() - began < limit_s:
@@ -70,10 +75,10 @@ def run_all(
     case: Case, scenario: Scenario, seeds: list[int], limit_s: float
 ) -> dict[tuple[str, str], list[Run]]:
     """Return the runs of a scenario by its name and each objective, one a seed."""
-    on_intensity = replace(case.space, cost_map=case.intensity)
+    on_intensity = replace(case.environment, cost_map=case.intensity)
     searched = {
-        COST_MAP: (case.space, Objective(voxel_sum=1.0)),
-        SHORTEST_PATH: (case.space, SHORTEST),
+        COST_MAP: (case.environment, Objective(voxel_sum=1.0)),
+        SHORTEST_PATH: (case.environment, SHORTEST),
         INTENSITY: (on_intensity, Objective(voxel_sum=1.0)),
     }
     for where, objective in searched.values():
@@ -99,10 +104,10 @@ def changes_of_cost(case: Case, seed: int, count: int, limit_s: float) -> Float:
     for query in candidates(case, np.random.default_rng([seed, 1])):
         if len(changes) == count:
             break
-        if not RestartingRRT(case.space, query).advance(TRIES * TRY_ITERATIONS):
+        if not RestartingRRT(case.environment, query).advance(TRIES * TRY_ITERATIONS):
             continue
         shortest, mapped = (
-            run(case.space, case.costs, query, objective, seed, limit_s)
+            run(case.environment, case.costs, query, objective, seed, limit_s)
             for objective in (SHORTEST, Objective(voxel_sum=1.0))
         )
         if shortest.paths and mapped.paths and shortest.sums[-1] >= LEAST_COST:
@@ -130,17 +135,19 @@ class Proofs:
 
 def paper_mode(case: Case, scenarios: list[Scenario], seeds: list[int]) -> Proofs:
     """Plan with the paper's inflated obstacles and lookups, and put every path to the proof."""
-    inflated, paths = inflated_space(case.space), []
+    inflated, paths = inflated_environment(case.environment), []
     for scenario, seed in product(scenarios, seeds):
         search = RestartingRRT(inflated, scenario.query, seed=seed, objective=SHORTEST)
         while (left := PAPER_MODE_ITERATIONS - search.iterations) > 0:
             if search.advance(left) and search.path is not None:
                 paths.append(search.path)
-    return proofs(case.space, paths)
+    return proofs(case.environment, paths)
 
 
-def proofs(space: NeedleSpace, paths: list[ArcPath]) -> Proofs:
+def proofs(environment: NeedleEnvironment, paths: list[ArcPath]) -> Proofs:
     """Put paths to the proof, and measure their distance from obstacles at samples of 0.05 mm."""
-    refuted = int(np.count_nonzero(refuting_labels(space, paths))) if paths else 0
-    least = [float(obstacle_clearance_mm(space.arrays, path.sample(0.05)[0]).min()) for path in paths]
+    refuted = int(np.count_nonzero(refuting_labels(environment, paths))) if paths else 0
+    least = [
+        float(obstacle_clearance_mm(environment.obstacles, path.sample(0.05)[0]).min()) for path in paths
+    ]
     return Proofs(paths=len(paths), refuted=refuted, least_mm=min(least, default=math.inf))

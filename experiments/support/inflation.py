@@ -2,8 +2,8 @@
 
 It is here to be compared with the clearance field, and proves nothing.  The paper calls the lookup
 conservative if steps are no longer than `largest_step_mm`.  It is not: the bound takes the tip for the centre
-of its voxel, and the ellipsoid of voxels for the ball it stands for.  Paths found in a space of this mode
-are never called proved; `refuting_labels` puts them to the proof.
+of its voxel, and the ellipsoid of voxels for the ball it stands for.  Paths found in an environment of this
+mode are never called proved; `refuting_labels` puts them to the proof.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from anatomy.grid import Volume, read_only
 from anatomy.inflation import grown_by_voxels, inflation_voxels
 from anatomy.structures import OUTSIDE
 from anatomy.typed import Int
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.path import ArcPath, blocker_on_path
-from stages.needle.space import NeedleSpace
 
 LEAST_STEP_MM = 1e-3
 """Shorter steps are no steps."""
@@ -50,8 +50,8 @@ def largest_step_mm(spacing_mm: ArrayLike, total_radius_mm: float) -> float:
     return step
 
 
-def inflated_space(space: NeedleSpace) -> NeedleSpace:
-    """Return the same space in the paper's mode: obstacles grown, and looked up at the ends of steps.
+def inflated_environment(environment: NeedleEnvironment) -> NeedleEnvironment:
+    """Return the same environment in the paper's mode: obstacles grown, and looked up at the ends of steps.
 
     Each structure that is an obstacle, and the voxels of infinite cost (as OUTSIDE), grow by an ellipsoid of
     `inflation_voxels`; grown voxels have infinite cost.  The kernels then look up voxels at steps of at most
@@ -59,11 +59,11 @@ def inflated_space(space: NeedleSpace) -> NeedleSpace:
     exist in the paper: a start in a grown voxel has no path.  Clearance, where an objective weighs it, is
     still that to the obstacles as they were.
 
-    No path of this space is proved clear, whatever the searches say of theirs: see `refuting_labels`.
+    No path of this environment is proved clear, whatever the searches say of theirs: see `refuting_labels`.
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
         Its `required_clearance_mm` is the paper's `r_total`.
 
     Raises
@@ -71,33 +71,36 @@ def inflated_space(space: NeedleSpace) -> NeedleSpace:
     SettingsError
         If the step bound is 0.
     """
-    field, labels, geometry, bits = space.arrays
-    step = largest_step_mm(space.grid.spacing_mm, space.required_clearance_mm)
-    axes = inflation_voxels(space.grid.spacing_mm, space.required_clearance_mm)
-    grown = np.zeros(space.grid.shape, dtype=np.uint16, order="F")
+    field, labels, geometry, bits = environment.obstacles
+    step = largest_step_mm(environment.grid.spacing_mm, environment.required_clearance_mm)
+    axes = inflation_voxels(environment.grid.spacing_mm, environment.required_clearance_mm)
+    grown = np.zeros(environment.grid.shape, dtype=np.uint16, order="F")
     for bit in (1 << n for n in range(16) if bits >> n & 1):
         grown |= np.where(grown_by_voxels((labels & bit) != 0, axes), np.uint16(bit), np.uint16(0))
-    costs = space.cost_map
+    costs = environment.cost_map
     if costs is not None:
         barred = grown_by_voxels(np.isposinf(costs.array), axes)
         grown |= np.where(barred & (grown == 0), np.uint16(OUTSIDE), np.uint16(0))
         bits |= OUTSIDE if barred.any() else 0
         values = np.where(grown != 0, np.float32(math.inf), costs.array)
         costs = Volume(grid=costs.grid, array=np.asfortranarray(values, dtype=np.float32))
-    limits = space.limits.copy()
+    limits = environment.limits.copy()
     limits[index.LOOKUP_STEP] = step
     limits[index.MAX_STEP] = min(step, limits[index.MAX_STEP])
     return replace(
-        space, arrays=(field, read_only(grown), geometry, bits), limits=read_only(limits), cost_map=costs
+        environment,
+        obstacles=(field, read_only(grown), geometry, bits),
+        limits=read_only(limits),
+        cost_map=costs,
     )
 
 
-def refuting_labels(space: NeedleSpace, paths: Iterable[ArcPath], branch: int = -1) -> Int:
+def refuting_labels(environment: NeedleEnvironment, paths: Iterable[ArcPath], branch: int = -1) -> Int:
     """Put paths to the proof: return `(P,)` 0 where a path is clear, else the label of what is too near.
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
         That from which the inflated one was made.
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
@@ -105,11 +108,11 @@ def refuting_labels(space: NeedleSpace, paths: Iterable[ArcPath], branch: int = 
     Raises
     ------
     SettingsError
-        If the space is itself of the paper's mode.
+        If the environment is itself of the paper's mode.
     """
-    if space.limits[index.LOOKUP_STEP] > 0.0:
+    if environment.limits[index.LOOKUP_STEP] > 0.0:
         raise SettingsError(
-            "Paths cannot be proved in a space of inflated obstacles",
-            expected="the space from which it was made",
+            "Paths cannot be proved in an environment of inflated obstacles",
+            expected="the environment from which it was made",
         )
-    return np.array([blocker_on_path(space, path, branch) for path in paths], dtype=np.int64)
+    return np.array([blocker_on_path(environment, path, branch) for path in paths], dtype=np.int64)

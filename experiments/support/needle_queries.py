@@ -26,8 +26,8 @@ from anatomy.patient import PatientImages
 from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
 from anatomy.typed import Float, Labels
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.path import ArcPath
-from stages.needle.space import NeedleSpace, space_of_labels
 
 NEEDLE_DIAMETER_MM = 2.0
 GOAL_TOLERANCE_MM = 1.0
@@ -77,8 +77,8 @@ class Obstacles:
         """Radius and half a voxel diagonal."""
         return 0.5 * NEEDLE_DIAMETER_MM + 0.5 * float(np.linalg.norm(self.grid.spacing_mm))
 
-    def space(self, query: Query) -> NeedleSpace:
-        """Return the needle's space: the labels in a box about start and target, less the exempt ball."""
+    def environment(self, query: Query) -> NeedleEnvironment:
+        """Return the labels in a box about start and target, less the exempt ball, as an environment."""
         ends = np.stack([query.lps_from_start[:3, 3], query.target_lps])
         border = BORDER_MM + 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
         corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
@@ -91,7 +91,7 @@ class Obstacles:
             centres = grid.lps(np.argwhere(labels & OBSTACLES).astype(float))
             near = np.linalg.norm(centres - ends[0], axis=1) <= query.exempt_mm
             labels[tuple(np.argwhere(labels & OBSTACLES)[near].T)] = 0
-        return space_of_labels(
+        return environment_of_labels(
             labels,
             grid,
             query.needle,
@@ -211,12 +211,12 @@ class Judge:
     It shares nothing with the planners but the path's own numbers.
     """
 
-    def __init__(self, space: NeedleSpace, query: Query) -> None:
+    def __init__(self, environment: NeedleEnvironment, query: Query) -> None:
         # From outside an obstacle, the nearest of its voxels has a free neighbour.
-        self._solid = (space.arrays[1] & OBSTACLES) != 0
+        self._solid = (environment.obstacles[1] & OBSTACLES) != 0
         surface = self._solid & ~binary_erosion(self._solid, border_value=1)
-        self._tree = cKDTree(space.grid.lps(np.argwhere(surface).astype(float)))
-        self._space = space
+        self._tree = cKDTree(environment.grid.lps(np.argwhere(surface).astype(float)))
+        self._environment = environment
         self._query = query
 
     def faults(self, path: ArcPath) -> list[str]:
@@ -224,13 +224,13 @@ class Judge:
         query, needle = self._query, self._query.needle
         out = []
         points, _lengths = path.sample(RECHECK_MM)
-        inside = self._solid[tuple(np.rint(self._space.grid.ijk(points)).astype(int).T)]
+        inside = self._solid[tuple(np.rint(self._environment.grid.ijk(points)).astype(int).T)]
         if inside.any():
             out.append("enters an obstacle")
         clearance = float(self._tree.query(points)[0].min())
-        if clearance < self._space.required_clearance_mm - 1e-9:
-            out.append(f"{self._space.required_clearance_mm - clearance:.4f} mm too near")
-        if not self._space.grid.contains(points).all():
+        if clearance < self._environment.required_clearance_mm - 1e-9:
+            out.append(f"{self._environment.required_clearance_mm - clearance:.4f} mm too near")
+        if not self._environment.grid.contains(points).all():
             out.append("leaves the box")
         if np.linalg.norm(points[-1] - query.target_lps) > GOAL_TOLERANCE_MM + 1e-9:
             out.append("ends off the target")

@@ -8,18 +8,18 @@ from collections import Counter
 from typing import Any
 
 from experiments.support.needle_queries import Judge, Query
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.search import base as searches
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.decision import Decision
 from stages.needle.search.planners import MakeSearch
 from stages.needle.search.resolution import Resolution, ResolutionSearch
-from stages.needle.space import NeedleSpace
 
 MARKS_S = (0.01, 0.1, 1.0)
 SLICE = 200
 UNIT = Resolution(fine_mm=1.0, fine_rolls=16)
 
-Problem = tuple[Query, NeedleSpace, Judge]
+Problem = tuple[Query, NeedleEnvironment, Judge]
 
 
 def asked(query: Query) -> searches.Query:
@@ -28,11 +28,11 @@ def asked(query: Query) -> searches.Query:
 
 
 def run(
-    make: MakeSearch, space: NeedleSpace, query: Query, seed: int, time_s: float, judge: Judge
+    make: MakeSearch, environment: NeedleEnvironment, query: Query, seed: int, time_s: float, judge: Judge
 ) -> dict[str, Any]:
     """Run one planner for some CPU time; return when it had which length, and its paths' faults."""
     began = time.process_time()
-    search = make(space, asked(query), seed)
+    search = make(environment, asked(query), seed)
     first: float | None = None
     history: list[tuple[float, float]] = []
     faults: list[str] = []
@@ -54,10 +54,12 @@ def run(
     }
 
 
-def decide(space: NeedleSpace, query: Query, seed: int, time_s: float, judge: Judge) -> dict[str, Any]:
+def decide(
+    environment: NeedleEnvironment, query: Query, seed: int, time_s: float, judge: Judge
+) -> dict[str, Any]:
     """Decide a query: a path, a proof that there is none, exhausted at a resolution, or undecided."""
     began = time.process_time()
-    decision = Decision(space, asked(query), seed=seed)
+    decision = Decision(environment, asked(query), seed=seed)
     while decision.outcome == "running" and time.process_time() - began < time_s:
         decision.advance(SLICE)
     found = {"outcome": decision.outcome, "s": time.process_time() - began, "faults": []}
@@ -65,7 +67,7 @@ def decide(space: NeedleSpace, query: Query, seed: int, time_s: float, judge: Ju
         found["faults"] = judge.faults(decision.path)
     elif decision.outcome != "no path":
         began = time.process_time()
-        search = ResolutionSearch(space, asked(query), resolution=UNIT)
+        search = ResolutionSearch(environment, asked(query), resolution=UNIT)
         while not search.finished and time.process_time() - began < time_s:
             search.advance(SLICE)
         exhausted = search.finished and search.path is None
@@ -93,8 +95,8 @@ def recheck(problems: list[Problem], wanted: int) -> tuple[int, Counter[str]]:
     count, faults, seed = 0, Counter[str](), 0
     while count < wanted and problems:
         seed += 1
-        for query, space, judge in problems:
-            search = RestartingRRT(space, asked(query), seed=seed)
+        for query, environment, judge in problems:
+            search = RestartingRRT(environment, asked(query), seed=seed)
             for _ in range(3):
                 if search.advance(5000) and search.path is not None:
                     faults.update(judge.faults(search.path))

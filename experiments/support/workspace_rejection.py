@@ -24,7 +24,7 @@ from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch, ReferenceSearchWit
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.coupled.kuntz2015_fcl.search import FOUND, obstacles_for
 from lungaccess.plans.assemble import Task
-from stages.needle.space import needle_space, workspace_lengths
+from stages.needle.environment import needle_environment, workspace_lengths
 
 RRT_TIME_S = 0.05
 PAPER_PATHS, PAPER_S = 15, (5.63, 42.62)
@@ -66,9 +66,9 @@ def prepared_obstacles(task: Task, atlas: Atlas) -> Obstacles:
 def goals_by_ease(lung: Lung, atlas: Atlas, points: Float) -> Float:
     """Return the points, that in the workspace of the most deployments first."""
     system, entries = atlas.system, atlas.deployments
-    space = needle_space(lung, system.needle, system.margins, with_fissures=atlas.with_fissures)
+    environment = needle_environment(lung, system.needle, system.margins, with_fissures=atlas.with_fissures)
     held = [
-        int(np.isfinite(workspace_lengths(space, entries.positions, entries.tangents, point)).sum())
+        int(np.isfinite(workspace_lengths(environment, entries.positions, entries.tangents, point)).sum())
         for point in points
     ]
     return np.asarray(points[np.argsort(held)[::-1]])

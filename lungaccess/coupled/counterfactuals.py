@@ -126,7 +126,7 @@ def _scope_diameter(search: AtlasSearch) -> Iterator[Remedy]:
     thin = AtlasSearch(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), atlas)
     entries, near = atlas.deployments, thin.in_workspace
     blockers, _lengths, _costs = direct_arcs(
-        thin.desk.space, entries.positions[near], entries.tangents[near], entries.branch[near],
+        thin.desk.environment, entries.positions[near], entries.tangents[near], entries.branch[near],
         task.target.lps_mm,
     )  # fmt: skip
     clear = near[blockers == 0]

@@ -7,7 +7,7 @@ import math
 from lungaccess.coupled.counterfactuals import Remedy, remedies
 from lungaccess.coupled.search import AtlasSearch
 from lungaccess.plans.no_plan import NoPlan
-from stages.needle import Needle, direct_arcs, needle_space
+from stages.needle import Needle, direct_arcs, needle_environment
 
 
 def explain(search: AtlasSearch, iterations: int) -> NoPlan:
@@ -97,16 +97,16 @@ def _thinner_scope(widest_mm: float) -> str:
 def _reached_with(search: AtlasSearch, needle: Needle, *, with_fissures: bool | None = None) -> bool:
     """Tell whether a direct arc of another needle reaches the target from the same deployments."""
     atlas, task = search.atlas, search.task
-    space = needle_space(
+    environment = needle_environment(
         task.lung,
         needle,
         task.system.margins,
         with_fissures=task.with_fissures if with_fissures is None else with_fissures,
     )
     entries, target = atlas.deployments, task.target.lps_mm
-    near, _lengths = atlas.index.holding(space, target)
+    near, _lengths = atlas.index.holding(environment, target)
     blockers, _lengths, _costs = direct_arcs(
-        space,
+        environment,
         entries.positions[near],
         entries.tangents[near],
         entries.branch[near],

@@ -18,11 +18,11 @@ from lungaccess.problem.target import Target
 from stages.needle import (
     PLANNERS,
     ArcPath,
-    NeedleSpace,
+    NeedleEnvironment,
     Objective,
     Query,
     Search,
-    needle_space,
+    needle_environment,
     path_costs,
 )
 
@@ -48,7 +48,7 @@ class NeedleAnswer:
         Of the path under the objective, as estimated within the search.
     branch : int
         Branch of the airway tree whose wall the start is taken to have pierced, -1 for none.
-    space : NeedleSpace
+    environment : NeedleEnvironment
         What the planner looked at.
     objective : Objective
         What it was asked to make small; planners of OMPL look at none.
@@ -60,7 +60,7 @@ class NeedleAnswer:
     path: ArcPath | None
     cost: float
     branch: int
-    space: NeedleSpace
+    environment: NeedleEnvironment
     objective: Objective
     first_path_s: float | None
 
@@ -72,7 +72,9 @@ class NeedleAnswer:
         """
         if self.path is None:
             return {}
-        return self.objective.stated(path_costs(self.space.arrays, self.space.cost_map, self.path))
+        return self.objective.stated(
+            path_costs(self.environment.obstacles, self.environment.cost_map, self.path)
+        )
 
     def record(self) -> dict[str, Any]:
         """Return plain JSON values; poses in LPS mm, angles in rad."""
@@ -158,12 +160,14 @@ def plan_needle(
             expected="a pose inside the lung",
             remedy="Check the frame of its numbers: RAS or LPS",
         )
-    space = needle_space(lung, system.needle, system.margins, with_fissures=not system.fissures_allowed)
+    environment = needle_environment(
+        lung, system.needle, system.margins, with_fissures=not system.fissures_allowed
+    )
     branch = pierced_branch(lung, lps_from_start[:3, 3])
     query = Query(lps_from_start=lps_from_start, target=target.lps_mm, branch=branch)
     if planner in OMPL_PLANNERS:
-        return _by_ompl(space, query, planner, weighed, seed, time_s or 0.0)
-    search = PLANNERS[planner](space, query, seed, weighed)
+        return _by_ompl(environment, query, planner, weighed, seed, time_s or 0.0)
+    search = PLANNERS[planner](environment, query, seed, weighed)
     first_path_s = None
     began = time.perf_counter()
     left = iterations
@@ -180,20 +184,20 @@ def plan_needle(
         path=search.path,
         cost=search.cost,
         branch=branch,
-        space=space,
+        environment=environment,
         objective=weighed,
         first_path_s=first_path_s,
     )
 
 
 def _by_ompl(
-    space: NeedleSpace, query: Query, planner: str, objective: Objective, seed: int, time_s: float
+    environment: NeedleEnvironment, query: Query, planner: str, objective: Objective, seed: int, time_s: float
 ) -> NeedleAnswer:
     """Let a planner of OMPL search; its cost is the length of the path."""
     from stages.needle.ompl import NeedleProblem, seed_ompl
 
     seed_ompl(seed + 1)
-    problem = NeedleProblem(space)
+    problem = NeedleProblem(environment)
     problem.setup.setPlanner(problem.planners()[planner](problem.si))
     problem.pose(query, goal_tolerance_mm=OMPL_TOLERANCE_MM)
     began = time.perf_counter()
@@ -205,7 +209,7 @@ def _by_ompl(
         path=path,
         cost=math.inf if path is None else path.length_mm,
         branch=query.branch,
-        space=space,
+        environment=environment,
         objective=objective,
         first_path_s=None if path is None else first_path_s,
     )

@@ -226,7 +226,7 @@ def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
     if not len(held):
         return frozenset()
     blockers, lengths, _costs = direct_arcs(
-        search.desk.space, entries.positions[held], entries.tangents[held], entries.branch[held], lesion
+        search.desk.environment, entries.positions[held], entries.tangents[held], entries.branch[held], lesion
     )
     clear = np.flatnonzero(blockers == 0)
     clear = held[clear[np.argsort(lengths[clear], kind="stable")]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
-from stages.needle import ArcPath, Objective, SpaceArrays, costs
+from stages.needle import ArcPath, Objective, Obstacles, costs
 
 
 def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fissures: bool) -> float:
@@ -36,7 +36,7 @@ def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> 
     return costs.obstacle_clearance_mm(_obstacles(lung, with_fissures), points)
 
 
-def _obstacles(lung: Lung, with_fissures: bool) -> SpaceArrays:
-    """Return the arrays of a lung as a `NeedleSpace` holds them."""
+def _obstacles(lung: Lung, with_fissures: bool) -> Obstacles:
+    """Return the arrays of a lung as a `NeedleEnvironment` holds them."""
     bits = obstacle_bits(with_fissures)
     return lung.obstacle_field(with_fissures=with_fissures).corners, lung.labels, lung.geometry, bits

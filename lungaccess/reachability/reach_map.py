@@ -21,7 +21,7 @@ from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.reachability.layers import LayerStore, counted_voxels, scan_layers
 from lungaccess.reachability.regions import Regions, lung_regions
-from stages.needle import DEFAULT_ARCS, DIRECT, NO_ROOM, SEARCHED, UNREACHED, ReachScan, needle_space
+from stages.needle import DEFAULT_ARCS, DIRECT, NO_ROOM, SEARCHED, UNREACHED, ReachScan, needle_environment
 
 DEFAULT_SPACING_MM = 3.0
 FORMAT = b"lungaccess-reach-1"
@@ -227,9 +227,9 @@ def reachability(
         )
     made = atlas or build_atlas(lung, system)
     began = time.perf_counter()
-    space = needle_space(lung, system.needle, system.margins, with_fissures=made.with_fissures)
+    environment = needle_environment(lung, system.needle, system.margins, with_fissures=made.with_fissures)
     entries = made.deployments
-    scan = ReachScan(space, entries.positions, entries.tangents, entries.branch, arcs=arcs, trees=trees)
+    scan = ReachScan(environment, entries.positions, entries.tangents, entries.branch, arcs=arcs, trees=trees)
     counted = counted_voxels(lung, grid, made.with_fissures)
     store = None if work is None else LayerStore(Path(work), _key(made, spacing_mm, arcs, trees))
     found, resumed = scan_layers(scan, grid, counted, store, progress)

@@ -25,7 +25,7 @@ from lungaccess.reachability.kernels.unreachable import (
     greatest_insertions,
     rule_out,
 )
-from stages.needle import needle_space
+from stages.needle import needle_environment
 from stages.needle.kernels import GOAL_TOLERANCE, REQUIRED
 from stages.scope import LEAVING_MM, MAX_TURN_AT_TIP_RAD, find_sites
 from stages.tube import tube_constants
@@ -91,7 +91,9 @@ class UnreachableProof:
     def __init__(self, lung: Lung, system: System, *, with_fissures: bool) -> None:
         self._lung = lung
         self._tubes = tube_constants(system.tubes, system.margins)
-        self._limits = needle_space(lung, system.needle, system.margins, with_fissures=with_fissures).limits
+        self._limits = needle_environment(
+            lung, system.needle, system.margins, with_fissures=with_fissures
+        ).limits
         longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
         greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)

@@ -49,8 +49,8 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
     costs = record["path"]["costs"]
     text = json.dumps(record, sort_keys=True)
     query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
-    tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.space.goal_tolerance_mm
-    why = objection(found.space, query, found.path, goal_tolerance_mm=tolerance_mm)
+    tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.environment.goal_tolerance_mm
+    why = objection(found.environment, query, found.path, goal_tolerance_mm=tolerance_mm)
     return Answer(
         key=run.key,
         outcome=PATH,

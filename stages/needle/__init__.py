@@ -10,6 +10,12 @@ if TYPE_CHECKING:
     from stages.needle.costs import map_integral as map_integral
     from stages.needle.costs import path_costs as path_costs
     from stages.needle.device import Needle as Needle
+    from stages.needle.environment import RRT_STEP_MM as RRT_STEP_MM
+    from stages.needle.environment import NeedleEnvironment as NeedleEnvironment
+    from stages.needle.environment import Obstacles as Obstacles
+    from stages.needle.environment import direct_arcs as direct_arcs
+    from stages.needle.environment import needle_environment as needle_environment
+    from stages.needle.environment import workspace_lengths as workspace_lengths
     from stages.needle.objective import NO_MAP as NO_MAP
     from stages.needle.objective import SHORTEST as SHORTEST
     from stages.needle.objective import TERMS as TERMS
@@ -33,12 +39,6 @@ if TYPE_CHECKING:
     from stages.needle.search.planners import PLANNERS as PLANNERS
     from stages.needle.search.portfolio import PortfolioSearch as PortfolioSearch
     from stages.needle.search.successive_halving import successive_halving as successive_halving
-    from stages.needle.space import RRT_STEP_MM as RRT_STEP_MM
-    from stages.needle.space import NeedleSpace as NeedleSpace
-    from stages.needle.space import SpaceArrays as SpaceArrays
-    from stages.needle.space import direct_arcs as direct_arcs
-    from stages.needle.space import needle_space as needle_space
-    from stages.needle.space import workspace_lengths as workspace_lengths
     from stages.needle.start_index import StartIndex as StartIndex
     from stages.needle.violations import objection as objection
 

@@ -11,10 +11,10 @@ from anatomy.fields import corner_geometry
 from anatomy.grid import Grid, Volume
 from anatomy.kernels import field as field_kernel
 from anatomy.typed import Float, Int
+from stages.needle.environment import Obstacles
 from stages.needle.kernels import cost as kernel
 from stages.needle.objective import TERMS, Term
 from stages.needle.path import ArcPath, _kernel_arcs
-from stages.needle.space import SpaceArrays
 
 SAMPLE_MM = 0.1
 EXACT_BELOW_VOXELS = 8.0
@@ -22,13 +22,13 @@ EXACT_BELOW_VOXELS = 8.0
 bound is less than 0.6 % off."""
 
 
-def obstacle_clearance_mm(arrays: SpaceArrays, points: Float) -> Float:
+def obstacle_clearance_mm(arrays: Obstacles, points: Float) -> Float:
     """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle.
 
     Parameters
     ----------
     arrays : tuple
-        See `NeedleSpace`: obstacles are taken as solid boxes or voxel centres as stated there.
+        See `NeedleEnvironment`: obstacles are taken as solid boxes or voxel centres as stated there.
     """
     field, labels, geometry, bits = arrays
     places = np.array(points, dtype=np.float64, order="C")
@@ -42,7 +42,7 @@ def obstacle_clearance_mm(arrays: SpaceArrays, points: Float) -> Float:
     return clearance
 
 
-def inverse_clearance(arrays: SpaceArrays, path: ArcPath) -> float:
+def inverse_clearance(arrays: Obstacles, path: ArcPath) -> float:
     """Return the integral of 1 / clearance over the length of a path [Kuntz2015, eq. 1].
 
     By the trapezoid rule with steps of at most 0.1 mm; clearance is that of the needle's axis, no less than
@@ -51,7 +51,7 @@ def inverse_clearance(arrays: SpaceArrays, path: ArcPath) -> float:
     Parameters
     ----------
     arrays : tuple
-        See `NeedleSpace`.
+        See `NeedleEnvironment`.
     """
     points, lengths = path.sample(SAMPLE_MM)
     clearance = np.maximum(obstacle_clearance_mm(arrays, points), kernel.CLEARANCE_FLOOR_MM)
@@ -94,7 +94,7 @@ def voxel_sum(cost_map: Volume | None, path: ArcPath) -> float:
     return float(_costs_of(cost_map, np.unique(voxels)).sum())
 
 
-_EVALUATED: dict[str, Callable[[SpaceArrays, Volume | None, ArcPath], float]] = {
+_EVALUATED: dict[str, Callable[[Obstacles, Volume | None, ArcPath], float]] = {
     "inverse_clearance": lambda arrays, _map, path: inverse_clearance(arrays, path),
     "cost_map": lambda _arrays, cost_map, path: map_integral(cost_map, path),
     "voxel_sum": lambda _arrays, cost_map, path: voxel_sum(cost_map, path),
@@ -103,14 +103,14 @@ _EVALUATED: dict[str, Callable[[SpaceArrays, Volume | None, ArcPath], float]] = 
 
 
 def path_costs(
-    arrays: SpaceArrays, cost_map: Volume | None, path: ArcPath, terms: Iterable[Term] = TERMS
+    arrays: Obstacles, cost_map: Volume | None, path: ArcPath, terms: Iterable[Term] = TERMS
 ) -> dict[str, float]:
     """Return costs of a path by their keys, exactly; see `stages.needle.objective.TERMS`.
 
     Parameters
     ----------
     arrays : tuple
-        See `NeedleSpace`.
+        See `NeedleEnvironment`.
     cost_map : Volume or None
         Without a map its costs are 0.
     path : ArcPath

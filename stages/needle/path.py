@@ -13,12 +13,12 @@ from anatomy import poses as frames
 from anatomy.grid import read_only
 from anatomy.kernels import arcs as arc_kernels
 from anatomy.typed import Float, Int
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import least_cosine
 from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.space import NeedleSpace
 
 LENGTH, ROLL, CURVATURE = 0, 1, 2
 
@@ -142,31 +142,31 @@ def path_from_tree(lps_from_start: Float, nodes: Float, parents: Int, last: int)
     return ArcPath(lps_from_start=lps_from_start, arcs=np.array(arcs))
 
 
-def blocker_on_path(space: NeedleSpace, path: ArcPath, branch: int) -> int:
+def blocker_on_path(environment: NeedleEnvironment, path: ArcPath, branch: int) -> int:
     """Prove every arc of a path clear; return 0, or the label of the voxel that is too near.
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     path : ArcPath
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
     """
     start = 0.0
     for pose, bend, length in _kernel_arcs(path):
-        label = blocker_on_arc(space.arrays, space.limits, pose, bend, length, start, branch)
+        label = blocker_on_arc(environment.obstacles, environment.limits, pose, bend, length, start, branch)
         if label:
             return int(label)
         start += length
     return 0
 
 
-def estimated_inverse_clearance(space: NeedleSpace, path: ArcPath) -> float:
+def estimated_inverse_clearance(environment: NeedleEnvironment, path: ArcPath) -> float:
     """Return the integral of 1 / clearance along a path from the kernel's estimate of distances."""
-    step = space.limits[index.COST_STEP]
+    step = environment.limits[index.COST_STEP]
     return float(
         sum(
-            inverse_clearance_on_arc(space.arrays, step, pose, bend, length)
+            inverse_clearance_on_arc(environment.obstacles, step, pose, bend, length)
             for pose, bend, length in _kernel_arcs(path)
         )
     )

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.typed import Float, Int, UInt8, UInt64
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import reach as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.search.base import RANDOM_SHARE
-from stages.needle.space import NeedleSpace
 
 DIRECT, SEARCHED, UNREACHED, NO_ROOM = kernel.DIRECT, kernel.SEARCHED, kernel.UNREACHED, kernel.NO_ROOM
 
@@ -47,13 +47,13 @@ class Reached:
 
 
 class ReachScan:
-    """Many start poses in one needle space, to be asked about any number of points.
+    """Many start poses in one needle environment, to be asked about any number of points.
 
     It may be used by several threads at once.
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     positions, tangents : (E, 3) float64, LPS mm
         Start poses; neighbours in the list should be alike.
     branches : (E,) int64
@@ -71,7 +71,7 @@ class ReachScan:
 
     def __init__(
         self,
-        space: NeedleSpace,
+        environment: NeedleEnvironment,
         positions: ArrayLike,
         tangents: ArrayLike,
         branches: ArrayLike,
@@ -84,7 +84,7 @@ class ReachScan:
                 f"Arcs and trees of a reachability scan are {arcs} and {trees}",
                 expected="at least 1 arc and 0 trees",
             )
-        self.space = space
+        self.environment = environment
         self.trees = trees
         self._arcs = arcs
         self._starts = np.ascontiguousarray(np.hstack([np.asarray(positions), np.asarray(tangents)]), float)
@@ -93,7 +93,7 @@ class ReachScan:
         # One order for all points: what is reached does not depend on how the points are shared out.
         self._order = np.random.Generator(np.random.PCG64(ORDER_SEED)).permutation(len(self._branches))
         self._mixed = np.ascontiguousarray(self._starts[self._order].T)
-        self._objective = space.objective_arrays(Objective(length=0.0, inverse_clearance=1.0))
+        self._objective = environment.objective_arrays(Objective(length=0.0, inverse_clearance=1.0))
 
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
         """Try all points, one after the other.
@@ -108,19 +108,19 @@ class ReachScan:
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds, found = np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 2))
-        space, entries = self.space, np.full(len(places), -1, dtype=np.int64)
+        environment, entries = self.environment, np.full(len(places), -1, dtype=np.int64)
         before = np.arange(len(places))[:, None] - 1 if near is None else near
         kernel.reach_by_arcs(
-            space.arrays, space.limits, self._starts, self._branches, self._order, self._mixed, places,
-            np.array(before, dtype=np.int64, order="C"), self._arcs, np.full(len(self._starts), 0.5),
+            environment.obstacles, environment.limits, self._starts, self._branches, self._order, self._mixed,
+            places, np.array(before, dtype=np.int64, order="C"), self._arcs, np.full(len(self._starts), 0.5),
             np.zeros(kernel.BLOCK, dtype=np.uint8), kinds, found, entries,
         )  # fmt: skip
         if self.trees:
             rows = RRT_ITERATIONS * tree.ROWS_PER_STEP
             kernel.reach_by_search(
-                space.arrays, space.limits, self._objective, self._starts, self._branches, self._order,
-                places, self.trees, RRT_ITERATIONS, RANDOM_SHARE, np.array(seeds, dtype=np.uint64),
-                np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64),
+                environment.obstacles, environment.limits, self._objective, self._starts, self._branches,
+                self._order, places, self.trees, RRT_ITERATIONS, RANDOM_SHARE, np.array(seeds,
+                dtype=np.uint64), np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64),
                 np.zeros(self.trees, dtype=np.int64), kinds, found, entries,
             )  # fmt: skip
         return Reached(

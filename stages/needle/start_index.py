@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.typed import Float, Int
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_index as kernel
-from stages.needle.space import NeedleSpace
 
 CELL_MM = 5.0
 """Poses of one bundle lie in one such cube."""
@@ -47,15 +47,15 @@ class StartIndex:
         """Number of poses, E."""
         return len(self._order)
 
-    def holding(self, space: NeedleSpace, target: ArrayLike) -> tuple[Int, Float]:
+    def holding(self, environment: NeedleEnvironment, target: ArrayLike) -> tuple[Int, Float]:
         """Return the poses with a target in their workspace, the nearest first, and path lengths in mm.
 
-        The same as finite entries of `stages.needle.space.workspace_lengths`; poses at the same length
+        The same as finite entries of `stages.needle.environment.workspace_lengths`; poses at the same length
         come in their own order.
 
         Parameters
         ----------
-        space : NeedleSpace
+        environment : NeedleEnvironment
             The needle.
         target : (3,) float64, LPS mm
         """
@@ -68,7 +68,7 @@ class StartIndex:
             self._positions,
             self._tangents,
             np.asarray(target, dtype=np.float64),
-            space.limits,
+            environment.limits,
             found,
             lengths,
         )

@@ -8,34 +8,36 @@ import numpy as np
 
 from anatomy.structures import BITS
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels.connections import least_cosine
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.path import ArcPath, bend_direction
 from stages.needle.search.base import Query
-from stages.needle.space import NeedleSpace
 
 SAME_MM = 1e-6
 SAME_RAD = 1e-6
 """Rounding that is forgiven."""
 
 
-def objection(space: NeedleSpace, query: Query, path: ArcPath, *, goal_tolerance_mm: float = 0.0) -> str:
+def objection(
+    environment: NeedleEnvironment, query: Query, path: ArcPath, *, goal_tolerance_mm: float = 0.0
+) -> str:
     """Tell why a path is no answer to a query; "" if it is one.
 
     All limits of the needle are tested, and every arc is proved clear.
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
     path : ArcPath
     goal_tolerance_mm : float
-        How far from the target the path may end, where the space's own tolerance is smaller.
+        How far from the target the path may end, where the environment's own tolerance is smaller.
     """
-    needle = space.needle
+    needle = environment.needle
     reference = query.lps_from_start[:3, 2] if query.reference is None else query.reference
     lengths, curvatures = path.arcs[:, 0], path.arcs[:, 2]
-    tolerance = max(goal_tolerance_mm, space.goal_tolerance_mm)
+    tolerance = max(goal_tolerance_mm, environment.goal_tolerance_mm)
     turned = query.turned_rad + path.accumulated_turn_rad
     # Not a number fails every one of these comparisons.
     tests = {
@@ -53,7 +55,7 @@ def objection(space: NeedleSpace, query: Query, path: ArcPath, *, goal_tolerance
     for reason, passed in tests.items():
         if not passed:
             return reason
-    label = _blocker(space, query, path)
+    label = _blocker(environment, query, path)
     return "" if label == 0 else "too near: " + next(name for name, bit in BITS.items() if label & bit)
 
 
@@ -66,13 +68,15 @@ def largest_angle_rad(path: ArcPath, reference: Float) -> float:
     return math.acos(least)
 
 
-def _blocker(space: NeedleSpace, query: Query, path: ArcPath) -> int:
+def _blocker(environment: NeedleEnvironment, query: Query, path: ArcPath) -> int:
     """Prove every arc clear as `blocker_on_path` does, behind what is inserted already."""
     begin = query.inserted_mm
     for frame, (length, roll, curvature) in zip(path.frames(), path.arcs.tolist(), strict=False):
         pose = (*frame[:3, 3].tolist(), *frame[:3, 2].tolist())
         bend = (curvature, *bend_direction(frame, roll).tolist())
-        label = blocker_on_arc(space.arrays, space.limits, pose, bend, length, begin, query.branch)
+        label = blocker_on_arc(
+            environment.obstacles, environment.limits, pose, bend, length, begin, query.branch
+        )
         if label:
             return int(label)
         begin += length

@@ -13,21 +13,26 @@ import lungaccess
 from anatomy.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
-from experiments.support.inflation import inflated_space, inflation_voxels, largest_step_mm, refuting_labels
+from experiments.support.inflation import (
+    inflated_environment,
+    inflation_voxels,
+    largest_step_mm,
+    refuting_labels,
+)
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path
 from stages.needle.search.base import Query, RestartingRRT
-from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 
 NEEDLE = Needle(diameter_mm=1.0, max_curvature_per_mm=0.05)
 
 
-def space_of(canvas: Canvas, required_mm: float, costs: np.ndarray | None = None) -> NeedleSpace:
-    return space_of_labels(
+def environment_of(canvas: Canvas, required_mm: float, costs: np.ndarray | None = None) -> NeedleEnvironment:
+    return environment_of_labels(
         canvas.labels,
         canvas.grid,
         NEEDLE,
@@ -36,11 +41,11 @@ def space_of(canvas: Canvas, required_mm: float, costs: np.ndarray | None = None
     )
 
 
-def single_voxel(required_mm: float) -> NeedleSpace:
+def single_voxel(required_mm: float) -> NeedleEnvironment:
     """One vessel voxel, the cube from 0 to 1 mm on every axis."""
     canvas = Canvas.empty([-10] * 3, [10] * 3, 1.0)
     canvas.labels[10, 10, 10] = VESSEL
-    return space_of(canvas, required_mm)
+    return environment_of(canvas, required_mm)
 
 
 def along_z(x: float, y: float) -> ArcPath:
@@ -74,7 +79,7 @@ class TestAsPrinted:
 
     def test_nor_without_any_radius(self) -> None:
         with pytest.raises(SettingsError, match="clearance field"):
-            inflated_space(single_voxel(0.0))
+            inflated_environment(single_voxel(0.0))
 
 
 class TestInflatedSpace:
@@ -87,51 +92,58 @@ class TestInflatedSpace:
         canvas = Canvas.empty([-12] * 3, [12] * 3, spacing)
         canvas.add(rng.uniform(size=canvas.labels.shape) < 2e-3, VESSEL)
         canvas.add(rng.uniform(size=canvas.labels.shape) < 1e-3, AIRWAY)
-        space = inflated_space(space_of(canvas, 1.7))
+        environment = inflated_environment(environment_of(canvas, 1.7))
         axes = np.array([3, 2, 4])
         assert inflation_voxels(spacing, 1.7).tolist() == axes.tolist()
         steps = np.stack(np.meshgrid(*[np.arange(-a, a + 1) for a in axes], indexing="ij"), axis=-1)
         ellipsoid = (steps.astype(float) ** 2 / axes**2).sum(axis=-1) <= 1 + 1e-12
         for bit in (VESSEL, AIRWAY):
             expected = ndimage.binary_dilation((canvas.labels & bit) != 0, structure=ellipsoid)
-            assert np.array_equal((space.arrays[1] & bit) != 0, expected)
+            assert np.array_equal((environment.obstacles[1] & bit) != 0, expected)
 
     def test_voxels_of_infinite_cost_are_obstacles(self) -> None:
         canvas = Canvas.empty([-10] * 3, [10] * 3, 1.0)
         costs = np.full(canvas.grid.shape, 0.5)
         costs[10, 10, 10] = math.inf
-        space = inflated_space(space_of(canvas, 1.5, costs))
-        assert space.cost_map is not None
-        barred = np.isinf(space.cost_map.array)
+        environment = inflated_environment(environment_of(canvas, 1.5, costs))
+        assert environment.cost_map is not None
+        barred = np.isinf(environment.cost_map.array)
         assert barred.sum() == 33, "a ball of radius 2 voxels"
-        assert np.array_equal(barred, space.arrays[1] == OUTSIDE)
-        assert blocker_on_path(space, along_z(1.5, 0.5), -1) == OUTSIDE
-        assert (space.cost_map.array[~barred] == 0.5).all()
+        assert np.array_equal(barred, environment.obstacles[1] == OUTSIDE)
+        assert blocker_on_path(environment, along_z(1.5, 0.5), -1) == OUTSIDE
+        assert (environment.cost_map.array[~barred] == 0.5).all()
 
     def test_the_rest_stays(self) -> None:
         before = single_voxel(1.5)
-        after = inflated_space(before)
-        assert before.limits[index.LOOKUP_STEP] == 0.0 and before.arrays[1].sum() == VESSEL
+        after = inflated_environment(before)
+        assert before.limits[index.LOOKUP_STEP] == 0.0 and before.obstacles[1].sum() == VESSEL
         assert (
             after.limits[index.LOOKUP_STEP] == after.limits[index.MAX_STEP] == largest_step_mm([1] * 3, 1.5)
         )
         assert after.grid is before.grid and after.needle is before.needle and after.cost_map is None
-        assert after.arrays[0] is before.arrays[0]
+        assert after.obstacles[0] is before.obstacles[0]
 
     def test_only_the_ends_of_steps_are_looked_up(self) -> None:
         """A slab one voxel thick lies between them, whatever its clearance."""
-        space = inflated_space(single_voxel(1.5))
-        labels = np.zeros_like(space.arrays[1])
+        environment = inflated_environment(single_voxel(1.5))
+        labels = np.zeros_like(environment.obstacles[1])
         labels[:, :, 10] = VESSEL
-        arrays = (space.arrays[0], labels, *space.arrays[2:])
+        arrays = (environment.obstacles[0], labels, *environment.obstacles[2:])
         for low, found in ((-1.2, 0), (0.2, VESSEL), (-2.0, VESSEL)):
             pose = (0.0, 0.0, low, 0.0, 0.0, 1.0)
-            assert blocker_on_arc(arrays, space.limits, pose, (0.0, 1.0, 0.0, 0.0), 2.4, 0.0, -1) == found
+            assert (
+                blocker_on_arc(arrays, environment.limits, pose, (0.0, 1.0, 0.0, 0.0), 2.4, 0.0, -1) == found
+            )
 
     def test_beyond_the_grid_is_outside(self) -> None:
-        space = inflated_space(single_voxel(1.5))
+        environment = inflated_environment(single_voxel(1.5))
         pose = (5.0, 5.0, 8.0, 0.0, 0.0, 1.0)
-        assert blocker_on_arc(space.arrays, space.limits, pose, (0.0, 1.0, 0.0, 0.0), 6.0, 0.0, -1) == OUTSIDE
+        assert (
+            blocker_on_arc(
+                environment.obstacles, environment.limits, pose, (0.0, 1.0, 0.0, 0.0), 6.0, 0.0, -1
+            )
+            == OUTSIDE
+        )
 
 
 class TestNotConservative:
@@ -139,10 +151,10 @@ class TestNotConservative:
 
     def test_the_ellipsoid_leaves_out_a_voxel_too_near(self) -> None:
         """Needle and margin of 1.9 mm grow the voxel by 2; that two aside and one up stays free."""
-        space = single_voxel(1.9)
+        environment = single_voxel(1.9)
         path = along_z(2.05, 1.05)
-        assert blocker_on_path(inflated_space(space), path, -1) == 0
-        assert refuting_labels(space, [path]).tolist() == [VESSEL]
+        assert blocker_on_path(inflated_environment(environment), path, -1) == 0
+        assert refuting_labels(environment, [path]).tolist() == [VESSEL]
         points, _lengths = path.sample(0.01)
         distance = np.linalg.norm(np.maximum(np.abs(points - 0.5) - 0.5, 0.0), axis=1).min()
         assert distance == pytest.approx(math.hypot(1.05, 0.05), abs=1e-6)
@@ -153,10 +165,10 @@ class TestNotConservative:
         canvas = Canvas.empty([-15, -15, -5], [15, 15, 50], 1.0)
         for centre in rng.uniform([-9, -9, 8], [9, 9, 36], (25, 3)):
             canvas.add(canvas.ball(centre, 1.5), VESSEL)
-        space = space_of(canvas, 1.3)
+        environment = environment_of(canvas, 1.3)
         query = Query(lps_from_start=np.eye(4), target=np.array([0.0, 0.0, 44.0]))
         refuted = {}
-        for name, planned_in in (("proof", space), ("paper", inflated_space(space))):
+        for name, planned_in in (("proof", environment), ("paper", inflated_environment(environment))):
             paths = []
             for seed in range(1, 13):
                 search = RestartingRRT(planned_in, query, seed=seed, objective=Objective(length=1.0))
@@ -165,13 +177,13 @@ class TestNotConservative:
                         assert search.path is not None
                         paths.append(search.path)
             assert len(paths) >= 20
-            refuted[name] = int((refuting_labels(space, paths) != 0).sum())
+            refuted[name] = int((refuting_labels(environment, paths) != 0).sum())
         assert refuted["proof"] == 0
         assert refuted["paper"] > 0
 
     def test_a_space_of_this_mode_proves_nothing(self) -> None:
         with pytest.raises(SettingsError, match="cannot be proved"):
-            refuting_labels(inflated_space(single_voxel(1.5)), [along_z(5.0, 5.0)])
+            refuting_labels(inflated_environment(single_voxel(1.5)), [along_z(5.0, 5.0)])
 
     def test_the_planner_of_the_whole_system_does_not_use_it(self) -> None:
         sources = [path.read_text() for path in Path(lungaccess.__file__).parent.rglob("*.py")]

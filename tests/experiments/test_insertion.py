@@ -20,38 +20,38 @@ from experiments.support.insertion.closed_loop import Insertion, Outcome, simula
 from experiments.support.insertion.repeated import Study, study, summary, wilson_interval
 from experiments.support.insertion.truth import Errors, Truth
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.path import ArcPath, arc_transform, direct_path
 from stages.needle.replanning.replanner import Failure, ReplanSettings, with_reserve
 from stages.needle.search.base import Query, RestartingRRT
-from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.scenes import Canvas, brute_clearance
 
 KAPPA = 1 / 40
 MANY = range(24)
 
 
-def space_with(*balls: tuple[Any, float], **changes: float) -> NeedleSpace:
+def environment_with(*balls: tuple[Any, float], **changes: float) -> NeedleEnvironment:
     """Free lung of 56 x 56 x 96 mm with balls of vessel."""
     canvas = Canvas.empty([-28, -28, -48], [28, 28, 48], 1.0)
     for centre, radius in balls:
         canvas.add(canvas.ball(centre, radius), VESSEL)
     values: dict[str, float] = {"diameter_mm": 1.0, "max_curvature_per_mm": KAPPA, **changes}
-    return needle_space(canvas.lung(), Needle(**values), Margins(), with_fissures=False)
+    return needle_environment(canvas.lung(), Needle(**values), Margins(), with_fissures=False)
 
 
 START = np.array(pose([0.0, 0.0, -40.0], [0.0, 0.0, 1.0]))
 TARGET = np.array([10.0, 4.0, 38.0])
 BEHIND = np.array([0.0, 0.0, 38.0])
-FREE = space_with()
-BALL = space_with(([0, 0, 0], 5.0))
+FREE = environment_with()
+BALL = environment_with(([0, 0, 0], 5.0))
 ASIDE = Query(lps_from_start=START, target=TARGET)
 AROUND = Query(lps_from_start=START, target=BEHIND)
 DIRECT = direct_path(START, TARGET)
 NONE = Errors()
 
 
-def planned(space: NeedleSpace, query: Query) -> ArcPath:
-    search = RestartingRRT(space, query, seed=3)
+def planned(environment: NeedleEnvironment, query: Query) -> ArcPath:
+    search = RestartingRRT(environment, query, seed=3)
     search.advance(20_000)
     assert search.path is not None
     return search.path
@@ -72,11 +72,11 @@ class TestTheNeedle:
 
     @pytest.mark.parametrize("closed_loop", [False, True])
     def test_without_errors_it_ends_exactly_at_the_target(self, closed_loop: bool) -> None:
-        for space, query, plan in ((FREE, ASIDE, DIRECT), (BALL, AROUND, planned(BALL, AROUND))):
-            made = simulate(space, query, plan, Errors(), closed_loop=closed_loop, seed=1)
+        for environment, query, plan in ((FREE, ASIDE, DIRECT), (BALL, AROUND, planned(BALL, AROUND))):
+            made = simulate(environment, query, plan, Errors(), closed_loop=closed_loop, seed=1)
             assert made.outcome is Outcome.REACHED
             assert made.tip_error_mm < 1e-9
-            assert made.clearance_mm > space.required_clearance_mm - space.needle.radius_mm
+            assert made.clearance_mm > environment.required_clearance_mm - environment.needle.radius_mm
             assert len(made.replans) == (math.ceil(made.inserted_mm[-1] / 5.0) - 1 if closed_loop else 0)
 
     def test_in_open_loop_without_errors_it_is_the_plan(self) -> None:
@@ -135,11 +135,11 @@ class TestTheNeedle:
         plan = planned(BALL, AROUND)
         made = simulate(BALL, AROUND, plan, Errors(curvature_bias=0.02), closed_loop=False, seed=1)
         points = np.ascontiguousarray(made.lps_from_tip[:, :3, 3])
-        gap = brute_clearance(BALL.arrays[1], BALL.grid, points, OBSTACLES, 30.0).min()
+        gap = brute_clearance(BALL.obstacles[1], BALL.grid, points, OBSTACLES, 30.0).min()
         assert made.clearance_mm == pytest.approx(gap - BALL.needle.radius_mm, abs=1e-9)
 
     def test_a_plan_longer_than_the_needle_is_out_of_length(self) -> None:
-        short = space_with(max_length_mm=40.1)
+        short = environment_with(max_length_mm=40.1)
         made = simulate(short, ASIDE, DIRECT, Errors(), closed_loop=False, seed=1)
         assert made.outcome is Outcome.OUT_OF_LENGTH
         assert made.inserted_mm[-1] == pytest.approx(40.1)
@@ -281,7 +281,7 @@ class TestClosedLoop:
         """The target drifts behind a wall with no way around."""
         canvas = Canvas.empty([-28, -28, -48], [28, 28, 48], 1.0)
         canvas.add(np.abs(canvas.points[..., 2] - 20.0) < 2.0, VESSEL)
-        wall = needle_space(
+        wall = needle_environment(
             canvas.lung(), Needle(diameter_mm=1.0, max_curvature_per_mm=KAPPA), Margins(), with_fissures=False
         )
         query = Query(lps_from_start=START, target=BEHIND)
@@ -292,7 +292,7 @@ class TestClosedLoop:
 
     def test_length_that_runs_out_is_told(self) -> None:
         """The target moves away from a needle that has nothing to spare."""
-        short = space_with(max_length_mm=DIRECT.length_mm + 0.01)
+        short = environment_with(max_length_mm=DIRECT.length_mm + 0.01)
         exact, drifting = ReplanSettings(largest_miss_mm=0.0), Errors(target_drift_mm=4.0)
         made = [
             simulate(

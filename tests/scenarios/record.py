@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lungaccess.problem.peripheral import peripheral_targets
-from stages.needle.space import direct_arcs, needle_space, workspace_lengths
+from stages.needle.environment import direct_arcs, needle_environment, workspace_lengths
 from tests.scenarios import expected as expectations
 from tests.scenarios.cases import (
     ANATOMIES,
@@ -46,14 +46,14 @@ def draw_targets(scenes: Scenes, anatomy: Anatomy) -> list[list[float]]:
     """Draw peripheral targets: `WITHIN_REACH` that a direct arc reaches, then `OTHERS`."""
     lung, system = scenes.lung(anatomy), scenes.system(anatomy, NEEDLE_DEVICE)
     atlas = scenes.atlas(Case(anatomy=anatomy, device=NEEDLE_DEVICE, planner="atlas"))
-    space = needle_space(lung, system.needle, system.margins, with_fissures=atlas.with_fissures)
+    environment = needle_environment(lung, system.needle, system.margins, with_fissures=atlas.with_fissures)
     entries = atlas.deployments
     points = peripheral_targets(lung, DRAWN_A_LUNG, 0).round(3)
     reached = []
     for point in points:
-        near, _lengths = atlas.index.holding(space, point)
+        near, _lengths = atlas.index.holding(environment, point)
         blockers, _lengths, _costs = direct_arcs(
-            space, entries.positions[near], entries.tangents[near], entries.branch[near], point
+            environment, entries.positions[near], entries.tangents[near], entries.branch[near], point
         )
         reached.append(bool((blockers == 0).any()))
     # Left and right in turns.
@@ -65,7 +65,9 @@ def draw_targets(scenes: Scenes, anatomy: Anatomy) -> list[list[float]]:
 def draw_queries(scenes: Scenes, anatomy: Anatomy) -> list[dict[str, Any]]:
     """Draw queries: first those with a clear direct arc, then blocked ones that `decide` solves."""
     lung, system = scenes.lung(anatomy), scenes.system(anatomy, NEEDLE_DEVICE)
-    space = needle_space(lung, system.needle, system.margins, with_fissures=not anatomy.fissures_allowed)
+    environment = needle_environment(
+        lung, system.needle, system.margins, with_fissures=not anatomy.fissures_allowed
+    )
     rng, targets = np.random.default_rng(0), peripheral_targets(lung, DRAWN_A_LUNG, 1).round(3)
     free: list[dict[str, Any]] = []
     blocked: list[dict[str, Any]] = []
@@ -78,9 +80,9 @@ def draw_queries(scenes: Scenes, anatomy: Anatomy) -> list[dict[str, Any]]:
         one = direction[None] / np.linalg.norm(direction)
         if not lung.grid.contains(start[None]).all() or not _clear(lung, start):
             continue
-        if not np.isfinite(workspace_lengths(space, start[None], one, target)).all():
+        if not np.isfinite(workspace_lengths(environment, start[None], one, target)).all():
             continue
-        blockers, _lengths, _costs = direct_arcs(space, start[None], one, np.array([-1]), target)
+        blockers, _lengths, _costs = direct_arcs(environment, start[None], one, np.array([-1]), target)
         kind, room = (free, FREE_QUERIES) if blockers[0] == 0 else (blocked, BLOCKED_QUERIES)
         query = {"start": start.tolist(), "direction": direction.tolist(), "target": target.tolist()}
         if len(kind) < room and needle_answers(scenes, anatomy, [query], "decide")[0].cost is not None:

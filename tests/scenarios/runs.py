@@ -96,7 +96,7 @@ def needle_answers(
             answers.append(Answer(cost=None, digest=found.outcome))
             continue
         asked = Query(lps_from_start=np.array(start), target=target.lps_mm, branch=found.branch)
-        wrong = objection(found.space, asked, found.path)
+        wrong = objection(found.environment, asked, found.path)
         answers.append(
             Answer(cost=found.cost, digest=found.path.arcs.tobytes().hex(), faults=(wrong,) if wrong else ())
         )

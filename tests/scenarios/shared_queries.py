@@ -26,14 +26,14 @@ class SharedQueries:
         """Plan for each query by length, and walk each path again against all obstacle voxels."""
         out = []
         for query in self._queries:
-            space = self._obstacles[query.patient].space(query)
+            environment = self._obstacles[query.patient].environment(query)
             asked = searches.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
-            search = PLANNERS[planner](space, asked, 0)
+            search = PLANNERS[planner](environment, asked, 0)
             search.advance(NEEDLE_ITERATIONS)
             path = search.path
             if path is None:
                 out.append(Answer(cost=None, digest=""))
                 continue
-            faults = tuple(Judge(space, query).faults(path))
+            faults = tuple(Judge(environment, query).faults(path))
             out.append(Answer(cost=search.cost, digest=path.arcs.tobytes().hex(), faults=faults))
         return out

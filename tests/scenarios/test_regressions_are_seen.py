@@ -10,8 +10,8 @@ import pytest
 
 import lungaccess as la
 from lungaccess.coupled.search import evaluator as desk
+from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.kernels.limits import REQUIRED
-from stages.needle.space import NeedleSpace, needle_space
 from tests.scenarios import runs
 from tests.scenarios.cases import CASES, COST_TOLERANCE, NEEDLE_PLANNERS
 from tests.scenarios.runs import answer_for, dearer, lost
@@ -53,13 +53,13 @@ def test_every_planner_and_device_has_something_to_lose(expected: dict[str, Any]
 def test_a_planner_without_the_clearance_test_is_refused(
     synthetic: Scenes, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def careless_space(*arguments: Any, **options: Any) -> NeedleSpace:
-        space = needle_space(*arguments, **options)
-        limits = space.limits.copy()
+    def careless_environment(*arguments: Any, **options: Any) -> NeedleEnvironment:
+        environment = needle_environment(*arguments, **options)
+        limits = environment.limits.copy()
         limits[REQUIRED] = 0.0
-        return replace(space, limits=limits, required_clearance_mm=0.0)
+        return replace(environment, limits=limits, required_clearance_mm=0.0)
 
-    monkeypatch.setattr(desk, "needle_space", careless_space)
+    monkeypatch.setattr(desk, "needle_environment", careless_environment)
     answers = [answer_for(synthetic, CASE, target) for target in expected["targets"][CASE.anatomy.name]]
     assert any("the check refuses" in fault for answer in answers for fault in answer.faults)
 

@@ -17,6 +17,7 @@ from anatomy.grid import read_only
 from anatomy.kernels.field import bounds_at, exact_at
 from anatomy.typed import Float
 from experiments.support.insertion.truth import Errors, Truth, tilt
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import SHORTEST, Objective
@@ -32,7 +33,6 @@ from stages.needle.replanning.replanner import (
     ReplanSettings,
 )
 from stages.needle.search.base import Query
-from stages.needle.space import NeedleSpace
 
 STEP_MM = 0.25
 TOLERANCE_MM = 2.0
@@ -94,8 +94,8 @@ class Insertion:
 class _Needle:
     """The true needle: where its tip is, and whether it has hit something."""
 
-    def __init__(self, space: NeedleSpace, query: Query, truth: Truth) -> None:
-        self._space = with_limit(space, index.REQUIRED, space.needle.radius_mm)
+    def __init__(self, environment: NeedleEnvironment, query: Query, truth: Truth) -> None:
+        self._environment = with_limit(environment, index.REQUIRED, environment.needle.radius_mm)
         self._branch = query.branch
         self._truth = truth
         self.frame = np.array(query.lps_from_start)
@@ -117,7 +117,7 @@ class _Needle:
         bend = (bent, *(float(v) for v in normal))
         self.label = int(
             blocker_on_arc(
-                self._space.arrays, self._space.limits, pose_at(self.frame), bend, length,
+                self._environment.obstacles, self._environment.limits, pose_at(self.frame), bend, length,
                 self.inserted_mm, self._branch,
             )
         )  # fmt: skip
@@ -193,7 +193,7 @@ class _Commands:
 
 
 def simulate(
-    space: NeedleSpace,
+    environment: NeedleEnvironment,
     query: Query,
     plan: ArcPath,
     errors: Errors,
@@ -216,7 +216,7 @@ def simulate(
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
         With all of the needle's curvature.  The planner keeps the required clearance, the judge the radius.
     query : Query
         What the plan was made for.
@@ -245,11 +245,11 @@ def simulate(
             f"A simulation has a step of {step_mm} mm, a tolerance of {tolerance_mm} mm and a gain of {gain}",
             expected="a finite step above 0, a finite tolerance of at least 0, a gain above 0 and at most 1",
         )
-    longest_mm = float(space.limits[index.MAX_LENGTH])
+    longest_mm = float(environment.limits[index.MAX_LENGTH])
     truth = Truth(errors, query, longest_mm - query.inserted_mm, seed)
-    needle, belief, commands = _Needle(space, query, truth), _Belief(query, gain), _Commands(plan)
+    needle, belief, commands = _Needle(environment, query, truth), _Belief(query, gain), _Commands(plan)
     replanner = Replanner(
-        space, query, plan, objective=objective, settings=replanning, iterations=iterations, seed=seed
+        environment, query, plan, objective=objective, settings=replanning, iterations=iterations, seed=seed
     )
     replans: list[Replan] = []
     stopped: Failure | None = None
@@ -263,7 +263,7 @@ def simulate(
             if path is not None:
                 commands = _Commands(path)
                 continue
-            if not _is_clear(space, commands.rest(belief.frame), needle.inserted_mm, query.branch):
+            if not _is_clear(environment, commands.rest(belief.frame), needle.inserted_mm, query.branch):
                 stopped = replans[-1].failure
                 break
         if needle.inserted_mm >= longest_mm - index.MIN_ARC_MM:
@@ -271,21 +271,23 @@ def simulate(
             break
         left_mm = min(measure_mm, longest_mm) - needle.inserted_mm
         commands.give(needle, belief, min(step_mm, left_mm))
-    return _insertion(space, query, needle, truth, stopped, tolerance_mm, replans)
+    return _insertion(environment, query, needle, truth, stopped, tolerance_mm, replans)
 
 
-def _is_clear(space: NeedleSpace, path: ArcPath, inserted_mm: float, branch: int) -> bool:
+def _is_clear(environment: NeedleEnvironment, path: ArcPath, inserted_mm: float, branch: int) -> bool:
     for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
         bend = (float(curvature), *(float(v) for v in bend_direction(frame, roll)))
         pose = pose_at(frame)
-        if blocker_on_arc(space.arrays, space.limits, pose, bend, float(length), inserted_mm, branch):
+        if blocker_on_arc(
+            environment.obstacles, environment.limits, pose, bend, float(length), inserted_mm, branch
+        ):
             return False
         inserted_mm += float(length)
     return True
 
 
 def _insertion(
-    space: NeedleSpace,
+    environment: NeedleEnvironment,
     query: Query,
     needle: _Needle,
     truth: Truth,
@@ -311,17 +313,19 @@ def _insertion(
         label=needle.label,
         target_lps=read_only(target),
         tip_error_mm=error,
-        clearance_mm=_smallest_clearance(space, query.branch, frames[:, :3, 3], lengths),
+        clearance_mm=_smallest_clearance(environment, query.branch, frames[:, :3, 3], lengths),
         replans=tuple(replans),
     )
 
 
-def _smallest_clearance(space: NeedleSpace, branch: int, points: Float, lengths: Float) -> float:
+def _smallest_clearance(environment: NeedleEnvironment, branch: int, points: Float, lengths: Float) -> float:
     """Return the exact smallest distance from the needle's surface to an obstacle at points `(N, 3)`."""
-    field, labels, geometry, bits = space.arrays
+    field, labels, geometry, bits = environment.obstacles
     bounds = np.zeros(len(points))
     bounds_at(field, geometry, np.ascontiguousarray(points), bounds)
-    in_exit = (lengths < space.limits[index.EXEMPT_LENGTH]) if branch >= 0 else np.zeros(len(points), bool)
+    in_exit = (
+        (lengths < environment.limits[index.EXEMPT_LENGTH]) if branch >= 0 else np.zeros(len(points), bool)
+    )
     cap = float(bounds.min()) + 1.0
     while True:
         least = cap
@@ -332,5 +336,5 @@ def _smallest_clearance(space: NeedleSpace, branch: int, points: Float, lengths:
             exact_at(labels, geometry, near, bits, spared, cap, distances)
             least = min(least, float(distances.min(initial=cap)))
         if least < cap or cap > WIDEST_CLEARANCE_MM:
-            return least - space.needle.radius_mm
+            return least - environment.needle.radius_mm
         cap *= 2.0

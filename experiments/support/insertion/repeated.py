@@ -18,11 +18,11 @@ from experiments.support.insertion.closed_loop import (
     simulate,
 )
 from experiments.support.insertion.truth import Errors
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.replanning.replanner import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
 from stages.needle.search.base import Query
-from stages.needle.space import NeedleSpace
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
@@ -64,7 +64,7 @@ class Study:
 
 
 def study(
-    space: NeedleSpace,
+    environment: NeedleEnvironment,
     query: Query,
     plan: ArcPath,
     errors: Errors,
@@ -91,7 +91,7 @@ def study(
     def insertions(closed_loop: bool) -> Iterator[Insertion]:
         for seed in chosen:
             yield simulate(
-                space, query, plan, errors, closed_loop=closed_loop, seed=seed, step_mm=step_mm,
+                environment, query, plan, errors, closed_loop=closed_loop, seed=seed, step_mm=step_mm,
                 tolerance_mm=tolerance_mm, gain=gain, objective=objective, replanning=replanning,
                 iterations=iterations,
             )  # fmt: skip

@@ -1,6 +1,6 @@
 """Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
-`tube` is the tuple (scene, constants) of `stages.tube.kernels.deployment`.  `needle` is the tuple (space,
+`tube` is the tuple (scene, constants) of `stages.tube.kernels.deployment`.  `needle` is the tuple (obstacles,
 limits, objective, whether voxels of infinite cost exist that the objective does not see, a cost map) of
 `stages.needle.kernels`.  A choice has two parts.  `x` holds a row of `scope_poses`, the rotation in rad, and
 the insertions of outer and inner tube in mm.  `vias` are points (LPS mm) through which single arcs lead from
@@ -76,7 +76,7 @@ def _tube_tip(constants, base, normal, outer, inner):
 @inner_kernel
 def _needle_cost(needle, pose, vias, count, target, cost_limit):
     """Return the cost of the arcs through `count` vias; infinite beyond a limit or from `cost_limit` on."""
-    space, limits, objective, sees_walls, walls = needle
+    obstacles, limits, objective, sees_walls, walls = needle
     length = 0.0
     turn = 0.0
     cost = 0.0
@@ -100,10 +100,10 @@ def _needle_cost(needle, pose, vias, count, target, cost_limit):
         aside = bend[1] * start[3] + bend[2] * start[4] + bend[3] * start[5]
         if least_cosine(forward, aside, angle) < cosine:
             return math.inf
-        cost += cost_of_arc(space, objective, limits[COST_STEP], pose, bend, arc, m == 0)
+        cost += cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, arc, m == 0)
         if not cost < cost_limit:
             return math.inf
-        if sees_walls and map_costs_on_arc(walls, space[2], pose, bend, arc, m == 0)[0] == math.inf:
+        if sees_walls and map_costs_on_arc(walls, obstacles[2], pose, bend, arc, m == 0)[0] == math.inf:
             return math.inf
         if m < count:
             pose = pose_on_arc(pose, bend, arc)
@@ -113,14 +113,14 @@ def _needle_cost(needle, pose, vias, count, target, cost_limit):
 @inner_kernel
 def _needle_clear(needle, pose, vias, count, target, branch):
     """Tell whether all arcs through the vias are proved clear."""
-    space, limits, _objective, _sees_walls, _walls = needle
+    obstacles, limits, _objective, _sees_walls, _walls = needle
     length = 0.0
     for m in range(count + 1):
         goal = target
         if m < count:
             goal = (vias[m, 0], vias[m, 1], vias[m, 2])
         arc, bend, _angle = arc_to_point(pose, goal)
-        if blocker_on_arc(space, limits, pose, bend, arc, length, branch) != 0:
+        if blocker_on_arc(obstacles, limits, pose, bend, arc, length, branch) != 0:
             return False
         length += arc
         pose = pose_on_arc(pose, bend, arc)

@@ -33,10 +33,10 @@ PRUNED_BY_BOUND = -2
 @inner_kernel
 def _clearance_bound(needle, x, y, z):
     """Return a distance in mm that the clearance at a point does not exceed."""
-    space, _limits, _objective, _sees_walls, _walls = needle
-    geometry = space[2]
+    obstacles, _limits, _objective, _sees_walls, _walls = needle
+    geometry = obstacles[2]
     diagonal = math.sqrt(geometry[0, 4] + geometry[1, 4] + geometry[2, 4])
-    return max(distance_estimate(space[0], geometry, x, y, z) + diagonal, CLEARANCE_FLOOR_MM)
+    return max(distance_estimate(obstacles[0], geometry, x, y, z) + diagonal, CLEARANCE_FLOOR_MM)
 
 
 @inner_kernel
@@ -93,7 +93,7 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
     float
         The cost of the cheapest clear arc, or `best`.
     """
-    space, limits, objective, _sees_walls, _walls = needle
+    obstacles, limits, objective, _sees_walls, _walls = needle
     end = _clearance_bound(needle, target[0], target[1], target[2])
     for n in range(positions.shape[0]):
         x, y, z = positions[n]
@@ -111,11 +111,11 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
         if _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length) > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        costs[n] = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, True)
+        costs[n] = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, True)
         if costs[n] > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        blockers[n] = blocker_on_arc(space, limits, pose, bend, length, 0.0, branches[n])
+        blockers[n] = blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branches[n])
         if blockers[n] == 0 and costs[n] < best:
             best = costs[n]
     return best

@@ -72,10 +72,10 @@ class AtlasSearch:
         self.judge = TubeJudge(
             task.lung, task.system.tubes, task.system.margins, with_fissures=task.with_fissures
         )
-        self.in_workspace, self._lengths = atlas.index.holding(self.desk.space, task.target.lps_mm)
+        self.in_workspace, self._lengths = atlas.index.holding(self.desk.environment, task.target.lps_mm)
         self.best: Step | None = None
         self.rng = np.random.Generator(np.random.PCG64(task.seed))
-        self._needle = needle_of(self.desk.space, task)
+        self._needle = needle_of(self.desk.environment, task)
         self._clear: Int = np.zeros(0, dtype=np.int64)
         self._share = (0, 1)
         self._refined_cost = math.inf
@@ -284,7 +284,7 @@ class AtlasSearch:
         if candidate is None:
             return None
         objective, query = objective_of(self.task), self.desk.query(candidate.deployment)
-        search = OptimalSearch(self.desk.space, query, seed=seed, objective=objective)
+        search = OptimalSearch(self.desk.environment, query, seed=seed, objective=objective)
         search.cost = PLANNER_SLACK * self._best_cost
         search.advance(iterations)
         return None if search.path is None else replace(candidate, path=search.path)

@@ -33,7 +33,7 @@ def different_candidates(search: AtlasSearch, count: int, separation_mm: float) 
     for sample in _samples(entries.branch[near]):
         looked = near[sample]
         blockers, lengths, inverse = direct_arcs(
-            search.desk.space,
+            search.desk.environment,
             entries.positions[looked],
             entries.tangents[looked],
             entries.branch[looked],

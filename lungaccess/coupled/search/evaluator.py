@@ -17,10 +17,10 @@ from lungaccess.plans.costs import path_cost
 from stages.needle import (
     CURVATURE,
     ArcPath,
-    NeedleSpace,
+    NeedleEnvironment,
     Query,
     map_integral,
-    needle_space,
+    needle_environment,
     objection,
     workspace_lengths,
 )
@@ -47,7 +47,7 @@ class NeedleDesk:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.space: NeedleSpace = needle_space(
+        self.environment: NeedleEnvironment = needle_environment(
             task.lung, task.system.needle, task.system.margins, with_fissures=task.with_fissures
         )
         self.blocked: Counter[str] = Counter()
@@ -60,7 +60,7 @@ class NeedleDesk:
     def reaches(self, lps_from_tip: Float) -> bool:
         """Tell whether the target lies in the workspace of a start pose."""
         length = workspace_lengths(
-            self.space, lps_from_tip[None, :3, 3], lps_from_tip[None, :3, 2], self.task.target.lps_mm
+            self.environment, lps_from_tip[None, :3, 3], lps_from_tip[None, :3, 2], self.task.target.lps_mm
         )
         return bool(np.isfinite(length[0]))
 
@@ -72,7 +72,7 @@ class NeedleDesk:
     def _problem(self) -> NeedleProblem:
         from stages.needle.ompl import NeedleProblem
 
-        return NeedleProblem(self.space)
+        return NeedleProblem(self.environment)
 
     def proved(self, deployment: Deployment, path: ArcPath) -> bool:
         """Prove the path once more, from the numbers that the plan will state, and all limits of the needle.
@@ -81,7 +81,7 @@ class NeedleDesk:
         """
         if path.arcs[:, CURVATURE].max() > self.task.system.needle.max_curvature_per_mm:
             return False
-        if objection(self.space, self.query(deployment), path):
+        if objection(self.environment, self.query(deployment), path):
             return False
         return math.isfinite(map_integral(self.task.lung.cost, path))
 

@@ -16,16 +16,16 @@ from lungaccess.plans.assemble import Candidate, Task
 from stages.needle import (
     NO_MAP,
     ArcPath,
-    NeedleSpace,
+    NeedleEnvironment,
     Objective,
     ObjectiveArrays,
-    SpaceArrays,
+    Obstacles,
     direct_path,
 )
 from stages.scope import Sites
 from stages.tube import Deployment, TubeJudge, scene_of, tube_constants
 
-Needle = tuple[SpaceArrays, Float, ObjectiveArrays, bool, Float32]
+Needle = tuple[Obstacles, Float, ObjectiveArrays, bool, Float32]
 
 KICK = np.array([4.0, math.radians(15.0), 2.0, 2.0])
 """Spread of stand (rows), rotation, and insertions in mm."""
@@ -66,12 +66,12 @@ class Climb:
     tries: int = field(default=0)
 
 
-def needle_of(space: NeedleSpace, task: Task) -> Needle:
+def needle_of(environment: NeedleEnvironment, task: Task) -> Needle:
     """Return a needle among obstacles, and what its path is to keep small, for the kernels."""
     objective, costs = objective_of(task), task.lung.cost
     blind = costs is not None and not objective.weighs_map and not np.isfinite(costs.array).all()
     walls = costs.array if blind and costs is not None else NO_MAP
-    return space.arrays, space.limits, space.objective_arrays(objective), blind, walls
+    return environment.obstacles, environment.limits, environment.objective_arrays(objective), blind, walls
 
 
 class Climber:
@@ -86,12 +86,12 @@ class Climber:
     """
 
     def __init__(self, desk: NeedleDesk, judge: TubeJudge, places: Sites, rng: np.random.Generator) -> None:
-        task, space = desk.task, desk.space
+        task, environment = desk.task, desk.environment
         tubes, margins = task.system.tubes, task.system.margins
         self._desk, self._judge, self._places, self._rng = desk, judge, places, rng
         scene = scene_of(task.lung, with_fissures=task.with_fissures)
         self.tube = (scene, tube_constants(tubes, margins))
-        self.needle = needle_of(space, task)
+        self.needle = needle_of(environment, task)
         x, y, z = task.target.lps_mm.tolist()
         self.target = (x, y, z)
 

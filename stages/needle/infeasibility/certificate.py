@@ -19,12 +19,12 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.typed import Float, Int, UInt64
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
 from stages.needle.infeasibility.kernels import reachability_pruning as hopes
 from stages.needle.infeasibility.kernels import reachable_sets as sets
 from stages.needle.kernels import limits as index
 from stages.needle.search.base import Query
-from stages.needle.space import NeedleSpace
 
 CUBES_MM = (0.5, 0.25)
 FIRST_CELL_MM = 0.5
@@ -81,7 +81,7 @@ class NoPathProof:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
     max_bytes : int
         Most memory for states and tables.
@@ -108,7 +108,7 @@ class NoPathProof:
     Without that, nothing is proved.  Where the exit may touch a pierced branch, that branch is no obstacle.
     """
 
-    def __init__(self, space: NeedleSpace, query: Query, *, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, environment: NeedleEnvironment, query: Query, *, max_bytes: int = MAX_BYTES) -> None:
         if max_bytes <= 0:
             raise SettingsError(f"The memory for a proof is {max_bytes} bytes", expected="more than 0")
         self.outcome = "running"
@@ -117,13 +117,13 @@ class NoPathProof:
         self.slope_cell = math.inf
         self.states = 0
         """Largest number of states on a plane so far."""
-        self._space = space
+        self._environment = environment
         self._query = query
         self._max_bytes = max_bytes
-        self._required = float(space.limits[index.REQUIRED])
-        self._exempt_mm = float(space.limits[index.EXEMPT_LENGTH]) - query.inserted_mm
-        self._kappa = max(float(space.limits[index.KAPPA]) * (1.0 + ROUNDING), LEAST_KAPPA)
-        self._tolerance = space.goal_tolerance_mm + bounds.SPARE
+        self._required = float(environment.limits[index.REQUIRED])
+        self._exempt_mm = float(environment.limits[index.EXEMPT_LENGTH]) - query.inserted_mm
+        self._kappa = max(float(environment.limits[index.KAPPA]) * (1.0 + ROUNDING), LEAST_KAPPA)
+        self._tolerance = environment.goal_tolerance_mm + bounds.SPARE
         self._planes: list[Plane] = []
         self._coarse: list[Plane] = []
         self._too_steep = False
@@ -166,14 +166,14 @@ class NoPathProof:
 
     def _measure(self) -> None:
         """Set up the line from start to target, and look whether the proof can hold or is already done."""
-        space, query = self._space, self._query
+        environment, query = self._environment, self._query
         start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
         chord = query.target - start
         total = float(np.linalg.norm(chord))
-        length = float(space.limits[index.MAX_LENGTH]) - query.inserted_mm + bounds.SPARE
-        turn = min(float(space.limits[index.MAX_TURN]) - query.turned_rad, self._kappa * length)
-        if space.limits[index.LOOKUP_STEP] > 0.0:
-            self._end("undecided", "paths of this space need not be clear")
+        length = float(environment.limits[index.MAX_LENGTH]) - query.inserted_mm + bounds.SPARE
+        turn = min(float(environment.limits[index.MAX_TURN]) - query.turned_rad, self._kappa * length)
+        if environment.limits[index.LOOKUP_STEP] > 0.0:
+            self._end("undecided", "paths of this environment need not be clear")
         elif turn > math.pi * (1.0 + ROUNDING):
             self._end("undecided", "the needle may turn by more than 180 degrees in all")
         elif total <= self._tolerance + LEAST_WAY_MM:
@@ -196,7 +196,9 @@ class NoPathProof:
 
     def _clearance_at_most(self, point: Float) -> float:
         exempt = self._query.branch if self._exempt_mm > 0.0 else -1
-        return float(blocked.clearance_above(self._space.arrays, self._required, 0.0, exempt, *point))
+        return float(
+            blocked.clearance_above(self._environment.obstacles, self._required, 0.0, exempt, *point)
+        )
 
     def _bound(self, total: float, length: float) -> None:
         """Bound the places and the angle to the line that a path of at most `length` mm can have."""
@@ -241,9 +243,9 @@ class NoPathProof:
         if 5 * size > self._max_bytes or size >= 1 << 31:
             return False
         return not cubes.flood(
-            self._space.arrays, self._required, self._query.branch, self._exempt_mm, self._scale, self._ends,
-            self._frame, side, np.array([-before, -beside, -beside]), np.zeros(shape, dtype=np.bool_),
-            np.zeros(size, dtype=np.int32),
+            self._environment.obstacles, self._required, self._query.branch, self._exempt_mm, self._scale,
+            self._ends, self._frame, side, np.array([-before, -beside, -beside]), np.zeros(shape,
+            dtype=np.bool_), np.zeros(size, dtype=np.int32),
         )  # fmt: skip
 
     def _aim_planes(self) -> None:
@@ -295,7 +297,7 @@ class NoPathProof:
         plane = self._allowed(number)
         hopes.keep_hopeful(
             plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
-            float(self._space.limits[index.MAX_ANGLE]),
+            float(self._environment.limits[index.MAX_ANGLE]),
         )  # fmt: skip
         if number > 0 and plane.bits.any():
             plane = plane.trimmed()
@@ -437,6 +439,13 @@ class NoPathProof:
             tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
             origin = self._frame[0] + depth * (self._frame[1] + tangent) + corners[n] @ across
             blocked.grade_clearance(
-                self._space.arrays, self._required, exempt, origin, across, probed[n], slacks, grades[n]
+                self._environment.obstacles,
+                self._required,
+                exempt,
+                origin,
+                across,
+                probed[n],
+                slacks,
+                grades[n],
             )
         blocked.keep_clear(plane.bits, plane.window, self._scale, probes, corners, grades, slacks)

@@ -36,9 +36,9 @@ OFF_GRID = -1
 
 
 @numba.njit(cache=True)
-def inverse_clearance_on_arc(space, step, pose, bend, length):
+def inverse_clearance_on_arc(obstacles, step, pose, bend, length):
     """Estimate the integral of 1 / clearance along an arc [Kuntz2015, eq. 1] by the trapezoid rule."""
-    field, _labels, geometry, _bits = space
+    field, _labels, geometry, _bits = obstacles
     count = max(int(math.ceil(length / step)), 1)
     total = 0.0
     for m in range(count + 1):
@@ -241,14 +241,14 @@ def map_costs_on_arc(costs, geometry, pose, bend, length, first):
 
 
 @numba.njit(cache=True)
-def cost_of_arc(space, objective, step, pose, bend, length, first):
+def cost_of_arc(obstacles, objective, step, pose, bend, length, first):
     """Return the weighted cost of an arc; `first` tells whether its path starts with it."""
     weights, costs = objective
     total = weights[LENGTH] * length
     if weights[INVERSE_CLEARANCE] > 0.0:
-        total += weights[INVERSE_CLEARANCE] * inverse_clearance_on_arc(space, step, pose, bend, length)
+        total += weights[INVERSE_CLEARANCE] * inverse_clearance_on_arc(obstacles, step, pose, bend, length)
     if weights[MAP_INTEGRAL] > 0.0 or weights[VOXEL_SUM] > 0.0:
-        integral, voxel_sum = map_costs_on_arc(costs, space[2], pose, bend, length, first)
+        integral, voxel_sum = map_costs_on_arc(costs, obstacles[2], pose, bend, length, first)
         if integral == math.inf:
             return math.inf
         total += weights[MAP_INTEGRAL] * integral + weights[VOXEL_SUM] * voxel_sum

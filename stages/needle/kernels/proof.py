@@ -1,6 +1,6 @@
 """The proof that an arc is clear of obstacles.
 
-`space` is the tuple (clearance field, label volume, their geometry, obstacle bits), see
+`obstacles` is the tuple (clearance field, label volume, their geometry, obstacle bits), see
 `anatomy.kernels.field`; `pose` and `bend` are the tuples of `anatomy.kernels.arcs`.
 """
 
@@ -25,9 +25,9 @@ _LUMEN = np.int64(LUMEN)
 
 
 @inner_kernel
-def _early_blocker(space, required, pose, bend, begin, length):
+def _early_blocker(obstacles, required, pose, bend, begin, length):
     """Look for an obstacle at a few points of an arc, the middle first; 0 if none is met."""
-    field, labels, geometry, bits = space
+    field, labels, geometry, bits = obstacles
     count = 1
     while (length - begin) / count > PROBE_SPACING_MM:
         for m in range(count):
@@ -41,9 +41,9 @@ def _early_blocker(space, required, pose, bend, begin, length):
 
 
 @inner_kernel
-def _blocker_by_lookup(space, step, pose, bend, length):
+def _blocker_by_lookup(obstacles, step, pose, bend, length):
     """Look up the voxels at the ends of steps of an arc [Fu2018, fig. 6, right]: no proof."""
-    _field, labels, geometry, bits = space
+    _field, labels, geometry, bits = obstacles
     count = max(int(math.ceil(length / step)), 1)
     for m in range(count + 1):
         x, y, z = point_on_arc(pose, bend, length * m / count)
@@ -54,7 +54,7 @@ def _blocker_by_lookup(space, step, pose, bend, length):
 
 
 @numba.njit(cache=True)
-def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
+def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
     """Prove an arc clear of obstacles: 0 if it is, else the label of the voxel that is too near.
 
     Clearance is 1-Lipschitz: where it exceeds the required one by `gap`, the next `gap` mm are clear.
@@ -65,12 +65,12 @@ def blocker_on_arc(space, limits, pose, bend, length, s0, branch):
     With `limits[LOOKUP_STEP]` nothing is proved: see `experiments.support.inflation`.
     """
     if limits[LOOKUP_STEP] > 0.0:
-        return _blocker_by_lookup(space, limits[LOOKUP_STEP], pose, bend, length)
-    field, labels, geometry, bits = space
+        return _blocker_by_lookup(obstacles, limits[LOOKUP_STEP], pose, bend, length)
+    field, labels, geometry, bits = obstacles
     required = limits[REQUIRED]
     reach = required + EXACT_REACH_MM
     exempt = limits[EXEMPT_LENGTH] - s0 if branch >= 0 else 0.0
-    early = _early_blocker(space, required, pose, bend, max(exempt, 0.0), length)
+    early = _early_blocker(obstacles, required, pose, bend, max(exempt, 0.0), length)
     if early != 0:
         return early
     s = 0.0

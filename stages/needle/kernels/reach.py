@@ -52,9 +52,9 @@ _NOBODY = np.int64(-1)
 
 
 @inner_kernel
-def _least_clearance(space, limits, pose, bend, length, s0, least):
+def _least_clearance(obstacles, limits, pose, bend, length, s0, least):
     """Return a clearance that an arc is never below beyond the exempt length, at most `least`."""
-    field, _labels, geometry, _bits = space
+    field, _labels, geometry, _bits = obstacles
     begin = min(max(limits[EXEMPT_LENGTH] - s0, 0.0), length)
     count = max(int(math.ceil((length - begin) / CLEARANCE_STEP_MM)), 1)
     half = 0.5 * (length - begin) / count
@@ -65,9 +65,9 @@ def _least_clearance(space, limits, pose, bend, length, s0, least):
 
 
 @inner_kernel
-def _is_blocked(space, required, x, y, z):
+def _is_blocked(obstacles, required, x, y, z):
     """Tell whether a point is nearer than `required` to an obstacle; exact distances only where in doubt."""
-    field, labels, geometry, bits = space
+    field, labels, geometry, bits = obstacles
     total, spread = interpolate_squared(field, geometry, x, y, z)
     if total - spread >= required * required:
         return False
@@ -79,7 +79,7 @@ def _is_blocked(space, required, x, y, z):
 
 
 @inner_kernel
-def _blocked_share(space, limits, pose, bend, length, share):
+def _blocked_share(obstacles, limits, pose, bend, length, share):
     """Look for an obstacle at a few points of an arc, first where it was met the last time; -1 if none is.
 
     `share` is that place, as a share of the length beyond the exempt one.
@@ -89,21 +89,21 @@ def _blocked_share(space, limits, pose, bend, length, share):
     if length <= begin:
         return -1.0
     x, y, z = point_on_arc(pose, bend, begin + (length - begin) * share)
-    if _is_blocked(space, required, x, y, z):
+    if _is_blocked(obstacles, required, x, y, z):
         return share
     count = 1
     while (length - begin) / count > PROBE_SPACING_MM:
         for m in range(count):
             share = (m + 0.5) / count
             x, y, z = point_on_arc(pose, bend, begin + (length - begin) * share)
-            if _is_blocked(space, required, x, y, z):
+            if _is_blocked(obstacles, required, x, y, z):
                 return share
         count *= 2
     return -1.0
 
 
 @inner_kernel
-def _arc_cost(space, limits, start, branch, q, below, hints, entry):
+def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
     """Return the estimated cost of the direct arc.
 
     It is inf if the arc breaks a limit, is not proved clear, or costs no less than `below`.
@@ -116,16 +116,16 @@ def _arc_cost(space, limits, start, branch, q, below, hints, entry):
         or turn > min(limits[MAX_ANGLE], limits[MAX_TURN])
     ):
         return math.inf
-    share = _blocked_share(space, limits, pose, bend, length, hints[entry])
+    share = _blocked_share(obstacles, limits, pose, bend, length, hints[entry])
     if share >= 0.0:
         hints[entry] = share
         return math.inf
     cost = -1.0
     if below < math.inf:
-        cost = inverse_clearance_on_arc(space, limits[COST_STEP], pose, bend, length)
-    if cost >= below or blocker_on_arc(space, limits, pose, bend, length, 0.0, branch) != 0:
+        cost = inverse_clearance_on_arc(obstacles, limits[COST_STEP], pose, bend, length)
+    if cost >= below or blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branch) != 0:
         return math.inf
-    return cost if cost >= 0.0 else inverse_clearance_on_arc(space, limits[COST_STEP], pose, bend, length)
+    return cost if cost >= 0.0 else inverse_clearance_on_arc(obstacles, limits[COST_STEP], pose, bend, length)
 
 
 @inner_kernel
@@ -155,7 +155,7 @@ def _mark_candidates(limits, mixed, q, begin, end, marks):
 
 
 @inner_kernel
-def _best_of_mixed(space, limits, starts, branches, order, mixed, q, wanted, hints, marks):
+def _best_of_mixed(obstacles, limits, starts, branches, order, mixed, q, wanted, hints, marks):
     """Return the cheapest of the first `wanted` clear arcs and its start pose, (inf, -1) if there is none."""
     best = math.inf
     chosen = -1
@@ -168,7 +168,7 @@ def _best_of_mixed(space, limits, starts, branches, order, mixed, q, wanted, hin
             if not marks[m - begin]:
                 continue
             entry = order[m]
-            cost = _arc_cost(space, limits, starts[entry], branches[entry], q, math.inf, hints, entry)
+            cost = _arc_cost(obstacles, limits, starts[entry], branches[entry], q, math.inf, hints, entry)
             if cost < math.inf:
                 clear += 1
                 if cost < best:
@@ -180,7 +180,7 @@ def _best_of_mixed(space, limits, starts, branches, order, mixed, q, wanted, hin
 
 
 @inner_kernel
-def _improved(space, limits, starts, branches, q, best, chosen, hints):
+def _improved(obstacles, limits, starts, branches, q, best, chosen, hints):
     """Move from the best start pose to its neighbours in the list as long as that is cheaper."""
     for _ in range(ROUNDS):
         centre = chosen
@@ -189,7 +189,7 @@ def _improved(space, limits, starts, branches, q, best, chosen, hints):
             for side in range(2):
                 other = centre + jump if side == 0 else centre - jump
                 if 0 <= other < starts.shape[0]:
-                    cost = _arc_cost(space, limits, starts[other], branches[other], q, best, hints, other)
+                    cost = _arc_cost(obstacles, limits, starts[other], branches[other], q, best, hints, other)
                     if cost < best:
                         best = cost
                         chosen = other
@@ -200,9 +200,9 @@ def _improved(space, limits, starts, branches, q, best, chosen, hints):
 
 
 @inner_kernel
-def _has_room(space, limits, q, bits):
+def _has_room(obstacles, limits, q, bits):
     """Tell whether the needle's tip keeps the required clearance at a point."""
-    _field, labels, geometry, _bits = space
+    _field, labels, geometry, _bits = obstacles
     required = limits[REQUIRED]
     distance, _label = exact_distance(labels, geometry, q[0], q[1], q[2], bits, -1, required + 0.1)
     return distance >= required
@@ -210,7 +210,8 @@ def _has_room(space, limits, q, bits):
 
 @numba.njit(cache=True, nogil=True)
 def reach_by_arcs(
-    space, limits, starts, branches, order, mixed, points, near, wanted, hints, marks, kinds, found, entries
+    obstacles, limits, starts, branches, order, mixed, points, near, wanted, hints, marks, kinds, found,
+    entries
 ):  # fmt: skip
     """Try the single arcs to each point.
 
@@ -221,7 +222,7 @@ def reach_by_arcs(
 
     Parameters
     ----------
-    space, limits : tuple, (N_LIMITS,) float64
+    obstacles, limits : tuple, (N_LIMITS,) float64
         See `proof` and `limits`.
     starts, branches, order, mixed
         See the module.
@@ -239,48 +240,50 @@ def reach_by_arcs(
     entries : (N,) int64
         Receives the start pose of what is reached, else -1.
     """
-    bits = space[3]
+    bits = obstacles[3]
     for n in range(points.shape[0]):
         q = (points[n, 0], points[n, 1], points[n, 2])
         kinds[n] = NO_ROOM
         entries[n] = -1
         # At the exit the airway may be nearer.
-        if not _has_room(space, limits, q, bits & ~AIRWAY):
+        if not _has_room(obstacles, limits, q, bits & ~AIRWAY):
             continue
-        best, chosen = _best_of_mixed(space, limits, starts, branches, order, mixed, q, wanted, hints, marks)
+        best, chosen = _best_of_mixed(
+            obstacles, limits, starts, branches, order, mixed, q, wanted, hints, marks
+        )
         if chosen < 0:
-            if _has_room(space, limits, q, bits):
+            if _has_room(obstacles, limits, q, bits):
                 kinds[n] = UNREACHED
             continue
         for other in near[n]:
             entry = entries[other] if other >= 0 else -1
             if entry >= 0:
-                cost = _arc_cost(space, limits, starts[entry], branches[entry], q, best, hints, entry)
+                cost = _arc_cost(obstacles, limits, starts[entry], branches[entry], q, best, hints, entry)
                 if cost < best:
                     best, chosen = cost, entry
-        best, chosen = _improved(space, limits, starts, branches, q, best, chosen, hints)
+        best, chosen = _improved(obstacles, limits, starts, branches, q, best, chosen, hints)
         entries[n] = chosen
         start = starts[chosen]
         pose = (start[0], start[1], start[2], start[3], start[4], start[5])
         length, bend, _turn = arc_to_point(pose, q)
         kinds[n] = DIRECT
         found[n, COST] = best
-        found[n, CLEARANCE] = _least_clearance(space, limits, pose, bend, length, 0.0, math.inf)
+        found[n, CLEARANCE] = _least_clearance(obstacles, limits, pose, bend, length, 0.0, math.inf)
 
 
 @inner_kernel
-def _grow(space, limits, objective, start, branch, q, nodes, parents, iterations, share, state):
+def _grow(obstacles, limits, objective, start, branch, q, nodes, parents, iterations, share, state):
     """Grow a tree from one start pose; return the row at the point, 0 if it was not reached."""
     for c in range(nodes.shape[1]):
         nodes[0, c] = start[c] if c < 6 else 0.0
     count, _used, solved = grow_rrt(
-        space, limits, objective, branch, q, nodes, parents, 1, iterations, share, state, math.inf
+        obstacles, limits, objective, branch, q, nodes, parents, 1, iterations, share, state, math.inf
     )
     return count - 1 if solved else 0
 
 
 @inner_kernel
-def _record_path(space, limits, nodes, parents, last, row):
+def _record_path(obstacles, limits, nodes, parents, last, row):
     """Fill `row` with cost and least clearance of the path to the node `last`."""
     least = math.inf
     node = last
@@ -291,7 +294,7 @@ def _record_path(space, limits, nodes, parents, last, row):
         pose = pose_of(nodes[parent])
         if nodes[node, PATH_LENGTH] > limits[EXEMPT_LENGTH] or node == last:
             begun = nodes[parent, PATH_LENGTH]
-            least = _least_clearance(space, limits, pose, bend, arc[ARC_LENGTH], begun, least)
+            least = _least_clearance(obstacles, limits, pose, bend, arc[ARC_LENGTH], begun, least)
         node = parent
     row[COST] = nodes[last, PATH_COST]
     row[CLEARANCE] = least
@@ -299,7 +302,7 @@ def _record_path(space, limits, nodes, parents, last, row):
 
 @numba.njit(cache=True, nogil=True)
 def reach_by_search(
-    space, limits, objective, starts, branches, order, points, trees, iterations, share, seeds,
+    obstacles, limits, objective, starts, branches, order, points, trees, iterations, share, seeds,
     nodes, parents, picked, kinds, found, entries,
 ):  # fmt: skip
     """Search paths of several arcs to the points that no single arc reaches.
@@ -309,7 +312,7 @@ def reach_by_search(
 
     Parameters
     ----------
-    space, limits, objective, starts, branches, order, points
+    obstacles, limits, objective, starts, branches, order, points
         See `reach_by_arcs` and `cost`.
     trees, iterations, share : int, int, float
         Trees for each point, and iterations and share of random arcs of each.
@@ -334,7 +337,9 @@ def reach_by_search(
             rho, h = seen_from((start[0], start[1], start[2], start[3], start[4], start[5]), q)
             if workspace_length(rho, h, limits) == math.inf:
                 continue
-            last = _grow(space, limits, objective, start, branches[entry], q, nodes, parents, 0, share, state)
+            last = _grow(
+                obstacles, limits, objective, start, branches[entry], q, nodes, parents, 0, share, state
+            )
             if last > 0:
                 break
             if count < trees:
@@ -344,11 +349,11 @@ def reach_by_search(
         while last == 0 and turn < count:
             entry = picked[turn]
             last = _grow(
-                space, limits, objective, starts[entry], branches[entry], q, nodes, parents, iterations,
+                obstacles, limits, objective, starts[entry], branches[entry], q, nodes, parents, iterations,
                 share, state,
             )  # fmt: skip
             turn += 1
         if last > 0:
             kinds[n] = SEARCHED
             entries[n] = entry
-            _record_path(space, limits, nodes, parents, last, found[n])
+            _record_path(obstacles, limits, nodes, parents, last, found[n])

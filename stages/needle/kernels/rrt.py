@@ -95,7 +95,7 @@ def random_arc(pose, limits, state):
 
 @numba.njit(cache=True, nogil=True)
 def grow_rrt(
-    space, limits, objective, branch, goal, nodes, parents, count, iterations, random_share, state, best
+    obstacles, limits, objective, branch, goal, nodes, parents, count, iterations, random_share, state, best
 ):
     """Grow the tree of [Kuntz2015, sec. IV-C] by up to `iterations` samples, until it reaches the goal.
 
@@ -104,7 +104,7 @@ def grow_rrt(
 
     Parameters
     ----------
-    space, limits, objective : tuple, (N_LIMITS,) float64, tuple
+    obstacles, limits, objective : tuple, (N_LIMITS,) float64, tuple
         See `proof`, `limits` and `cost`.
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
@@ -131,7 +131,7 @@ def grow_rrt(
         return count, 0, False
     if count == 1:
         count = add_goal(
-            space, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
+            obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
         )
         if count > 1:
             return count, 0, True
@@ -149,11 +149,13 @@ def grow_rrt(
             length, bend, _turn = arc_to_point(pose_of(nodes[near]), q)
             length = min(length, limits[MAX_STEP])
         if not add_arc(
-            space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
+            obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
         ):
             continue
         count += 1
-        rows = add_goal(space, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state)
+        rows = add_goal(
+            obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
+        )
         if rows > count:
             return rows, used + 1, True
     return count, iterations, False

@@ -22,7 +22,7 @@ def workspace_scan(positions, tangents, target, limits, lengths):
 
 
 @numba.njit(cache=True, nogil=True)
-def direct_arcs(space, limits, positions, tangents, branches, target, blockers, costs):
+def direct_arcs(obstacles, limits, positions, tangents, branches, target, blockers, costs):
     """Try the single arc from each pose to `target`.
 
     `blockers` (N,) gets 0 where the arc is proved clear, the label that blocks it, or -1 where no
@@ -42,6 +42,6 @@ def direct_arcs(space, limits, positions, tangents, branches, target, blockers, 
         ):
             blockers[n] = -1
             continue
-        blockers[n] = blocker_on_arc(space, limits, pose, bend, length, 0.0, branches[n])
+        blockers[n] = blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branches[n])
         if blockers[n] == 0:
-            costs[n, 1] = inverse_clearance_on_arc(space, limits[COST_STEP], pose, bend, length)
+            costs[n, 1] = inverse_clearance_on_arc(obstacles, limits[COST_STEP], pose, bend, length)

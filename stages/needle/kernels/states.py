@@ -74,7 +74,7 @@ def inserted_at(state, origin):
 
 
 @numba.njit(cache=True)
-def is_allowed(space, limits, state, origin, branch):
+def is_allowed(obstacles, limits, state, origin, branch):
     """Tell whether a needle may stand at a state: clear, and within length and angle as far as it shows."""
     length = inserted_at(state, origin)
     _ex, _ey, (tx, ty, tz) = axes(state)
@@ -83,11 +83,11 @@ def is_allowed(space, limits, state, origin, branch):
         return False
     pose = (state[0], state[1], state[2], tx, ty, tz)
     nx, ny, nz = any_normal(tx, ty, tz)
-    return blocker_on_arc(space, limits, pose, (0.0, nx, ny, nz), 0.0, length, branch) == 0
+    return blocker_on_arc(obstacles, limits, pose, (0.0, nx, ny, nz), 0.0, length, branch) == 0
 
 
 @numba.njit(cache=True)
-def proved_step(space, limits, state, roll, curvature, length, origin, branch):
+def proved_step(obstacles, limits, state, roll, curvature, length, origin, branch):
     """Return the state at the end of an arc, not a number where the arc is not proved clear.
 
     The arc bends towards the angle `roll` about the tip's axis, which the rotation does not keep: the
@@ -98,7 +98,7 @@ def proved_step(space, limits, state, roll, curvature, length, origin, branch):
     pose = (state[0], state[1], state[2], ez[0], ez[1], ez[2])
     bend = (curvature, c * ex[0] + s * ey[0], c * ex[1] + s * ey[1], c * ex[2] + s * ey[2])
     begin = inserted_at(state, origin)
-    if not length >= 0.0 or blocker_on_arc(space, limits, pose, bend, length, begin, branch) != 0:
+    if not length >= 0.0 or blocker_on_arc(obstacles, limits, pose, bend, length, begin, branch) != 0:
         return math.nan, math.nan, math.nan, state[3], state[4], state[5], state[6]
     half = 0.5 * curvature * length
     bx, by, bw = -s * math.sin(half), c * math.sin(half), math.cos(half)

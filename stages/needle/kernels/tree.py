@@ -70,7 +70,7 @@ def angle_kept(limits, reference, pose, bend, turn):
 
 
 @numba.njit(cache=True)
-def add_arc(space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best):
+def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best):
     """Add an arc from node `near` as row `count`; True if it was added.
 
     Refused are arcs that turn too far or are not proved clear, and those from whose end no path within
@@ -101,9 +101,11 @@ def add_arc(space, limits, objective, branch, nodes, parents, count, near, bend,
     rate = objective[0][LEAST_RATE]
     if node[PATH_COST] + rate * (length + ahead - limits[GOAL_TOLERANCE]) >= best:
         return False
-    if blocker_on_arc(space, limits, pose, bend, length, node[PATH_LENGTH], branch) != 0:
+    if blocker_on_arc(obstacles, limits, pose, bend, length, node[PATH_LENGTH], branch) != 0:
         return False
-    cost = node[PATH_COST] + cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, near == 0)
+    cost = node[PATH_COST] + cost_of_arc(
+        obstacles, objective, limits[COST_STEP], pose, bend, length, near == 0
+    )
     cost += rate * missing
     if cost + rate * max(ahead - limits[GOAL_TOLERANCE], 0.0) >= best:
         return False
@@ -121,7 +123,7 @@ def add_arc(space, limits, objective, branch, nodes, parents, count, near, bend,
 
 
 @numba.njit(cache=True)
-def add_legs(space, limits, objective, branch, nodes, parents, count, near, q, goal, best):
+def add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best):
     """Add the shortest path from node `near` to a point, as one or two rows; return the new `count`.
 
     All or nothing: if the second leg is refused, the first is dropped.
@@ -134,14 +136,14 @@ def add_legs(space, limits, objective, branch, nodes, parents, count, near, q, g
     rows = count
     if first_length > MIN_ARC_MM:
         if not add_arc(
-            space, limits, objective, branch, nodes, parents, rows, at, first, first_length, goal, best
+            obstacles, limits, objective, branch, nodes, parents, rows, at, first, first_length, goal, best
         ):
             return count
         at = rows
         rows += 1
     if second_length > MIN_ARC_MM:
         if not add_arc(
-            space, limits, objective, branch, nodes, parents, rows, at, second, second_length, goal, best
+            obstacles, limits, objective, branch, nodes, parents, rows, at, second, second_length, goal, best
         ):
             return count
         rows += 1
@@ -181,7 +183,7 @@ def within(goal, tolerance, state):
 
 
 @numba.njit(cache=True)
-def add_goal(space, limits, objective, branch, nodes, parents, count, near, goal, best, state):
+def add_goal(obstacles, limits, objective, branch, nodes, parents, count, near, goal, best, state):
     """Try to finish from node `near`: by the single arc, else by the shortest path; return the new `count`.
 
     If rows were added, the last of them is at the goal.
@@ -192,7 +194,7 @@ def add_goal(space, limits, objective, branch, nodes, parents, count, near, goal
     if length < MIN_ARC_MM:
         return count
     if bend[0] <= limits[KAPPA] * (1.0 + TINY) and add_arc(
-        space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
+        obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
     ):
         return count + 1
-    return add_legs(space, limits, objective, branch, nodes, parents, count, near, q, goal, best)
+    return add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best)

@@ -12,11 +12,11 @@ from ompl import base
 
 from anatomy.kernels.field import MIN_GAP_MM
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import states
 from stages.needle.ompl.planner import Question
 from stages.needle.ompl.states import numbers_of, put_numbers
-from stages.needle.space import NeedleSpace
 
 ARC_STEPS = 20
 """A control of duration 1 is an arc; OMPL propagates it in so many steps."""
@@ -24,9 +24,9 @@ LONGEST_STEP_MM = 1.0
 """Longest step of a propagation."""
 
 
-def position_bounds(space: NeedleSpace) -> Any:
+def position_bounds(environment: NeedleEnvironment) -> Any:
     """Bound positions by the box of the grid."""
-    grid = space.grid
+    grid = environment.grid
     corners = grid.lps(list(itertools.product(*[(-0.5, n - 0.5) for n in grid.shape])))
     bounds = base.RealVectorBounds(3)
     for axis in range(3):
@@ -35,36 +35,36 @@ def position_bounds(space: NeedleSpace) -> Any:
     return bounds
 
 
-def control_bounds(space: NeedleSpace) -> Any:
+def control_bounds(environment: NeedleEnvironment) -> Any:
     """Bound length, roll and curvature of an arc, so that a step is at most 1 mm long."""
     bounds = base.RealVectorBounds(3)
-    highs = (ARC_STEPS * LONGEST_STEP_MM, math.pi, space.needle.max_curvature_per_mm)
+    highs = (ARC_STEPS * LONGEST_STEP_MM, math.pi, environment.needle.max_curvature_per_mm)
     for n, (low, high) in enumerate(zip((0.0, -math.pi, 0.0), highs, strict=True)):
         bounds.setLow(n, low)
         bounds.setHigh(n, high)
     return bounds
 
 
-def _limits_of_steps(space: NeedleSpace) -> Float:
+def _limits_of_steps(environment: NeedleEnvironment) -> Float:
     """Return the limits by which steps are proved, so that whatever is proved as an arc passes.
 
     The proof refuses points that have less than MIN_GAP_MM to spare.  Between its points half of that is
     left at least; so arcs that passed, cut anywhere, pass again with so much less required clearance, and
     what passes this way still has all of it.
     """
-    limits = np.array(space.limits)
+    limits = np.array(environment.limits)
     limits[index.REQUIRED] = max(limits[index.REQUIRED] - 0.5 * MIN_GAP_MM, 0.0)
     return limits
 
 
-def propagator(space: NeedleSpace, question: Question) -> Callable[[Any, Any, float, Any], None]:
+def propagator(environment: NeedleEnvironment, question: Question) -> Callable[[Any, Any, float, Any], None]:
     """Return how OMPL moves a state by a control."""
-    limits = _limits_of_steps(space)
+    limits = _limits_of_steps(environment)
 
     def propagate(state: Any, u: Any, duration: float, result: Any) -> None:
         """Advance along a share `duration` of an arc that bends towards `u[1]`, if that is proved clear."""
         moved = states.proved_step(
-            space.arrays,
+            environment.obstacles,
             limits,
             numbers_of(state),
             u[1],
@@ -78,14 +78,16 @@ def propagator(space: NeedleSpace, question: Question) -> Callable[[Any, Any, fl
     return propagate
 
 
-def validity(space: NeedleSpace, question: Question) -> Callable[[Any], bool]:
+def validity(environment: NeedleEnvironment, question: Question) -> Callable[[Any], bool]:
     """Return how OMPL tells whether a state is allowed."""
-    limits = _limits_of_steps(space)
+    limits = _limits_of_steps(environment)
 
     def is_valid(state: Any) -> bool:
         # A numpy.bool_ would raise std::bad_cast.
         return bool(
-            states.is_allowed(space.arrays, limits, numbers_of(state), question.origin, question.branch)
+            states.is_allowed(
+                environment.obstacles, limits, numbers_of(state), question.origin, question.branch
+            )
         )
 
     return is_valid

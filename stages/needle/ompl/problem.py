@@ -9,19 +9,19 @@ from typing import Any
 from ompl import base, control, util
 
 from anatomy.errors import SettingsError
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.ompl.motion import ARC_STEPS, control_bounds, position_bounds, propagator, validity
 from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question
 from stages.needle.ompl.states import path_of, put_numbers
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query, Search
 from stages.needle.search.planners import PLANNERS
-from stages.needle.space import NeedleSpace
 from stages.needle.violations import objection
 
 util.setLogLevel(util.LogLevel.LOG_ERROR)
 
-SearchFactory = Callable[[NeedleSpace, Query, int], Search]
-"""Makes a search of a space, a query and a seed."""
+SearchFactory = Callable[[NeedleEnvironment, Query, int], Search]
+"""Makes a search of an environment, a query and a seed."""
 Allocator = Callable[[Any], Any]
 """Makes an OMPL planner of a `control.SpaceInformation`."""
 
@@ -31,9 +31,9 @@ class NeedleProblem:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     searches : mapping of names to callables, optional
-        Each makes a search of a space, a query and a seed.  The first is the default; without any,
+        Each makes a search of an environment, a query and a seed.  The first is the default; without any,
         all of `stages.needle.search.planners`.
 
     Attributes
@@ -44,22 +44,24 @@ class NeedleProblem:
         The planner installed in `setup`: the default search, which may also be `anytime`.
     """
 
-    def __init__(self, space: NeedleSpace, searches: Mapping[str, SearchFactory] | None = None) -> None:
-        self.space = space
+    def __init__(
+        self, environment: NeedleEnvironment, searches: Mapping[str, SearchFactory] | None = None
+    ) -> None:
+        self.environment = environment
         self._searches = dict(searches or PLANNERS)
         self._question = Question()
         self._own: dict[str, NeedlePlanner] = {}
         self._tolerance_mm = 0.0
         position = base.SE3StateSpace()
-        position.setBounds(position_bounds(space))
+        position.setBounds(position_bounds(environment))
         controls = control.RealVectorControlSpace(position, 3)
-        controls.setBounds(control_bounds(space))
+        controls.setBounds(control_bounds(environment))
         self.setup = control.SimpleSetup(controls)
         self.si = self.setup.getSpaceInformation()
         self.si.setPropagationStepSize(1.0 / ARC_STEPS)
         self.si.setMinMaxControlDuration(1, ARC_STEPS)
-        self.setup.setStatePropagator(propagator(space, self._question))
-        self.setup.setStateValidityChecker(validity(space, self._question))
+        self.setup.setStatePropagator(propagator(environment, self._question))
+        self.setup.setStateValidityChecker(validity(environment, self._question))
         self.planner = self.planners()[self.default](self.si)
         self.setup.setPlanner(self.planner)
 
@@ -74,11 +76,11 @@ class NeedleProblem:
         For `setup.setPlanner(allocator(problem.si))` or `setup.setPlannerAllocator(allocator)`.
         """
         # The allocators may be kept by `setup`, so they must not refer to it: it would never be freed.
-        space, question = self.space, self._question
+        environment, question = self.environment, self._question
 
         def ours(name: str, make: SearchFactory) -> Allocator:
             def search(query: Query, seed: int) -> Search:
-                return make(space, query, seed)
+                return make(environment, query, seed)
 
             return lambda si: NeedlePlanner(si, search, question, name)
 
@@ -153,8 +155,8 @@ class NeedleProblem:
         ----------
         query : Query
         goal_tolerance_mm : float
-            How far from the target a path may end, where the space's own tolerance is smaller.  OMPL's
-            planners steer by chance and need about 1 mm; ours aim at what the space allows.
+            How far from the target a path may end, where the environment's own tolerance is smaller.  OMPL's
+            planners steer by chance and need about 1 mm; ours aim at what the environment allows.
         """
         self.setup.clear()
         self.setup.setGoal(self._ask(query, goal_tolerance_mm))
@@ -174,7 +176,7 @@ class NeedleProblem:
         query = self._question.query
         if query is None:
             return "no query was posed"
-        return objection(self.space, query, path, goal_tolerance_mm=self._tolerance_mm)
+        return objection(self.environment, query, path, goal_tolerance_mm=self._tolerance_mm)
 
     def unproved_solution(self) -> ArcPath | None:
         """Return the path that `setup` found, whether or not it is an answer; None if there is none."""
@@ -182,7 +184,7 @@ class NeedleProblem:
 
     def _ask(self, query: Query, goal_tolerance_mm: float) -> NeedleGoal:
         self._question.ask(query)
-        self._tolerance_mm = max(goal_tolerance_mm, self.space.goal_tolerance_mm)
+        self._tolerance_mm = max(goal_tolerance_mm, self.environment.goal_tolerance_mm)
         return NeedleGoal(self.si, query.target, self._tolerance_mm)
 
     def _start(self) -> Any:

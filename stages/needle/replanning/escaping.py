@@ -12,13 +12,13 @@ from anatomy.grid import read_only
 from anatomy.kernels.arcs import pose_on_arc
 from anatomy.kernels.field import EXACT_REACH_MM, exact_distance
 from anatomy.structures import BITS, LUMEN
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import ObjectiveArrays
 from stages.needle.path import bend_direction
 from stages.needle.replanning.reaiming import Bend, Root, Source, Trials, as_point, pose_at, root_after
 from stages.needle.search.base import Query
-from stages.needle.space import NeedleSpace
 
 ROLLS = 8
 STEP_MM = 0.25
@@ -31,19 +31,21 @@ def structure_name(label: int) -> str:
     return next((name for name, bit in BITS.items() if label & bit), "nothing")
 
 
-def with_limit(space: NeedleSpace, which: int, value: float) -> NeedleSpace:
-    """Return a space with one limit changed, see `stages.needle.kernels.limits`."""
-    limits = np.array(space.limits)
+def with_limit(environment: NeedleEnvironment, which: int, value: float) -> NeedleEnvironment:
+    """Return an environment with one limit changed, see `stages.needle.kernels.limits`."""
+    limits = np.array(environment.limits)
     limits[which] = value
-    return replace(space, limits=read_only(limits))
+    return replace(environment, limits=read_only(limits))
 
 
-def blocker_at(space: NeedleSpace, pose: tuple[float, ...], inserted_mm: float, branch: int) -> int:
+def blocker_at(
+    environment: NeedleEnvironment, pose: tuple[float, ...], inserted_mm: float, branch: int
+) -> int:
     """Return the label of what a point of the needle is too near to, 0 if it is clear.
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     pose : (6,) floats
         See `anatomy.kernels.arcs`.
     inserted_mm : float
@@ -52,29 +54,31 @@ def blocker_at(space: NeedleSpace, pose: tuple[float, ...], inserted_mm: float, 
         Pierced branch; -1 for none.
     """
     straight = (0.0, 1.0, 0.0, 0.0)
-    return int(blocker_on_arc(space.arrays, space.limits, pose, straight, 0.0, inserted_mm, branch))
+    return int(
+        blocker_on_arc(environment.obstacles, environment.limits, pose, straight, 0.0, inserted_mm, branch)
+    )
 
 
-def tip_clearance(space: NeedleSpace, query: Query) -> tuple[float, int]:
+def tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, int]:
     """Return the exact distance in mm from a query's start to what it has to keep clear of, and its label.
 
     Beyond the required clearance and a little more it is not measured.
     """
-    _field, labels, geometry, bits = space.arrays
-    reach = space.required_clearance_mm + EXACT_REACH_MM
+    _field, labels, geometry, bits = environment.obstacles
+    reach = environment.required_clearance_mm + EXACT_REACH_MM
     point = as_point(query.lps_from_start[:3, 3])
-    in_exit = query.branch >= 0 and query.inserted_mm < space.limits[index.EXEMPT_LENGTH]
+    in_exit = query.branch >= 0 and query.inserted_mm < environment.limits[index.EXEMPT_LENGTH]
     spared = query.branch if in_exit else -1
     distance, label = exact_distance(labels, geometry, *point, bits, spared, reach)
     if in_exit:
         lumen, lumen_label = exact_distance(labels, geometry, *point, LUMEN, -1, reach)
-        if lumen < min(distance, space.needle.radius_mm):
+        if lumen < min(distance, environment.needle.radius_mm):
             distance, label = lumen, lumen_label
     return float(distance), int(label)
 
 
 def roots_of_tip(
-    space: NeedleSpace, objective: ObjectiveArrays, query: Query, longest_mm: float
+    environment: NeedleEnvironment, objective: ObjectiveArrays, query: Query, longest_mm: float
 ) -> tuple[list[Root], float]:
     """Return where to plan from, the nearest first, and the clearance proved on the way there.
 
@@ -84,7 +88,7 @@ def roots_of_tip(
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     objective : tuple
         See `stages.needle.kernels.cost`.
     query : Query
@@ -92,16 +96,16 @@ def roots_of_tip(
     longest_mm : float
         Longest arc.
     """
-    required = space.required_clearance_mm
+    required = environment.required_clearance_mm
     pose = pose_at(query.lps_from_start)
-    if not blocker_at(space, pose, query.inserted_mm, query.branch):
+    if not blocker_at(environment, pose, query.inserted_mm, query.branch):
         return [Root(query=query)], required
-    clearance, _label = tip_clearance(space, query)
-    relaxed = min(max(space.needle.radius_mm, clearance - SLACK_MM), required)
-    near = with_limit(space, index.REQUIRED, relaxed)
+    clearance, _label = tip_clearance(environment, query)
+    relaxed = min(max(environment.needle.radius_mm, clearance - SLACK_MM), required)
+    near = with_limit(environment, index.REQUIRED, relaxed)
     roots = []
-    for bend in _bends(space, query):
-        length = _way_out(space, query, pose, bend, longest_mm)
+    for bend in _bends(environment, query):
+        length = _way_out(environment, query, pose, bend, longest_mm)
         trials = Trials(near, objective, Root(query=query))
         if length > 0.0:
             trials.by_arc(bend, length, Source.REJOIN)
@@ -110,21 +114,21 @@ def roots_of_tip(
     return sorted(roots, key=lambda root: root.away_mm), relaxed
 
 
-def _bends(space: NeedleSpace, query: Query) -> Iterator[Bend]:
+def _bends(environment: NeedleEnvironment, query: Query) -> Iterator[Bend]:
     """Yield straight on, and the tightest arcs to all sides."""
     for n in range(ROLLS):
         side = as_point(bend_direction(query.lps_from_start, 2.0 * math.pi * n / ROLLS))
         if n == 0:
             yield 0.0, *side
-        yield float(space.limits[index.KAPPA]), *side
+        yield float(environment.limits[index.KAPPA]), *side
 
 
 def _way_out(
-    space: NeedleSpace, query: Query, pose: tuple[float, ...], bend: Bend, longest_mm: float
+    environment: NeedleEnvironment, query: Query, pose: tuple[float, ...], bend: Bend, longest_mm: float
 ) -> float:
     """Return the length of an arc after which the required clearance is regained, 0 if never."""
     for n in range(1, int(longest_mm / STEP_MM) + 1):
         s = n * STEP_MM
-        if not blocker_at(space, pose_on_arc(pose, bend, s), query.inserted_mm + s, query.branch):
+        if not blocker_at(environment, pose_on_arc(pose, bend, s), query.inserted_mm + s, query.branch):
             return s
     return 0.0

@@ -11,12 +11,12 @@ import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective, ObjectiveArrays
 from stages.needle.path import LENGTH, ArcPath, arc_transform, path_from_tree
 from stages.needle.search.base import Query, RestartingRRT, root_of
-from stages.needle.space import NeedleSpace
 
 LOOK_AHEADS_MM = (5.0, 10.0, 20.0, 40.0)
 """How far ahead the plan that is being followed is met again."""
@@ -128,7 +128,7 @@ class Trials:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     objective : tuple
         See `stages.needle.kernels.cost`.
     root : Root
@@ -145,10 +145,10 @@ class Trials:
     """
 
     def __init__(
-        self, space: NeedleSpace, objective: ObjectiveArrays, root: Root, most_points: int = 0
+        self, environment: NeedleEnvironment, objective: ObjectiveArrays, root: Root, most_points: int = 0
     ) -> None:
         rows = 2 * most_points + 3
-        self._space = space
+        self._environment = environment
         self._objective = objective
         self._nodes, self._parents = np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, np.int64)
         self._nodes[0] = root_of(root.query)
@@ -177,8 +177,8 @@ class Trials:
                 return
         query = self.root.query
         rows = tree.add_goal(
-            self._space.arrays, self._space.limits, self._objective, query.branch, self._nodes, self._parents,
-            count, count - 1, query.goal, self.wanted, self._state,
+            self._environment.obstacles, self._environment.limits, self._objective, query.branch, self._nodes,
+            self._parents, count, count - 1, query.goal, self.wanted, self._state,
         )  # fmt: skip
         self._keep(count, rows, source)
 
@@ -193,7 +193,7 @@ class Trials:
 
     def search(self, iterations: int, seed: int, objective: Objective) -> int:
         """Let the RRT look for cheaper ways; return the iterations spent."""
-        rrt = RestartingRRT(self._space, self.root.query, seed=seed, objective=objective)
+        rrt = RestartingRRT(self._environment, self.root.query, seed=seed, objective=objective)
         rrt.cost = self.wanted
         spent = 0
         while spent < iterations:
@@ -212,7 +212,7 @@ class Trials:
         length, bend, _turn = arc_to_point(tree.pose_of(self._nodes[count - 1]), point)
         if length < index.MIN_ARC_MM:
             return count
-        if bend[0] <= self._space.limits[index.KAPPA] and self._arc(
+        if bend[0] <= self._environment.limits[index.KAPPA] and self._arc(
             count, bend, length, self.root.query.goal
         ):
             return count + 1
@@ -221,16 +221,16 @@ class Trials:
 
     def _arc(self, count: int, bend: Bend, length: float, goal: tuple[float, float, float]) -> bool:
         added = tree.add_arc(
-            self._space.arrays, self._space.limits, self._objective, self.root.query.branch, self._nodes,
-            self._parents, count, count - 1, bend, float(length), goal, self.wanted,
+            self._environment.obstacles, self._environment.limits, self._objective, self.root.query.branch,
+            self._nodes, self._parents, count, count - 1, bend, float(length), goal, self.wanted,
         )  # fmt: skip
         return bool(added)
 
     def _legs(self, count: int, point: tuple[float, float, float]) -> int:
         query = self.root.query
         rows = tree.add_legs(
-            self._space.arrays, self._space.limits, self._objective, query.branch, self._nodes, self._parents,
-            count, count - 1, point, query.goal, self.wanted,
+            self._environment.obstacles, self._environment.limits, self._objective, query.branch, self._nodes,
+            self._parents, count, count - 1, point, query.goal, self.wanted,
         )  # fmt: skip
         return int(rows)
 

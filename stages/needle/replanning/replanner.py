@@ -14,6 +14,7 @@ from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.field import MIN_GAP_MM
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import length_ahead, nearest_turn, seen_from
@@ -36,7 +37,6 @@ from stages.needle.replanning.reaiming import (
     ways_ahead,
 )
 from stages.needle.search.base import Query, root_of
-from stages.needle.space import NeedleSpace
 
 ITERATIONS = 1500
 """Iterations of the search in a replan; see docs/replanning.md for what they take."""
@@ -125,12 +125,12 @@ class Replan:
     relaxed_clearance_mm: float = 0.0
 
 
-def with_reserve(space: NeedleSpace, reserve: float) -> NeedleSpace:
-    """Return a space whose needle bends less by a share of its largest curvature.
+def with_reserve(environment: NeedleEnvironment, reserve: float) -> NeedleEnvironment:
+    """Return an environment whose needle bends less by a share of its largest curvature.
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     reserve : float
         At least 0, less than 1.
 
@@ -141,9 +141,9 @@ def with_reserve(space: NeedleSpace, reserve: float) -> NeedleSpace:
     """
     if not 0.0 <= reserve < 1.0:
         raise SettingsError(f"The curvature reserve is {reserve}", expected="a share of at least 0, below 1")
-    curvature = space.needle.max_curvature_per_mm * (1.0 - reserve)
-    needle = replace(space.needle, max_curvature_per_mm=curvature)
-    return replace(with_limit(space, index.KAPPA, curvature), needle=needle)
+    curvature = environment.needle.max_curvature_per_mm * (1.0 - reserve)
+    needle = replace(environment.needle, max_curvature_per_mm=curvature)
+    return replace(with_limit(environment, index.KAPPA, curvature), needle=needle)
 
 
 def _arrived(query: Query, miss_mm: float) -> Replan:
@@ -163,7 +163,7 @@ class Replanner:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
         What the plan was made for.
     plan : ArcPath
@@ -187,7 +187,7 @@ class Replanner:
 
     def __init__(
         self,
-        space: NeedleSpace,
+        environment: NeedleEnvironment,
         query: Query,
         plan: ArcPath,
         *,
@@ -200,22 +200,22 @@ class Replanner:
             raise SettingsError(f"A replan has {iterations} iterations", expected="0 or more")
         self.plan = plan
         """The plan that is being followed; the last replan, if there is one."""
-        self._space = space
+        self._environment = environment
         self._query = query
         self._objective = objective
-        self._objective_arrays = space.objective_arrays(objective)
+        self._objective_arrays = environment.objective_arrays(objective)
         self._settings = settings
         self._iterations = iterations
         self._seed = seed
         self._replans = 0
         self._begin_mm = query.inserted_mm
         self._turned_rad = query.turned_rad
-        exact = with_limit(space, index.GOAL_TOLERANCE, 0.0)
+        exact = with_limit(environment, index.GOAL_TOLERANCE, 0.0)
         self._variants = [exact]
         if settings.curvature_reserve > 0.0:
             self._variants.insert(0, with_reserve(exact, settings.curvature_reserve))
-        if space.goal_tolerance_mm > 0.0:
-            self._variants.append(space)
+        if environment.goal_tolerance_mm > 0.0:
+            self._variants.append(environment)
 
     def replan(
         self,
@@ -262,9 +262,11 @@ class Replanner:
 
     def _find(self, query: Query, ways: list[Way]) -> Replan:
         away = float(np.linalg.norm(query.target - query.lps_from_start[:3, 3]))
-        if away <= max(self._space.goal_tolerance_mm, index.MIN_ARC_MM):
+        if away <= max(self._environment.goal_tolerance_mm, index.MIN_ARC_MM):
             return _arrived(query, away)
-        roots, relaxed = roots_of_tip(self._space, self._objective_arrays, query, self._settings.relaxed_mm)
+        roots, relaxed = roots_of_tip(
+            self._environment, self._objective_arrays, query, self._settings.relaxed_mm
+        )
         if not roots:
             return self._stuck(query)
         failure, why = self._out_of_reach(query)
@@ -281,13 +283,13 @@ class Replanner:
         return missed or Replan(path=None, failure=failure, why=why)
 
     def _try(
-        self, space: NeedleSpace, roots: list[Root], ways: list[Way], iterations: int
+        self, environment: NeedleEnvironment, roots: list[Root], ways: list[Way], iterations: int
     ) -> tuple[Trials | None, int]:
         """Try all ways from all roots, then search; return the best, and the iterations spent."""
         tried = []
         most = max(len(points) for points, _source in ways)
         for root in roots:
-            trials = Trials(space, self._objective_arrays, root, most)
+            trials = Trials(environment, self._objective_arrays, root, most)
             for points, source in ways:
                 trials.through(points, source)
             trials.by_legs()
@@ -305,7 +307,7 @@ class Replanner:
         root, path = trials.root, trials.path
         arcs = root.arcs if path is None else np.concatenate([root.arcs, path.arcs])
         whole = ArcPath(lps_from_start=query.lps_from_start, arcs=arcs)
-        left = (1.0 - self._settings.curvature_reserve) * float(self._space.limits[index.KAPPA])
+        left = (1.0 - self._settings.curvature_reserve) * float(self._environment.limits[index.KAPPA])
         return Replan(
             path=whole,
             cost=trials.total,
@@ -320,9 +322,9 @@ class Replanner:
         """Return the tightest arc towards the target if it passes near enough, or stay if the tip is."""
         best: Trials | None = None
         least = min(away, self._settings.largest_miss_mm)
-        kappa = float(self._space.limits[index.KAPPA])
+        kappa = float(self._environment.limits[index.KAPPA])
         for root in roots:
-            trials = Trials(self._space, self._objective_arrays, root)
+            trials = Trials(self._environment, self._objective_arrays, root)
             pose, target = pose_at(root.query.lps_from_start), query.goal
             turn, miss = nearest_turn(*seen_from(pose, target), kappa)
             if turn > index.MIN_ARC_MM * kappa and miss < least:
@@ -336,16 +338,16 @@ class Replanner:
 
     def _out_of_reach(self, query: Query) -> tuple[Failure | None, str]:
         """Tell why no path leads to the target even in free space."""
-        limits = self._space.limits
+        limits = self._environment.limits
         left = float(limits[index.MAX_LENGTH]) - query.inserted_mm
         if left <= index.MIN_ARC_MM:
             return Failure.OUT_OF_LENGTH, f"All of the needle ({limits[index.MAX_LENGTH]:g} mm) is inserted"
-        tolerance = self._space.goal_tolerance_mm
+        tolerance = self._environment.goal_tolerance_mm
         if tolerance == 0.0:
             at_target = (*query.goal, 0.0, 0.0, 1.0)
-            label = blocker_at(self._space, at_target, math.inf, -1)
+            label = blocker_at(self._environment, at_target, math.inf, -1)
             if label:
-                required, name = self._space.required_clearance_mm, structure_name(label)
+                required, name = self._environment.required_clearance_mm, structure_name(label)
                 return Failure.TARGET_BLOCKED, f"The target is nearer than {required:.2f} mm to {name}"
         pose, reference = pose_at(query.lps_from_start), tree.reference_of(root_of(query))
         angle = math.acos(float(np.clip(np.dot(pose[3:], reference), -1.0, 1.0)))
@@ -364,13 +366,13 @@ class Replanner:
         return None, ""
 
     def _stuck(self, query: Query) -> Replan:
-        clearance, label = tip_clearance(self._space, query)
-        radius = self._space.needle.radius_mm
+        clearance, label = tip_clearance(self._environment, query)
+        radius = self._environment.needle.radius_mm
         where = f"The axis at the tip is {clearance:.2f} mm from {structure_name(label)}"
         if clearance < radius + MIN_GAP_MM:
             return Replan(
                 path=None, failure=Failure.TOUCHES, why=f"{where}, the needle's radius is {radius:g} mm"
             )
-        required, longest = self._space.required_clearance_mm, self._settings.relaxed_mm
+        required, longest = self._environment.required_clearance_mm, self._settings.relaxed_mm
         why = f"{where}, and no arc of up to {longest:g} mm leads back to {required:.2f} mm"
         return Replan(path=None, failure=Failure.STUCK, why=why)

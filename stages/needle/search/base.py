@@ -10,11 +10,11 @@ import numpy as np
 
 from anatomy.errors import FrameError, SettingsError
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
-from stages.needle.space import NeedleSpace
 
 MAX_NODES = 20_000
 RANDOM_SHARE = 0.5
@@ -129,16 +129,16 @@ class TreeSearch:
     """What the searches that grow a tree share: its arrays, random state and best path."""
 
     def __init__(
-        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
-        self.space = space
+        self.environment = environment
         self.query = query
         self.path: ArcPath | None = None
         self.cost = math.inf
         self.finished = False
         self.iterations = 0
         """Iterations spent so far."""
-        self.objective = space.objective_arrays(objective)
+        self.objective = environment.objective_arrays(objective)
         self.state = np.array([seed], dtype=np.uint64)
         self.nodes, self.parents = np.zeros((MAX_NODES, tree.NODE_COLUMNS)), np.zeros(MAX_NODES, np.int64)
         self.nodes[0] = root_of(query)
@@ -157,9 +157,9 @@ class RestartingRRT(TreeSearch):
     """
 
     def __init__(
-        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
-        super().__init__(space, query, seed=seed, objective=objective)
+        super().__init__(environment, query, seed=seed, objective=objective)
         self._restarts = 0
         self._left = RESTART_ITERATIONS
 
@@ -185,7 +185,7 @@ class RestartingRRT(TreeSearch):
         """Grow the tree; return its rows, the iterations spent, and whether the last row is at the goal."""
         query = self.query
         return grow_rrt(  # type: ignore[no-any-return]
-            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
+            self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
             self.nodes, self.parents, self.count, iterations, RANDOM_SHARE, self.state, self.cost,
         )  # fmt: skip
 

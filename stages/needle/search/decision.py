@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query, Search
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
-from stages.needle.space import NeedleSpace
 
 FIRST_ITERATIONS = 10_000
 """Tried before the proof is begun: a path that is easy to find is found by then."""
@@ -25,7 +25,7 @@ class Decision:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
     seed : int
     objective : Objective
@@ -38,11 +38,11 @@ class Decision:
     """
 
     def __init__(
-        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
-        self.search = OptimalSearch(space, query, seed=seed, objective=objective)
-        self.resolution = ResolutionSearch(space, query, objective=objective)
-        self.proof = NoPathProof(space, query)
+        self.search = OptimalSearch(environment, query, seed=seed, objective=objective)
+        self.resolution = ResolutionSearch(environment, query, objective=objective)
+        self.proof = NoPathProof(environment, query)
         self.path: ArcPath | None = None
         self.cost = math.inf
         self.finished = False

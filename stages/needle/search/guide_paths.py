@@ -10,11 +10,11 @@ from operator import itemgetter
 import numpy as np
 
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import Objective
 from stages.needle.search.base import Query
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.state_lattice import SKEWS, StateLatticeSearch, via_points
-from stages.needle.space import NeedleSpace
 
 ARCS_PER_ITERATION = 8
 """Arcs of a lattice take as long as one iteration of a search."""
@@ -45,15 +45,17 @@ class GuidePathFinder:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
     seed : int
         Of how lattices are turned.
     objective : Objective
     """
 
-    def __init__(self, space: NeedleSpace, query: Query, *, seed: int, objective: Objective) -> None:
-        self._lattices = StateLatticeSearch(space, query, objective)
+    def __init__(
+        self, environment: NeedleEnvironment, query: Query, *, seed: int, objective: Objective
+    ) -> None:
+        self._lattices = StateLatticeSearch(environment, query, objective)
         self._random = np.random.default_rng(seed)
         self._layers: tuple[int, ...] = LAYERS
         self._unsearched = list(product(range(SKEWS), LAYERS)) if self._lattices.is_possible else []

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.search.base import Query, RestartingRRT
 from stages.needle.search.kernels import optimal
-from stages.needle.space import NeedleSpace
 
 MAX_VIAS = 64
 REFINE_SHARE = 0.7
@@ -31,9 +31,9 @@ class OptimalSearch(RestartingRRT):
     """
 
     def __init__(
-        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
-        super().__init__(space, query, seed=seed, objective=objective)
+        super().__init__(environment, query, seed=seed, objective=objective)
         self._vias = np.zeros((MAX_VIAS, optimal.VIA_COLUMNS))
         self._via_count = 0
         self._scratch = np.zeros((2 * MAX_VIAS + 2, tree.NODE_COLUMNS))
@@ -68,7 +68,7 @@ class OptimalSearch(RestartingRRT):
             Ends of its arcs; nothing is followed whose last one lies beyond the goal tolerance.
         """
         missing = float(np.linalg.norm(points[-1] - self.query.target))
-        if len(points) > MAX_VIAS or missing > self.space.limits[index.GOAL_TOLERANCE] + index.TINY:
+        if len(points) > MAX_VIAS or missing > self.environment.limits[index.GOAL_TOLERANCE] + index.TINY:
             return False
         vias = np.zeros_like(self._vias)
         vias[: len(points), :3] = points
@@ -85,7 +85,7 @@ class OptimalSearch(RestartingRRT):
             return super().grow(iterations)
         query = self.query
         return optimal.grow_optimal(  # type: ignore[no-any-return]
-            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
+            self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
             self.nodes, self.parents, self.count, iterations, self.state, self.cost,
         )  # fmt: skip
 
@@ -109,7 +109,7 @@ class OptimalSearch(RestartingRRT):
             return False
         query = self.query
         self._via_count, cost, improved = optimal.refine(
-            self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
+            self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
             self._scratch, self._scratch_parents, self._vias, self._via_count, tries, self.state, self.cost,
         )  # fmt: skip
         self.iterations += tries
@@ -124,7 +124,7 @@ class OptimalSearch(RestartingRRT):
         query = self.query
         return int(
             optimal.build(
-                self.space.arrays, self.space.limits, self.objective, query.branch, query.goal,
+                self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
                 self._scratch, self._scratch_parents, vias, count, best,
             )
         )  # fmt: skip

@@ -9,13 +9,13 @@ from typing import Protocol
 
 import numpy as np
 
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query
 from stages.needle.search.guide_paths import GuidePathFinder, Work
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.successive_halving import successive_halving
-from stages.needle.space import NeedleSpace
 
 FIRST_SIZE, LARGEST_SIZE = 4, 64
 """Searches in the first round of halving; each round has twice as many as the one before, up to the largest.
@@ -45,7 +45,7 @@ class PortfolioSearch:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
     seed : int
         Of the first search; it is alone until it has found a path.
@@ -53,14 +53,14 @@ class PortfolioSearch:
     """
 
     def __init__(
-        self, space: NeedleSpace, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
         self.path: ArcPath | None = None
         self.cost = math.inf
         self.finished = False
         self.iterations = 0
         """Iterations spent so far, by all searches."""
-        self._space, self._query, self._seed, self._objective = space, query, seed, objective
+        self._environment, self._query, self._seed, self._objective = environment, query, seed, objective
         self._made = [0, 0]
         self._patience = 0
         self._free = _Turns(self._free_turns())
@@ -89,7 +89,9 @@ class PortfolioSearch:
                 return self._free
             self._patience = self._free.spent
             self._free.spent = 0
-            finder = GuidePathFinder(self._space, self._query, seed=self._seed, objective=self._objective)
+            finder = GuidePathFinder(
+                self._environment, self._query, seed=self._seed, objective=self._objective
+            )
             self._guided = finder, _Turns(self._guided_turns(finder))
         finder, guided = self._guided
         is_behind = (1.0 - GUIDED_SHARE) * guided.spent <= GUIDED_SHARE * self._free.spent
@@ -102,7 +104,7 @@ class PortfolioSearch:
             numbers = [self._seed, self._made[kind], *([GUIDED] if kind == GUIDED else [])]
             seed = int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
         self._made[kind] += 1
-        return OptimalSearch(self._space, self._query, seed=seed, objective=self._objective)
+        return OptimalSearch(self._environment, self._query, seed=seed, objective=self._objective)
 
     def _free_turns(self) -> Iterator[Turn]:
         """Yield whose turn it is and for how many iterations, for ever."""

@@ -15,6 +15,7 @@ from anatomy.errors import SettingsError
 from anatomy.kernels import arcs as arc_kernels
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.typed import Array, Float, Int, Int32, UInt8
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
@@ -23,7 +24,6 @@ from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.search.base import Query, root_of
 from stages.needle.search.kernels import rank_queue
 from stages.needle.search.kernels import resolution as kernel
-from stages.needle.space import NeedleSpace
 
 T = TypeVar("T", bound=np.generic)
 Words = tuple[float, Float, Float, Int, Int]
@@ -171,7 +171,7 @@ class ResolutionSearch:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
         The directions of bending count from +x of the start pose.
     resolution : Resolution, optional
@@ -184,7 +184,7 @@ class ResolutionSearch:
     Raises
     ------
     SettingsError
-        If the space is one in which arcs are looked up instead of proved.
+        If the environment is one in which arcs are looked up instead of proved.
 
     Attributes
     ----------
@@ -195,7 +195,7 @@ class ResolutionSearch:
 
     def __init__(
         self,
-        space: NeedleSpace,
+        environment: NeedleEnvironment,
         query: Query,
         *,
         resolution: Resolution | None = None,
@@ -203,12 +203,12 @@ class ResolutionSearch:
         duplicates: Cells | None = None,
         max_memory_mb: float = 1000.0,
     ) -> None:
-        if space.limits[index.LOOKUP_STEP] > 0.0:
+        if environment.limits[index.LOOKUP_STEP] > 0.0:
             raise SettingsError(
-                "The resolution search is asked for a space whose arcs are looked up, not proved",
-                expected="a space with a clearance field, because the search goes on from what is proved",
+                "The resolution search is asked for an environment whose arcs are looked up, not proved",
+                expected="an environment with a clearance field: the search goes on from what is proved",
             )
-        self.space = space
+        self.environment = environment
         self.query = query
         self.path: ArcPath | None = None
         self.cost = math.inf
@@ -217,15 +217,15 @@ class ResolutionSearch:
         self.resolution = resolution or Resolution()
         self.duplicates = duplicates
         self.max_memory_mb = max_memory_mb
-        self.objective = space.objective_arrays(objective)
-        self._rates = _rates(self.objective[0], space)
+        self.objective = environment.objective_arrays(objective)
+        self._rates = _rates(self.objective[0], environment)
         self._merge = (EQUAL_CELL_MM, EQUAL_CELL_MM, False)
         if duplicates is not None:
             self._merge = (duplicates.position_mm, math.radians(duplicates.angle_deg), True)
-        self._words = _words(self.resolution, float(space.limits[index.KAPPA]))
+        self._words = _words(self.resolution, float(environment.limits[index.KAPPA]))
         self._reference = tree.reference_of(root_of(query))
         self._store = self._first_store()
-        left = space.limits[index.MAX_LENGTH] - query.inserted_mm
+        left = environment.limits[index.MAX_LENGTH] - query.inserted_mm
         pieces = max(int(left / self.resolution.fine_mm), 0) + 2
         self._queue = _first_queue(pieces * len(self._words[4]) + rank_queue.LOOK_AHEAD + 1)
         self._state = np.zeros(rank_queue.STATE_SIZE, dtype=np.int64)
@@ -267,9 +267,10 @@ class ResolutionSearch:
         stop = int(self._counts[kernel.POPS]) + iterations
         while not self.finished and self._counts[kernel.POPS] < stop:
             reason, self.cost = kernel.search_words(
-                self.space.arrays, self.space.limits, self.objective, self._rates, self.query.branch,
-                self.query.goal, self._reference, self._words, self._merge, self._store, self._queue,
-                self._state, self._counts, self._best, self.cost, stop - int(self._counts[kernel.POPS]),
+                self.environment.obstacles, self.environment.limits, self.objective, self._rates,
+                self.query.branch, self.query.goal, self._reference, self._words, self._merge, self._store,
+                self._queue, self._state, self._counts, self._best, self.cost, stop -
+                int(self._counts[kernel.POPS]),
             )  # fmt: skip
             if reason == kernel.BETTER:
                 self.path = self._best_path()
@@ -319,7 +320,7 @@ class ResolutionSearch:
         rows = [np.zeros(tree.NODE_COLUMNS)]
         for at in reversed(chain):
             parent, direction, steps = (int(v) for v in links[at, : kernel.NODE_RANK])
-            bend = kernel.bend_of(nodes, rolls, self.space.limits[index.KAPPA], parent, direction)
+            bend = kernel.bend_of(nodes, rolls, self.environment.limits[index.KAPPA], parent, direction)
             rows.append(_row(fine_mm * steps, bend))
         for leg in range(2):
             length, *bend = self._best[kernel.BEST_LEGS + kernel.LEG_SIZE * leg :][: kernel.LEG_SIZE]
@@ -379,12 +380,12 @@ def _words(resolution: Resolution, kappa: float) -> Words:
     )
 
 
-def _rates(weights: Float, space: NeedleSpace) -> tuple[float, float]:
-    """Return the least cost of a mm in this space, and what a mm costs by which a path ends short.
+def _rates(weights: Float, environment: NeedleEnvironment) -> tuple[float, float]:
+    """Return the least cost of a mm in this environment, and what a mm costs by which a path ends short.
 
     The former counts the largest clearance that there is, where an objective knows none.
     """
     least = float(weights[LEAST_RATE])
-    largest = max(float(space.arrays[0].max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
+    largest = max(float(environment.obstacles[0].max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
     gain = weights[INVERSE_CLEARANCE] * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
     return least + max(float(gain), 0.0), least

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment, workspace_lengths
 from stages.needle.kernels import limits as index
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query
 from stages.needle.search.kernels import state_lattice as kernel
-from stages.needle.space import NeedleSpace, workspace_lengths
 
 MOST_STATES = 1 << 15
 """States of a lattice, in 2 MB; so many are searched in 0.1 s."""
@@ -59,21 +59,21 @@ class StateLatticeSearch:
 
     Parameters
     ----------
-    space : NeedleSpace
+    environment : NeedleEnvironment
     query : Query
     objective : Objective
     """
 
-    def __init__(self, space: NeedleSpace, query: Query, objective: Objective) -> None:
-        self._space, self._query = space, query
-        self._objective = space.objective_arrays(objective)
-        self._kappa = CURVATURE_SHARE * float(space.limits[index.KAPPA])
+    def __init__(self, environment: NeedleEnvironment, query: Query, objective: Objective) -> None:
+        self._environment, self._query = environment, query
+        self._objective = environment.objective_arrays(objective)
+        self._kappa = CURVATURE_SHARE * float(environment.limits[index.KAPPA])
         self._start, self._tangent = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
         ahead = query.target - self._start
         self._distance = float(np.linalg.norm(ahead))
         self._axis = ahead / max(self._distance, index.MIN_ARC_MM)
         self._cosine = float(self._tangent @ self._axis)
-        length = workspace_lengths(space, self._start[None], self._tangent[None], query.target)[0]
+        length = workspace_lengths(environment, self._start[None], self._tangent[None], query.target)[0]
         self.is_possible = bool(
             self._distance > index.MIN_ARC_MM and self._cosine > LEAST_COSINE and np.isfinite(length)
         )
@@ -174,8 +174,8 @@ class StateLatticeSearch:
         arrays = (begins, self._states, self._before, self._costs)
         query = self._query
         arcs, is_whole = kernel.explore(
-            self._space.arrays, self._space.limits, self._objective, query.branch, base, axes, goal_cells,
-            self._kappa, reach, query.inserted_mm, bound, *arrays, self._table, self._order,
+            self._environment.obstacles, self._environment.limits, self._objective, query.branch, base, axes,
+            goal_cells, self._kappa, reach, query.inserted_mm, bound, *arrays, self._table, self._order,
         )  # fmt: skip
         controls, cost = np.zeros_like(base), math.inf
         if is_whole:

@@ -13,7 +13,7 @@ from lungaccess.coupled.search import AtlasSearch
 from lungaccess.plans.assemble import Candidate, Task
 from lungaccess.problem.target import point_target, require_free
 from stages.needle import Objective
-from stages.needle.space import direct_arcs
+from stages.needle.environment import direct_arcs
 
 AHEAD_MM = 25.0
 ASIDE_MM = 3.0
@@ -37,7 +37,7 @@ def turned_candidates(lung: Lung, atlas: la.Atlas) -> Iterator[tuple[AtlasSearch
         )  # fmt: skip
         search, one = AtlasSearch(task, atlas), slice(int(entry), int(entry) + 1)
         blockers, _lengths, _costs = direct_arcs(
-            search.desk.space, entries.positions[one], entries.tangents[one], entries.branch[one], point
+            search.desk.environment, entries.positions[one], entries.tangents[one], entries.branch[one], point
         )
         candidate = search.finished(int(entry)) if blockers[0] == 0 else None
         if candidate is not None:

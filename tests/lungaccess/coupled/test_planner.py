@@ -25,7 +25,7 @@ from lungaccess.plans.assemble import Task
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from stages.needle import TERMS, Objective
-from stages.needle.space import direct_arcs, workspace_lengths
+from stages.needle.environment import direct_arcs, workspace_lengths
 from tests.lungaccess.cli.ahead import turned_candidates
 from tests.lungaccess.resample import needle_walk, problems
 
@@ -346,7 +346,7 @@ def prices(search: AtlasSearch, slack: float) -> tuple[Int, Float]:
     blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
     x, y, z = search.task.target.lps_mm.tolist()
     evaluate_arcs(
-        needle_of(search.desk.space, search.task), entries.positions[near], entries.tangents[near],
+        needle_of(search.desk.environment, search.task), entries.positions[near], entries.tangents[near],
         entries.branch[near], (x, y, z), slack, math.inf, blockers, costs,
     )  # fmt: skip
     return blockers, costs
@@ -358,7 +358,7 @@ class TestPrices:
     def test_what_is_not_passed_over_is_judged_as_by_the_needle_stage(self, search: AtlasSearch) -> None:
         entries, near = search.atlas.deployments, search.in_workspace
         labels, _lengths, inverse = direct_arcs(
-            search.desk.space, entries.positions[near], entries.tangents[near], entries.branch[near],
+            search.desk.environment, entries.positions[near], entries.tangents[near], entries.branch[near],
             search.task.target.lps_mm,
         )  # fmt: skip
         blockers, costs = prices(search, math.inf)
@@ -372,9 +372,9 @@ class TestPrices:
 
     def test_lower_bounds_are_below_exact_costs(self, search: AtlasSearch) -> None:
         entries, near = search.atlas.deployments, search.in_workspace
-        needle, target = needle_of(search.desk.space, search.task), search.task.target.lps_mm
+        needle, target = needle_of(search.desk.environment, search.task), search.task.target.lps_mm
         lengths = workspace_lengths(
-            search.desk.space, entries.positions[near], entries.tangents[near], target
+            search.desk.environment, entries.positions[near], entries.tangents[near], target
         )
         bounds = cost_bounds(needle, entries, near, lengths, target)
         clear = np.flatnonzero(prices(search, math.inf)[0] == 0)

@@ -15,7 +15,7 @@ from lungaccess.plans.assemble import Task, assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target, require_free
 from stages.needle import SHORTEST
-from stages.needle.space import direct_arcs
+from stages.needle.environment import direct_arcs
 
 SYSTEM = la.load_system("ultrathin")
 COUNT = 12
@@ -42,7 +42,7 @@ def plans(small_lung: Lung) -> list[Plan]:
         search = AtlasSearch(task, atlas)
         one = slice(int(entry), int(entry) + 1)
         blockers, _lengths, _costs = direct_arcs(
-            search.desk.space, entries.positions[one], entries.tangents[one], entries.branch[one], point
+            search.desk.environment, entries.positions[one], entries.tangents[one], entries.branch[one], point
         )
         candidate = search.finished(int(entry)) if blockers[0] == 0 else None
         if candidate is not None:

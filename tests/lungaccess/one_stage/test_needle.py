@@ -45,7 +45,7 @@ def test_every_planner_finds_a_short_way(small_lung: Lung, system: System, plann
     answer = plan_needle(small_lung, system, start, target, planner=planner, iterations=3000)
     assert answer.path is not None
     assert answer.outcome in ("path", "best at resolution")
-    assert blocker_on_path(answer.space, answer.path, answer.branch) == 0
+    assert blocker_on_path(answer.environment, answer.path, answer.branch) == 0
     assert np.linalg.norm(answer.path.frames()[-1][:3, 3] - target.lps_mm) < 1e-6
 
 

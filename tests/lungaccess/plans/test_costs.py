@@ -14,8 +14,8 @@ from anatomy.margins import Margins
 from anatomy.structures import FISSURE, OUTSIDE, VESSEL
 from lungaccess.plans.costs import obstacle_clearance_mm, path_cost, path_costs
 from stages.needle.device import Needle
+from stages.needle.environment import needle_environment
 from stages.needle.path import ArcPath, estimated_inverse_clearance
-from stages.needle.space import needle_space
 from tests.stages.scenes import Canvas
 
 START = np.eye(4)
@@ -67,7 +67,7 @@ def test_the_estimate_is_near_the_cost() -> None:
         canvas.add(canvas.ball(rng.uniform(-18, 18, 3), 1.5), VESSEL)
     crowded = canvas.lung()
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=0.05)
-    space = needle_space(crowded, needle, Margins(), with_fissures=False)
+    environment = needle_environment(crowded, needle, Margins(), with_fissures=False)
     tested = 0
     for _ in range(40):
         arcs = [[rng.uniform(3, 9), rng.uniform(-3, 3), rng.uniform(0, 0.03)] for _ in range(2)]
@@ -76,7 +76,7 @@ def test_the_estimate_is_near_the_cost() -> None:
         clearance = obstacle_clearance_mm(crowded, path.sample(0.1)[0], with_fissures=False)
         if clearance.min() > 1.0:
             tested += 1
-            assert 0.9 * exact <= estimated_inverse_clearance(space, path) <= 1.1 * exact
+            assert 0.9 * exact <= estimated_inverse_clearance(environment, path) <= 1.1 * exact
     assert tested > 10
 
 

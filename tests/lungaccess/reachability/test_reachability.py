@@ -21,9 +21,9 @@ from lungaccess.cli.app import BAD_INPUT, OK, main
 from lungaccess.reachability.layers import _earlier_neighbours
 from lungaccess.reachability.reach_map import KINDS, NOT_COUNTED, ReachMap, compare, reach_grid, reachability
 from lungaccess.reachability.regions import LEFT, RIGHT, lung_regions
+from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment
 from stages.needle.path import direct_path
 from stages.needle.reach import DIRECT, NO_ROOM, SEARCHED, UNREACHED, ReachScan
-from stages.needle.space import NeedleSpace, direct_arcs, needle_space
 from tests.stages.scenes import Canvas
 
 SYSTEM = la.load_system("ultrathin")
@@ -37,8 +37,8 @@ def atlas(small_lung: Lung) -> la.Atlas:
 
 
 @pytest.fixture(scope="module")
-def space(small_lung: Lung, atlas: la.Atlas) -> NeedleSpace:
-    return needle_space(small_lung, SYSTEM.needle, SYSTEM.margins, with_fissures=atlas.with_fissures)
+def environment(small_lung: Lung, atlas: la.Atlas) -> NeedleEnvironment:
+    return needle_environment(small_lung, SYSTEM.needle, SYSTEM.margins, with_fissures=atlas.with_fissures)
 
 
 @pytest.fixture(scope="module")
@@ -46,26 +46,30 @@ def reach(small_lung: Lung, atlas: la.Atlas) -> ReachMap:
     return reachability(small_lung, SYSTEM, spacing_mm=SPACING_MM, atlas=atlas)
 
 
-def arcs_to(space: NeedleSpace, atlas: la.Atlas, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def arcs_to(
+    environment: NeedleEnvironment, atlas: la.Atlas, point: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     entries = atlas.deployments
-    blockers, _lengths, costs = direct_arcs(space, entries.positions, entries.tangents, entries.branch, point)
+    blockers, _lengths, costs = direct_arcs(
+        environment, entries.positions, entries.tangents, entries.branch, point
+    )
     return blockers == 0, costs
 
 
 def test_every_point_agrees_with_all_arcs_tried(
-    reach: ReachMap, space: NeedleSpace, small_lung: Lung, atlas: la.Atlas
+    reach: ReachMap, environment: NeedleEnvironment, small_lung: Lung, atlas: la.Atlas
 ) -> None:
     assert atlas.with_fissures
     ratios = []
     for ijk in np.argwhere(reach.kinds.array != NOT_COUNTED):
         point, kind = reach.kinds.grid.lps(ijk), reach.kinds.array[tuple(ijk)]
-        clear, costs = arcs_to(space, atlas, point)
+        clear, costs = arcs_to(environment, atlas, point)
         assert (kind == DIRECT) == clear.any()
         if clear.any():
             ratios.append(float(reach.cost.array[tuple(ijk)]) / costs[clear].min())
             continue
         room = small_lung.exact_clearance_mm(point, OBSTACLES | FISSURE, cap_mm=2.0)[0]
-        assert (kind == NO_ROOM) == (room < space.required_clearance_mm)
+        assert (kind == NO_ROOM) == (room < environment.required_clearance_mm)
         assert reach.cost.array[tuple(ijk)] == reach.clearance_mm.array[tuple(ijk)] == 0.0
     assert min(ratios) >= 1.0 - 1e-6
     assert np.median(ratios) < 1.3
@@ -81,12 +85,12 @@ def test_counted_is_free_lung_tissue(reach: ReachMap, small_lung: Lung) -> None:
 
 
 def test_the_clearance_is_kept(
-    space: NeedleSpace, small_lung: Lung, atlas: la.Atlas, reach: ReachMap
+    environment: NeedleEnvironment, small_lung: Lung, atlas: la.Atlas, reach: ReachMap
 ) -> None:
     from anatomy.poses import pose
 
     entries = atlas.deployments
-    scan = ReachScan(space, entries.positions, entries.tangents, entries.branch)
+    scan = ReachScan(environment, entries.positions, entries.tangents, entries.branch)
     points = reach.kinds.grid.lps(np.argwhere(reach.kinds.array == DIRECT))[:40]
     reached = scan.reach(points, np.zeros(len(points), dtype=np.uint64))
     assert (reached.kinds == DIRECT).all()
@@ -99,7 +103,7 @@ def test_the_clearance_is_kept(
         gap = small_lung.exact_clearance_mm(beyond, OBSTACLES | FISSURE, cap_mm=6.0)
         assert reached.clearance_mm[n] <= gap.min() + 1e-6 or gap.min() >= 6.0 - 1e-9
         if path.length_mm > SYSTEM.needle.exit_exemption_mm + 1.0:
-            assert reached.clearance_mm[n] >= space.required_clearance_mm - 1.2
+            assert reached.clearance_mm[n] >= environment.required_clearance_mm - 1.2
 
 
 def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
@@ -165,7 +169,7 @@ def test_a_known_voxel_is_where_it_was(reach: ReachMap, small_lung: Lung, tmp_pa
     back = read_volume(written[0])
     assert back.array[tuple(np.rint(back.grid.ijk(point)).astype(int))] == DIRECT
     assert small_lung.grid.contains(point)
-    assert b"space: left-posterior-superior" in written[0].read_bytes()[:2000]
+    assert b"environment: left-posterior-superior" in written[0].read_bytes()[:2000]
 
 
 def test_the_grid_covers_the_lung(small_lung: Lung) -> None:
@@ -243,14 +247,16 @@ def test_devices_are_compared(small_lung: Lung) -> None:
     assert (gained - lost) == pytest.approx((shares[1] - shares[0]) * maps[0].total.volume_ml)
 
 
-def test_bad_input_is_refused(small_lung: Lung, atlas: la.Atlas, space: NeedleSpace, reach: ReachMap) -> None:
+def test_bad_input_is_refused(
+    small_lung: Lung, atlas: la.Atlas, environment: NeedleEnvironment, reach: ReachMap
+) -> None:
     for spacing in (0.1, 100.0, float("nan")):
         with pytest.raises(SettingsError, match="spacing"):
             reachability(small_lung, SYSTEM, spacing_mm=spacing, atlas=atlas)
     with pytest.raises(SettingsError, match="atlas was made for"):
         reachability(small_lung, la.load_system("lung-default"), atlas=atlas)
     with pytest.raises(SettingsError, match="at least 1 arc"):
-        ReachScan(space, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), arcs=0)
+        ReachScan(environment, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), arcs=0)
     finer = Volume(grid=reach_grid(small_lung, 10.0), array=np.zeros(reach_grid(small_lung, 10.0).shape))
     with pytest.raises(GridMismatchError):
         reach.gained_and_lost_ml(replace(reach, kinds=finer))

@@ -23,8 +23,8 @@ from lungaccess.refinement.geometry import Geometry
 from lungaccess.refinement.problem import Court, Problem
 from lungaccess.refinement.program import Program, program
 from stages.needle import SHORTEST, Objective
+from stages.needle.environment import direct_arcs, needle_environment
 from stages.needle.path import ArcPath, direct_path
-from stages.needle.space import direct_arcs, needle_space
 from stages.scope.sites import Sites, find_sites
 from stages.scope.tips import looks_ahead, tip_at
 from stages.tube.deployments import Deployment, TubeJudge, enumerate_deployments, tracking_length_mm
@@ -61,9 +61,9 @@ def case(small_lung: Lung) -> Case:
     places = find_sites(lung, system.scope, reach_mm=tracking_length_mm(system.tubes))
     fissures = {"with_fissures": task.with_fissures}
     found = enumerate_deployments(lung, system.tubes, system.margins, places.poses, **fissures)
-    space = needle_space(lung, system.needle, system.margins, **fissures)
+    environment = needle_environment(lung, system.needle, system.margins, **fissures)
     blockers, _lengths, costs = direct_arcs(
-        space, found.positions, found.tangents, found.branch, target.lps_mm
+        environment, found.positions, found.tangents, found.branch, target.lps_mm
     )
     inside = ~places.turned[found.site] & (found.outer_mm > 0.0)
     clear = np.flatnonzero((blockers == 0) & inside)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from anatomy.structures import VESSEL
 from anatomy.typed import Float
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.search.base import Query
-from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 
 CLEARANCE_MM = 1.0
@@ -56,12 +56,12 @@ class Maze:
         """Start and target."""
         return Query(lps_from_start=self.start, target=self.target)
 
-    def space(self) -> NeedleSpace:
+    def environment(self) -> NeedleEnvironment:
         """Draw the blocks."""
         canvas = Canvas.empty(self.low, self.high, self.voxel_mm)
         for block_low, block_high in self.blocks:
             canvas.add(((canvas.points > block_low) & (canvas.points < block_high)).all(axis=-1), VESSEL)
-        return space_of_labels(
+        return environment_of_labels(
             canvas.labels,
             canvas.grid,
             self.needle,

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.structures import OBSTACLES
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.path import ArcPath, blocker_on_path
-from stages.needle.space import NeedleSpace
 from tests.stages.scenes import brute_clearance
 
 
-def assert_proved(space: NeedleSpace, path: ArcPath, target: np.ndarray) -> None:
+def assert_proved(environment: NeedleEnvironment, path: ArcPath, target: np.ndarray) -> None:
     """Fail unless a path is clear by proof and by trying, bends as the needle can, and ends at its target."""
-    assert blocker_on_path(space, path, -1) == 0
+    assert blocker_on_path(environment, path, -1) == 0
     points, _ = path.sample(0.02)
-    gap = brute_clearance(space.arrays[1], space.grid, points, OBSTACLES, 2.0)
-    assert gap.min() >= space.required_clearance_mm - 1e-9
-    assert path.arcs[:, 2].max() <= space.needle.max_curvature_per_mm * (1 + 1e-9)
+    gap = brute_clearance(environment.obstacles[1], environment.grid, points, OBSTACLES, 2.0)
+    assert gap.min() >= environment.required_clearance_mm - 1e-9
+    assert path.arcs[:, 2].max() <= environment.needle.max_curvature_per_mm * (1 + 1e-9)
     assert np.linalg.norm(points[-1] - target) < 1e-6

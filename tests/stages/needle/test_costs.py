@@ -23,12 +23,12 @@ from stages.needle.costs import (
     voxels_crossed,
 )
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.kernels import cost as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query, RestartingRRT
-from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 
 UNIT = Grid.from_spacing((40, 40, 40), (1.0, 1.0, 1.0), (0.5, 0.5, 0.5))
@@ -294,12 +294,12 @@ class TestInfinite:
         assert voxel_sum(None, path) == 0.0 and map_integral(None, path) == 0.0
 
 
-def scene(obstacles_as: float = 0.5, with_map: bool = True) -> NeedleSpace:
+def scene(obstacles_as: float = 0.5, with_map: bool = True) -> NeedleEnvironment:
     """A vessel across the way, a map that is cheap on one side of it."""
     canvas = Canvas.empty([-20, -20, -5], [20, 20, 45], 1.0)
     canvas.add(canvas.capsule([-20, 0, 20], [20, 0, 20], 2.0), VESSEL)
     values = np.where(canvas.points[..., 1] > 0, 0.9, 0.2).astype(np.float32)
-    return space_of_labels(
+    return environment_of_labels(
         canvas.labels,
         canvas.grid,
         Needle(diameter_mm=1.0, max_curvature_per_mm=0.05),
@@ -310,14 +310,14 @@ def scene(obstacles_as: float = 0.5, with_map: bool = True) -> NeedleSpace:
 
 
 class TestSpaces:
-    """Costs of paths in a needle space."""
+    """Costs of paths in a needle environment."""
 
     @pytest.mark.parametrize("obstacles_as", [0.5, CENTRES])
     def test_clearance_to_boxes_and_to_centres(self, obstacles_as: float) -> None:
-        space = scene(obstacles_as)
+        environment = scene(obstacles_as)
         points = np.random.default_rng(0).uniform([-15, -15, 0], [15, 15, 40], (300, 3))
-        found = obstacle_clearance_mm(space.arrays, points)
-        centres = space.grid.lps(np.argwhere((space.arrays[1] & OBSTACLES) != 0).astype(float))
+        found = obstacle_clearance_mm(environment.obstacles, points)
+        centres = environment.grid.lps(np.argwhere((environment.obstacles[1] & OBSTACLES) != 0).astype(float))
         gaps = np.maximum(np.abs(points[:, None] - centres) - obstacles_as, 0.0)
         exact = np.linalg.norm(gaps, axis=2).min(axis=1)
         edge = np.minimum(points - [-20, -20, -5], [20, 20, 45] - points).min(axis=1)
@@ -329,13 +329,13 @@ class TestSpaces:
         assert (found[far & (edge > 8.0)] > 0.99 * exact[far & (edge > 8.0)]).all()
 
     def test_every_cost_by_its_name(self) -> None:
-        space = scene()
+        environment = scene()
         path = line([0.5, 8.5, 0.5], [0, 0, 1.0], 30.0)
-        costs = path_costs(space.arrays, space.cost_map, path)
+        costs = path_costs(environment.obstacles, environment.cost_map, path)
         assert costs["length_mm"] == 30.0
         assert costs["cost_map"] == pytest.approx(0.9 * 30, rel=1e-6)
         assert costs["voxel_sum"] == pytest.approx(0.9 * 31, rel=1e-6)
-        assert costs["inverse_clearance"] == inverse_clearance(space.arrays, path)
+        assert costs["inverse_clearance"] == inverse_clearance(environment.obstacles, path)
 
 
 class TestSearches:
@@ -345,13 +345,13 @@ class TestSearches:
 
     @pytest.mark.parametrize("objective", [Objective(voxel_sum=1.0), Objective(cost_map=1.0)])
     def test_the_cost_of_a_path_found(self, objective: Objective) -> None:
-        space = scene()
-        search = RestartingRRT(space, self.QUERY, seed=3, objective=objective)
+        environment = scene()
+        search = RestartingRRT(environment, self.QUERY, seed=3, objective=objective)
         costs = []
         for _ in range(60):
             if search.advance(300):
                 assert search.path is not None
-                exact = objective.total(path_costs(space.arrays, space.cost_map, search.path))
+                exact = objective.total(path_costs(environment.obstacles, environment.cost_map, search.path))
                 assert search.cost == pytest.approx(exact, rel=1e-6) or (
                     objective.voxel_sum > 0.0 and exact < search.cost < 1.2 * exact
                 )
@@ -366,7 +366,7 @@ class TestSearches:
         canvas = Canvas.empty([-20, -20, -5], [20, 20, 45], 1.0)
         values = np.full(canvas.grid.shape, 0.5, dtype=np.float32)
         values[:, :, 25] = math.inf
-        space = space_of_labels(
+        environment = environment_of_labels(
             canvas.labels,
             canvas.grid,
             Needle(diameter_mm=1.0, max_curvature_per_mm=0.05),
@@ -374,19 +374,19 @@ class TestSearches:
             cost_map=Volume(grid=canvas.grid, array=values),
         )
         for objective, found in ((Objective(voxel_sum=1.0), False), (Objective(length=1.0), True)):
-            search = RestartingRRT(space, self.QUERY, objective=objective)
+            search = RestartingRRT(environment, self.QUERY, objective=objective)
             assert search.advance(500) is found
 
     def test_the_start_voxel_counts_once(self) -> None:
         """A tree of three arcs along a line, as the searches grow it."""
-        space = scene()
-        arrays = space.objective_arrays(Objective(voxel_sum=1.0))
+        environment = scene()
+        arrays = environment.objective_arrays(Objective(voxel_sum=1.0))
         nodes, parents = np.zeros((5, tree.NODE_COLUMNS)), np.zeros(5, dtype=np.int64)
         nodes[0, :6] = [0.5, 8.5, 0.5, 0.0, 0.0, 1.0]
         goal = np.array([0.5, 8.5, 40.0])
         for n, length in enumerate([2.2, 3.3, 0.3], start=1):
             assert tree.add_arc(
-                space.arrays, space.limits, arrays, -1, nodes, parents, n, n - 1,
+                environment.obstacles, environment.limits, arrays, -1, nodes, parents, n, n - 1,
                 (0.0, 1.0, 0.0, 0.0), length, goal, math.inf,
             )  # fmt: skip
         assert nodes[:4, tree.PATH_COST] == pytest.approx([0.0, 0.9 * 3, 0.9 * 7, 0.9 * 7])

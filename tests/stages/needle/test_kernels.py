@@ -15,12 +15,12 @@ from anatomy.margins import Margins
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from anatomy.typed import Float
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment, workspace_lengths
 from stages.needle.kernels import connections, proof, rrt, tree
 from stages.needle.kernels import cost as cost_kernels
 from stages.needle.kernels import limits as limits_index
 from stages.needle.objective import SHORTEST
 from stages.needle.path import ArcPath, blocker_on_path, path_from_tree
-from stages.needle.space import NeedleSpace, direct_arcs, needle_space, workspace_lengths
 from tests.stages.scenes import Canvas, brute_clearance, line_tree, lung_of
 
 RADIUS = 50.0
@@ -138,7 +138,7 @@ N = 22
 
 
 @st.composite
-def crowded_spaces(draw: Any) -> tuple[Lung, Float, tuple[float, ...], tuple[float, ...], float]:
+def crowded_environments(draw: Any) -> tuple[Lung, Float, tuple[float, ...], tuple[float, ...], float]:
     """A small volume with obstacles strewn about, limits, and an arc that begins near its middle."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     spacing = np.array(draw(SPACINGS))
@@ -192,7 +192,7 @@ def spare_clearance(lung: Lung, limits: Float, points: Float, s: Float, branch: 
 class TestBlocker:
     """`blocker_on_arc` is a proof: it neither passes a blocked arc nor refuses a clear one."""
 
-    @given(scene=crowded_spaces())
+    @given(scene=crowded_environments())
     @settings(max_examples=150)
     def test_without_exemption(self, scene: Any) -> None:
         lung, limits, pose, bend, length = scene
@@ -204,7 +204,9 @@ class TestBlocker:
         else:
             assert spare < 0.01 + 0.01
 
-    @given(scene=crowded_spaces(), begun=st.sampled_from([0.0, 0.5, 2.0]), branch=st.sampled_from([0, 1]))
+    @given(
+        scene=crowded_environments(), begun=st.sampled_from([0.0, 0.5, 2.0]), branch=st.sampled_from([0, 1])
+    )
     @settings(max_examples=150)
     def test_with_exemption(self, scene: Any, begun: float, branch: int) -> None:
         lung, limits, pose, bend, length = scene
@@ -270,11 +272,11 @@ class TestExemption:
         canvas = Canvas.empty([-10, -10, -10], [10, 10, 10], 0.5)
         x = canvas.points[..., 0]
         canvas.airway(x < -1, x < 4, 0)
-        space = arrays(canvas.lung())
+        environment = arrays(canvas.lung())
         values = limits_of(REQUIRED=0.9, RADIUS=0.4, EXEMPT_LENGTH=5.0)
         for gap, clear in ((0.41, True), (0.39, False)):
             pose = (-1.0 + gap, 0.0, 0.0, 0.0, 0.0, 1.0)
-            label = proof.blocker_on_arc(space, values, pose, (0.0, 1.0, 0, 0), 3.0, 0.0, 0)
+            label = proof.blocker_on_arc(environment, values, pose, (0.0, 1.0, 0, 0), 3.0, 0.0, 0)
             assert (label == 0) == clear
             assert clear or label & LUMEN
 
@@ -295,12 +297,12 @@ def arrays(lung: Lung) -> Any:
     return field.corners, lung.labels, field.geometry, OBSTACLES
 
 
-def ball_space(**changes: float) -> NeedleSpace:
+def ball_environment(**changes: float) -> NeedleEnvironment:
     """Free lung with a vessel ball in the middle of the way from (0, 0, -28) to (0, 0, 28)."""
     canvas = Canvas.empty([-32, -32, -32], [32, 32, 32], 1.0)
     canvas.add(canvas.ball([0, 0, 0], 4.0), VESSEL)
     values: dict[str, float] = {"diameter_mm": 1.0, "max_curvature_per_mm": 1 / 30, **changes}
-    return needle_space(canvas.lung(), Needle(**values), Margins(), with_fissures=False)
+    return needle_environment(canvas.lung(), Needle(**values), Margins(), with_fissures=False)
 
 
 GOAL = np.array([0.0, 0.0, 28.0])
@@ -309,14 +311,29 @@ START = np.array([0.0, 0.0, -28.0, 0.0, 0.0, 1.0])
 
 
 def grow(
-    space: NeedleSpace, seed: int = 5, goal: Float = GOAL, iterations: int = 20000, size: int = 20000
+    environment: NeedleEnvironment,
+    seed: int = 5,
+    goal: Float = GOAL,
+    iterations: int = 20000,
+    size: int = 20000,
 ) -> tuple[Float, np.ndarray, int, int, bool]:
     """Run the RRT from START."""
     nodes, parents = np.zeros((size, tree.NODE_COLUMNS)), np.zeros(size, dtype=np.int64)
     nodes[0, :6] = START
     state = np.array([seed], dtype=np.uint64)
     count, used, solved = rrt.grow_rrt(
-        space.arrays, space.limits, OBJECTIVE, -1, goal, nodes, parents, 1, iterations, 0.5, state, math.inf
+        environment.obstacles,
+        environment.limits,
+        OBJECTIVE,
+        -1,
+        goal,
+        nodes,
+        parents,
+        1,
+        iterations,
+        0.5,
+        state,
+        math.inf,
     )
     return nodes[:count], parents[:count], count, used, solved
 
@@ -331,10 +348,10 @@ class TestDirectArcs:
     """Many starts at once."""
 
     def test_every_outcome(self) -> None:
-        space = ball_space()
+        environment = ball_environment()
         positions = np.array([[0.0, 0, -28], [20, 0, -28], [0, 0, 20], [0, 0, 30], [0, 0, 28]])
         tangents = np.array([[0.0, 0, 1], [0, 0, 1], [1, 0, 0], [0, 0, 1], [0, 0, 1]])
-        blockers, lengths, cost = direct_arcs(space, positions, tangents, np.full(5, -1), GOAL)
+        blockers, lengths, cost = direct_arcs(environment, positions, tangents, np.full(5, -1), GOAL)
         assert blockers[0] == VESSEL
         assert blockers[1] == 0
         assert blockers[2] == blockers[3] == -1, "too tight; straight behind"
@@ -350,18 +367,18 @@ class TestDirectArcs:
         start = np.array([[20.0, 0, -28]])
         for name in ("max_angle_from_start_deg", "max_accumulated_turn_deg"):
             for over, outcome in ((0.1, 0), (-0.1, -1)):
-                space = ball_space(**{name: math.degrees(2 * half) + over})
-                found = direct_arcs(space, start, np.array([[0.0, 0, 1]]), np.array([-1]), GOAL)[0]
+                environment = ball_environment(**{name: math.degrees(2 * half) + over})
+                found = direct_arcs(environment, start, np.array([[0.0, 0, 1]]), np.array([-1]), GOAL)[0]
                 assert found[0] == outcome
 
     def test_where_an_arc_exists_the_workspace_holds_the_target(self) -> None:
-        space = ball_space()
+        environment = ball_environment()
         rng = np.random.default_rng(0)
         positions = rng.uniform(-30, 30, (3000, 3))
         tangents = rng.normal(size=(3000, 3))
         tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-        blockers, lengths, _ = direct_arcs(space, positions, tangents, np.full(3000, -1), GOAL)
-        shortest = workspace_lengths(space, positions, tangents, GOAL)
+        blockers, lengths, _ = direct_arcs(environment, positions, tangents, np.full(3000, -1), GOAL)
+        shortest = workspace_lengths(environment, positions, tangents, GOAL)
         arc = blockers != -1
         assert arc.sum() > 100
         assert (shortest[arc] <= lengths[arc] + 1e-9).all()
@@ -370,11 +387,11 @@ class TestDirectArcs:
         """Straight along a flat pleura at 5 mm for 20 mm: 20 / 5."""
         canvas = Canvas.empty([-20, -20, -20], [20, 20, 20], 1.0)
         canvas.add(canvas.points[..., 0] < -5, OUTSIDE)
-        space = needle_space(
+        environment = needle_environment(
             canvas.lung(), Needle(diameter_mm=1.0, max_curvature_per_mm=0.01), Margins(), with_fissures=False
         )
         cost = cost_kernels.inverse_clearance_on_arc(
-            space.arrays, 0.5, (0.0, 0, -10, 0, 0, 1.0), (0.0, 1.0, 0, 0), 20.0
+            environment.obstacles, 0.5, (0.0, 0, -10, 0, 0, 1.0), (0.0, 1.0, 0, 0), 20.0
         )
         assert cost == pytest.approx(4.0, rel=5e-3)
 
@@ -383,18 +400,18 @@ class TestRrt:
     """The RRT goes around what blocks the direct arc."""
 
     def test_goes_around_the_ball(self) -> None:
-        space = ball_space()
-        blockers, _, _ = direct_arcs(space, START[None, :3], START[None, 3:], np.array([-1]), GOAL)
+        environment = ball_environment()
+        blockers, _, _ = direct_arcs(environment, START[None, :3], START[None, 3:], np.array([-1]), GOAL)
         assert blockers[0] == VESSEL
-        nodes, parents, count, used, solved = grow(space)
+        nodes, parents, count, used, solved = grow(environment)
         assert solved and used > 0
         path = path_from_tree(start_frame(), nodes, parents, count - 1)
         assert len(path.arcs) >= 2
         assert np.linalg.norm(path.frames()[-1][:3, 3] - GOAL) < 1e-6
-        assert blocker_on_path(space, path, -1) == 0
+        assert blocker_on_path(environment, path, -1) == 0
         points, _ = path.sample(0.02)
-        gap = brute_clearance(space.arrays[1], space.grid, points, OBSTACLES, 2.0)
-        assert gap.min() >= space.required_clearance_mm - 1e-6
+        gap = brute_clearance(environment.obstacles[1], environment.grid, points, OBSTACLES, 2.0)
+        assert gap.min() >= environment.required_clearance_mm - 1e-6
 
     @pytest.mark.parametrize(
         "changes",
@@ -407,11 +424,11 @@ class TestRrt:
         ],
     )
     def test_every_node_is_within_the_limits(self, changes: dict[str, float]) -> None:
-        space = ball_space(**changes)
-        needle = space.needle
+        environment = ball_environment(**changes)
+        needle = environment.needle
         solutions = 0
         for seed in range(3):
-            nodes, parents, count, _, solved = grow(space, seed)
+            nodes, parents, count, _, solved = grow(environment, seed)
             solutions += solved
             for last in range(1, count):
                 path = path_from_tree(start_frame(), nodes, parents, last)
@@ -427,23 +444,23 @@ class TestRrt:
         assert solutions > 0
 
     def test_the_same_seed_grows_the_same_tree(self) -> None:
-        space = ball_space()
-        first, again, other = (grow(space, seed) for seed in (11, 11, 12))
+        environment = ball_environment()
+        first, again, other = (grow(environment, seed) for seed in (11, 11, 12))
         assert np.array_equal(first[0], again[0])
         assert np.array_equal(first[1], again[1])
         assert first[0].shape != other[0].shape or not np.array_equal(first[0], other[0])
 
     def test_slices_grow_the_same_tree_as_one_run(self) -> None:
-        space = ball_space(max_length_mm=57.5)
-        whole = grow(space, 3, iterations=4000)
+        environment = ball_environment(max_length_mm=57.5)
+        whole = grow(environment, 3, iterations=4000)
         nodes, parents = np.zeros((20000, tree.NODE_COLUMNS)), np.zeros(20000, dtype=np.int64)
         nodes[0, :6] = START
         state = np.array([3], dtype=np.uint64)
         count, used, solved = 1, 0, False
         while used < 4000 and not solved:
             count, spent, solved = rrt.grow_rrt(
-                space.arrays,
-                space.limits,
+                environment.obstacles,
+                environment.limits,
                 OBJECTIVE,
                 -1,
                 GOAL,
@@ -461,15 +478,15 @@ class TestRrt:
         assert np.array_equal(nodes[:count], whole[0])
 
     def test_a_goal_that_cannot_be_reached(self) -> None:
-        _, _, _, used, solved = grow(ball_space(), goal=np.array([0.0, 0.0, -31.0]), iterations=500)
+        _, _, _, used, solved = grow(ball_environment(), goal=np.array([0.0, 0.0, -31.0]), iterations=500)
         assert used == 500 and not solved
-        _, _, _, used, solved = grow(ball_space(), goal=np.array([0.0, 0.0, 0.0]), iterations=500)
+        _, _, _, used, solved = grow(ball_environment(), goal=np.array([0.0, 0.0, 0.0]), iterations=500)
         assert used == 500 and not solved, "in the vessel"
 
     def test_a_goal_at_the_start_and_a_full_tree_end_the_search(self) -> None:
-        _, _, count, used, solved = grow(ball_space(), goal=START[:3].copy(), iterations=500)
+        _, _, count, used, solved = grow(ball_environment(), goal=START[:3].copy(), iterations=500)
         assert (count, used, solved) == (1, 0, False)
-        _, _, count, used, solved = grow(ball_space(max_length_mm=57.5), iterations=50000, size=6)
+        _, _, count, used, solved = grow(ball_environment(max_length_mm=57.5), iterations=50000, size=6)
         assert count <= 6 and used < 50000 and not solved
 
     def test_goals_more_than_two_radii_away(self) -> None:
@@ -477,11 +494,11 @@ class TestRrt:
         canvas = Canvas.empty([-22, -22, -52], [22, 22, 52], 1.0)
         canvas.add(canvas.ball([0, 0, 0], 5.0), VESSEL)
         needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 40)
-        space = needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
+        environment = needle_environment(canvas.lung(), needle, Margins(), with_fissures=False)
         nodes, parents = np.zeros((5000, tree.NODE_COLUMNS)), np.zeros(5000, dtype=np.int64)
         nodes[0, :6] = 0.0, 0.0, -46.0, 0.0, 0.0, 1.0
         _, _, solved = rrt.grow_rrt(
-            space.arrays, space.limits, OBJECTIVE, -1, np.array([0.0, 0.0, 46.0]), nodes, parents, 1,
-            20000, 0.5, np.array([1], dtype=np.uint64), math.inf,
+            environment.obstacles, environment.limits, OBJECTIVE, -1, np.array([0.0, 0.0, 46.0]), nodes,
+            parents, 1, 20000, 0.5, np.array([1], dtype=np.uint64), math.inf,
         )  # fmt: skip
         assert solved

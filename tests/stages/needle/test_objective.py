@@ -16,9 +16,9 @@ from anatomy.grid import Volume
 from anatomy.structures import VESSEL
 from anatomy.typed import Float32
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.kernels import cost as kernel
 from stages.needle.objective import NO_MAP, SHORTEST, TERMS, Objective, Term
-from stages.needle.space import NeedleSpace, space_of_labels
 from tests.stages.scenes import Canvas
 
 NAMES = [field.name for field in fields(Objective)]
@@ -31,10 +31,10 @@ def a_map(low: float = 0.25) -> Float32:
 
 
 @pytest.fixture(scope="module")
-def space() -> NeedleSpace:
+def environment() -> NeedleEnvironment:
     canvas = Canvas.empty([-15] * 3, [15] * 3, 1.0)
     canvas.add(canvas.ball([6, 0, 0], 2.0), VESSEL)
-    return space_of_labels(
+    return environment_of_labels(
         canvas.labels,
         canvas.grid,
         Needle(diameter_mm=1.0, max_curvature_per_mm=0.05),
@@ -172,7 +172,7 @@ PLACES = st.tuples(*[st.floats(-9.0, 9.0)] * 3)
        curvature=st.floats(0, 0.2), first=st.booleans())  # fmt: skip
 @settings(max_examples=300)
 def test_no_arc_costs_less(
-    space: NeedleSpace,
+    environment: NeedleEnvironment,
     weights: tuple[float, ...],
     place: tuple[float, ...],
     angle: float,
@@ -181,19 +181,19 @@ def test_no_arc_costs_less(
     first: bool,
 ) -> None:
     """Of whatever length, however many voxels it enters."""
-    objective = space.objective_arrays(Objective(**dict(zip(NAMES, weights, strict=True))))
+    objective = environment.objective_arrays(Objective(**dict(zip(NAMES, weights, strict=True))))
     pose = (*place, math.cos(angle), 0.0, math.sin(angle))
     bend = (curvature, 0.0, 1.0, 0.0)
-    cost = kernel.cost_of_arc(space.arrays, objective, 0.5, pose, bend, length, first)
+    cost = kernel.cost_of_arc(environment.obstacles, objective, 0.5, pose, bend, length, first)
     assert cost >= objective[0][kernel.LEAST_RATE] * length * (1.0 - 1e-12)
 
 
-def test_weights_add_up(space: NeedleSpace) -> None:
+def test_weights_add_up(environment: NeedleEnvironment) -> None:
     pose, bend = (1.0, -3.0, -9.0, 0.0, 0.0, 1.0), (0.03, 0.6, 0.8, 0.0)
 
     def cost(**weights: float) -> float:
-        arrays = space.objective_arrays(Objective(**weights))
-        return float(kernel.cost_of_arc(space.arrays, arrays, 0.5, pose, bend, 17.0, True))
+        arrays = environment.objective_arrays(Objective(**weights))
+        return float(kernel.cost_of_arc(environment.obstacles, arrays, 0.5, pose, bend, 17.0, True))
 
     weights = dict(zip(NAMES, (2.0, 3.0, 5.0, 7.0), strict=True))
     assert cost(**weights) == pytest.approx(sum(w * cost(**{name: 1.0}) for name, w in weights.items()))

@@ -15,9 +15,9 @@ from anatomy.margins import Margins
 from anatomy.structures import VESSEL
 from anatomy.typed import Float
 from stages.needle.device import Needle
+from stages.needle.environment import needle_environment
 from stages.needle.kernels import tree
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path, direct_path, path_from_tree
-from stages.needle.space import needle_space
 from tests.stages.scenes import Canvas
 
 ARCS = st.lists(
@@ -165,12 +165,12 @@ def test_a_path_is_proved_arc_by_arc() -> None:
     canvas = Canvas.empty([-15, -15, -5], [15, 15, 35], 1.0)
     canvas.add(canvas.ball([0, 0, 20], 2.0), VESSEL)
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=0.05)
-    space = needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
+    environment = needle_environment(canvas.lung(), needle, Margins(), with_fissures=False)
     clear = ArcPath(lps_from_start=np.eye(4), arcs=np.array([[10.0, 0.0, 0.0], [4.0, 0.0, 0.0]]))
     blocked = ArcPath(lps_from_start=np.eye(4), arcs=np.array([[10.0, 0.0, 0.0], [14.0, 0.0, 0.0]]))
     around = ArcPath(
         lps_from_start=np.eye(4), arcs=np.array([[12.0, 1.0, 0.05], [10.0, math.pi, 0.05], [5.0, 0.0, 0.0]])
     )
-    assert blocker_on_path(space, clear, -1) == 0
-    assert blocker_on_path(space, blocked, -1) == VESSEL
-    assert blocker_on_path(space, around, -1) == 0
+    assert blocker_on_path(environment, clear, -1) == 0
+    assert blocker_on_path(environment, blocked, -1) == VESSEL
+    assert blocker_on_path(environment, around, -1) == 0

@@ -11,9 +11,9 @@ import pytest
 from anatomy.margins import Margins
 from anatomy.structures import VESSEL
 from stages.needle.device import Needle
+from stages.needle.environment import needle_environment
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query
-from stages.needle.space import needle_space
 from stages.needle.violations import largest_angle_rad, objection
 from tests.stages.scenes import Canvas
 
@@ -35,10 +35,10 @@ def reason(path: ArcPath, *, needle: Any = None, asked: Any = None, tolerance_mm
     canvas = Canvas.empty([-32, -32, -32], [32, 32, 32], 1.0)
     canvas.add(canvas.ball([0, 0, 0], 4.0), VESSEL)
     device = Needle(**{"diameter_mm": 1.0, "max_curvature_per_mm": 1 / 30, **(needle or {})})
-    space = needle_space(canvas.lung(), device, Margins(), with_fissures=False)
+    environment = needle_environment(canvas.lung(), device, Margins(), with_fissures=False)
     target = around().frames()[-1][:3, 3]
     query = Query(**{"lps_from_start": start(), "target": target, **(asked or {})})
-    return objection(space, query, path, goal_tolerance_mm=tolerance_mm)
+    return objection(environment, query, path, goal_tolerance_mm=tolerance_mm)
 
 
 def test_a_path_within_all_limits_is_an_answer() -> None:

@@ -62,12 +62,12 @@ def mark_probed(states, window, scale, depths, probed, corners):
 
 
 @numba.njit(cache=True)
-def clearance_above(space, required, spare, exempt_branch, x, y, z):
+def clearance_above(obstacles, required, spare, exempt_branch, x, y, z):
     """Return a clearance in mm that the true one of a point is never above, as far as it is worth knowing.
 
     Where the clearance is at least `required - spare` and the field says so, `required` is returned.
     """
-    field, labels, geometry, bits = space
+    field, labels, geometry, bits = obstacles
     squared, spread2 = interpolate_squared(field, geometry, x, y, z)
     least = max(required - spare, 0.0)
     if squared > 0.0 and squared - spread2 >= least * least:
@@ -88,7 +88,7 @@ def _grade_of(slacks, value):
 
 
 @numba.njit(cache=True)
-def grade_clearance(space, required, exempt_branch, origin, across, probed, slacks, grades):
+def grade_clearance(obstacles, required, exempt_branch, origin, across, probed, slacks, grades):
     """Fill `grades` (Y, 64 W) uint8 with the first of the `slacks` that a cell's lack of clearance is within.
 
     Of the cells of one plane only those are looked at that are set in `probed` (Y, W).  A lack is required
@@ -102,7 +102,7 @@ def grade_clearance(space, required, exempt_branch, origin, across, probed, slac
             if not (probed[y, x // 64] >> np.uint64(x % 64)) & ONE:
                 continue
             above = clearance_above(
-                space, required, slacks[0], exempt_branch,
+                obstacles, required, slacks[0], exempt_branch,
                 origin[0] + y * across[0, 0] + x * across[1, 0],
                 origin[1] + y * across[0, 1] + x * across[1, 1],
                 origin[2] + y * across[0, 2] + x * across[1, 2],

@@ -12,14 +12,14 @@ from stages.needle.infeasibility.kernels.reachability_pruning import hope_of_pla
 
 
 @numba.njit(cache=True)
-def flood(space, required, exempt_branch, exempt_mm, scale, ends, frame, side, corner, seen, queue):
+def flood(obstacles, required, exempt_branch, exempt_mm, scale, ends, frame, side, corner, seen, queue):
     """Fill the cubes that may be passed, from that of the start on; return whether one of the goal's is met.
 
     A path goes from one cube to another through a point of both, so to one of its 26 neighbours.
 
     Parameters
     ----------
-    space : tuple
+    obstacles : tuple
         See `stages.needle.kernels.proof`.
     required : float
     exempt_branch : int, exempt_mm : float
@@ -62,7 +62,7 @@ def flood(space, required, exempt_branch, exempt_mm, scale, ends, frame, side, c
                         continue
                     exempt = exempt_branch if math.sqrt(h * h + y * y + x * x) - half < exempt_mm else -1
                     above = clearance_above(
-                        space, required, half, exempt,
+                        obstacles, required, half, exempt,
                         frame[0, 0] + h * frame[1, 0] + y * frame[2, 0] + x * frame[3, 0],
                         frame[0, 1] + h * frame[1, 1] + y * frame[2, 1] + x * frame[3, 1],
                         frame[0, 2] + h * frame[1, 2] + y * frame[2, 2] + x * frame[3, 2],

@@ -70,7 +70,7 @@ def _choose(nodes, count, q, limits, rate, cost_bound):
 
 
 @numba.njit(cache=True, nogil=True)
-def grow_optimal(space, limits, objective, branch, goal, nodes, parents, count, iterations, state, best):
+def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, count, iterations, state, best):
     """Grow a tree in state and cost by up to `iterations` samples, until it has a path cheaper than `best`.
 
     Points are drawn between start and goal; a tree node goes there by a single arc or by the shortest path
@@ -84,7 +84,7 @@ def grow_optimal(space, limits, objective, branch, goal, nodes, parents, count, 
         return count, 0, False
     if count == 1:
         count = add_goal(
-            space, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
+            obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
         )
         if count > 1:
             return count, 0, True
@@ -97,7 +97,7 @@ def grow_optimal(space, limits, objective, branch, goal, nodes, parents, count, 
             near = int(uniform(state) * count)
             bend, length = random_arc(pose_of(nodes[near]), limits, state)
             if add_arc(
-                space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
+                obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
             ):
                 count += 1
         else:
@@ -110,31 +110,35 @@ def grow_optimal(space, limits, objective, branch, goal, nodes, parents, count, 
             if near < 0:
                 continue
             count = _extend(
-                space, limits, objective, branch, nodes, parents, count, near, q, goal, best, state
+                obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best, state
             )
         if count == before:
             continue
-        rows = add_goal(space, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state)
+        rows = add_goal(
+            obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
+        )
         if rows > count:
             return rows, used + 1, True
     return count, iterations, False
 
 
 @inner_kernel
-def _extend(space, limits, objective, branch, nodes, parents, count, near, q, goal, best, state):
+def _extend(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best, state):
     """Go from a node to a point, by legs or by an arc of at most the longest step; return the new `count`."""
     if uniform(state) < 0.5:
-        return add_legs(space, limits, objective, branch, nodes, parents, count, near, q, goal, best)
+        return add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best)
     length, bend, _turn = arc_to_point(pose_of(nodes[near]), q)
     length = min(length, limits[MAX_STEP])
     if bend[0] > limits[KAPPA] or length < MIN_ARC_MM:
         return count
-    added = add_arc(space, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best)
+    added = add_arc(
+        obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
+    )
     return count + 1 if added else count
 
 
 @numba.njit(cache=True)
-def build(space, limits, objective, branch, goal, nodes, parents, vias, count, best):
+def build(obstacles, limits, objective, branch, goal, nodes, parents, vias, count, best):
     """Lay a path from the root through via points, rows 1 onwards; return the last row, 0 if refused.
 
     `vias` (N, 4): a point, and whether it is reached by a single ARC or by the LEGS of the shortest path.
@@ -148,12 +152,14 @@ def build(space, limits, objective, branch, goal, nodes, parents, vias, count, b
             if length < MIN_ARC_MM or bend[0] > limits[KAPPA] * (1.0 + TINY):
                 return 0
             if not add_arc(
-                space, limits, objective, branch, nodes, parents, last + 1, last, bend, length, goal, best
+                obstacles, limits, objective, branch, nodes, parents, last + 1, last, bend, length, goal, best
             ):
                 return 0
             last += 1
         else:
-            rows = add_legs(space, limits, objective, branch, nodes, parents, last + 1, last, q, goal, best)
+            rows = add_legs(
+                obstacles, limits, objective, branch, nodes, parents, last + 1, last, q, goal, best
+            )
             if rows == last + 1:
                 return 0
             last = rows - 1
@@ -228,7 +234,7 @@ def _mutate(vias, trial, count, goal, limits, state):
 
 
 @numba.njit(cache=True, nogil=True)
-def refine(space, limits, objective, branch, goal, nodes, parents, vias, count, tries, state, best):
+def refine(obstacles, limits, objective, branch, goal, nodes, parents, vias, count, tries, state, best):
     """Vary the via points of a path at random and keep what is cheaper; return count, cost, improvements.
 
     `vias` (N, 4) holds the path and gets the best one; rows of `nodes` but the root are scratch.
@@ -242,7 +248,7 @@ def refine(space, limits, objective, branch, goal, nodes, parents, vias, count, 
             continue
         if 2 * number + 1 > nodes.shape[0]:
             continue
-        last = build(space, limits, objective, branch, goal, nodes, parents, trial, number, best)
+        last = build(obstacles, limits, objective, branch, goal, nodes, parents, trial, number, best)
         if last == 0 or not nodes[last, PATH_COST] < best:
             continue
         best = nodes[last, PATH_COST]

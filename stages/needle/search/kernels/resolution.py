@@ -309,7 +309,7 @@ def _push_level(
 
 @inner_kernel
 def _add(
-    space, limits, objective, rates, branch, goal, reference, words, merge, store, counts, at, primitive,
+    obstacles, limits, objective, rates, branch, goal, reference, words, merge, store, counts, at, primitive,
     rank, most,
 ):  # fmt: skip
     """Make the node at the end of a primitive from node `at`; return its estimate, inf if there is none.
@@ -334,12 +334,12 @@ def _add(
         return math.inf
     pose = _pose(nodes, at)
     if steps > proved[at, direction, CLEAR]:
-        if blocker_on_arc(space, limits, pose, bend, length, nodes[at, PATH_LENGTH], branch) != 0:
+        if blocker_on_arc(obstacles, limits, pose, bend, length, nodes[at, PATH_LENGTH], branch) != 0:
             proved[at, direction, USELESS] = steps
             counts[REFUSED] += 1
             return math.inf
         proved[at, direction, CLEAR] = steps
-    cost = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, at == 0)
+    cost = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, at == 0)
     if cost > rates[0] * length:
         nodes[row, PATH_COST] = nodes[at, PATH_COST] + cost
         slot, duplicate = find_duplicate(nodes, seen, merge, n_rolls, row)
@@ -363,7 +363,7 @@ def _add(
 
 
 @inner_kernel
-def _connect(space, limits, objective, rates, branch, goal, reference, nodes, best, at, cost):
+def _connect(obstacles, limits, objective, rates, branch, goal, reference, nodes, best, at, cost):
     """Try the goal from a node; keep a path cheaper than `cost` in `best`, and return the least cost.
 
     A path ends where it first is within the goal tolerance, or goes on to the goal where that costs no more.
@@ -388,10 +388,10 @@ def _connect(space, limits, objective, rates, branch, goal, reference, nodes, be
                     within
                     and found + rates[0] * length < most
                     and angle_kept(limits, reference, pose, bend, bend[0] * length)[0]
-                    and blocker_on_arc(space, limits, pose, bend, length, begun, branch) == 0
+                    and blocker_on_arc(obstacles, limits, pose, bend, length, begun, branch) == 0
                 ):
                     break
-                paid = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, is_start)
+                paid = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, is_start)
                 if leg == 2:
                     if paid <= rates[1] * missing * (1.0 + ROUNDING):
                         total = found + paid
@@ -422,14 +422,14 @@ def _connect(space, limits, objective, rates, branch, goal, reference, nodes, be
 
 @numba.njit(cache=True, nogil=True)
 def search_words(
-    space, limits, objective, rates, branch, goal, reference, words, merge, store, queue, state, counts, best,
-    cost, pops,
+    obstacles, limits, objective, rates, branch, goal, reference, words, merge, store, queue, state, counts,
+    best, cost, pops,
 ):  # fmt: skip
     """Go on with the search for up to `pops` entries, or until a cheaper path is found.
 
     Parameters
     ----------
-    space, limits, objective : tuple, (N_LIMITS,) float64, tuple
+    obstacles, limits, objective : tuple, (N_LIMITS,) float64, tuple
         See `proof`, `limits` and `cost`.
     rates : tuple of float
         Least cost of a mm of path, and what each mm costs by which the path ends short of the goal; no
@@ -482,7 +482,7 @@ def search_words(
             f = _estimate(nodes, at, rates, goal, limits, reference)
             bend = bend_of(nodes, words[1], limits[KAPPA], at, words[1].shape[0])
             begun = nodes[at, PATH_LENGTH]
-            if blocker_on_arc(space, limits, _pose(nodes, at), bend, 0.0, begun, branch) != 0:
+            if blocker_on_arc(obstacles, limits, _pose(nodes, at), bend, 0.0, begun, branch) != 0:
                 f = math.inf
             slot, _duplicate = find_duplicate(nodes, store[3], merge, words[1].shape[0], at)
             store[3][slot] = at + 1
@@ -498,15 +498,17 @@ def search_words(
                 f = math.inf
             elif primitive >= 0:
                 f = _add(
-                    space, limits, objective, rates, branch, goal, reference, words, merge, store, counts, at,
-                    primitive, rank, most,
+                    obstacles, limits, objective, rates, branch, goal, reference, words, merge, store, counts,
+                    at, primitive, rank, most,
                 )  # fmt: skip
                 at = counts[NODES] - 1
         counts[POPS] += 1
         if f == math.inf:
             continue
         if level == 0:
-            found = _connect(space, limits, objective, rates, branch, goal, reference, nodes, best, at, cost)
+            found = _connect(
+                obstacles, limits, objective, rates, branch, goal, reference, nodes, best, at, cost
+            )
             better = found < cost
             cost = found
             most = cost * (1.0 - ROUNDING)

@@ -105,7 +105,7 @@ def _middle(base, axes, goal_cells, layer, a, b, at_a, at_b):
 
 
 @inner_kernel
-def _arc_cost(space, limits, objective, branch, p, along, q, kappa, behind, first, most):
+def _arc_cost(obstacles, limits, objective, branch, p, along, q, kappa, behind, first, most):
     """Return the cost of the arc from a point to another that begins along a vector.
 
     It is infinite if the arc bends more than `kappa`, is not clear or costs `most` or more; `behind` mm of
@@ -116,8 +116,8 @@ def _arc_cost(space, limits, objective, branch, p, along, q, kappa, behind, firs
     length, bend, _turn = arc_to_point(pose, q)
     if bend[0] > kappa:
         return math.inf
-    cost = cost_of_arc(space, objective, limits[COST_STEP], pose, bend, length, first)
-    if cost >= most or blocker_on_arc(space, limits, pose, bend, length, behind, branch) != 0:
+    cost = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, first)
+    if cost >= most or blocker_on_arc(obstacles, limits, pose, bend, length, behind, branch) != 0:
         return math.inf
     return cost
 
@@ -141,7 +141,7 @@ def _sort_by_cost(order, costs, begin, end):
 
 @numba.njit(cache=True, nogil=True)
 def explore(
-    space, limits, objective, branch, base, axes, goal_cells, kappa, reach, inserted, bound,
+    obstacles, limits, objective, branch, base, axes, goal_cells, kappa, reach, inserted, bound,
     begins, states, before, costs, table, order,
 ):  # fmt: skip
     """Find the cheapest path to each state; return how many arcs were tried, and whether all states fitted.
@@ -188,7 +188,7 @@ def explore(
         for rank in range(begins[layer], begins[layer + 1]):
             m = order[rank]
             count, arcs = _follow(
-                space, limits, objective, branch, base, axes, goal_cells, kappa, reach, behind, bound,
+                obstacles, limits, objective, branch, base, axes, goal_cells, kappa, reach, behind, bound,
                 layer, begins[layer + 1], count, m, states, before, costs, table,
             )  # fmt: skip
             tried += arcs
@@ -202,7 +202,7 @@ def explore(
 
 @inner_kernel
 def _follow(
-    space, limits, objective, branch, base, axes, goal_cells, kappa, reach, behind, bound,
+    obstacles, limits, objective, branch, base, axes, goal_cells, kappa, reach, behind, bound,
     layer, begin, count, m, states, before, costs, table,
 ):  # fmt: skip
     """Enter the states after state `m` of a layer to which it leads cheapest, if the goal may be met.
@@ -231,7 +231,7 @@ def _follow(
             continue
         q = _middle(base, axes, goal_cells, layer + 1, a, b, at_a, at_b)
         cost = costs[m] + _arc_cost(
-            space, limits, objective, branch, p, along, q, kappa, behind, m == 0, least - costs[m]
+            obstacles, limits, objective, branch, p, along, q, kappa, behind, m == 0, least - costs[m]
         )
         tried += 1
         if cost >= least:

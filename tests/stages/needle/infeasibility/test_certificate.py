@@ -11,23 +11,23 @@ from anatomy.fields import CENTRES, SOLID
 from anatomy.grid import Grid
 from anatomy.structures import VESSEL
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.infeasibility.kernels import bitmaps
 from stages.needle.search.base import Query, RestartingRRT
-from stages.needle.space import NeedleSpace, space_of_labels
 
 SIDE = 64
 ROW = np.arange(SIDE)
 X, Y, Z = np.meshgrid(*[ROW - 31.5] * 3, indexing="ij")
 
 
-def space_of(blocked: np.ndarray, radius_mm: float = 60.0, **more: float) -> NeedleSpace:
+def environment_of(blocked: np.ndarray, radius_mm: float = 60.0, **more: float) -> NeedleEnvironment:
     """Return a cube of 1 mm voxels about the origin with obstacles."""
     labels = np.asfortranarray(np.where(blocked, VESSEL, 0).astype(np.uint16))
     grid = Grid.from_spacing(labels.shape, (1.0, 1.0, 1.0), (-31.5, -31.5, -31.5))
     values = {"required_clearance_mm": 1.0, **more}
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / radius_mm)
-    return space_of_labels(labels, grid, needle, **values)
+    return environment_of_labels(labels, grid, needle, **values)
 
 
 def query(x: float = 0.0, z: float = 28.0, tilt: float = 0.0) -> Query:
@@ -39,17 +39,17 @@ def query(x: float = 0.0, z: float = 28.0, tilt: float = 0.0) -> Query:
     return Query(lps_from_start=frame, target=np.array([x, 0.0, z]))
 
 
-def outcome(space: NeedleSpace, asked: Query, steps: int = 60) -> str:
+def outcome(environment: NeedleEnvironment, asked: Query, steps: int = 60) -> str:
     """Return how a proof ends, "running" if it takes more steps."""
-    proof = NoPathProof(space, asked)
+    proof = NoPathProof(environment, asked)
     for _ in range(steps):
         if proof.advance():
             break
     return proof.outcome
 
 
-def finds(space: NeedleSpace, asked: Query, iterations: int = 20_000) -> bool:
-    return RestartingRRT(space, asked).advance(iterations)
+def finds(environment: NeedleEnvironment, asked: Query, iterations: int = 20_000) -> bool:
+    return RestartingRRT(environment, asked).advance(iterations)
 
 
 def wall(hole_mm: float = 0.0, at: float = 0.0) -> np.ndarray:
@@ -57,24 +57,24 @@ def wall(hole_mm: float = 0.0, at: float = 0.0) -> np.ndarray:
 
 
 def test_a_wall_is_proved_and_a_hole_is_not() -> None:
-    assert outcome(space_of(wall()), query()) == "no path"
-    assert outcome(space_of(wall(4.0)), query()) != "no path"
-    assert finds(space_of(wall(4.0)), query())
+    assert outcome(environment_of(wall()), query()) == "no path"
+    assert outcome(environment_of(wall(4.0)), query()) != "no path"
+    assert finds(environment_of(wall(4.0)), query())
 
 
 def test_a_hole_that_is_too_narrow() -> None:
     """A hole of one voxel's width leaves 0.5 mm about its middle."""
     narrow = (np.abs(Z) < 2.0) & ~((np.abs(X) < 1.0) & (np.abs(Y) < 1.0))
-    assert outcome(space_of(narrow, required_clearance_mm=1.2), query()) == "no path"
-    assert finds(space_of(narrow, required_clearance_mm=0.9), query())
+    assert outcome(environment_of(narrow, required_clearance_mm=1.2), query()) == "no path"
+    assert finds(environment_of(narrow, required_clearance_mm=0.9), query())
 
 
 def test_a_hole_that_only_a_tighter_curve_passes() -> None:
     """Away, back and on to the target, a path comes about 257 mm^2 / radius aside half-way: 4, 6 or 9 mm."""
     aside = wall(3.0, 8.0)
-    assert outcome(space_of(aside, radius_mm=60.0), query()) == "no path"
-    assert outcome(space_of(aside, radius_mm=28.0), query()) != "no path"
-    assert finds(space_of(aside, radius_mm=28.0), query())
+    assert outcome(environment_of(aside, radius_mm=60.0), query()) == "no path"
+    assert outcome(environment_of(aside, radius_mm=28.0), query()) != "no path"
+    assert finds(environment_of(aside, radius_mm=28.0), query())
 
 
 def test_two_holes_that_do_not_fit_one_path() -> None:
@@ -82,26 +82,26 @@ def test_two_holes_that_do_not_fit_one_path() -> None:
     first = (np.abs(Z + 6.0) < 2.0) & (np.hypot(X - 4.0, Y) >= 3.0)
     second = (np.abs(Z - 6.0) < 2.0) & (np.hypot(X + 4.0, Y) >= 3.0)
     for one in (first, second):
-        assert finds(space_of(one), query())
-    assert outcome(space_of(first | second, radius_mm=60.0), query(), 200) == "no path"
-    assert not finds(space_of(first | second, radius_mm=60.0), query())
+        assert finds(environment_of(one), query())
+    assert outcome(environment_of(first | second, radius_mm=60.0), query(), 200) == "no path"
+    assert not finds(environment_of(first | second, radius_mm=60.0), query())
 
 
 def test_the_edge_of_the_workspace() -> None:
-    free = space_of(np.zeros((SIDE,) * 3, dtype=bool), radius_mm=60.0)
+    free = environment_of(np.zeros((SIDE,) * 3, dtype=bool), radius_mm=60.0)
     edge = 60.0 - math.sqrt(60.0**2 - 40.0**2)
     assert outcome(free, query(x=edge + 0.1, z=12.0)) == "no path"
     assert outcome(free, query(x=edge - 0.1, z=12.0)) != "no path"
-    near = space_of(np.zeros((SIDE,) * 3, dtype=bool), radius_mm=60.0, goal_tolerance_mm=1.0)
+    near = environment_of(np.zeros((SIDE,) * 3, dtype=bool), radius_mm=60.0, goal_tolerance_mm=1.0)
     assert outcome(near, query(x=edge + 0.8, z=12.0)) != "no path"
 
 
 def test_a_start_in_an_obstacle() -> None:
-    assert outcome(space_of(np.hypot(X, Y, Z + 28) < 3.0), query()) == "no path"
+    assert outcome(environment_of(np.hypot(X, Y, Z + 28) < 3.0), query()) == "no path"
 
 
 def test_odd_questions_are_undecided_or_proved_but_no_crash() -> None:
-    free = space_of(np.zeros((SIDE,) * 3, dtype=bool))
+    free = environment_of(np.zeros((SIDE,) * 3, dtype=bool))
     assert outcome(free, query(z=-28.0)) == "undecided", "the target lies at the start"
     assert outcome(free, query(z=-30.0)) in ("no path", "undecided"), "behind"
     assert outcome(free, query(tilt=1.5), 10) in ("no path", "undecided", "running")
@@ -123,18 +123,18 @@ def test_where_there_is_a_path_there_is_no_proof(seed: int, obstacles_as: float)
     asked = query(x=float(rng.uniform(-3, 3)), tilt=float(rng.uniform(-0.1, 0.1)))
     required = 3.0
     while required > 0.4:
-        space = space_of(
+        environment = environment_of(
             blocked, required_clearance_mm=required, obstacles_as=obstacles_as, goal_tolerance_mm=0.5
         )
-        if finds(space, asked, 4000):
-            assert outcome(space, asked) != "no path", f"clearance {required:.2f} mm"
+        if finds(environment, asked, 4000):
+            assert outcome(environment, asked) != "no path", f"clearance {required:.2f} mm"
             return
         required *= 0.9
 
 
 def test_the_same_question_has_the_same_answer() -> None:
     def run() -> tuple[str, str, int]:
-        proof = NoPathProof(space_of(wall(3.0, 8.0), radius_mm=45.0), query())
+        proof = NoPathProof(environment_of(wall(3.0, 8.0), radius_mm=45.0), query())
         proof.run()
         return proof.outcome, proof.reason, proof.states
 

@@ -30,6 +30,7 @@ from anatomy.structures import OUTSIDE, VESSEL
 from anatomy.typed import Float
 from stages.needle import ompl as ompl_planner
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.kernels.states import proved_step
 from stages.needle.ompl import (
     NeedleGoal,
@@ -44,7 +45,6 @@ from stages.needle.ompl import (
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path
 from stages.needle.search.base import Query, RestartingRRT, Search
 from stages.needle.search.planners import PLANNERS
-from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.scenes import Canvas
 
 GOAL = np.array([0.0, 0.0, 28.0])
@@ -64,18 +64,18 @@ def scene() -> Lung:
 
 
 @pytest.fixture(scope="module")
-def space() -> NeedleSpace:
+def environment() -> NeedleEnvironment:
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 30)
-    return needle_space(scene(), needle, Margins(), with_fissures=False)
+    return needle_environment(scene(), needle, Margins(), with_fissures=False)
 
 
 @pytest.fixture(scope="module")
-def problem(space: NeedleSpace) -> NeedleProblem:
-    return NeedleProblem(space)
+def problem(environment: NeedleEnvironment) -> NeedleProblem:
+    return NeedleProblem(environment)
 
 
-def with_needle(space: NeedleSpace, **more: float) -> NeedleSpace:
-    return needle_space(scene(), replace(space.needle, **more), Margins(), with_fissures=False)
+def with_needle(environment: NeedleEnvironment, **more: float) -> NeedleEnvironment:
+    return needle_environment(scene(), replace(environment.needle, **more), Margins(), with_fissures=False)
 
 
 def start() -> Float:
@@ -120,25 +120,25 @@ class Given:
         return True
 
 
-def given(*paths: ArcPath) -> Callable[[NeedleSpace, Query, int], Search]:
-    return lambda _space, _query, _seed: Given(*paths)
+def given(*paths: ArcPath) -> Callable[[NeedleEnvironment, Query, int], Search]:
+    return lambda _environment, _query, _seed: Given(*paths)
 
 
 # A query answered with arcs.
 
 
-def test_a_planner_written_in_python_solves(problem: NeedleProblem, space: NeedleSpace) -> None:
+def test_a_planner_written_in_python_solves(problem: NeedleProblem, environment: NeedleEnvironment) -> None:
     path = require(ask(problem))
     assert len(path.arcs) >= 2
     assert np.linalg.norm(path.frames()[-1][:3, 3] - GOAL) < 1e-6
-    assert blocker_on_path(space, path, -1) == 0
+    assert blocker_on_path(environment, path, -1) == 0
     assert np.array_equal(path.lps_from_start, start())
 
 
-def test_the_same_seed_gives_the_same_path(problem: NeedleProblem, space: NeedleSpace) -> None:
+def test_the_same_seed_gives_the_same_path(problem: NeedleProblem, environment: NeedleEnvironment) -> None:
     first, again = require(ask(problem, 7)), require(ask(problem, 7))
     assert np.array_equal(first.arcs, again.arcs)
-    assert np.array_equal(first.arcs, require(ask(NeedleProblem(space), 7)).arcs)
+    assert np.array_equal(first.arcs, require(ask(NeedleProblem(environment), 7)).arcs)
     assert not np.array_equal(first.arcs, require(ask(problem, 8)).arcs)
 
 
@@ -172,12 +172,14 @@ def test_a_termination_condition_that_holds_already_stops_at_once(problem: Needl
     assert problem.planner.path is None and problem.planner.iterations_used == 0
 
 
-def test_the_exemption_reaches_the_kernel(space: NeedleSpace) -> None:
+def test_the_exemption_reaches_the_kernel(environment: NeedleEnvironment) -> None:
     """A start in the wall of branch 0 has a path only if that is the pierced branch."""
     canvas = Canvas.empty([-20, -20, -20], [20, 20, 20], 1.0)
     x = canvas.points[..., 0]
     canvas.airway(x < -4, x < 0, 0)
-    problem = NeedleProblem(needle_space(canvas.lung(), space.needle, Margins(), with_fissures=False))
+    problem = NeedleProblem(
+        needle_environment(canvas.lung(), environment.needle, Margins(), with_fissures=False)
+    )
     frame = np.eye(4)
     frame[:3, :3] = [[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]
     frame[0, 3] = -1.0
@@ -191,11 +193,14 @@ def test_the_exemption_reaches_the_kernel(space: NeedleSpace) -> None:
     assert "airway" in problem.objection(path)
 
 
-def test_searches_are_chosen_by_name(space: NeedleSpace) -> None:
+def test_searches_are_chosen_by_name(environment: NeedleEnvironment) -> None:
     path = arcs_of((20.0, 0.0, 0.0))
     problem = NeedleProblem(
-        space,
-        {"line": given(path), "tree": lambda space, query, seed: RestartingRRT(space, query, seed=seed)},
+        environment,
+        {
+            "line": given(path),
+            "tree": lambda environment, query, seed: RestartingRRT(environment, query, seed=seed),
+        },
     )
     assert require(ask(problem)) is path
     assert len(require(ask(problem, method="tree")).arcs) >= 2
@@ -218,8 +223,8 @@ def test_the_simple_setup_of_ompl_solves_with_the_same_planner(problem: NeedlePr
     assert np.abs(require(problem.solution()).frames() - require(problem.planner.path).frames()).max() < 1e-9
 
 
-def test_a_planner_may_be_allocated_by_the_setup(space: NeedleSpace) -> None:
-    problem = NeedleProblem(space)
+def test_a_planner_may_be_allocated_by_the_setup(environment: NeedleEnvironment) -> None:
+    problem = NeedleProblem(environment)
     problem.setup.setPlannerAllocator(problem.planners()["rrt"])
     problem.pose(query())
     assert bool(problem.setup.solve(LONG_S))
@@ -243,11 +248,11 @@ def test_planners_of_ompl_run_on_the_same_problem(problem: NeedleProblem, name: 
     last = read_state(found.getState(found.getStateCount() - 1))
     assert np.abs(path.frames()[-1][:3, 2:] - last[:3, 2:]).max() < 1e-9
     assert path.arcs[:, 2].max() <= 1 / 30
-    assert blocker_on_path(problem.space, path, -1) == 0
+    assert blocker_on_path(problem.environment, path, -1) == 0
 
 
-def test_a_solve_without_query_or_start_is_no_crash(space: NeedleSpace) -> None:
-    problem = NeedleProblem(space)
+def test_a_solve_without_query_or_start_is_no_crash(environment: NeedleEnvironment) -> None:
+    problem = NeedleProblem(environment)
     alone = NeedlePlanner(problem.si, lambda _query, _seed: Given(), ompl_planner.Question())
     problem.pose(query())
     problem.setup.setPlanner(alone)
@@ -297,9 +302,9 @@ def test_the_goal_is_a_ball_and_any_orientation_at_its_centre(problem: NeedlePro
 # OMPL's own propagation: independent arithmetic, and proved.
 
 
-def test_ompl_propagates_the_arcs_to_the_same_end(space: NeedleSpace) -> None:
+def test_ompl_propagates_the_arcs_to_the_same_end(environment: NeedleEnvironment) -> None:
     """Quaternions in steps of a twentieth of each control, against the kernel's numbers."""
-    problem = NeedleProblem(with_needle(space, max_angle_from_start_deg=28.0))
+    problem = NeedleProblem(with_needle(environment, max_angle_from_start_deg=28.0))
     deepest = 0
     for seed in range(6):
         path = require(ask(problem, seed))
@@ -333,14 +338,14 @@ def test_the_check_of_ompl_notices_a_path_that_is_not_the_arcs(problem: NeedlePr
     assert not solution.check()
 
 
-def test_a_step_is_the_arc(space: NeedleSpace) -> None:
+def test_a_step_is_the_arc(environment: NeedleEnvironment) -> None:
     rng = np.random.default_rng(0)
     for seed in range(50):
         frame = np.eye(4)
         frame[:3, :3] = Rotation.random(random_state=seed).as_matrix()
         frame[:3, 3] = 15.0, 15.0, 15.0
         length, roll, curvature = rng.uniform([0.0, -3.0, 0.0], [5.0, 3.0, 1 / 30])
-        problem = NeedleProblem(space)
+        problem = NeedleProblem(environment)
         before, after = problem.si.allocState(), problem.si.allocState()
         write_state(before, frame)
         problem.pose(Query(lps_from_start=frame, target=GOAL))
@@ -369,12 +374,12 @@ def test_the_bounds_hold_the_whole_lung(problem: NeedleProblem) -> None:
     assert [float(bounds.high[n]) for n in range(3)] == pytest.approx([32.0] * 3)
 
 
-def thin_sheet() -> NeedleSpace:
+def thin_sheet() -> NeedleEnvironment:
     """A vessel 0.2 mm thick across the way at z = 0, and a needle of 0.1 mm."""
     canvas = Canvas.empty([-4, -4, -4], [4, 4, 4], 0.2)
     canvas.add(np.abs(canvas.points[..., 2] - 0.1) < 0.05, VESSEL)
     needle = Needle(diameter_mm=0.1, max_curvature_per_mm=0.05)
-    return needle_space(canvas.lung(), needle, Margins(segmentation_margin_mm=0.0), with_fissures=False)
+    return needle_environment(canvas.lung(), needle, Margins(segmentation_margin_mm=0.0), with_fissures=False)
 
 
 def test_a_step_over_an_obstacle_between_two_valid_states_is_refused() -> None:
@@ -397,19 +402,19 @@ def test_a_step_over_an_obstacle_between_two_valid_states_is_refused() -> None:
     assert problem.si.propagateWhileValid(before, u, 1, after) == 1
 
 
-def test_a_step_backwards_is_refused(space: NeedleSpace) -> None:
+def test_a_step_backwards_is_refused(environment: NeedleEnvironment) -> None:
     moved = proved_step(
-        space.arrays, space.limits, (15.0, 15.0, 15.0, 0.0, 0.0, 0.0, 1.0), 0.0, 0.0, -1.0,
+        environment.obstacles, environment.limits, (15.0, 15.0, 15.0, 0.0, 0.0, 0.0, 1.0), 0.0, 0.0, -1.0,
         (15.0, 15.0, 15.0, 0.0, 0.0, 1.0, 0.0), -1,
     )  # fmt: skip
     assert math.isnan(moved[0])
 
 
-def test_what_is_proved_as_arcs_passes_in_steps(space: NeedleSpace) -> None:
+def test_what_is_proved_as_arcs_passes_in_steps(environment: NeedleEnvironment) -> None:
     """Short paths graze the obstacle, where steps meet points that the arcs' proof passed over."""
-    problem = NeedleProblem(space)
+    problem = NeedleProblem(environment)
     rng = np.random.default_rng(0)
-    _field, labels, geometry, bits = space.arrays
+    _field, labels, geometry, bits = environment.obstacles
     grazing = 0
     for seed in range(25):
         target = np.append(rng.uniform(-4, 4, 2), rng.uniform(15, 28))
@@ -418,7 +423,7 @@ def test_what_is_proved_as_arcs_passes_in_steps(space: NeedleSpace) -> None:
         points, _lengths = path.sample(0.02)
         distances = np.zeros(len(points))
         exact_at(labels, geometry, points, bits, -1, 2.0, distances)
-        grazing += float(distances.min()) < space.required_clearance_mm + 0.03
+        grazing += float(distances.min()) < environment.required_clearance_mm + 0.03
     assert grazing >= 3
 
 
@@ -431,9 +436,9 @@ def test_a_step_needs_half_of_what_an_arc_needs_to_spare(gap_mm: float, as_arc: 
     canvas = Canvas.empty([-8, -8, -8], [8, 8, 8], 1.0)
     canvas.add(canvas.points[..., 0] > 0, VESSEL)
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=0.05)
-    problem = NeedleProblem(needle_space(canvas.lung(), needle, Margins(), with_fissures=False))
+    problem = NeedleProblem(needle_environment(canvas.lung(), needle, Margins(), with_fissures=False))
     frame = np.eye(4)
-    frame[0, 3] = -problem.space.required_clearance_mm - gap_mm
+    frame[0, 3] = -problem.environment.required_clearance_mm - gap_mm
     problem.pose(Query(lps_from_start=frame, target=frame[:3, 3] + [0.0, 0.0, 4.0]))
     assert (
         problem.objection(ArcPath(lps_from_start=frame, arcs=np.array([[4.0, 0.0, 0.0]]))) == ""
@@ -464,15 +469,15 @@ def test_a_start_that_is_not_clear_is_refused_by_the_validity_checker(problem: N
     assert problem.own().search is None
 
 
-def test_no_state_is_valid_before_a_query(space: NeedleSpace) -> None:
-    problem = NeedleProblem(space)
+def test_no_state_is_valid_before_a_query(environment: NeedleEnvironment) -> None:
+    problem = NeedleProblem(environment)
     state = problem.si.allocState()
     write_state(state, start())
     assert problem.si.isValid(state) is False
 
 
-def test_a_state_is_valid_only_within_the_angle_and_length(space: NeedleSpace) -> None:
-    problem = NeedleProblem(with_needle(space, max_angle_from_start_deg=30.0, max_length_mm=20.0))
+def test_a_state_is_valid_only_within_the_angle_and_length(environment: NeedleEnvironment) -> None:
+    problem = NeedleProblem(with_needle(environment, max_angle_from_start_deg=30.0, max_length_mm=20.0))
     state = problem.si.allocState()
 
     def valid(turned_deg: float, ahead_mm: float, asked: Query) -> bool:
@@ -489,9 +494,9 @@ def test_a_state_is_valid_only_within_the_angle_and_length(space: NeedleSpace) -
     assert valid(0.0, 4.9, query(inserted_mm=15.0)) and not valid(0.0, 5.1, query(inserted_mm=15.0))
 
 
-def test_what_ompl_takes_for_a_solution_is_refused_if_it_is_none(space: NeedleSpace) -> None:
+def test_what_ompl_takes_for_a_solution_is_refused_if_it_is_none(environment: NeedleEnvironment) -> None:
     through = arcs_of((40.0, 0.0, 0.0))
-    problem = NeedleProblem(space, {"given": given(through)})
+    problem = NeedleProblem(environment, {"given": given(through)})
     assert "no query" in problem.objection(through)
     problem.pose(query(through.frames()[-1][:3, 3]))
     assert problem.setup.solve(1.0).asString() == "Exact solution"
@@ -527,8 +532,8 @@ def test_the_path_outlives_the_states_of_ompl(problem: NeedleProblem) -> None:
     assert np.array_equal(path.frames(), before[1])
 
 
-def test_a_converted_path_outlives_the_setup(space: NeedleSpace) -> None:
-    problem = NeedleProblem(space)
+def test_a_converted_path_outlives_the_setup(environment: NeedleEnvironment) -> None:
+    problem = NeedleProblem(environment)
     problem.pose(query())
     assert bool(problem.setup.solve(LONG_S))
     path = require(problem.solution())
@@ -539,10 +544,10 @@ def test_a_converted_path_outlives_the_setup(space: NeedleSpace) -> None:
     assert np.array_equal(path.arcs, expected[0]) and np.array_equal(path.lps_from_start, expected[1])
 
 
-def test_the_best_path_is_the_only_solution_of_the_problem_definition(space: NeedleSpace) -> None:
+def test_the_best_path_is_the_only_solution_of_the_problem_definition(environment: NeedleEnvironment) -> None:
     """OMPL would rank by the number of arcs, and put the first path before the cheaper second."""
     dear, cheap = arcs_of((20.0, 0.0, 0.0)), arcs_of((8.0, 0.0, 0.01), (8.0, 1.0, 0.01), (4.0, 0.0, 0.0))
-    problem = NeedleProblem(space, {"given": given(dear, cheap)})
+    problem = NeedleProblem(environment, {"given": given(dear, cheap)})
     target = cheap.frames()[-1][:3, 3]
     problem.pose(query(target), goal_tolerance_mm=5.0)
     problem.planner.anytime = True
@@ -607,9 +612,9 @@ def test_memory_does_not_grow_with_queries(problem: NeedleProblem) -> None:
     assert peak_mib() - before < 8.0
 
 
-def test_a_problem_is_freed_when_it_is_dropped(space: NeedleSpace) -> None:
+def test_a_problem_is_freed_when_it_is_dropped(environment: NeedleEnvironment) -> None:
     """Whatever refers to the setup it is installed in keeps everything for ever."""
-    problem = NeedleProblem(space)
+    problem = NeedleProblem(environment)
     require(ask(problem))
     problem.setup.setPlannerAllocator(problem.planners()["rrt"])
     problem.setup.setPlanner(problem.planners()["control.EST"](problem.si))
@@ -634,10 +639,10 @@ from stages.needle.ompl import NeedleProblem, seed_ompl
 from tests.stages.needle.ompl.test_ompl import NEAR, query, scene
 from anatomy.margins import Margins
 from stages.needle.device import Needle
-from stages.needle.space import needle_space
+from stages.needle.environment import needle_environment
 seed_ompl(int(sys.argv[1]))
 needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 30)
-problem = NeedleProblem(needle_space(scene(), needle, Margins(), with_fissures=False))
+problem = NeedleProblem(needle_environment(scene(), needle, Margins(), with_fissures=False))
 problem.setup.setPlanner(problem.planners()["control.RRT"](problem.si))
 problem.pose(query(NEAR), goal_tolerance_mm=4.0)
 problem.setup.solve(120.0)
@@ -703,9 +708,9 @@ def test_the_log_of_a_benchmark_can_be_read_by_ompl(problem: NeedleProblem, tmp_
     assert results["rrt"].lengths_mm == pytest.approx(expected)
 
 
-def test_a_benchmark_counts_what_it_refuses_apart(space: NeedleSpace) -> None:
+def test_a_benchmark_counts_what_it_refuses_apart(environment: NeedleEnvironment) -> None:
     through = arcs_of((40.0, 0.0, 0.0))
-    problem = NeedleProblem(space, {"given": given(through)})
+    problem = NeedleProblem(environment, {"given": given(through)})
     result = benchmark(
         problem, query(through.frames()[-1][:3, 3]), time_s=1.0, runs=2, planners=["given"]
     )["given"]  # fmt: skip
@@ -762,7 +767,7 @@ def test_the_search_tree_holds_the_path(problem: NeedleProblem) -> None:
         (at,) = data.getIncomingEdges(at)
         arcs += 1
     assert arcs == len(path.arcs)
-    assert NeedleProblem(problem.space).planner.search_tree().numVertices() == 0
+    assert NeedleProblem(problem.environment).planner.search_tree().numVertices() == 0
 
 
 def test_the_search_tree_is_written_and_read_again(problem: NeedleProblem, tmp_path: Path) -> None:

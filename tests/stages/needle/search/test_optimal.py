@@ -11,23 +11,23 @@ from anatomy.fields import CENTRES
 from anatomy.margins import Margins
 from anatomy.structures import OUTSIDE, VESSEL
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, environment_of_labels, needle_environment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.search.base import Query, RestartingRRT, luby
 from stages.needle.search.decision import Decision
 from stages.needle.search.optimal import OptimalSearch
-from stages.needle.space import NeedleSpace, needle_space, space_of_labels
 from tests.stages.needle.proved import assert_proved
 from tests.stages.scenes import Canvas
 
 BALL_MM = 6.0
 
 
-def ball_space(radius_mm: float = 60.0, **more: float) -> NeedleSpace:
+def ball_environment(radius_mm: float = 60.0, **more: float) -> NeedleEnvironment:
     """A vessel ball between start and goal."""
     canvas = Canvas.empty([-32, -32, -42], [32, 32, 42], 1.0)
     canvas.add(canvas.ball([0, 0, 0], BALL_MM), VESSEL)
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / radius_mm)
-    return needle_space(canvas.lung(), needle, Margins(), with_fissures=False, **more)
+    return needle_environment(canvas.lung(), needle, Margins(), with_fissures=False, **more)
 
 
 def query(goal: tuple[float, float, float] = (0.0, 0.0, 38.0)) -> Query:
@@ -68,16 +68,16 @@ def shortest_around_a_ball(radius_mm: float, keep_mm: float, half_mm: float) -> 
 
 def test_the_length_goes_to_that_of_the_shortest_path_around_a_ball() -> None:
     """The plane path is an upper bound of the optimum; voxels make the ball a little larger or smaller."""
-    space = ball_space()
-    search = OptimalSearch(space, query(), seed=1)
+    environment = ball_environment()
+    search = OptimalSearch(environment, query(), seed=1)
     lengths = []
     for _ in range(150):
         if search.advance(400) and search.path is not None:
             lengths.append(search.path.length_mm)
     assert lengths == sorted(lengths, reverse=True)
-    bound = shortest_around_a_ball(60.0, BALL_MM + 0.5 + 0.87 + space.required_clearance_mm, 38.0)
+    bound = shortest_around_a_ball(60.0, BALL_MM + 0.5 + 0.87 + environment.required_clearance_mm, 38.0)
     assert 76.0 < lengths[-1] <= bound
-    rrt = RestartingRRT(space, query(), seed=1)
+    rrt = RestartingRRT(environment, query(), seed=1)
     while rrt.iterations < search.iterations:
         rrt.advance(2000)
     assert rrt.path is not None
@@ -88,23 +88,23 @@ def test_the_length_goes_to_that_of_the_shortest_path_around_a_ball() -> None:
     "objective", [SHORTEST, Objective(inverse_clearance=1.0), Objective(inverse_clearance=1.0, length=0.1)]
 )
 def test_paths_are_clear_and_within_the_limits(objective: Objective) -> None:
-    space = ball_space()
-    search = OptimalSearch(space, query(), seed=3, objective=objective)
+    environment = ball_environment()
+    search = OptimalSearch(environment, query(), seed=3, objective=objective)
     costs = []
     for _ in range(20):
         if not search.advance(300):
             continue
         assert search.path is not None
         costs.append(search.cost)
-        assert_proved(space, search.path, query().target)
+        assert_proved(environment, search.path, query().target)
     assert len(costs) >= 2
     assert costs == sorted(costs, reverse=True)
 
 
 def test_a_path_that_ends_short_pays_for_it() -> None:
     exact, loose = (
-        OptimalSearch(ball_space(), query()),
-        OptimalSearch(ball_space(goal_tolerance_mm=1.0), query()),
+        OptimalSearch(ball_environment(), query()),
+        OptimalSearch(ball_environment(goal_tolerance_mm=1.0), query()),
     )
     for search in (exact, loose):
         for _ in range(60):
@@ -118,7 +118,7 @@ def test_a_path_that_ends_short_pays_for_it() -> None:
 
 def test_the_same_seed_repeats() -> None:
     def run(seed: int) -> np.ndarray:
-        search = OptimalSearch(ball_space(), query(), seed=seed)
+        search = OptimalSearch(ball_environment(), query(), seed=seed)
         for _ in range(10):
             search.advance(250)
         assert search.path is not None
@@ -133,7 +133,7 @@ def test_luby() -> None:
 
 
 def test_a_decision_is_a_path_or_a_proof() -> None:
-    open_way = Decision(ball_space(), query())
+    open_way = Decision(ball_environment(), query())
     while open_way.outcome == "running":
         open_way.advance(500)
     assert open_way.outcome == "path" and open_way.path is not None and not open_way.finished
@@ -141,7 +141,7 @@ def test_a_decision_is_a_path_or_a_proof() -> None:
     canvas = Canvas.empty([-32, -32, -42], [32, 32, 42], 1.0)
     canvas.add(np.abs(canvas.points[..., 2]) < 2.0, OUTSIDE)
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 60)
-    walled = Decision(needle_space(canvas.lung(), needle, Margins(), with_fissures=False), query())
+    walled = Decision(needle_environment(canvas.lung(), needle, Margins(), with_fissures=False), query())
     while walled.outcome == "running":
         walled.advance(500)
     assert walled.outcome == "no path" and walled.finished and walled.path is None
@@ -158,8 +158,10 @@ def test_obstacles_as_centres_and_as_boxes() -> None:
     straight = Query(lps_from_start=frame, target=np.array([2.0, 0.0, 10.0]))
 
     def solves(required: float, **how: float) -> bool:
-        space = space_of_labels(canvas.labels, canvas.grid, needle, required_clearance_mm=required, **how)
-        return RestartingRRT(space, straight).advance(0)
+        environment = environment_of_labels(
+            canvas.labels, canvas.grid, needle, required_clearance_mm=required, **how
+        )
+        return RestartingRRT(environment, straight).advance(0)
 
     assert solves(0.9) and not solves(1.1), "the faces lie at x = 3"
     assert solves(1.4, obstacles_as=CENTRES) and not solves(1.6, obstacles_as=CENTRES), "centres at 3.5"

@@ -11,11 +11,11 @@ from anatomy.grid import Volume
 from anatomy.margins import Margins
 from anatomy.structures import VESSEL
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.search.base import Query
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.portfolio import FIRST_ITERATIONS, PortfolioSearch
-from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.needle.proved import assert_proved
 from tests.stages.scenes import Canvas
 
@@ -23,25 +23,27 @@ INVERSE = Objective(inverse_clearance=1.0)
 MAP = Objective(cost_map=1.0)
 
 
-def clutter(seed: int) -> NeedleSpace:
+def clutter(seed: int) -> NeedleEnvironment:
     """Forty vessel balls, none at start and target."""
     rng = np.random.default_rng(seed)
     canvas = Canvas.empty([-25, -25, -42], [25, 25, 42], 1.0)
     for centre in rng.uniform([-25, -25, -28], [25, 25, 28], (40, 3)):
         canvas.add(canvas.ball(centre.tolist(), float(rng.uniform(2.0, 6.0))), VESSEL)
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 50)
-    return needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
+    return needle_environment(canvas.lung(), needle, Margins(), with_fissures=False)
 
 
-def two_valleys() -> NeedleSpace:
+def two_valleys() -> NeedleEnvironment:
     """Free tissue where two bows from start to target cost least, one a little less than the other."""
     canvas = Canvas.empty([-25, -25, -42], [25, 25, 42], 1.0)
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 60)
-    space = needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
-    x, y, z = np.moveaxis(space.grid.lps(np.stack(np.indices(space.grid.shape), axis=-1)), -1, 0)
+    environment = needle_environment(canvas.lung(), needle, Margins(), with_fissures=False)
+    x, y, z = np.moveaxis(environment.grid.lps(np.stack(np.indices(environment.grid.shape), axis=-1)), -1, 0)
     bow = 12.0 * np.sin(np.pi * np.clip(z + 38.0, 0.0, 76.0) / 76.0)
     costs = np.minimum(0.6 + 0.3 * np.hypot(x - bow, y), 0.4 + 0.3 * np.hypot(x + bow, y))
-    return replace(space, cost_map=Volume(grid=space.grid, array=np.asfortranarray(costs, dtype=np.float32)))
+    return replace(
+        environment, cost_map=Volume(grid=environment.grid, array=np.asfortranarray(costs, dtype=np.float32))
+    )
 
 
 def query(goal: tuple[float, float, float] = (0.0, 0.0, 38.0)) -> Query:
@@ -57,9 +59,9 @@ def run(search: OptimalSearch | PortfolioSearch, iterations: int, slice_of: int 
 
 
 def test_a_portfolio_finds_paths_that_a_single_search_does_not_leave_its_own_for() -> None:
-    space = two_valleys()
+    environment = two_valleys()
     single, portfolio = (
-        np.array([run(kind(space, query(), seed=seed, objective=MAP), 60_000) for seed in range(3)])
+        np.array([run(kind(environment, query(), seed=seed, objective=MAP), 60_000) for seed in range(3)])
         for kind in (OptimalSearch, PortfolioSearch)
     )
     assert portfolio.max() < 1.001 * min(portfolio.min(), single.min())
@@ -68,21 +70,21 @@ def test_a_portfolio_finds_paths_that_a_single_search_does_not_leave_its_own_for
 
 @pytest.mark.parametrize("objective", [SHORTEST, INVERSE])
 def test_each_path_is_cheaper_clear_and_within_the_limits(objective: Objective) -> None:
-    space, costs = clutter(1), []
-    search = PortfolioSearch(space, query(), seed=3, objective=objective)
+    environment, costs = clutter(1), []
+    search = PortfolioSearch(environment, query(), seed=3, objective=objective)
     for _ in range(100):
         if not search.advance(300):
             continue
         assert search.path is not None
         costs.append(search.cost)
-        assert_proved(space, search.path, query().target)
+        assert_proved(environment, search.path, query().target)
     assert len(costs) >= 2
     assert (np.diff(costs) < 0.0).all()
 
 
 def test_the_first_path_is_that_of_the_single_search() -> None:
-    space = clutter(1)
-    single, portfolio = (kind(space, query(), seed=5) for kind in (OptimalSearch, PortfolioSearch))
+    environment = clutter(1)
+    single, portfolio = (kind(environment, query(), seed=5) for kind in (OptimalSearch, PortfolioSearch))
     while single.path is None:
         single.advance(100)
     while portfolio.path is None:

@@ -16,6 +16,7 @@ from anatomy.grid import Volume
 from anatomy.kernels.arcs import pose_on_arc
 from anatomy.structures import OBSTACLES
 from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment, workspace_lengths
 from stages.needle.kernels import limits as index
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path
@@ -23,7 +24,6 @@ from stages.needle.search.base import Query
 from stages.needle.search.kernels import goal_ball, rank_queue
 from stages.needle.search.kernels import resolution as kernel
 from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
-from stages.needle.space import NeedleSpace, workspace_lengths
 from tests.stages.needle import mazes
 from tests.stages.needle.mazes import CLEARANCE_MM, Maze, in_box, winding_maze
 from tests.stages.scenes import brute_clearance
@@ -33,27 +33,29 @@ MIDDLE = Resolution(coarse_mm=8.0, fine_mm=4.0, coarse_rolls=4, fine_rolls=8)
 
 
 def run(
-    maze: Maze, resolution: Resolution, space: NeedleSpace | None = None, **more: Any
+    maze: Maze, resolution: Resolution, environment: NeedleEnvironment | None = None, **more: Any
 ) -> ResolutionSearch:
     """Search until the end, and judge every path on the way."""
-    search = ResolutionSearch(space or maze.space(), maze.query, resolution=resolution, **more)
+    search = ResolutionSearch(environment or maze.environment(), maze.query, resolution=resolution, **more)
     best = math.inf
     while not search.finished:
         if search.advance(10**9):
             assert search.path is not None
             assert search.cost < best
             best = search.cost
-            judge(search.space, maze, search.path)
+            judge(search.environment, maze, search.path)
     assert search.outcome == (Outcome.NONE if search.path is None else Outcome.BEST)
     return search
 
 
-def judge(space: NeedleSpace, maze: Maze, path: ArcPath) -> None:
+def judge(environment: NeedleEnvironment, maze: Maze, path: ArcPath) -> None:
     """Walk a path in steps of 0.02 mm."""
     points, _ = path.sample(0.02)
-    clearance = brute_clearance(space.arrays[1], space.grid, points, OBSTACLES, CLEARANCE_MM + 1.0)
+    clearance = brute_clearance(
+        environment.obstacles[1], environment.grid, points, OBSTACLES, CLEARANCE_MM + 1.0
+    )
     assert clearance.min() >= CLEARANCE_MM - 1e-9
-    assert blocker_on_path(space, path, -1) == 0
+    assert blocker_on_path(environment, path, -1) == 0
     assert np.array_equal(path.lps_from_start, maze.start)
     assert np.linalg.norm(points[-1] - maze.target) <= maze.goal_tolerance_mm + 1e-6
     needle = maze.needle
@@ -66,7 +68,9 @@ def judge(space: NeedleSpace, maze: Maze, path: ArcPath) -> None:
 def shortest_mm(maze: Maze) -> float:
     """Length of the shortest path without obstacles."""
     start = maze.start
-    return float(workspace_lengths(maze.space(), start[None, :3, 3], start[None, :3, 2], maze.target)[0])
+    return float(
+        workspace_lengths(maze.environment(), start[None, :3, 3], start[None, :3, 2], maze.target)[0]
+    )
 
 
 class TestResolution:
@@ -115,11 +119,11 @@ class TestResolution:
 
     def test_no_search_where_nothing_is_proved(self) -> None:
         maze = in_box([])
-        space = maze.space()
-        limits = space.limits.copy()
+        environment = maze.environment()
+        limits = environment.limits.copy()
         limits[index.LOOKUP_STEP] = 0.5
         with pytest.raises(SettingsError, match="proved"):
-            ResolutionSearch(replace(space, limits=limits), maze.query)
+            ResolutionSearch(replace(environment, limits=limits), maze.query)
 
 
 class TestGoalBall:
@@ -241,10 +245,10 @@ class TestKnownAnswers:
     def test_free_space(self, target: tuple[float, ...], tolerance_mm: float) -> None:
         """The shortest path is the first one tried, and nothing can beat it."""
         maze = replace(in_box([]), target=np.array(target), goal_tolerance_mm=tolerance_mm)
-        search = ResolutionSearch(maze.space(), maze.query)
+        search = ResolutionSearch(maze.environment(), maze.query)
         assert search.advance(1) and search.finished and search.outcome == Outcome.BEST
         assert search.path is not None
-        judge(search.space, maze, search.path)
+        judge(search.environment, maze, search.path)
         assert search.cost == pytest.approx(shortest_mm(maze), abs=1e-9)
         end = search.path.frames()[-1][:3, 3]
         assert np.linalg.norm(end - target) < 1e-6, "ending short would not be cheaper"
@@ -376,24 +380,24 @@ class TestAgainstEnumeration:
         between dear and cheap would leave their cost open.
         """
         rng = np.random.default_rng(seed)
-        space = maze.space()
+        environment = maze.environment()
         few = rng.choice(
-            np.array([1.0, 4.0], dtype=np.float32), [-(-(n + 3) // 16) for n in space.grid.shape]
+            np.array([1.0, 4.0], dtype=np.float32), [-(-(n + 3) // 16) for n in environment.grid.shape]
         )
         costs = np.kron(few, np.ones((16, 16, 16), dtype=np.float32))
-        costs = np.asfortranarray(costs[tuple(slice(3, 3 + n) for n in space.grid.shape)])
-        space = replace(space, cost_map=Volume(grid=space.grid, array=costs))
+        costs = np.asfortranarray(costs[tuple(slice(3, 3 + n) for n in environment.grid.shape)])
+        environment = replace(environment, cost_map=Volume(grid=environment.grid, array=costs))
 
         def cost_at(points: Float) -> Float:
-            ijk = np.clip(np.rint(space.grid.ijk(points)).astype(int), 0, np.array(costs.shape) - 1)
+            ijk = np.clip(np.rint(environment.grid.ijk(points)).astype(int), 0, np.array(costs.shape) - 1)
             return np.asarray(costs[tuple(np.moveaxis(ijk, -1, 0))], dtype=np.float64)
 
         least = float(costs.min())
         expected = mazes.enumerate_words(maze, 8.0, 4, 4, cost_at, least)
         maze = replace(maze, needle=replace(maze.needle, max_length_mm=39.0))
-        space = replace(space, limits=maze.space().limits)
+        environment = replace(environment, limits=maze.environment().limits)
         resolution = Resolution(coarse_mm=8.0, fine_mm=8.0, coarse_rolls=2, fine_rolls=4)
-        found = run(maze, resolution, space, objective=Objective(cost_map=1.0)).cost
+        found = run(maze, resolution, environment, objective=Objective(cost_map=1.0)).cost
         assert expected.possible - 0.5 <= found <= expected.sure + 0.5
 
     @given(maze=crowded_mazes())
@@ -517,7 +521,7 @@ class TestRunning:
         maze, _walls = winding_maze()
         runs = []
         for pops in (10**9, 10**9, 7):
-            search = ResolutionSearch(maze.space(), maze.query, resolution=MIDDLE)
+            search = ResolutionSearch(maze.environment(), maze.query, resolution=MIDDLE)
             costs = []
             while not search.finished:
                 before = search.counts.pops
@@ -537,7 +541,7 @@ class TestRunning:
         maze, _walls = winding_maze(2)
         needed = run(maze, MIDDLE, duplicates=Cells()).memory_mb
         search = ResolutionSearch(
-            maze.space(), maze.query, resolution=MIDDLE, duplicates=Cells(), max_memory_mb=0.5 * needed
+            maze.environment(), maze.query, resolution=MIDDLE, duplicates=Cells(), max_memory_mb=0.5 * needed
         )
         while not search.finished:
             assert not search.advance(1000)
@@ -550,7 +554,7 @@ class TestRunning:
         maze = replace(in_box([]), target=np.array([0.0, 4.0, 20.0]))
         start = maze.start
         needed = shortest_mm(maze)
-        turn = ResolutionSearch(maze.space(), maze.query)
+        turn = ResolutionSearch(maze.environment(), maze.query)
         turn.advance(1)
         assert turn.path is not None
         turned = turn.path.accumulated_turn_rad
@@ -564,7 +568,7 @@ class TestRunning:
             ({"reference": tilt}, False),
         ):
             query = Query(lps_from_start=start, target=maze.target, **more)
-            search = ResolutionSearch(maze.space(), query, resolution=COARSE)
+            search = ResolutionSearch(maze.environment(), query, resolution=COARSE)
             search.advance(10**9)
             while not search.finished:
                 search.advance(10**9)

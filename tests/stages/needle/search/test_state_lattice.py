@@ -15,6 +15,7 @@ from anatomy.structures import VESSEL
 from anatomy.typed import Float
 from stages.needle.costs import map_integral
 from stages.needle.device import Needle
+from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.search import guide_paths
@@ -23,7 +24,6 @@ from stages.needle.search.guide_paths import ARCS_PER_ITERATION, CELLS, LAYERS, 
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.state_lattice import CURVATURE_SHARE, SKEWS, StateLatticeSearch, via_points
-from stages.needle.space import NeedleSpace, needle_space
 from tests.stages.needle.proved import assert_proved
 from tests.stages.scenes import Canvas
 
@@ -31,16 +31,18 @@ MAP = Objective(cost_map=1.0)
 RADIUS_MM = 60.0
 
 
-def space_with(costs: np.ndarray | None = None, *balls: tuple[list[float], float]) -> NeedleSpace:
+def environment_with(costs: np.ndarray | None = None, *balls: tuple[list[float], float]) -> NeedleEnvironment:
     """A box of tissue of 50 x 50 x 84 mm with vessel balls, and costs at its voxels."""
     canvas = Canvas.empty([-25, -25, -42], [25, 25, 42], 1.0)
     for centre, radius in balls:
         canvas.add(canvas.ball(centre, radius), VESSEL)
     needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / RADIUS_MM)
-    space = needle_space(canvas.lung(), needle, Margins(), with_fissures=False)
+    environment = needle_environment(canvas.lung(), needle, Margins(), with_fissures=False)
     if costs is None:
-        return space
-    return replace(space, cost_map=Volume(grid=space.grid, array=np.asfortranarray(costs, dtype=np.float32)))
+        return environment
+    return replace(
+        environment, cost_map=Volume(grid=environment.grid, array=np.asfortranarray(costs, dtype=np.float32))
+    )
 
 
 def random_costs(seed: int) -> np.ndarray:
@@ -97,9 +99,9 @@ def arcs_along(controls: Float) -> list[ArcPath]:
     return arcs
 
 
-def map_cost(space: NeedleSpace, controls: Float) -> float:
+def map_cost(environment: NeedleEnvironment, controls: Float) -> float:
     """Return the line integral of the cost map along the arcs of a guide path."""
-    return sum(map_integral(space.cost_map, each) for each in arcs_along(controls))
+    return sum(map_integral(environment.cost_map, each) for each in arcs_along(controls))
 
 
 def bending(controls: Float) -> Float:
@@ -107,12 +109,14 @@ def bending(controls: Float) -> Float:
     return np.array([each.arcs[0, 2] for each in arcs_along(controls)])
 
 
-def assert_followed(space: NeedleSpace, asked: Query, controls: Float, objective: Objective = MAP) -> float:
+def assert_followed(
+    environment: NeedleEnvironment, asked: Query, controls: Float, objective: Objective = MAP
+) -> float:
     """Fail unless a needle can follow a guide path; return what that costs."""
-    search = OptimalSearch(space, asked, objective=objective)
+    search = OptimalSearch(environment, asked, objective=objective)
     assert search.follow(via_points(controls))
     assert search.path is not None
-    assert_proved(space, search.path, asked.target)
+    assert_proved(environment, search.path, asked.target)
     return search.cost
 
 
@@ -120,8 +124,8 @@ def assert_followed(space: NeedleSpace, asked: Query, controls: Float, objective
 def test_the_cheapest_guide_path_is_that_of_all_sequences_of_moves(tilt_deg: float, skew: int) -> None:
     """All 7^5 sequences of moves are tried; those that end at the target are rated piece by piece."""
     layers, asked = 5, query(tilt_deg)
-    space = space_with(random_costs(1))
-    lattices = StateLatticeSearch(space, asked, MAP)
+    environment = environment_with(random_costs(1))
+    lattices = StateLatticeSearch(environment, asked, MAP)
     base, axes, goal_cells = lattices._straight(layers, skew)
     guide = lattices.everywhere(layers, skew=skew)
     units = np.array([[0, 0], [1, 0], [0, 1], [-1, 1], [-1, 0], [0, -1], [1, -1]])
@@ -136,25 +140,25 @@ def test_the_cheapest_guide_path_is_that_of_all_sequences_of_moves(tilt_deg: flo
         inner = base[1:-1] + each @ axes
         controls = np.concatenate([base[:1], inner, asked.target[None]])
         if bending(controls).max() <= CURVATURE_SHARE / RADIUS_MM:
-            costs.append(map_cost(space, controls))
+            costs.append(map_cost(environment, controls))
     assert len(costs) > 10
     assert guide.is_whole and guide.controls is not None
     assert guide.cost == pytest.approx(min(costs), rel=1e-6)
-    assert map_cost(space, guide.controls) == pytest.approx(min(costs), rel=1e-6)
+    assert map_cost(environment, guide.controls) == pytest.approx(min(costs), rel=1e-6)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 10.0, -15.0])
 def test_a_needle_can_follow_the_guide_paths_around_a_ball(tilt_deg: float) -> None:
     asked, objective = query(tilt_deg), Objective(length=1.0, inverse_clearance=1.0)
-    space = space_with(None, ([0.0, 0.0, 0.0], 3.0))
-    lattices = StateLatticeSearch(space, asked, objective)
+    environment = environment_with(None, ([0.0, 0.0, 0.0], 3.0))
+    lattices = StateLatticeSearch(environment, asked, objective)
     middles = []
     for skew in range(SKEWS):
         guide = lattices.everywhere(12, skew=skew)
         assert guide.controls is not None
         assert bending(guide.controls).max() <= CURVATURE_SHARE / RADIUS_MM * (1 + 1e-9)
         assert guide.controls[-1] == pytest.approx(asked.target, abs=1e-9)
-        assert assert_followed(space, asked, guide.controls, objective) == pytest.approx(
+        assert assert_followed(environment, asked, guide.controls, objective) == pytest.approx(
             guide.cost, rel=0.002
         )
         middles.append(guide.controls[6])
@@ -165,18 +169,20 @@ def test_a_needle_can_follow_the_guide_paths_around_a_ball(tilt_deg: float) -> N
 def test_a_needle_can_follow_guide_paths_that_touch_what_they_pass(tilt_deg: float) -> None:
     """The shortest path bends around the ball: the arcs lie nearer to it than the vertices."""
     asked = query(tilt_deg)
-    space = space_with(None, ([1.0, 0.0, 0.0], 5.0))
-    lattices = StateLatticeSearch(space, asked, SHORTEST)
+    environment = environment_with(None, ([1.0, 0.0, 0.0], 5.0))
+    lattices = StateLatticeSearch(environment, asked, SHORTEST)
     guide = lattices.everywhere(10)
     for cells, turn_rad in ((1 / 3, 0.1), (1 / 6, 0.4), (1 / 6, 0.8), (1 / 12, 0.2)):
         assert guide.controls is not None
-        assert assert_followed(space, asked, guide.controls, SHORTEST) == pytest.approx(guide.cost, rel=1e-4)
+        assert assert_followed(environment, asked, guide.controls, SHORTEST) == pytest.approx(
+            guide.cost, rel=1e-4
+        )
         guide = lattices.around(guide.controls, cells, turn_rad, guide.cost * (1 + 1e-9))
 
 
 def test_guide_paths_around_another_are_cheaper_and_meet_the_target() -> None:
-    space, asked = space_with(random_costs(2)), query(10.0)
-    lattices = StateLatticeSearch(space, asked, MAP)
+    environment, asked = environment_with(random_costs(2)), query(10.0)
+    lattices = StateLatticeSearch(environment, asked, MAP)
     guide = lattices.everywhere(10)
     costs = [guide.cost]
     for cells in (0.5, 0.25, 0.125):
@@ -186,7 +192,7 @@ def test_guide_paths_around_another_are_cheaper_and_meet_the_target() -> None:
         assert guide.controls is not None
         assert bending(guide.controls).max() <= CURVATURE_SHARE / RADIUS_MM * (1 + 1e-9)
         assert guide.controls[-1] == pytest.approx(asked.target, abs=1e-9)
-        assert map_cost(space, guide.controls) == pytest.approx(guide.cost, rel=1e-9)
+        assert map_cost(environment, guide.controls) == pytest.approx(guide.cost, rel=1e-9)
     assert (np.diff(costs) <= 1e-9).all()
     assert costs[-1] < 0.97 * costs[0]
     dearer = lattices.around(guide.controls, 0.125, 0.3, 0.5 * costs[-1])
@@ -194,11 +200,11 @@ def test_guide_paths_around_another_are_cheaper_and_meet_the_target() -> None:
 
 
 def test_controls_of_a_path_lead_along_it() -> None:
-    space, asked = space_with(random_costs(3)), query(10.0)
-    lattices = StateLatticeSearch(space, asked, MAP)
+    environment, asked = environment_with(random_costs(3)), query(10.0)
+    lattices = StateLatticeSearch(environment, asked, MAP)
     controls = lattices.everywhere(12).controls
     assert controls is not None
-    search = OptimalSearch(space, asked, objective=MAP)
+    search = OptimalSearch(environment, asked, objective=MAP)
     assert search.follow(via_points(controls)) and search.path is not None
     again = lattices.controls_of(search.path, 12)
     assert again is not None
@@ -208,7 +214,7 @@ def test_controls_of_a_path_lead_along_it() -> None:
 def test_a_path_that_turns_back_has_no_controls() -> None:
     frame = query().lps_from_start
     back = ArcPath(lps_from_start=frame, arcs=np.array([[120.0, 0.0, 1 / RADIUS_MM]]))
-    assert StateLatticeSearch(space_with(random_costs(1)), query(), MAP).controls_of(back, 12) is None
+    assert StateLatticeSearch(environment_with(random_costs(1)), query(), MAP).controls_of(back, 12) is None
 
 
 @pytest.mark.parametrize(
@@ -220,29 +226,29 @@ def test_a_path_that_turns_back_has_no_controls() -> None:
     ],
 )
 def test_there_are_no_guide_paths_where_none_can_be(asked: Query, why: str) -> None:
-    space = space_with(random_costs(1))
-    assert not StateLatticeSearch(space, asked, MAP).is_possible, why
-    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
-    search = OptimalSearch(space, asked, objective=MAP)
+    environment = environment_with(random_costs(1))
+    assert not StateLatticeSearch(environment, asked, MAP).is_possible, why
+    finder = GuidePathFinder(environment, asked, seed=1, objective=MAP)
+    search = OptimalSearch(environment, asked, objective=MAP)
     assert not finder.has_guide_paths
     assert not list(finder.begin(search, math.inf)) and search.path is None
 
 
 def test_a_lattice_with_too_many_states_has_no_guide_path() -> None:
-    guide = StateLatticeSearch(space_with(random_costs(1)), query(10.0), MAP).everywhere(40)
+    guide = StateLatticeSearch(environment_with(random_costs(1)), query(10.0), MAP).everywhere(40)
     assert not guide.is_whole and guide.controls is None
 
 
 def test_a_blocked_start_has_no_guide_path() -> None:
-    space = space_with(random_costs(1), ([0.0, 0.0, -36.0], 3.0))
-    assert StateLatticeSearch(space, query(), MAP).everywhere(10).controls is None
+    environment = environment_with(random_costs(1), ([0.0, 0.0, -36.0], 3.0))
+    assert StateLatticeSearch(environment, query(), MAP).everywhere(10).controls is None
 
 
 def test_searches_follow_only_what_is_cheaper_and_can_be_followed() -> None:
-    space, asked = space_with(random_costs(1)), query()
-    controls = StateLatticeSearch(space, asked, MAP).everywhere(10).controls
+    environment, asked = environment_with(random_costs(1)), query()
+    controls = StateLatticeSearch(environment, asked, MAP).everywhere(10).controls
     assert controls is not None
-    search = OptimalSearch(space, asked, objective=MAP)
+    search = OptimalSearch(environment, asked, objective=MAP)
     assert not search.follow(np.array([[15.0, 0.0, -30.0], asked.target])), "bends too much"
     assert not search.follow(np.array([[0.0, 0.0, 0.0]])), "does not reach the target"
     assert not search.follow(np.repeat(asked.target[None], 99, axis=0)), "too many points"
@@ -257,14 +263,14 @@ def test_searches_follow_only_what_is_cheaper_and_can_be_followed() -> None:
 
 def test_a_lattice_holds_the_path_through_a_hole_in_a_wall_of_cost() -> None:
     """Searches led by guide paths alone go through the hole: they are not refined, and no tree grows."""
-    space, asked = space_with(wall_with_a_hole()), query()
-    assert StateLatticeSearch(space, asked, MAP).everywhere(10).cost < 1.0
-    search = OptimalSearch(space, asked, objective=MAP)
-    work = list(GuidePathFinder(space, asked, seed=1, objective=MAP).begin(search, math.inf))
+    environment, asked = environment_with(wall_with_a_hole()), query()
+    assert StateLatticeSearch(environment, asked, MAP).everywhere(10).cost < 1.0
+    search = OptimalSearch(environment, asked, objective=MAP)
+    work = list(GuidePathFinder(environment, asked, seed=1, objective=MAP).begin(search, math.inf))
     assert search.cost < 1.0
     assert search.iterations == 0 < sum(iterations for iterations, _ in work) < 20_000
-    assert map_integral(space.cost_map, straight(asked.lps_from_start[:3, 3], asked.target)) > 200.0
-    portfolio = PortfolioSearch(space, asked, seed=3, objective=MAP)
+    assert map_integral(environment.cost_map, straight(asked.lps_from_start[:3, 3], asked.target)) > 200.0
+    portfolio = PortfolioSearch(environment, asked, seed=3, objective=MAP)
     while portfolio.iterations < 6_000:
         portfolio.advance(500)
     assert portfolio.cost < 1.0
@@ -278,13 +284,13 @@ def test_searches_begin_with_the_cheapest_guide_paths(
     monkeypatch.setattr(guide_paths, "ARCS_PER_BEGINNING", look_arcs)
     monkeypatch.setattr(guide_paths, "LAYERS", (8, 10))
     monkeypatch.setattr(guide_paths, "CELLS", ())
-    space, asked = space_with(random_costs(5)), query(5.0)
-    lattices = StateLatticeSearch(space, asked, MAP)
+    environment, asked = environment_with(random_costs(5)), query(5.0)
+    lattices = StateLatticeSearch(environment, asked, MAP)
     every = [lattices.everywhere(layers, skew=skew) for skew in range(SKEWS) for layers in (8, 10)]
-    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
+    finder = GuidePathFinder(environment, asked, seed=1, objective=MAP)
     unseen, seen, begun = list(every), [], []
     for _ in range(len(every) + 2):
-        search = OptimalSearch(space, asked, objective=MAP)
+        search = OptimalSearch(environment, asked, objective=MAP)
         work = list(finder.begin(search, math.inf))
         looks = 1 if look_arcs == 1 or not begun else len(unseen)
         looked, unseen = unseen[:looks], unseen[looks:]
@@ -294,7 +300,7 @@ def test_searches_begin_with_the_cheapest_guide_paths(
             seen, begun = begun, []
         seen.sort(key=lambda guide: guide.cost)
         begun.append(seen.pop(0))
-        expected = OptimalSearch(space, asked, objective=MAP)
+        expected = OptimalSearch(environment, asked, objective=MAP)
         assert begun[-1].controls is not None and expected.follow(via_points(begun[-1].controls))
         assert search.cost == expected.cost
     assert len(begun) == 2 and finder.has_guide_paths
@@ -302,12 +308,12 @@ def test_searches_begin_with_the_cheapest_guide_paths(
 
 def test_layers_of_which_there_are_too_many_states_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guide_paths, "LAYERS", (8, 40))
-    space, asked = space_with(random_costs(5)), query(5.0)
-    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
-    search = OptimalSearch(space, asked, objective=MAP)
+    environment, asked = environment_with(random_costs(5)), query(5.0)
+    finder = GuidePathFinder(environment, asked, seed=1, objective=MAP)
+    search = OptimalSearch(environment, asked, objective=MAP)
     list(finder.begin(search, math.inf))
     assert search.path is not None and finder.has_guide_paths
-    list(finder.begin(OptimalSearch(space, asked, objective=MAP), math.inf))
+    list(finder.begin(OptimalSearch(environment, asked, objective=MAP), math.inf))
     assert finder._layers == (8,)
     cost = search.cost
     for _ in range(3):
@@ -316,9 +322,9 @@ def test_layers_of_which_there_are_too_many_states_are_left(monkeypatch: pytest.
 
 
 def test_a_guide_path_is_refined_as_long_as_that_gains() -> None:
-    space, asked = space_with(random_costs(2)), query(10.0)
-    finder = GuidePathFinder(space, asked, seed=1, objective=MAP)
-    search, costs = OptimalSearch(space, asked, objective=MAP), []
+    environment, asked = environment_with(random_costs(2)), query(10.0)
+    finder = GuidePathFinder(environment, asked, seed=1, objective=MAP)
+    search, costs = OptimalSearch(environment, asked, objective=MAP), []
     for _ in finder.begin(search, math.inf):
         if search.path is not None:
             costs.append(search.cost)
@@ -330,11 +336,11 @@ def test_a_guide_path_is_refined_as_long_as_that_gains() -> None:
 
 def test_where_no_lattice_has_a_guide_path_all_time_goes_to_free_searches() -> None:
     """The target takes more than the share of the curvature that guide paths take."""
-    space, asked = space_with(random_costs(1)), query(0.0, (15.0, 0.0, 2.0))
-    lattices = StateLatticeSearch(space, asked, MAP)
+    environment, asked = environment_with(random_costs(1)), query(0.0, (15.0, 0.0, 2.0))
+    lattices = StateLatticeSearch(environment, asked, MAP)
     assert lattices.is_possible
     assert all(lattices.everywhere(layers).controls is None for layers in LAYERS)
-    portfolio = PortfolioSearch(space, asked, objective=MAP)
+    portfolio = PortfolioSearch(environment, asked, objective=MAP)
     spent = []
     for iterations in (3_000, 10_000):
         while portfolio.path is None or portfolio.iterations < iterations:
@@ -346,7 +352,7 @@ def test_where_no_lattice_has_a_guide_path_all_time_goes_to_free_searches() -> N
 
 def test_the_same_iterations_give_the_same_path() -> None:
     def run(seed: int) -> np.ndarray:
-        search = PortfolioSearch(space_with(random_costs(1)), query(5.0), seed=seed, objective=MAP)
+        search = PortfolioSearch(environment_with(random_costs(1)), query(5.0), seed=seed, objective=MAP)
         while search.iterations < 20_000:
             before = search.iterations
             assert search.advance(250) or search.iterations - before == 250
@@ -358,11 +364,11 @@ def test_the_same_iterations_give_the_same_path() -> None:
 
 
 def test_the_target_may_lie_straight_ahead() -> None:
-    lattices = StateLatticeSearch(space_with(random_costs(4)), query(), MAP)
+    lattices = StateLatticeSearch(environment_with(random_costs(4)), query(), MAP)
     controls = lattices.everywhere(10).controls
     assert controls is not None
     assert controls[-1] == pytest.approx(query().target, abs=1e-12)
-    assert_followed(space_with(random_costs(4)), query(), controls)
+    assert_followed(environment_with(random_costs(4)), query(), controls)
 
 
 def test_pure_length_needs_no_guide_paths() -> None:
@@ -371,7 +377,7 @@ def test_pure_length_needs_no_guide_paths() -> None:
     assert not MAP.is_length and not Objective(length=1.0, inverse_clearance=0.1).is_length
     guided = []
     for objective in (SHORTEST, MAP):
-        search = PortfolioSearch(space_with(random_costs(1)), query(5.0), objective=objective)
+        search = PortfolioSearch(environment_with(random_costs(1)), query(5.0), objective=objective)
         while search.iterations < 2000:
             search.advance(500)
         guided.append(search._guided is not None)

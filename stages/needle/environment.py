@@ -20,7 +20,7 @@ from stages.needle.kernels import limits as index
 from stages.needle.kernels import scan
 from stages.needle.objective import Objective, ObjectiveArrays
 
-SpaceArrays = tuple[Labels, Labels, Float, int]
+Obstacles = tuple[Labels, Labels, Float, int]
 
 RRT_STEP_MM = 20.0
 COST_STEP_MM = 0.5
@@ -29,7 +29,7 @@ ROUNDING_MM = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class NeedleSpace:
+class NeedleEnvironment:
     """One needle among obstacles.
 
     Parameters
@@ -40,7 +40,7 @@ class NeedleSpace:
         Distance that the needle's axis keeps from obstacles.
     goal_tolerance_mm : float
         How far from the target a path may end.
-    arrays : tuple
+    obstacles : tuple
         Clearance field, labels, geometry and obstacle bits, for the kernels.
     limits : (N_LIMITS,) float64
         See `stages.needle.kernels.limits`.
@@ -52,7 +52,7 @@ class NeedleSpace:
     needle: Needle
     required_clearance_mm: float
     goal_tolerance_mm: float
-    arrays: SpaceArrays
+    obstacles: Obstacles
     limits: Float
     cost_map: Volume | None
     _objectives: dict[Objective, ObjectiveArrays] = field(default_factory=dict, init=False, repr=False)
@@ -65,9 +65,9 @@ class NeedleSpace:
         return self._objectives[objective]
 
 
-def needle_space(
+def needle_environment(
     lung: Lung, needle: Needle, margins: Margins, *, with_fissures: bool, goal_tolerance_mm: float = 0.0
-) -> NeedleSpace:
+) -> NeedleEnvironment:
     """Gather what the kernels need to steer `needle` through `lung`.
 
     The needle's axis keeps its radius and the margins from obstacles, whose voxels are solid boxes.
@@ -85,10 +85,12 @@ def needle_space(
     clearance = lung.obstacle_field(with_fissures=with_fissures)
     bits = obstacle_bits(with_fissures)
     required = needle.radius_mm + margins.total_mm
-    return _space(lung.grid, needle, required, clearance, lung.labels, bits, lung.cost, goal_tolerance_mm)
+    return _environment(
+        lung.grid, needle, required, clearance, lung.labels, bits, lung.cost, goal_tolerance_mm
+    )
 
 
-def space_of_labels(
+def environment_of_labels(
     labels: Labels,
     grid: Grid,
     needle: Needle,
@@ -98,7 +100,7 @@ def space_of_labels(
     obstacles_as: float = SOLID,
     goal_tolerance_mm: float = 0.0,
     cost_map: Volume | None = None,
-) -> NeedleSpace:
+) -> NeedleEnvironment:
     """Gather the same from a label volume alone.
 
     Parameters
@@ -135,12 +137,12 @@ def space_of_labels(
         )
     labels = np.asfortranarray(labels, dtype=np.uint16)
     clearance = distance_field("obstacle", (labels & bits) != 0, grid, obstacles_as)
-    return _space(
+    return _environment(
         grid, needle, required_clearance_mm, clearance, read_only(labels), bits, cost_map, goal_tolerance_mm
     )
 
 
-def _space(
+def _environment(
     grid: Grid,
     needle: Needle,
     required_mm: float,
@@ -149,7 +151,7 @@ def _space(
     bits: int,
     cost_map: Volume | None,
     goal_tolerance_mm: float,
-) -> NeedleSpace:
+) -> NeedleEnvironment:
     for name, value in (("required clearance", required_mm), ("goal tolerance", goal_tolerance_mm)):
         if not 0.0 <= value < math.inf:
             raise SettingsError(f"The {name} is {value} mm", expected="a finite length of 0 or more")
@@ -164,19 +166,19 @@ def _space(
     limits[index.MAX_STEP] = RRT_STEP_MM
     limits[index.COST_STEP] = COST_STEP_MM
     limits[index.GOAL_TOLERANCE] = max(goal_tolerance_mm - ROUNDING_MM, 0.0)
-    return NeedleSpace(
+    return NeedleEnvironment(
         grid=grid,
         needle=needle,
         required_clearance_mm=required_mm,
         goal_tolerance_mm=goal_tolerance_mm,
-        arrays=(clearance.corners, labels, clearance.geometry, bits),
+        obstacles=(clearance.corners, labels, clearance.geometry, bits),
         limits=read_only(limits),
         cost_map=cost_map,
     )
 
 
 def workspace_lengths(
-    space: NeedleSpace, positions: ArrayLike, tangents: ArrayLike, target: ArrayLike
+    environment: NeedleEnvironment, positions: ArrayLike, tangents: ArrayLike, target: ArrayLike
 ) -> Float:
     """Return the shortest path length from each start pose to a target, infinite where there is none.
 
@@ -194,12 +196,12 @@ def workspace_lengths(
     """
     places = _plain(positions)
     lengths = np.zeros(len(places))
-    scan.workspace_scan(places, _plain(tangents), _plain(target), space.limits, lengths)
+    scan.workspace_scan(places, _plain(tangents), _plain(target), environment.limits, lengths)
     return lengths
 
 
 def direct_arcs(
-    space: NeedleSpace,
+    environment: NeedleEnvironment,
     positions: ArrayLike,
     tangents: ArrayLike,
     branches: Int,
@@ -225,8 +227,8 @@ def direct_arcs(
     blockers = np.zeros(len(branches), dtype=np.int64)
     costs = np.zeros((len(branches), 2))
     scan.direct_arcs(
-        space.arrays,
-        space.limits,
+        environment.obstacles,
+        environment.limits,
         _plain(positions),
         _plain(tangents),
         np.array(branches, dtype=np.int64),

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from anatomy.typed import Float, Int
+from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
 from lungaccess.coupled.kernels.separation import choose_separated
 from lungaccess.coupled.search.atlas_search import AtlasSearch
+from lungaccess.coupled.search.local_search import needle_of
 from lungaccess.plans.assemble import Candidate
-from stages.needle import direct_arcs
 
 SAMPLES = 17
 """Points of each path that are compared; between two of them a path strays less than 1 mm from a line."""
@@ -25,25 +27,30 @@ def different_candidates(search: AtlasSearch, count: int, separation_mm: float) 
     The nearest deployments are looked at, and an even sample of the others; of these all, sample by sample,
     only as long as there are not enough plans.
     """
-    near, target = search.in_workspace, search.task.target.lps_mm
+    near, needle = search.in_workspace, needle_of(search.desk.environment, search.task)
+    x, y, z = search.task.target.lps_mm.tolist()
     entries = search.atlas.deployments
-    pool, prices = np.zeros(0, dtype=np.int64), np.zeros(0)
+    pool, costs = np.zeros(0, dtype=np.int64), np.zeros(0)
     proved: dict[int, Candidate | None] = {}
     chosen: list[int] = []
     for sample in _samples(entries.branch[near]):
         looked = near[sample]
-        blockers, lengths, inverse = direct_arcs(
-            search.desk.environment,
+        blockers, estimates = np.zeros(len(looked), dtype=np.int64), np.zeros(len(looked))
+        evaluate_arcs(
+            needle,
             entries.positions[looked],
             entries.tangents[looked],
             entries.branch[looked],
-            target,
+            (x, y, z),
+            math.inf,
+            math.inf,
+            blockers,
+            estimates,
         )
         search.desk.count_blockers(blockers)
         clear = np.flatnonzero(blockers == 0)
-        price = {"length_mm": lengths, "inverse_clearance": inverse}.get(str(search.task.objective), lengths)
-        pool, prices = np.append(pool, looked[clear]), np.append(prices, price[clear])
-        chosen = _chosen(search, pool[np.argsort(prices, kind="stable")], count, separation_mm, proved)
+        pool, costs = np.append(pool, looked[clear]), np.append(costs, estimates[clear])
+        chosen = _chosen(search, pool[np.argsort(costs, kind="stable")], count, separation_mm, proved)
         if len(chosen) == count:
             break
     for entry in chosen:

@@ -13,6 +13,7 @@ import pytest
 
 import lungaccess as la
 from anatomy.errors import SettingsError
+from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
 from lungaccess.coupled.alternatives import Alternative, alternatives, judged
@@ -50,6 +51,33 @@ def test_each_branch_comes_first_once(menu: tuple[Alternative, ...]) -> None:
     first = list(dict.fromkeys(branches))
     assert branches[: len(first)] == first
     assert _branches_first(np.array([4, 4, 2, 4, 7, 2])).tolist() == [0, 2, 4, 1, 3, 5]
+
+
+def patchy(lung: Lung) -> Lung:
+    """A cost map of patches, between 0.01 and 100, so that short paths are seldom cheap ones."""
+    coarse = 10.0 ** np.random.default_rng(0).uniform(-2.0, 2.0, [n // 6 + 1 for n in lung.grid.shape])
+    values = np.kron(coarse, np.ones((6, 6, 6)))[tuple(slice(n) for n in lung.grid.shape)]
+    return replace(lung, cost=Volume(grid=lung.grid, array=np.asfortranarray(values, dtype=np.float32)))
+
+
+@pytest.mark.parametrize(
+    "objective", ["inverse_clearance", "cost_map", "voxel_sum", "length_mm", "length=1,cost-map=20"]
+)
+def test_the_cheapest_under_the_objective_come_first(
+    small_lung: Lung, atlas: la.Atlas, objective: str
+) -> None:
+    """Of each branch first, then of all; the order is that of estimates, which are some per cent off."""
+    lung = patchy(small_lung)
+    found = alternatives(
+        lung, SYSTEM, la.resolve_target(lung), objective=objective, atlas=atlas, count=8, separation_mm=3.0
+    )
+    by_branch: dict[int, list[float]] = {}
+    for each in found:
+        by_branch.setdefault(each.plan.tube.exit.branch, []).append(each.plan.cost)
+    cheapest = [costs[0] for costs in by_branch.values()]
+    others = [each.plan.cost for each in found[len(cheapest) :]]
+    for costs in (cheapest, others, *by_branch.values()):
+        assert all(later > 0.97 * sooner for sooner, later in itertools.pairwise(costs)), costs
 
 
 def test_samples_are_all_and_hold_every_branch_first() -> None:

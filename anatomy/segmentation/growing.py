@@ -8,6 +8,8 @@ import numpy as np
 
 from anatomy.segmentation.kernels import growing as kernel
 from anatomy.segmentation.kernels import lumen_edge
+from anatomy.segmentation.kernels.neighbours import box_offsets, face_offsets
+from anatomy.segmentation.kernels.states import BANNED, LUMEN
 from anatomy.segmentation.thin_airways import follow_thin_airways
 from anatomy.typed import Array, Float, Int, Int16, Mask, UInt8
 
@@ -124,19 +126,19 @@ def grow(ground: Ground, start: Mask) -> Grown:
         behind,
         layer_ends,
     )
-    banned = np.flatnonzero(flat == kernel.BANNED)
-    flat[flat != lumen_edge.LUMEN] = 0
+    banned = np.flatnonzero(flat == BANNED)
+    flat[flat != LUMEN] = 0
     known = len(seeds)
     edged, count = _to_its_edge(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, lumen[:count])
     # Thin airways are as wide as a voxel: the edge of something so narrow is not to be seen.
-    flat[banned[flat[banned] == 0]] = kernel.BANNED
+    flat[banned[flat[banned] == 0]] = BANNED
     tubes = follow_thin_airways(
         hu, smooth, state, _padded(ground.lung), ground.spacing_mm, edged, known, count
     )
-    flat[flat != lumen_edge.LUMEN] = 0
+    flat[flat != LUMEN] = 0
     _join_and_wall(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, edged, tubes.count)
     return Grown(
-        lumen=_inner(state == lumen_edge.LUMEN),
+        lumen=_inner(state == LUMEN),
         wall=_inner(state == lumen_edge.WALL),
         undone=int(undone),
     )
@@ -149,7 +151,7 @@ def _to_its_edge(
 
     All arrays are padded and flat.  Returns its voxels and their count.
     """
-    near, faces = kernel.box_offsets(shape, 1), kernel.face_offsets(shape)
+    near, faces = box_offsets(shape, 1), face_offsets(shape)
     count = len(grown)
     # A voxel joins a list once, when its state changes: no list can be longer than the image.  Memory that
     # is not written to is not taken.
@@ -170,7 +172,7 @@ def _join_and_wall(
     """Join the first `count` voxels of `lumen` by faces and put the wall around them; as above."""
     count = lumen_edge.join_corners(hu, state, shape, lumen, count)
     layers = int(np.ceil(WALL_MM / ground.spacing_mm.mean()))
-    near, wall = kernel.box_offsets(shape, 1), np.zeros(state.size, dtype=np.int64)
+    near, wall = box_offsets(shape, 1), np.zeros(state.size, dtype=np.int64)
     lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, WALL_LEAST_HU, WALL_DIFFERENCE_HU, wall)
 
 

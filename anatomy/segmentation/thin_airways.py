@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.segmentation.kernels import lumen_ends, tube_stretch
 from anatomy.segmentation.kernels import thin_airways as kernel
-from anatomy.segmentation.kernels.growing import box_offsets
+from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.typed import Float, Int, Int16, Mask, UInt8
 
 N_DIRECTIONS = 260
@@ -102,13 +103,13 @@ def _false_contrast(
     apart = np.ceil(FAR_MM / spacing_mm).astype(np.int64)
     stride = max(int(np.count_nonzero(lung)) // (LOOKED_AT * N_PLACES), 1)
     places = np.zeros((LOOKED_AT * N_PLACES, 3), dtype=np.int64)
-    count = kernel.places_beside_bright(smooth, state, lung, stride, apart, bright_hu, places)
+    count = tube_stretch.places_beside_bright(smooth, state, lung, stride, apart, bright_hu, places)
     if count < LEAST_PLACES:
         return 0.0
     places = places[np.linspace(0, count - 1, min(count, N_PLACES)).astype(np.int64)]
     contrast = np.zeros(len(places))
     about = directions[(WAY_STEP * np.arange(len(places))) % len(directions)]
-    kernel.best_contrasts(
+    tube_stretch.best_contrasts(
         hu, state, lung, 1.0 / spacing_mm, places * spacing_mm, about, directions, radii_mm, contrast
     )
     np.maximum(contrast, 0.0, out=contrast)
@@ -130,10 +131,10 @@ def _find_starts(state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known:
     far = np.zeros(state.shape, dtype=np.int32)
     queue, parent = lumen.copy(), np.zeros(len(lumen), dtype=np.int64)
     near = box_offsets(shape, 1)
-    count = kernel.measure_way(state.reshape(-1), near, queue, known, parent, far.reshape(-1))
+    count = lumen_ends.walk_lumen(state.reshape(-1), near, queue, known, parent, far.reshape(-1))
     reach = np.ceil(END_REACH_MM / spacing_mm).astype(np.int64)
     return int(
-        kernel.find_ends(
+        lumen_ends.find_ends(
             far, lung, queue, known, count, parent, reach, spacing_mm, starts[0], starts[1], starts[2]
         )
     )

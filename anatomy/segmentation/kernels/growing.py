@@ -10,9 +10,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-FREE = np.uint8(0)
-LUMEN = np.uint8(1)
-BANNED = np.uint8(2)
+from anatomy.segmentation.kernels.neighbours import box_offsets
+from anatomy.segmentation.kernels.states import BANNED, FREE, LUMEN
+
 IN_LAYER = np.uint8(3)
 IN_SECTION = np.uint8(4)
 FIRST_MARK = 5
@@ -28,33 +28,6 @@ POCKET_SHARE = 0.2
 """A piece of which more than this lies in or behind pockets is one."""
 REPEATS = 8
 """How often a piece is grown anew around the leaks that were cut out of it."""
-
-
-@numba.njit(cache=True)
-def box_offsets(shape, reach):
-    """Return the flat offsets of all voxels of a box of `2 reach + 1` but its middle, `(N,)` int64."""
-    side = 2 * reach + 1
-    out = np.zeros(side**3 - 1, dtype=np.int64)
-    at = 0
-    for dk in range(-reach, reach + 1):
-        for dj in range(-reach, reach + 1):
-            for di in range(-reach, reach + 1):
-                if dk != 0 or dj != 0 or di != 0:
-                    out[at] = (dk * shape[1] + dj) * shape[2] + di
-                    at += 1
-    return out
-
-
-@numba.njit(cache=True)
-def face_offsets(shape):
-    """Return the flat offsets of the six voxels that share a face with a voxel, `(6,)` int64."""
-    out = np.zeros(6, dtype=np.int64)
-    step = 1
-    for axis in range(3):
-        out[2 * axis] = -step
-        out[2 * axis + 1] = step
-        step *= shape[2 - axis]
-    return out
 
 
 @numba.njit(cache=True)

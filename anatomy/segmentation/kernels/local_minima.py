@@ -33,38 +33,29 @@ def smooth_slice(image, out):
             out[r, c] = np.int16(np.floor(total / count + 0.5))
 
 
-@numba.njit(cache=True, nogil=True)
-def dilate_slice(image, out):
-    """Write the largest value of every pixel and its neighbours."""
-    rows, columns = image.shape
-    for r in range(rows):
-        above = image[max(r - 1, 0)]
-        here = image[r]
-        below = image[min(r + 1, rows - 1)]
-        target = out[r]
-        for c in range(columns):
-            target[c] = max(here[c], max(above[c], below[c]))
-        for c in range(columns - 1):
-            target[c] = max(target[c], here[c + 1])
-        for c in range(1, columns):
-            target[c] = max(target[c], here[c - 1])
+def _over_neighbours(extreme):
+    """Return the kernel that writes the extreme, `max` or `min`, of every pixel and its neighbours."""
+
+    @numba.njit(cache=True, nogil=True)
+    def filter_slice(image, out):
+        rows, columns = image.shape
+        for r in range(rows):
+            above = image[max(r - 1, 0)]
+            here = image[r]
+            below = image[min(r + 1, rows - 1)]
+            target = out[r]
+            for c in range(columns):
+                target[c] = extreme(here[c], extreme(above[c], below[c]))
+            for c in range(columns - 1):
+                target[c] = extreme(target[c], here[c + 1])
+            for c in range(1, columns):
+                target[c] = extreme(target[c], here[c - 1])
+
+    return filter_slice
 
 
-@numba.njit(cache=True, nogil=True)
-def erode_slice(image, out):
-    """Write the smallest value of every pixel and its neighbours."""
-    rows, columns = image.shape
-    for r in range(rows):
-        above = image[max(r - 1, 0)]
-        here = image[r]
-        below = image[min(r + 1, rows - 1)]
-        target = out[r]
-        for c in range(columns):
-            target[c] = min(here[c], min(above[c], below[c]))
-        for c in range(columns - 1):
-            target[c] = min(target[c], here[c + 1])
-        for c in range(1, columns):
-            target[c] = min(target[c], here[c - 1])
+dilate_slice = _over_neighbours(max)
+erode_slice = _over_neighbours(min)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -111,9 +102,9 @@ def reconstruct_slice(marker, mask, queue, waiting):
         c = at - r * columns
         value = marker[r, c]
         waiting[r, c] = False
-        for way in range(4):
-            y = r + (1 if way == 0 else (-1 if way == 1 else 0))
-            x = c + (1 if way == 2 else (-1 if way == 3 else 0))
+        for n in range(4):
+            y = r + (1 if n == 0 else (-1 if n == 1 else 0))
+            x = c + (1 if n == 2 else (-1 if n == 3 else 0))
             if 0 <= y < rows and 0 <= x < columns and marker[y, x] > value and marker[y, x] > mask[y, x]:
                 marker[y, x] = max(value, mask[y, x])
                 if not waiting[y, x]:

@@ -11,7 +11,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-LUMEN = np.uint8(1)
+from anatomy.segmentation.kernels.states import LUMEN
+
 WALL = np.uint8(2)
 REPLACING_HU = np.int16(0)
 """r: what the lumen is painted with before it is closed."""

@@ -1,8 +1,36 @@
-"""What the neighbours of a voxel hold."""
+"""Neighbours of a voxel: where they lie, and what they hold."""
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
+
+
+@njit(cache=True)
+def box_offsets(shape, reach):
+    """Return the flat offsets of all voxels of a box of `2 reach + 1` but its middle, `(N,)` int64."""
+    side = 2 * reach + 1
+    out = np.zeros(side**3 - 1, dtype=np.int64)
+    at = 0
+    for dk in range(-reach, reach + 1):
+        for dj in range(-reach, reach + 1):
+            for di in range(-reach, reach + 1):
+                if dk != 0 or dj != 0 or di != 0:
+                    out[at] = (dk * shape[1] + dj) * shape[2] + di
+                    at += 1
+    return out
+
+
+@njit(cache=True)
+def face_offsets(shape):
+    """Return the flat offsets of the six voxels that share a face with a voxel, `(6,)` int64."""
+    out = np.zeros(6, dtype=np.int64)
+    step = 1
+    for axis in range(3):
+        out[2 * axis] = -step
+        out[2 * axis + 1] = step
+        step *= shape[2 - axis]
+    return out
 
 
 @njit(cache=True, nogil=True)

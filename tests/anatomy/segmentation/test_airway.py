@@ -19,8 +19,9 @@ from anatomy.segmentation.airway import Airways, segment_airway
 from anatomy.segmentation.airway_warnings import airway_warnings
 from anatomy.segmentation.growing import LEVEL_RATIO, levels
 from anatomy.segmentation.kernels import local_minima as kernel
-from anatomy.segmentation.kernels.growing import box_offsets
-from anatomy.segmentation.kernels.lumen_edge import LUMEN, grow_wall, join_corners
+from anatomy.segmentation.kernels.lumen_edge import grow_wall, join_corners
+from anatomy.segmentation.kernels.neighbours import box_offsets
+from anatomy.segmentation.kernels.states import LUMEN
 from anatomy.segmentation.local_minima import local_minima_map, scale_of
 from anatomy.segmentation.lungs import Lungs
 from anatomy.typed import Int16, Mask

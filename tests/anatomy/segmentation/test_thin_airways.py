@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from anatomy.segmentation.kernels.thin_airways import BANNED, LUMEN
+from anatomy.segmentation.kernels.states import BANNED, LUMEN
 from anatomy.segmentation.thin_airways import Tubes, follow_thin_airways
 from anatomy.typed import Float, Int16, Mask
 

@@ -1,7 +1,7 @@
 """Plan all three stages to a nodule.
 
-`la.plan` yields a plan whenever it finds a better one. The same seed and number of iterations give the same plans.
-The independent check judges the last plan before it is stored.
+`la.plan` yields a plan whenever it finds a better one. The same seed and number of iterations give the
+same plans. The independent check judges the last plan before it is stored.
 """
 
 import lungaccess as la

@@ -1,7 +1,8 @@
 """Describe a device of your own.
 
-A device is a TOML file with the unit in every key; an unknown key or an impossible value is an error that names it.
-The picture compares the cost of the plans of this device, whose needle bends tightly, with that of a preset.
+A device is a TOML file with the unit in every key; an unknown key or an impossible value is an error that
+names it. The picture compares the cost of the plans of this device, whose needle bends tightly, with that
+of a preset.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
 """Find the sites of a bronchoscope.
 
-A site is a pose of the scope's tip on the medial axis of the airways, to which the lumen is proved wide enough
-all the way. The picture compares the sites of two bronchoscopes, seen from the front.
+A site is a pose of the scope's tip on the medial axis of the airways, to which the lumen is proved wide
+enough all the way. The picture compares the sites of two bronchoscopes, seen from the front.
 """
 
 import matplotlib.pyplot as plt

@@ -1,7 +1,8 @@
 """Compare devices in a study.
 
-A study is every case with every planner and every seed; `lungaccess study run` reads the same values from a TOML file.
-The runs are stored in one SQLite file. Here each case has 20 random targets in the periphery of the lungs.
+A study is every case with every planner and every seed; `lungaccess study run` reads the same values from
+a TOML file. The runs are stored in one SQLite file. Here each case has 20 random targets in the periphery
+of the lungs.
 """
 
 from pathlib import Path

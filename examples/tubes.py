@@ -1,7 +1,8 @@
 """Shape of two concentric tubes.
 
-The mechanics computes the equilibrium of nested precurved tubes, torsion included. Here the straight outer tube is
-inserted further and further over the curved inner one, which straightens the part where they overlap.
+The mechanics computes the equilibrium of nested precurved tubes, torsion included. Here the straight
+outer tube is inserted further and further over the curved inner one, which straightens the part where
+they overlap.
 """
 
 import matplotlib.pyplot as plt

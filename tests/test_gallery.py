@@ -1,0 +1,42 @@
+"""The examples of the gallery run, use public names alone, and are all on the page."""
+
+from __future__ import annotations
+
+import ast
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem != "run_all")
+OURS = ("anatomy", "stages", "lungaccess")
+
+
+def test_the_page_shows_every_script_in_the_order_in_which_they_run() -> None:
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    shown = re.findall(r"\{literalinclude\} \.\./examples/(\w+)\.py", page)
+    assert tuple(shown) == runpy.run_path(str(EXAMPLES / "run_all.py"))["NAMES"]
+    assert shown == re.findall(r"\(pictures/(\w+)\.png\)", page)
+    assert sorted(shown) == [path.stem for path in SCRIPTS]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_examples_are_short_and_use_public_names(script: Path) -> None:
+    text = script.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 45
+    modules = [node.module or "" for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ImportFrom)]
+    ours = [module for module in modules if module.split(".")[0] in OURS]
+    assert not [module for module in ours if "kernels" in module or "._" in module]
+
+
+@pytest.mark.slow
+def test_examples_run_and_draw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setenv("LUNGACCESS_CACHE", str(tmp_path / "cache"))
+    runpy.run_path(str(EXAMPLES / "run_all.py"))["run_all"](tmp_path / "pictures")
+    pictures = {path.stem: path.stat().st_size for path in (tmp_path / "pictures").iterdir()}
+    assert set(pictures) == {path.stem for path in SCRIPTS}
+    assert min(pictures.values()) > 5000

@@ -10,13 +10,13 @@ import numpy as np
 from anatomy.grid import Grid
 from anatomy.structures import VESSEL
 from stages.needle import PLANNERS, Needle, Objective, Query
-from stages.needle.space import space_of_labels
+from stages.needle.environment import environment_of_labels
 
 grid = Grid.from_spacing((64, 64, 64), (1.0, 1.0, 1.0), (-31.5, -31.5, -31.5))
 i, j, k = np.meshgrid(*[np.arange(64) - 31.5] * 3, indexing="ij")
 labels = np.where(i**2 + j**2 + k**2 <= 16.0, VESSEL, 0).astype(np.uint16)
 needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 30)
-space = space_of_labels(labels, grid, needle, required_clearance_mm=1.0)
+environment = environment_of_labels(labels, grid, needle, required_clearance_mm=1.0)
 
 lps_from_start = np.eye(4)  # +z is the direction of insertion
 lps_from_start[:3, 3] = 0.0, 0.0, -28.0
@@ -26,7 +26,7 @@ objectives = {"length": Objective(length=1.0), "1 / clearance": Objective(invers
 figure, ax = plt.subplots(figsize=(8, 3))
 ax.add_patch(plt.Circle((0.0, 0.0), 4.0, color="C3", alpha=0.5, label="vessel"))
 for name, objective in objectives.items():
-    search = PLANNERS["optimal"](space, query, 0, objective)
+    search = PLANNERS["optimal"](environment, query, 0, objective)
     for _slice in range(10):
         search.advance(500)
     points, _lengths = search.path.sample(step_mm=0.5)

@@ -18,6 +18,7 @@ NAMES = (
     "tubes",
     "needle",
     "coupled_plan",
+    "objective",
     "diverse_plans",
     "risk",
     "device",

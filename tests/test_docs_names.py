@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
+PAGES = sorted(
+    [
+        *(ROOT / "docs").glob("*.md"),
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "examples").glob("*.py"),
+    ]
+)
 PACKAGES = "anatomy|stages|lungaccess|experiments|benchmarks|tests"
 NAME = re.compile(rf"^(?:{PACKAGES})(?:\.\w+)+")
 NOT_A_NAME = ("anatomy.seg.nrrd", "experiments.NAME")

@@ -9,10 +9,10 @@ from anatomy.grid import Grid, Volume
 from benchmarks.fresh import FreshProcess
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import Weights, best_motion
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
-from stages.scope.advisor.navigation import goal_at, navigation_field
+from stages.scope.advisor.nf1 import goal_at, navigation_field
 from stages.scope.advisor.orientability import measure_orientability
 from stages.scope.advisor.path_search import PathSettings
 
@@ -76,11 +76,11 @@ class Stage:
 
     def time_best_motion(self) -> None:
         """121 candidates with the true radius."""
-        best_motion(self.advisor.scene, self.start, 5.0, Weights())
+        best_motion(self.advisor.environment, self.start, 5.0, Weights())
 
     def time_best_motion_printed_rules(self) -> None:
         """121 candidates with eq. 1."""
-        best_motion(self.printed.scene, self.start, 5.0, Weights())
+        best_motion(self.printed.environment, self.start, 5.0, Weights())
 
     def time_path(self) -> None:
         """A path with retreats, if it needs any."""
@@ -96,8 +96,8 @@ class Stage:
 
     def time_orientability(self) -> None:
         """Where the tip can point in the trachea."""
-        scene = Scene(model=self.model, field=self.advisor.field)
-        measure_orientability(scene, self.tree, 60)
+        environment = ScopeEnvironment(model=self.model, field=self.advisor.field)
+        measure_orientability(environment, self.tree, 60)
 
 
 class Compile(FreshProcess):

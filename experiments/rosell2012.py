@@ -29,7 +29,7 @@ from experiments.support.scope_speed import ARRIVED_MM, ROOM_VOXELS, measure_spe
 from lungaccess.report import style
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import Weights
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import lumen_of_lung
 from stages.scope.advisor.path import ScopePath
@@ -51,15 +51,15 @@ NOT_REPRODUCED = [
     "The three lesions and the haptic guidance of figs. 7 and 8.",
 ]
 
-Curves = tuple[dict[str, ScopePath], Scene | None]
+Curves = tuple[dict[str, ScopePath], ScopeEnvironment | None]
 Values = dict[str, list[dict[str, float]]]
 
 
-def measures(path: ScopePath, scene: Scene, length_mm: float) -> dict[str, float]:
+def measures(path: ScopePath, environment: ScopeEnvironment, length_mm: float) -> dict[str, float]:
     """Return mean distance (voxels) and change of twist (deg/mm) on the first part of a path, and its end."""
     part = path.states[np.cumsum(path.steps_mm) <= length_mm + 1e-9]
     return {
-        "distance": float(scene.distances(part).mean()),
+        "distance": float(environment.distances(part).mean()),
         "twist": float(np.degrees(np.abs(np.diff(part[:, 12])).sum()) / max(length_mm, 1e-9)),
         "arrived": float(path.distance_mm <= ARRIVED_MM),
     }
@@ -85,9 +85,9 @@ def compare_weights(lung: Lung, seeds: list[int]) -> tuple[Values, Curves]:
                 paths[name] = advisor.path(state, seed=seed)
             common = min(path.length_mm for path in paths.values())
             for name, path in paths.items():
-                runs[name].append(measures(path, advisor.scene, common))
+                runs[name].append(measures(path, advisor.environment, common))
             if common > longest:
-                longest, curves = common, (paths, advisor.scene)
+                longest, curves = common, (paths, advisor.environment)
         for name, of_seeds in runs.items():
             middle = {key: float(np.median([run[key] for run in of_seeds])) for key in MEASURES}
             values[name].append({**middle, "arrived": float(np.mean([run["arrived"] for run in of_seeds]))})
@@ -137,12 +137,12 @@ def add_ends(result: Result, lung: Lung, radii: tuple[float, ...], seeds: list[i
 
 def draw_fig6(curves: Curves) -> Figure:
     """Draw distance and twist along a path for each set of weights, as in fig. 6."""
-    paths, scene = curves
+    paths, environment = curves
     figure = style.new_figure(8.0, 5.6)
     above, below = figure.subplots(2, 1, sharex=True)
     for (name, path), colour in zip(paths.items(), COLOURS, strict=True):
         way = np.cumsum(path.steps_mm)
-        above.plot(way, scene.distances(path.states), color=colour, label=name)
+        above.plot(way, environment.distances(path.states), color=colour, label=name)
         below.plot(way, np.degrees(path.states[:, 12]), color=colour)
     above.set_ylabel("distance (sum of clearances, voxels)")
     above.legend(title="weights NF1, clearance, twist", frameon=False, fontsize=9)

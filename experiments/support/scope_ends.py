@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 from anatomy.lung import Lung
 from experiments.support.scope_goals import end_goals, ends, goal_with_room
 from stages.scope.advisor.advisor import Advisor, start_state
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, joints
 from stages.scope.advisor.lumen import Lumen, lumen_of_lung
-from stages.scope.advisor.navigation import navigation_field
+from stages.scope.advisor.nf1 import navigation_field
 from stages.scope.advisor.path import ScopePath
 from stages.scope.advisor.path_search import PathSettings
 
@@ -101,13 +101,13 @@ def touching(lung: Lung, seeds: list[int]) -> dict[str, Any]:
     for point in ends(lung):
         goal = goal_with_room(lumen, lung, point, model, 0)
         advisor = Advisor(lumen, model, goal, PathSettings(retreats=0), reproduction=True)
-        strict = Scene(model=model, field=advisor.field)
+        strict = ScopeEnvironment(model=model, field=advisor.field)
         for seed in seeds:
             path = advisor.path(state, seed=seed)
             wrong = ~strict.fits(path.states)
             poses += path.count
             touched += int(wrong.sum())
-            violating += int((~advisor.scene.fits(path.states)).sum())
+            violating += int((~advisor.environment.fits(path.states)).sum())
             paths_touched += bool(wrong.any())
             paths += 1
     return {

@@ -6,10 +6,10 @@ import numpy as np
 
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
-from stages.scope.advisor.kernels.field import widest_ways
+from stages.scope.advisor.kernels.voxel_graph import widest_paths
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
-from stages.scope.advisor.navigation import Goal, goal_at, navigation_field
+from stages.scope.advisor.nf1 import Goal, goal_at, navigation_field
 
 PAPER_VOXELS = 116_758
 PAPER_SPACING_MM = (0.7, 0.7, 0.6)
@@ -53,7 +53,7 @@ def goal_with_room(lumen: Lumen, lung: Lung, point: int, model: ScopeModel, spar
     field = navigation_field(lumen, end.voxel, metric="voxels")
     start, _away = lumen.nearest_voxel(lung.tree.carina_lps)
     width = np.zeros(lumen.count, dtype=np.int64)
-    widest_ways(lumen.neighbours, lumen.steps_to_wall.astype(np.int64), start, width)
+    widest_paths(lumen.neighbours, lumen.steps_to_wall.astype(np.int64), start, width)
     roomy = np.flatnonzero(width > model.link_mm / lumen.grid.spacing_mm.max() + spare_voxels)
     voxel = int(roomy[np.argmin(field.potential[roomy])])
     return goal_at(lumen, lumen.centres(voxel), 0.5 * float(lumen.grid.spacing_mm.min()))

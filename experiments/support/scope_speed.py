@@ -15,7 +15,7 @@ from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import best_motion
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen
-from stages.scope.advisor.navigation import Goal, goal_at, navigation_field
+from stages.scope.advisor.nf1 import Goal, goal_at, navigation_field
 from stages.scope.advisor.path_search import PathSettings
 
 FIELD_S, MOTION_S, PATH_S = 10.0, 0.3, 31.0
@@ -49,7 +49,8 @@ def _measure_rules(
     paths = _path_times(advisors, state, result.seeds[0], repeats)
     motions = [
         median_cpu_s(
-            partial(best_motion, advisors[n].scene, path.state(number), LOOK_AHEAD_MM, options.weights), 3
+            partial(best_motion, advisors[n].environment, path.state(number), LOOK_AHEAD_MM, options.weights),
+            3,
         )
         for n, path in enumerate(found)
         for number in range(0, path.count, 20)

@@ -15,7 +15,6 @@ from anatomy.typed import Float
 from lungaccess.problem.system import System
 from stages.needle import StartIndex
 from stages.scope import Sites, find_sites
-from stages.scope.advisor import Scene, lumen_of_lung, measure_orientability, model_of, navigation_field
 from stages.tube import (
     DEFAULT_ROTATIONS,
     DEFAULT_STOP_MM,
@@ -88,22 +87,6 @@ class Atlas:
         rear_ends = insertions - np.array([tubes.inner.length_mm, tubes.outer.length_mm])
         solved = TubeMechanics((tubes.inner, tubes.outer)).batch(np.zeros_like(rear_ends), rear_ends)
         return np.asarray(np.where(solved.converged, solved.least_determinant, -np.inf)[which.ravel()])
-
-    def tip_miss_rad(self, site: int) -> float:
-        """Return by how much a bending scope tip misses the direction of a site, pi if it cannot stand there.
-
-        See `advisor.orientability`: the tip may stand aside from the medial axis, as far as there
-        is room.  About 0.05 s a site; sites themselves are chosen by a stricter rule.
-        """
-        point = int(self.sites.tree_point[site])
-        return measure_orientability(self._scope_scene, self.lung.tree, point).angle_rad(
-            self.sites.poses[site, 3:]
-        )
-
-    @cached_property
-    def _scope_scene(self) -> Scene:
-        lumen = lumen_of_lung(self.lung)
-        return Scene(model=model_of(self.system.scope), field=navigation_field(lumen, 0))
 
 
 def require_same(atlas: Atlas, lung: Lung, system: System) -> None:

@@ -24,7 +24,7 @@ from stages.needle import StartIndex
 from stages.scope import Sites
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
-FORMAT = 3
+FORMAT = 4
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 

@@ -130,12 +130,12 @@ def _scope_diameter(search: AtlasSearch) -> Iterator[Remedy]:
         task.target.lps_mm,
     )  # fmt: skip
     clear = near[blockers == 0]
-    room = atlas.sites.room_mm[entries.site[clear]] - scope.lumen_margin_mm
-    for entry in clear[np.argsort(-room, kind="stable")]:
+    radius_mm = atlas.sites.narrowest_radius_mm[entries.site[clear]] - scope.lumen_margin_mm
+    for entry in clear[np.argsort(-radius_mm, kind="stable")]:
         candidate = thin.finished(int(entry))
         if candidate is None:
             continue
-        widest = 2.0 * float(room[clear == entry][0])
+        widest = 2.0 * float(radius_mm[clear == entry][0])
         needed = round(math.floor(widest / SCOPE_STEP_MM + 1e-9) * SCOPE_STEP_MM, 6)
         system = _with_scope(task.system, needed)
         plan = _assembled(replace(task, system=system), atlas, candidate)

@@ -1,4 +1,4 @@
-"""The bronchoscope alone: the way of a patient's scope to a lesion, told and stored."""
+"""The bronchoscope alone: the path of a patient's scope to a lesion, with instructions."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from stages.scope.advisor import (
 )
 
 ADVICE_FILE, CAMERA_FILE = "advice.json", "camera.mrk.json"
-ROOM_AT_GOAL_MM = 0.25
-"""A goal in the lesion is chosen, if there is one, where the scope has so much room to spare."""
+CLEARANCE_AT_GOAL_MM = 0.25
+"""A goal in the lesion is chosen, if there is one, where the scope has this clearance, about half a voxel."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScopeAdvice:
-    """The way of a scope to a lesion.
+    """The path of a scope to a lesion, with instructions.
 
     Parameters
     ----------
     path : ScopePath
         To the goal or to the nearest point that was reached.
-    told : tuple of Instruction
-        Branch by branch.
+    instructions : tuple of Instruction
+        What to do, branch by branch.
     why_stopped : str
         Why it ends before the goal; "" if it does not.
     thinner : tuple of ThinnerScope
@@ -47,7 +47,7 @@ class ScopeAdvice:
     """
 
     path: ScopePath
-    told: tuple[Instruction, ...]
+    instructions: tuple[Instruction, ...]
     why_stopped: str
     thinner: tuple[ThinnerScope, ...]
 
@@ -67,7 +67,7 @@ class ScopeAdvice:
             },
             "inserted_mm": path.length_mm,
             "lps_from_tip": path.lps_from_tip.tolist(),
-            "instructions": [{**asdict(one), "text": one.text()} for one in self.told],
+            "instructions": [{**asdict(one), "text": one.text()} for one in self.instructions],
             "thinner_scopes": [asdict(one) for one in self.thinner],
             "states": [
                 {"advance_mm": step, "twist_rad": twist, "bend_rad": bend}
@@ -81,7 +81,7 @@ class ScopeAdvice:
 def advise_scope(
     lung: Lung, system: System, lesion_lps: Float, lesion_radius_mm: float, *, seed: int = 0
 ) -> ScopeAdvice:
-    """Find the way of a system's scope from the trachea to a lesion, with its true radius clear of the wall.
+    """Find a path of a system's scope from the trachea to a lesion, with its true radius clear of the wall.
 
     The goal is the lumen voxel nearest to the lesion's centre, if possible one in the lesion where the scope
     fits.
@@ -106,12 +106,12 @@ def advise_scope(
     lumen, model = lumen_of_lung(lung), model_of(system.scope)
     start = start_state(lumen, lung.tree, model)
     width = lumen.width_from(lumen.voxel_at(start.lps_from_base[:3, 3]))
-    fits = width >= model.radius_mm + ROOM_AT_GOAL_MM
+    fits = width >= model.radius_mm + CLEARANCE_AT_GOAL_MM
     advisor = Advisor(lumen, model, goal_at(lumen, lesion_lps, lesion_radius_mm, preferred=fits))
     path = advisor.path(start, seed=seed)
     return ScopeAdvice(
         path=path,
-        told=instructions_along(path, lung.tree),
+        instructions=instructions_along(path, lung.tree),
         why_stopped=why_stopped(path, advisor.field, lung.tree),
         thinner=() if path.reached else advisor.thinner(start, seed=seed),
     )

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from stages.scope.device import Bronchoscope as Bronchoscope
     from stages.scope.sites import Sites as Sites
     from stages.scope.sites import approach_depth_mm as approach_depth_mm
-    from stages.scope.sites import can_stand as can_stand
     from stages.scope.sites import find_sites as find_sites
+    from stages.scope.sites import tip_is_feasible as tip_is_feasible
     from stages.scope.tips import LEAVING_MM as LEAVING_MM
     from stages.scope.tips import MAX_TURN_AT_TIP_RAD as MAX_TURN_AT_TIP_RAD
     from stages.scope.tips import MedialAxis as MedialAxis

@@ -1,4 +1,4 @@
-"""Where the tip of the bronchoscope can stand: points of the medial axis, with the way there."""
+"""Sites: candidate scope poses on the medial axis, with the proved lumen radius of the route to each."""
 
 from __future__ import annotations
 
@@ -22,18 +22,26 @@ from stages.scope.tips import (
 )
 
 WALL_PROBE_MM = 2.5
+"""Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes leave."""
 PROBE_DIRECTIONS = 8
+"""Directions across the airway in which tissue is looked for; at 2 to 6 mm they are a few voxels apart."""
 PROOF_STEP_MM = 0.05
+"""Spacing of the samples of a proof along the medial axis; half of it is lost, far less than a voxel."""
 APPROACH_STEP_MM = 0.25
+"""Spacing of the samples where a turned scope leaves the axis: coarser, for there are many more of them."""
 ARC_SAGITTA_MM = 0.01
+"""Distance between the arc of a bent scope and its polyline, at most; see `tips.approach`."""
 TURNED_SPACING_MM = 2.0
+"""Spacing of turned tips: each has 25 directions, and nearer ones give about the same poses."""
 TURNS_RAD = tuple(math.radians(angle) for angle in (0.0, 15.0, 30.0, 45.0))
+"""Angles of turned tips from the chord behind them, up to `tips.MAX_TURN_AT_TIP_RAD`."""
 TURN_DIRECTIONS = 8
+"""Directions of a turn about the chord, 45 degrees apart: at most 30 degrees apart at the largest angle."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sites:
-    """Places for the scope tip: S tree points, about evenly spaced, and why others are not among them.
+    """Candidate poses of the scope tip: S tree points, about evenly spaced, and why others are no sites.
 
     Parameters
     ----------
@@ -43,13 +51,13 @@ class Sites:
         Point and direction of the scope tip, LPS mm.
     turned : (S,) bool
         Whether the tip is turned aside, or looks along the medial axis.
-    room_mm : (S,) float64
-        Proved radius of the narrowest place of the lumen on the way there, also beside the axis.
+    narrowest_radius_mm : (S,) float64
+        Proved radius of the narrowest place of the lumen on the route to the site, also beside the axis.
     lumen_radius_mm : (N,) float64
-        For each tree point, the smallest radius of the lumen on the way to it from the root, proved for
-        every point of the way and not only for the tree points.
+        For each tree point, the smallest radius of the lumen on the route to it from the root, proved for
+        every point of the route and not only for the tree points.
     passable : (N,) bool
-        Whether the scope fits at each tree point and all the way to it.
+        Whether the scope fits at each tree point and on the whole route to it.
     exits_ahead : (N,) bool
         Whether an airway lying in lung tissue, not in the mediastinum, is within reach ahead.
     narrowest : tuple of (int, float)
@@ -62,7 +70,7 @@ class Sites:
     tree_point: Int
     poses: Float
     turned: Bool
-    room_mm: Float
+    narrowest_radius_mm: Float
     lumen_radius_mm: Float
     passable: Bool
     exits_ahead: Bool
@@ -86,11 +94,11 @@ class Sites:
 def find_sites(
     lung: Lung, scope: Bronchoscope, *, reach_mm: float, spacing_mm: float = 1.0, turning: bool = True
 ) -> Sites:
-    """Find where the scope tip can stand so that tubes can leave the airway from there.
+    """Find the sites: scope poses from which tubes can leave the airway.
 
-    A site is a point of the medial axis that the scope reaches through a lumen wider than itself all
-    the way, where its tip looks on along the route, with an airway inside the lung within `reach_mm`
-    ahead.  Airways in the mediastinum are not such: leaving them pierces the pleura [Kuntz2015, fig. 5].
+    A site is a point of the medial axis that the scope reaches through a lumen wider than itself on the
+    whole route, where its tip looks on along the route, with an airway inside the lung within `reach_mm`
+    ahead.  Airways in the mediastinum do not count: leaving them pierces the pleura [Kuntz2015, fig. 5].
 
     Parameters
     ----------
@@ -102,7 +110,7 @@ def find_sites(
         Distance between sites along a branch.
     turning : bool
         Whether tips are also turned aside, every 2 mm, by up to 45 degrees from where the scope comes from,
-        as far as the lumen leaves room for its body.
+        as far as its body fits into the lumen.
 
     References
     ----------
@@ -110,7 +118,7 @@ def find_sites(
     """
     tree = lung.tree
     needed = scope.radius_mm + scope.lumen_margin_mm
-    narrowest_so_far = _narrowest_on_the_way(lung)
+    narrowest_so_far = _narrowest_on_the_route(lung)
     passable = narrowest_so_far >= needed
     ahead = _distance_to_exit(tree, _in_lung_tissue(lung)) <= reach_mm
     spaced = np.flatnonzero(ahead & _every(tree, spacing_mm))
@@ -126,7 +134,7 @@ def find_sites(
         tree_point=chosen,
         poses=np.concatenate([along, np.array(aside).reshape(-1, 6)]),
         turned=np.arange(len(chosen)) >= len(straight),
-        room_mm=np.minimum(
+        narrowest_radius_mm=np.minimum(
             narrowest_so_far[chosen], np.concatenate([np.full(len(straight), np.inf), depths])
         ),
         lumen_radius_mm=narrowest_so_far,
@@ -146,9 +154,18 @@ def approach_depth_mm(lung: Lung, tip: ScopeTip) -> float:
     return float(_approach_depths(lung, [tip])[0])
 
 
-def can_stand(lung: Lung, scope: Bronchoscope, places: Sites, tip: ScopeTip) -> bool:
-    """Tell whether a scope can stand with its tip so: it fits all the way, and bends no more than it can."""
-    if not places.passable[tip.tree_point]:
+def tip_is_feasible(lung: Lung, scope: Bronchoscope, sites: Sites, tip: ScopeTip) -> bool:
+    """Tell whether a scope can reach a tip pose: it fits on the whole route, and bends no more than it can.
+
+    Parameters
+    ----------
+    lung : Lung
+    scope : Bronchoscope
+    sites : Sites
+        Those of this scope; they tell where it fits.
+    tip : ScopeTip
+    """
+    if not sites.passable[tip.tree_point]:
         return False
     if not tip.turned:
         return looks_ahead(lung.tree, tip)
@@ -175,7 +192,7 @@ def _approach_depths(lung: Lung, tips: list[ScopeTip]) -> Float:
 
 
 def _turned_tips(lung: Lung, scope: Bronchoscope, points: Int) -> tuple[list[ScopeTip], Float]:
-    """Return the turned tips at tree points that the scope's body fits behind, and the room that it has."""
+    """Return the turned tips at tree points that the scope's body fits behind, and the lumen radii there."""
     tips = []
     for point in points:
         along = tip_at(lung.tree, int(point))
@@ -191,7 +208,7 @@ def _looking_ahead(tree: AirwayTree, points: Int) -> Int:
     return np.array([p for p in points if looks_ahead(tree, tip_at(tree, int(p)))], dtype=np.int64)
 
 
-def _narrowest_on_the_way(lung: Lung) -> Float:
+def _narrowest_on_the_route(lung: Lung) -> Float:
     """Return the proved lumen radius of the narrowest place between the root and each point.
 
     The depth in the lumen is 1-Lipschitz: between two samples it is at most half their distance less.

@@ -12,19 +12,24 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.typed import Bool, Float
 
 TURN_CHORD_MM = 2.0
+"""The direction from which a scope comes is that of its last few points, about two voxels of the lumen."""
 MAX_TURN_AT_TIP_RAD = math.radians(45.0)
-"""A tip must look where the scope comes from going, within this angle of its last TURN_CHORD_MM."""
+"""A tip must look along the route, within this angle of its last TURN_CHORD_MM: more means sideways."""
 STRAIGHT_END_MM = 1.0
 """So much of a scope whose tip is turned aside lies straight behind the tip."""
 BENDING_RADIUS_MM = 10.0
 """Radius with which such a scope bends; thin bronchoscopes bend at least so tightly."""
 LEAVING_MM = 15.0
-"""Way along the medial axis, behind the tip, on which it leaves the axis."""
+"""A turned scope leaves the medial axis so far behind the tip: the length of a bending section."""
 MAX_BEND_RAD = math.radians(75.0)
+"""Largest bend of a turned scope where it leaves the axis: no more than scopes with a tool in them bend."""
 ARC_PIECE_RAD = math.radians(4.0)
+"""Angle of a piece of the arc: its polyline lies within BENDING_RADIUS_MM (1 - cos 2 degrees) < 0.01 mm."""
 MAX_PIECE_MM = 2.5
+"""Longest piece of the straight parts of an approach."""
 TINY_MM = 1e-9
 TINY_RAD = 1e-6
+"""Lengths and angles below these are 0 but for rounding."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,7 +41,7 @@ class ScopeTip:
     tree_point : int
         The tree point at the tip or next beyond it.
     back_mm : float
-        How far before that point the tip stands, towards the root.
+        Distance of the tip before that point, towards the root.
     lps_from_scope_tip : (4, 4) float64
     turned : bool
         Whether it looks elsewhere than along the medial axis.
@@ -49,14 +54,14 @@ class ScopeTip:
 
 
 def step_length_mm(tree: AirwayTree, point: int) -> float:
-    """Return the way from a tree point to its parent, 0 at the root."""
+    """Return the distance from a tree point to its parent, 0 at the root."""
     parent = tree.parent_point[point]
-    way = tree.distance_from_root_mm
-    return 0.0 if parent < 0 else float(way[point] - way[parent])
+    depth_mm = tree.distance_from_root_mm
+    return 0.0 if parent < 0 else float(depth_mm[point] - depth_mm[parent])
 
 
 def tip_at(tree: AirwayTree, point: int, back_mm: float = 0.0) -> ScopeTip:
-    """Return the tip that stands `back_mm` before a tree point, at most as far as its parent."""
+    """Return the tip `back_mm` before a tree point, at most as far as its parent, looking along the axis."""
     step = step_length_mm(tree, point)
     share = min(max(back_mm / step, 0.0), 1.0) if step > 0.0 else 0.0
     parent = max(int(tree.parent_point[point]), 0)
@@ -69,10 +74,10 @@ def tip_at(tree: AirwayTree, point: int, back_mm: float = 0.0) -> ScopeTip:
 
 def leaving_point(tree: AirwayTree, tip: ScopeTip) -> int:
     """Return the last tree point of the route that a scope with a turned tip still passes."""
-    way = tree.distance_from_root_mm
-    most = float(way[tip.tree_point]) - tip.back_mm - LEAVING_MM
+    depth_mm = tree.distance_from_root_mm
+    most = float(depth_mm[tip.tree_point]) - tip.back_mm - LEAVING_MM
     point = tip.tree_point
-    while way[point] > most and tree.parent_point[point] >= 0:
+    while depth_mm[point] > most and tree.parent_point[point] >= 0:
         point = int(tree.parent_point[point])
     return point
 
@@ -81,7 +86,7 @@ def approach(tree: AirwayTree, tip: ScopeTip) -> Float | None:
     """Return the polyline `(K, 3)` by which a turned tip leaves the medial axis, the tip last, LPS mm.
 
     It is straight, an arc of BENDING_RADIUS_MM, and straight again; None if the bend is more than
-    MAX_BEND_RAD or finds no room.  The polyline is nearer than 0.01 mm to the arc.
+    MAX_BEND_RAD or does not fit between them.  The polyline is nearer than 0.01 mm to the arc.
     """
     position, forward = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
     begin = tree.points_lps[leaving_point(tree, tip)]
@@ -160,7 +165,7 @@ def walk(tree: AirwayTree, tip: ScopeTip, distance_mm: float, rng: np.random.Gen
 
 
 class MedialAxis:
-    """The medial axis where the scope may stand, as one line of segments [Kuntz2015, sec. IV-A].
+    """The medial axis where the scope tip may be, as one line of segments [Kuntz2015, sec. IV-A].
 
     Parameters
     ----------

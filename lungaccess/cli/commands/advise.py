@@ -1,4 +1,4 @@
-"""The command `lungaccess advise`: the way of the bronchoscope alone, turn by turn."""
+"""The command `lungaccess advise`: the path of the bronchoscope alone, turn by turn."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def advise(
 
 def _show(advice: ScopeAdvice) -> None:
     path = advice.path
-    rows = [("insertion", f"{path.length_mm:.0f} mm"), ("retreats on the way", f"{path.retreats}")]
+    rows = [("insertion", f"{path.length_mm:.0f} mm"), ("retreats", f"{path.retreats}")]
     if path.reached:
         rows.insert(0, ("outcome", "reaches the goal in the airway"))
     else:
@@ -91,7 +91,7 @@ def _show(advice: ScopeAdvice) -> None:
             ("lesion", f"touches no lumen; the nearest is {path.goal.distance_mm:.1f} mm from its centre")
         )
     terminal.show([terminal.table("bronchoscope", ("", ""), rows)])
-    for number, one in enumerate(advice.told, start=1):
+    for number, one in enumerate(advice.instructions, start=1):
         terminal.console.print(terminal.escaped(f"{number}. {one.text()}"))
     terminal.console.print()
     if advice.thinner:

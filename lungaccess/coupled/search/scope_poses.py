@@ -7,7 +7,7 @@ import numpy as np
 from anatomy import poses
 from anatomy.lung import Lung
 from anatomy.typed import Bool, Float
-from stages.scope import Bronchoscope, ScopeTip, Sites, can_stand, walk
+from stages.scope import Bronchoscope, ScopeTip, Sites, tip_is_feasible, walk
 
 STEP_MM = 0.25
 REACH_MM = 4.0
@@ -57,7 +57,7 @@ class Stands:
             across = sideways - (sideways @ frame[:3, 2]) * frame[:3, 2]
             size = float(np.linalg.norm(across))
             self.rows[n, 6:] = across / size if size > 0.1 else frame[:3, 0]
-            self.allowed[n] = can_stand(lung, scope, places, each)
+            self.allowed[n] = tip_is_feasible(lung, scope, places, each)
 
     def rotation_rad(self, stand: int, rotation_rad: float) -> float:
         """Return the rotation counted from the tip's own +x, from one counted from the row's vector."""

@@ -141,7 +141,7 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     except LungaccessError as error:
         return f"<p>No instructions: {words.text(error)}</p>"
     path = advice.path
-    told = words.steps(one.text() for one in advice.told)
+    steps = words.steps(one.text() for one in advice.instructions)
     end = (
         "This way reaches the place of the plan's tip."
         if path.reached
@@ -151,7 +151,7 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
         f"Insertion {path.length_mm:.0f} mm, {path.retreats} retreats. Found by the search for the scope "
         "alone, with its true radius clear of the wall; twist 0 is as the scope enters the trachea."
     )
-    return f"{told}<p>{words.text(end)}</p><p class='note'>{words.text(note)}</p>"
+    return f"{steps}<p>{words.text(end)}</p><p class='note'>{words.text(note)}</p>"
 
 
 def risk_section(report: RiskReport) -> str:

@@ -11,15 +11,15 @@ if TYPE_CHECKING:
     from stages.scope.advisor.advisor import ThinnerScope as ThinnerScope
     from stages.scope.advisor.advisor import start_state as start_state
     from stages.scope.advisor.advisor import why_stopped as why_stopped
-    from stages.scope.advisor.collision import Scene as Scene
+    from stages.scope.advisor.environment import ScopeEnvironment as ScopeEnvironment
     from stages.scope.advisor.fly_through import MARKUPS_SCHEMA as MARKUPS_SCHEMA
     from stages.scope.advisor.fly_through import camera_flight as camera_flight
     from stages.scope.advisor.instructions import Instruction as Instruction
     from stages.scope.advisor.instructions import instructions_along as instructions_along
     from stages.scope.advisor.kinematics import model_of as model_of
     from stages.scope.advisor.lumen import lumen_of_lung as lumen_of_lung
-    from stages.scope.advisor.navigation import goal_at as goal_at
-    from stages.scope.advisor.navigation import navigation_field as navigation_field
+    from stages.scope.advisor.nf1 import goal_at as goal_at
+    from stages.scope.advisor.nf1 import navigation_field as navigation_field
     from stages.scope.advisor.orientability import measure_orientability as measure_orientability
     from stages.scope.advisor.path import ScopePath as ScopePath
 

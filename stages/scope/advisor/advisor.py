@@ -12,10 +12,10 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
 from anatomy.typed import Float
 from stages.scope.advisor.best_motion import Candidates, Judgement, Motion, best_motion
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, straight_state, tip_frames
 from stages.scope.advisor.lumen import Lumen
-from stages.scope.advisor.navigation import Goal, NavigationField, navigation_field
+from stages.scope.advisor.nf1 import Goal, NavigationField, navigation_field
 from stages.scope.advisor.path import ScopePath
 from stages.scope.advisor.path_search import PathSearch, PathSettings
 
@@ -97,12 +97,12 @@ class Advisor:
         self.goal = goal
         self.options = options or PathSettings()
         field = navigation_field(lumen, goal.voxel, metric="voxels" if reproduction else "mm")
-        self.scene = Scene(model=model, field=field, reproduction=reproduction)
+        self.environment = ScopeEnvironment(model=model, field=field, reproduction=reproduction)
 
     @property
     def field(self) -> NavigationField:
         """The navigation field of the goal."""
-        return self.scene.field
+        return self.environment.field
 
     def advise(
         self, state: ScopeState, *, own: Motion | None = None, rng: np.random.Generator | None = None
@@ -125,8 +125,8 @@ class Advisor:
         AnatomyError
             If the tip is not in the lumen.
         """
-        tip = tip_frames(self.scene.model, state.array)[0][:3, 3]
-        voxel = self.scene.lumen.voxel_at(tip)
+        tip = tip_frames(self.environment.model, state.array)[0][:3, 3]
+        voxel = self.environment.lumen.voxel_at(tip)
         if voxel < 0:
             raise AnatomyError(
                 f"The tip of the scope is not in the lumen, at LPS {tip.round(1).tolist()}",
@@ -148,9 +148,13 @@ class Advisor:
     def _weigh(self, state: ScopeState, rng: np.random.Generator | None) -> Candidates:
         """Return the candidates of the longest look-ahead at which one is valid, or of the least."""
         look_ahead = self.options.look_ahead_mm
-        least = look_ahead if self.scene.reproduction else float(self.scene.lumen.grid.spacing_mm.min())
+        least = (
+            look_ahead
+            if self.environment.reproduction
+            else float(self.environment.lumen.grid.spacing_mm.min())
+        )
         while True:
-            found, _ = best_motion(self.scene, state, look_ahead, self.options.weights, rng=rng)
+            found, _ = best_motion(self.environment, state, look_ahead, self.options.weights, rng=rng)
             if found.best >= 0 or look_ahead <= least:
                 return found
             look_ahead = max(0.5 * look_ahead, least)
@@ -166,24 +170,24 @@ class Advisor:
     def _judge(self, state: ScopeState, own: Motion, rng: np.random.Generator | None) -> Judgement | None:
         most = self.options.look_ahead_mm
         ahead = min(own.advance_mm, most) if own.advance_mm > 0.0 else most
-        return best_motion(self.scene, state, ahead, self.options.weights, rng=rng, own=own)[1]
+        return best_motion(self.environment, state, ahead, self.options.weights, rng=rng, own=own)[1]
 
     def path(self, start: ScopeState, *, seed: int = 0) -> ScopePath:
         """Return the path from a state to the goal, or to the nearest point that was reached.
 
         The same seed and settings give the same path, bit for bit.
         """
-        return PathSearch(self.scene, self.goal, self.options, seed).run(start)
+        return PathSearch(self.environment, self.goal, self.options, seed).run(start)
 
     def thinner(self, start: ScopeState, *, seed: int = 0) -> tuple[ThinnerScope, ...]:
         """Return what thinner scopes reach from a state, thickest first, until one reaches the goal."""
         results: list[ThinnerScope] = []
-        model = self.scene.model
+        model = self.environment.model
         count = math.ceil((model.radius_mm - THINNEST_MM) / THINNER_STEP_MM)
         for n in range(1, count + 1):
             radius = max(model.radius_mm - n * THINNER_STEP_MM, THINNEST_MM)
-            scene = Scene(model=replace(model, radius_mm=radius), field=self.field)
-            found = PathSearch(scene, self.goal, self.options, seed).run(start)
+            environment = ScopeEnvironment(model=replace(model, radius_mm=radius), field=self.field)
+            found = PathSearch(environment, self.goal, self.options, seed).run(start)
             results.append(
                 ThinnerScope(radius_mm=radius, reached=found.reached, distance_mm=found.distance_mm)
             )
@@ -193,9 +197,10 @@ class Advisor:
 
 
 def start_state(lumen: Lumen, tree: AirwayTree, model: ScopeModel) -> ScopeState:
-    """Return the first state on the way in where the straight scope fits in the trachea.
+    """Return the first state, from the root on, at which the straight scope fits in the trachea.
 
-    Twist 0 and a positive bend turn the tip anteriorly (superiorly where the trachea runs that way).
+    Twist 0 and a positive bend turn the tip anteriorly, or superiorly where the trachea is parallel to that
+    axis.
 
     Raises
     ------
@@ -203,13 +208,13 @@ def start_state(lumen: Lumen, tree: AirwayTree, model: ScopeModel) -> ScopeState
         If the scope fits nowhere in the trachea.
     """
     field = navigation_field(lumen, lumen.nearest_voxel(tree.carina_lps)[0])
-    scene = Scene(model=model, field=field)
-    way = tree.distance_from_root_mm
+    environment = ScopeEnvironment(model=model, field=field)
+    depth_mm = tree.distance_from_root_mm
     for point in tree.branch_points(0)[:-1]:
-        ahead = int(np.searchsorted(way[: tree.carina_point + 1], way[point] + model.length_mm))
+        ahead = int(np.searchsorted(depth_mm[: tree.carina_point + 1], depth_mm[point] + model.length_mm))
         ahead = min(ahead, tree.carina_point)
         state = straight_state(tree.points_lps[point], tree.points_lps[ahead] - tree.points_lps[point])
-        if scene.fits(state.array)[0]:
+        if environment.fits(state.array)[0]:
             return state
     wide = 2.0 * float(lumen.depth_mm.max())
     raise AnatomyError(
@@ -233,14 +238,15 @@ def why_stopped(path: ScopePath, field: NavigationField, tree: AirwayTree) -> st
     if path.reached:
         return ""
     lumen, tip = field.lumen, path.lps_from_tip[:3, 3]
-    way = field.route(lumen.nearest_voxel(tip)[0])
-    numbers = [lumen.voxel_at(point) for point in way]
+    route = field.route(lumen.nearest_voxel(tip)[0])
+    numbers = [lumen.voxel_at(point) for point in route]
     narrow = np.flatnonzero(lumen.depth_mm[numbers] < path.model.radius_mm)
     width = float(lumen.width_from(numbers[0])[path.goal.voxel])
     if width < path.model.radius_mm and len(narrow):
         return (
-            f"too narrow {place_words(tree, way[narrow[0]])}: no ball thicker than {2.0 * width:.1f} mm gets "
-            f"from there to the goal, the scope with its gap is {2.0 * path.model.radius_mm:.1f} mm thick"
+            f"too narrow {place_words(tree, route[narrow[0]])}: no ball thicker than {2.0 * width:.1f} mm "
+            f"gets from there to the goal, and the scope with its gap is {2.0 * path.model.radius_mm:.1f} mm "
+            "thick"
         )
     return f"no motion found that leads on {place_words(tree, tip)}, though the lumen is wide enough"
 

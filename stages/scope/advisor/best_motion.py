@@ -1,4 +1,4 @@
-"""Which motion is best now: 121 candidates, weighed by eqs. 4 to 9 of [Rosell2012].
+"""The best motion: 121 candidates (eq. 3) and their costs (eqs. 4 to 9) [Rosell2012].
 
 Where all valid candidates have the same potential, K_NF1 is 0 for all; the same holds for K_cl.  A range of 0
 adds nothing to K_alpha.  Among equals the first wins, in the order of the table.
@@ -16,7 +16,7 @@ import numpy as np
 from anatomy.grid import read_only
 from anatomy.settings import impossible, quantity, settings
 from anatomy.typed import Float, Int
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels import motion as kernel
 from stages.scope.advisor.kinematics import ScopeState
 
@@ -27,7 +27,7 @@ SUM_TOLERANCE = 1e-9
 
 @settings
 class Weights:
-    """What counts in a motion (eq. 9); they add up to 1.
+    """Weights of the terms of a motion's cost (eq. 9); they add up to 1.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Candidates:
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """What a motion of one's own is worth beside the candidates.
+    """The evaluation of the user's own motion beside the candidates.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def offsets(rng: np.random.Generator | None) -> Float:
 
 
 def best_motion(
-    scene: Scene,
+    environment: ScopeEnvironment,
     state: ScopeState,
     advance_mm: float,
     weights: Weights,
@@ -146,11 +146,11 @@ def best_motion(
     rng: np.random.Generator | None = None,
     own: Motion | None = None,
 ) -> tuple[Candidates, Judgement | None]:
-    """Weigh all candidates from a state, and a motion of one's own if there is one.
+    """Evaluate all candidates from a state (eqs. 3 to 9), and the user's own motion if there is one.
 
     Parameters
     ----------
-    scene : Scene
+    environment : ScopeEnvironment
     state : ScopeState
         Its tip lies in the lumen.
     advance_mm : float
@@ -160,25 +160,31 @@ def best_motion(
         Moves all candidates but the middle one at random within their spacing (fig. 5b); they stay on the
         grid of eq. 3 if None.
     own : Motion, optional
-        Judged with the candidates' look-ahead.
+        A motion of the user, evaluated with the candidates' look-ahead.
     """
     table = np.zeros((CANDIDATES + (own is not None), kernel.COLUMNS))
     if own is not None:
         table[CANDIDATES, kernel.TWIST], table[CANDIDATES, kernel.BEND] = own.twist_rad, own.bend_rad
     best = kernel.best_motion(
-        scene.space, scene.scope, state.array, float(advance_mm), weights.array, offsets(rng), table
+        environment.arrays,
+        environment.scope,
+        state.array,
+        float(advance_mm),
+        weights.array,
+        offsets(rng),
+        table,
     )
     mine = None
     if own is not None:
         row = table[CANDIDATES]
         mine = Judgement(verdict=VERDICTS[int(row[kernel.VERDICT])], cost=float(row[kernel.COST]))
-        if _beyond_range(scene, own):
+        if _beyond_range(environment, own):
             mine = Judgement(verdict=VERDICTS[0], cost=math.inf)
     return _candidates(table[:CANDIDATES], float(advance_mm), int(best)), mine
 
 
-def _beyond_range(scene: Scene, own: Motion) -> bool:
-    scope = scene.scope
+def _beyond_range(environment: ScopeEnvironment, own: Motion) -> bool:
+    scope = environment.scope
     return not (
         scope.twist_low <= own.twist_rad <= scope.twist_high
         and scope.bend_low <= own.bend_rad <= scope.bend_high

@@ -97,7 +97,7 @@ def camera_flight(
 
 
 def _pieces(path: ScopePath, number: int, spacing_mm: float, turn_rad: float) -> int:
-    """Return into how many pieces the way to a state is cut: the tip moves at most as far as its parts do."""
+    """Return into how many pieces the motion to a state is cut; the tip moves at most as far as its parts."""
     before, after = path.states[number - 1], path.states[number]
     step = float(path.steps_mm[number])
     twist, bend = abs(float(after[12] - before[12])), abs(float(after[13] - before[13]))

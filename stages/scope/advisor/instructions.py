@@ -1,4 +1,4 @@
-"""A path told to a person: at every bifurcation, how far to turn, bend and advance."""
+"""Instructions for a person: at every bifurcation of a path, how far to turn, bend and advance."""
 
 from __future__ import annotations
 
@@ -92,20 +92,20 @@ def _place(from_carina_mm: float) -> str:
 def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, ...]:
     """Return what to do branch by branch, up to the state nearest to the goal.
 
-    The tip is taken to be in the branch of the tree point nearest to it on the way to where it ends.
+    The tip is taken to be in the branch of the tree point nearest to it on the route to where it ends.
     """
     tips = path.tips()[: path.nearest + 1, :3, 3]
     place = _places_on_route(tree, tips)
     branch = tree.branch_of_point[place]
     starts = [0, *(np.flatnonzero(np.diff(branch)) + 1).tolist(), len(branch)]
     carina = float(tree.distance_from_root_mm[tree.carina_point])
-    told: list[Instruction] = []
+    instructions: list[Instruction] = []
     twist_before = math.degrees(path.states[0, 12])
     for number, (begin, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
         now = int(branch[begin])
         twist, bend = np.degrees(path.states[begin, 12:14]).tolist()
         bends = np.degrees(path.states[begin:end, 13])
-        told.append(
+        instructions.append(
             Instruction(
                 branch=now,
                 generation=int(tree.generation[now]),
@@ -120,16 +120,16 @@ def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, 
             )
         )
         twist_before = twist
-    return tuple(told)
+    return tuple(instructions)
 
 
-def instructions_json(told: tuple[Instruction, ...]) -> str:
+def instructions_json(instructions: tuple[Instruction, ...]) -> str:
     """Return instructions as JSON: a list of objects, each with its sentence under "text"."""
-    return json.dumps([{**asdict(one), "text": one.text()} for one in told], indent=1)
+    return json.dumps([{**asdict(one), "text": one.text()} for one in instructions], indent=1)
 
 
 def _places_on_route(tree: AirwayTree, tips: Float) -> Int:
-    """Return for each tip the nearest tree point on the way to the last one, never going back."""
+    """Return for each tip the nearest tree point on the route to the last one, never going back."""
     route = tree.route(tree.nearest_point(tips[-1]))
     away = np.linalg.norm(tips[:, None] - tree.points_lps[route][None], axis=2)
     return np.asarray(route[np.maximum.accumulate(np.argmin(away, axis=1))])
@@ -143,11 +143,11 @@ def _first_point(tree: AirwayTree, branch: int) -> int:
 def _heading(tree: AirwayTree, branch: int) -> str:
     """Say on which of the patient's sides a branch lies, compared with what else goes on from there."""
     fork, parent = _first_point(tree, branch), int(tree.branch_parent[branch])
-    way = tree.distance_from_root_mm
+    depth_mm = tree.distance_from_root_mm
     others = [
         int(tree.branch_start[child])
         for child in tree.children(parent)
-        if child != branch and abs(way[_first_point(tree, int(child))] - way[fork]) <= LOOK_MM
+        if child != branch and abs(depth_mm[_first_point(tree, int(child))] - depth_mm[fork]) <= LOOK_MM
     ]
     if fork + 1 < tree.branch_start[parent + 1]:
         others.append(fork + 1)
@@ -160,8 +160,8 @@ def _heading(tree: AirwayTree, branch: int) -> str:
 def _direction(tree: AirwayTree, fork: int, first: int) -> Float:
     """Return the unit vector from a fork to a place some mm down the branch of the point `first`."""
     points = np.arange(first, tree.branch_start[tree.branch_of_point[first] + 1])
-    way = tree.distance_from_root_mm
-    near = points[way[points] <= way[fork] + LOOK_MM]
+    depth_mm = tree.distance_from_root_mm
+    near = points[depth_mm[points] <= depth_mm[fork] + LOOK_MM]
     return _unit(tree.points_lps[near[-1] if len(near) else first] - tree.points_lps[fork])
 
 

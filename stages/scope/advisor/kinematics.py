@@ -18,7 +18,7 @@ from stages.scope.advisor.kernels import chain
 from stages.scope.device import Bronchoscope
 
 FREEST_TWIST_DEG = 90.0
-"""A device is turned so far to either side; bending both ways, it then bends in every direction."""
+"""A device is turned so far to either side; as it bends up and down, it then bends in every direction."""
 TIGHTEST_BEND_DEG_PER_MM = 12.0
 """The tip of a device is bent at most so much for each mm of its chain, as that of [Rosell2012]."""
 
@@ -154,21 +154,21 @@ def base_from_tool(model: ScopeModel, twist_rad: float, bend_rad: float) -> Floa
 
 
 def advanced(
-    model: ScopeModel, state: ScopeState, way_mm: float, twist_rad: float, bend_rad: float
+    model: ScopeModel, state: ScopeState, distance_mm: float, twist_rad: float, bend_rad: float
 ) -> ScopeState:
     """Return the state after Algorithm 1: a new twist and bend, then the base moved along its circle.
 
-    A negative way with the present twist and bend takes an advance back exactly.
+    A negative distance with the present twist and bend takes an advance back exactly.
 
     Raises
     ------
     SettingsError
         If a value is not finite, or a joint would bend by 180 degrees or more.
     """
-    values = (way_mm, twist_rad, bend_rad)
+    values = (distance_mm, twist_rad, bend_rad)
     if not np.isfinite(values).all() or abs(bend_rad) >= math.pi * model.links:
         raise SettingsError(
-            f"The scope cannot move by {way_mm:g} mm with twist {twist_rad:g} and bend {bend_rad:g} rad",
+            f"The scope cannot move by {distance_mm:g} mm with twist {twist_rad:g} and bend {bend_rad:g} rad",
             expected="finite values, a joint bent by less than 180 degrees",
         )
     moved = chain.advance(state.array, model.link_mm, model.links, *(float(value) for value in values))

@@ -16,7 +16,7 @@ from anatomy.lung import Lung
 from anatomy.structures import OUTSIDE
 from anatomy.typed import Float, Int32, Labels
 from stages.scope.advisor.kernels.collision import FINE_DEPTH_MM
-from stages.scope.advisor.kernels.field import WALL, clearance_l1, number_component, widest_ways
+from stages.scope.advisor.kernels.voxel_graph import WALL, clearance_l1, number_component, widest_paths
 
 DEPTH_UNITS_PER_MM = 256.0
 
@@ -106,7 +106,7 @@ class Lumen:
         if start not in self._widths:
             depth = (self.depth_mm * DEPTH_UNITS_PER_MM).astype(np.int64)
             out = np.zeros(self.count, dtype=np.int64)
-            widest_ways(self.neighbours, depth, start, out)
+            widest_paths(self.neighbours, depth, start, out)
             self._widths[start] = read_only(out / DEPTH_UNITS_PER_MM)
         return self._widths[start]
 

@@ -1,4 +1,4 @@
-"""Where the tip can point at a site: the bending range, cut down by the lumen.
+"""Orientability: the directions in which the tip can point at a site, within its bends and the lumen.
 
 Scopes that reached a site and could not be turned to the planned exit were what failed in a first human study
 of tunnelling through the airway wall; hence this question is asked for every site.
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import read_only
 from anatomy.typed import Bool, Float
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels.orientation import pointable
 from stages.scope.advisor.kinematics import ScopeState, straight_state, tool_frames
 
@@ -57,7 +57,7 @@ class Orientability:
         return float(np.abs(self.bend_rad[self.possible]).max(initial=0.0))
 
     def angle_rad(self, direction: ArrayLike) -> float:
-        """Return how far the tip must at least miss a direction (3,), pi if it cannot stand at the site."""
+        """Return the least angle between the tip and a direction (3,), pi if the scope does not fit."""
         wanted = np.asarray(direction, dtype=np.float64)
         cosines = self.directions[self.possible] @ (wanted / np.linalg.norm(wanted))
         return float(np.arccos(np.clip(cosines.max(initial=-1.0), -1.0, 1.0)))
@@ -68,18 +68,18 @@ class Orientability:
 
 
 def measure_orientability(
-    scene: Scene, tree: AirwayTree, point: int, *, shaft_mm: float = 5.0
+    environment: ScopeEnvironment, tree: AirwayTree, point: int, *, shaft_mm: float = 5.0
 ) -> Orientability:
-    """Return where a scope can point whose tip stands at a tree point, give or take what room there is.
+    """Return the directions in which a scope can point whose tip is at a tree point or beside it.
 
-    The tip may stand aside from the medial axis as far as the lumen leaves room beside the scope.  The base
+    The tip may lie aside from the medial axis as far as the clearance beside the scope allows.  The base
     of the bending tip lies in the direction of the airway one tip's length before, or leans 15 degrees from
-    it; its roll is what the scope has when it has come all the way without rolling.  Twists every
+    it; its roll is that of a scope that has come from the root without rolling.  Twists every
     15 degrees and bends every 7.5 degrees are tried.
 
     Parameters
     ----------
-    scene : Scene
+    environment : ScopeEnvironment
         Its model and lumen count, not its goal.
     tree : AirwayTree
     point : int
@@ -87,14 +87,14 @@ def measure_orientability(
     shaft_mm : float
         So much of the body behind the bending tip is straight and must fit, too.
     """
-    model = scene.model
+    model = environment.model
     base = _base_frame(tree, point, model.length_mm)
-    tips = _beside(tree, point, scene)
+    tips = _beside(tree, point, environment)
     twists = _steps(math.radians(model.twist_low_deg), math.radians(model.twist_high_deg), TWIST_STEP_RAD)
     bends = _steps(math.radians(model.bend_low_deg), math.radians(model.bend_high_deg), BEND_STEP_RAD)
     fits = np.zeros((len(twists), len(bends)), dtype=bool)
     bases = np.array([turned.ravel() for turned in _leaning(base)])
-    pointable(scene.space, scene.scope, bases, tips, float(shaft_mm), twists, bends, fits)
+    pointable(environment.arrays, environment.scope, bases, tips, float(shaft_mm), twists, bends, fits)
     twist, bend = (values.ravel() for values in np.meshgrid(twists, bends, indexing="ij"))
     frame = np.eye(4)
     frame[:3, :3] = base
@@ -120,8 +120,8 @@ def _steps(low: float, high: float, step: float) -> Float:
 def _base_frame(tree: AirwayTree, point: int, length_mm: float) -> Float:
     """Return the rotation (3, 3) of a base one tip's length before, come from the root without rolling."""
     route = tree.route(point)
-    way = tree.distance_from_root_mm
-    before = route[way[route] <= max(way[point] - length_mm, 0.0)]
+    depth_mm = tree.distance_from_root_mm
+    before = route[depth_mm[route] <= max(depth_mm[point] - length_mm, 0.0)]
     first, *others = before if len(before) else route[:1]
     rotation = np.array(straight_state(np.zeros(3), tree.tangents[first]).lps_from_base[:3, :3])
     for number in others:
@@ -146,14 +146,14 @@ def _leaning(base: Float) -> list[Float]:
     return made
 
 
-def _beside(tree: AirwayTree, point: int, scene: Scene) -> Float:
-    """Return places for the tip: the site, and rings about it as far as the scope has room."""
+def _beside(tree: AirwayTree, point: int, environment: ScopeEnvironment) -> Float:
+    """Return places for the tip: the site, and rings about it as far as the clearance of the scope goes."""
     site, forward = tree.points_lps[point], tree.tangents[point]
     helper = np.eye(3)[int(np.argmin(np.abs(forward)))]
     first = np.cross(forward, helper)
     first /= np.linalg.norm(first)
     second = np.cross(forward, first)
-    spare = max(float(tree.radius_mm[point]) - scene.model.radius_mm, 0.0)
+    spare = max(float(tree.radius_mm[point]) - environment.model.radius_mm, 0.0)
     places = [site]
     for radius in (0.5 * spare, spare) if spare > 0.0 else ():
         for angle in np.arange(ASIDE) * (2.0 * math.pi / ASIDE):

@@ -11,12 +11,12 @@ from anatomy.grid import read_only
 from anatomy.typed import Float
 from stages.scope.advisor import kinematics
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState
-from stages.scope.advisor.navigation import Goal
+from stages.scope.advisor.nf1 import Goal
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScopePath:
-    """What Algorithm 2 found; M states.
+    """A path of Algorithm 2 [Rosell2012]; M states.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class ScopePath:
     nearest : int
         The first state of least potential: the last one, except in reproduction.
     retreats : int
-        How often the scope was pulled back and tried another way.
+        How often the scope was pulled back and tried again.
     reproduction : bool
         Whether eq. 1 decided about collisions: then the path must not feed a plan.
     """
@@ -91,14 +91,14 @@ class ScopePath:
         return kinematics.tip_frames(self.model, self.states)
 
     def between(self, number: int, fraction: float) -> Float:
-        """Return the state (14,) at a fraction of the way from state `number - 1` to state `number`.
+        """Return the state (14,) at a fraction of the motion from state `number - 1` to state `number`.
 
         The base moves along its arc while twist and bend change evenly.
         """
         before, after = self.states[number - 1], self.states[number]
-        way = fraction * float(self.steps_mm[number])
+        advance_mm = fraction * float(self.steps_mm[number])
         moved = kinematics.advanced(
-            self.model, ScopeState.of_array(before), way, float(after[12]), float(after[13])
+            self.model, ScopeState.of_array(before), advance_mm, float(after[12]), float(after[13])
         ).array
         moved[12:] = before[12:] + fraction * (after[12:] - before[12:])
         return moved

@@ -1,7 +1,7 @@
-"""Paths to a goal: Algorithm 2 of [Rosell2012], and what to do when it is stuck.
+"""Algorithm 2 of [Rosell2012], paths to a goal, with retreats where it is stuck.
 
 The paper stops where no candidate is valid.  Here the look-ahead is first halved, down to a voxel; then the
-scope is pulled back some way, as it came, and tries again with other weights and another look-ahead.  What
+scope is pulled back along its path and tries again with other weights and another look-ahead.  The path that
 comes nearest is kept.
 """
 
@@ -15,19 +15,20 @@ from pydantic import Field
 from anatomy.settings import impossible, quantity, settings, switch
 from anatomy.typed import Float
 from stages.scope.advisor.best_motion import Weights
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels import motion as kernel
 from stages.scope.advisor.kinematics import ScopeState, tool_frames
-from stages.scope.advisor.navigation import Goal
+from stages.scope.advisor.nf1 import Goal
 from stages.scope.advisor.path import ScopePath
 
 RETREATS_MM = (3.0, 6.0, 12.0, 24.0, 48.0)
-"""Lengths of retreat, taken in turn, each times 0.5 to 1.5."""
+"""Lengths of retreat, taken in turn, each times 0.5 to 1.5: from a fork just missed to a lost lobe."""
 LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
-"""Of these shares of the look-ahead one is drawn for a retry."""
+"""For a retry one of these shares of the look-ahead is drawn: a shorter one fits into a tighter turn."""
 LOOKS_PER_MM = 4
-"""So many poses between two states are tried for collision."""
+"""So many poses a mm of advance are tried for collision: the body moves by less than a voxel between two."""
 SAME_POTENTIAL = 1e-9
+"""Potentials nearer than this are equal: rounding of sums of steps."""
 
 
 @settings
@@ -67,25 +68,25 @@ class PathSettings:
 
 
 class PathSearch:
-    """Looks for a path from a state, again and again.
+    """Algorithm 2 from a state, repeated with retreats until the goal is reached.
 
     Parameters
     ----------
-    scene : Scene
+    environment : ScopeEnvironment
     goal : Goal
-        Of the scene's field.
+        Of the environment's field.
     options : PathSettings
         In reproduction the look-ahead is never shortened and nothing is retried.
     seed : int
     """
 
-    def __init__(self, scene: Scene, goal: Goal, options: PathSettings, seed: int) -> None:
-        self._scene = scene
+    def __init__(self, environment: ScopeEnvironment, goal: Goal, options: PathSettings, seed: int) -> None:
+        self._environment = environment
         self._goal = goal
         self._options = options
         self._rng = np.random.default_rng(seed)
-        self._looks = 1 if scene.reproduction else max(1, round(LOOKS_PER_MM * options.sub_step_mm))
-        self._least = min(options.sub_step_mm, float(scene.lumen.grid.spacing_mm.min()))
+        self._looks = 1 if environment.reproduction else max(1, round(LOOKS_PER_MM * options.sub_step_mm))
+        self._least = min(options.sub_step_mm, float(environment.lumen.grid.spacing_mm.min()))
 
     def run(self, start: ScopeState) -> ScopePath:
         """Return the path from a state that ends at the goal or comes nearest to it."""
@@ -104,8 +105,8 @@ class PathSearch:
         options = self._options
         begin = np.zeros((len(states), 4))
         begin[:, 2], begin[:, 3] = steps_mm, self._potentials(states)
-        states, info, end = self._follow(states, begin, options.weights, options.look_ahead_mm)
-        if self._scene.reproduction:
+        states, info, end = self._compute_path(states, begin, options.weights, options.look_ahead_mm)
+        if self._environment.reproduction:
             return self._path(states, info, end == kernel.REACHED, 0)
         states, info = _cut(states, info)
         used = 0
@@ -113,7 +114,7 @@ class PathSearch:
         while end != kernel.REACHED and info[-1, 3] > enough and used < options.retreats:
             kept = self._retreat(info, used)
             ahead = max(options.look_ahead_mm * float(self._rng.choice(LOOK_AHEADS)), options.sub_step_mm)
-            more, more_info, new_end = self._follow(
+            more, more_info, new_end = self._compute_path(
                 states[: kept + 1], info[: kept + 1], self._random_weights(), ahead
             )
             more, more_info = _cut(more, more_info)
@@ -124,9 +125,9 @@ class PathSearch:
 
     def _potentials(self, states: Float) -> Float:
         """Return the potential at the tip of states, infinity outside the lumen."""
-        tips = tool_frames(self._scene.model, states)[:, :3, 3]
-        voxels = [self._scene.lumen.voxel_at(tip) for tip in tips]
-        return np.array([self._scene.field.potential[v] if v >= 0 else np.inf for v in voxels])
+        tips = tool_frames(self._environment.model, states)[:, :3, 3]
+        voxels = [self._environment.lumen.voxel_at(tip) for tip in tips]
+        return np.array([self._environment.field.potential[v] if v >= 0 else np.inf for v in voxels])
 
     def _random_weights(self) -> Weights:
         low, high = (float(value) for value in np.sort(self._rng.uniform(size=2)))
@@ -134,36 +135,36 @@ class PathSearch:
 
     def _retreat(self, info: Float, used: int) -> int:
         """Return the number of the state to which the scope is pulled back."""
-        way = RETREATS_MM[used % len(RETREATS_MM)] * self._rng.uniform(0.5, 1.5)
+        retreat_mm = RETREATS_MM[used % len(RETREATS_MM)] * self._rng.uniform(0.5, 1.5)
         behind = np.cumsum(info[::-1, 2])[::-1]
-        return int(np.flatnonzero(behind >= way).max(initial=0))
+        return int(np.flatnonzero(behind >= retreat_mm).max(initial=0))
 
     def _lowest_that_fits(self, state: Float) -> float:
         """Return the lowest potential of a voxel to which a ball of the scope's radius gets."""
-        scene = self._scene
-        start = scene.lumen.voxel_at(state[9:12])
+        environment = self._environment
+        start = environment.lumen.voxel_at(state[9:12])
         if start < 0:
-            start, _away = scene.lumen.nearest_voxel(state[9:12])
-        fits = scene.lumen.width_from(start) >= scene.model.radius_mm
-        return float(scene.field.potential[fits].min(initial=np.inf)) if fits.any() else -np.inf
+            start, _away = environment.lumen.nearest_voxel(state[9:12])
+        fits = environment.lumen.width_from(start) >= environment.model.radius_mm
+        return float(environment.field.potential[fits].min(initial=np.inf)) if fits.any() else -np.inf
 
-    def _follow(
+    def _compute_path(
         self, begin: Float, begin_info: Float, weights: Weights, look_ahead_mm: float
     ) -> tuple[Float, Float, int]:
-        """Go on from the last of some states; return all states, their numbers and the end."""
+        """Run Algorithm 2 from the last of some states; return all states, their numbers and the end."""
         options = self._options
         done = len(begin) - 1
         left_mm = max(options.max_length_mm - float(begin_info[:, 2].sum()), 0.0)
-        room = len(begin) + 1 + int(left_mm / min(self._least, look_ahead_mm))
-        states, info = np.zeros((room, 14)), np.zeros((room, 4))
+        most = len(begin) + 1 + int(left_mm / min(self._least, look_ahead_mm))
+        states, info = np.zeros((most, 14)), np.zeros((most, 4))
         states[: done + 1], info[: done + 1] = begin, begin_info
         randomness = np.zeros(1, dtype=np.uint64)
         if options.random_offsets:
             randomness[0] = self._rng.integers(1, 2**62)
-        least = look_ahead_mm if self._scene.reproduction else self._least
+        least = look_ahead_mm if self._environment.reproduction else self._least
         count, end = kernel.compute_path(
-            self._scene.space,
-            self._scene.scope,
+            self._environment.arrays,
+            self._environment.scope,
             weights.array,
             self._goal.voxel,
             np.array([look_ahead_mm, options.sub_step_mm, least, left_mm]),
@@ -176,7 +177,7 @@ class PathSearch:
 
     def _path(self, states: Float, info: Float, reached: bool, used: int) -> ScopePath:
         return ScopePath(
-            model=self._scene.model,
+            model=self._environment.model,
             goal=self._goal,
             states=states,
             steps_mm=info[:, 2],
@@ -185,7 +186,7 @@ class PathSearch:
             reached=reached,
             nearest=int(np.argmin(info[:, 3])),
             retreats=used,
-            reproduction=self._scene.reproduction,
+            reproduction=self._environment.reproduction,
         )
 
 

@@ -1,4 +1,7 @@
-"""Advice on the way: a plan is followed, made anew when the scope leaves it, undone where it is stuck."""
+"""Advice during a procedure: the best motion from any configuration that the user is in [Rosell2012].
+
+A path is followed, planned again when the scope leaves it, and undone where the scope is stuck.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ from stages.scope.advisor.kinematics import ScopeState, joints
 from stages.scope.advisor.path import ScopePath
 from stages.scope.advisor.path_search import PathSearch
 
-ON_THE_WAY_MM = 0.75
-"""The scope is where a state of the plan is, if its base, its tip and all between are so near."""
+SAME_STATE_MM = 0.75
+"""The scope is at a state of the plan if its base, its joints and its tip are this near, about a voxel."""
 
 
 class Session:
@@ -35,11 +38,11 @@ class Session:
 
     def __init__(self, advisor: Advisor, start: ScopeState, *, seed: int = 0) -> None:
         self._advisor = advisor
-        self._search = PathSearch(advisor.scene, advisor.goal, advisor.options, seed)
+        self._search = PathSearch(advisor.environment, advisor.goal, advisor.options, seed)
         self.plan: ScopePath = self._search.run(start)
         self._at = 0
-        self._way_back = np.zeros((0, 14))
-        self._back_mm = np.zeros(0)
+        self._return_states = np.zeros((0, 14))
+        self._return_mm = np.zeros(0)
 
     def advise(self, state: ScopeState, *, own: Motion | None = None) -> Advice:
         """Return what to do now: the next motion of the plan, or how far to pull back.
@@ -51,7 +54,7 @@ class Session:
         state : ScopeState
             Where the scope is now, in the lumen.
         own : Motion, optional
-            A motion that somebody is about to make, to be judged.
+            A motion that the user is about to make, to be evaluated.
 
         Raises
         ------
@@ -85,31 +88,31 @@ class Session:
         """Return the state that the scope is in, -1 if in none; the last on ties."""
         if not len(states):
             return -1
-        model = self._advisor.scene.model
+        model = self._advisor.environment.model
         away = np.linalg.norm(joints(model, states) - joints(model, state.array), axis=2).max(axis=1)
         nearest = len(away) - 1 - int(np.argmin(away[::-1]))
-        return nearest if away[nearest] <= ON_THE_WAY_MM else -1
+        return nearest if away[nearest] <= SAME_STATE_MM else -1
 
     def _pulling(self, state: ScopeState) -> Motion | None:
-        """Return how far to pull back still, if the scope is on its way back."""
-        number = self._place(self._way_back, state)
+        """Return how far to pull back still, if the scope is being pulled back."""
+        number = self._place(self._return_states, state)
         if number < 0 or self._place(self.plan.states, state) >= 0:
             return None
-        return self._back(float(self._back_mm[: number + 1].sum()))
+        return self._back(float(self._return_mm[: number + 1].sum()))
 
-    def _back(self, way_mm: float) -> Motion:
+    def _back(self, length_mm: float) -> Motion:
         target = self.plan.states[self._at]
-        return Motion(advance_mm=-way_mm, twist_rad=float(target[12]), bend_rad=float(target[13]))
+        return Motion(advance_mm=-length_mm, twist_rad=float(target[12]), bend_rad=float(target[13]))
 
     def _plan_anew(self, state: ScopeState) -> Motion | None:
         """Plan from where the scope is and how it came; return how far to pull back, if that is the plan."""
-        came, steps = self.plan.states[: self._at + 1], self.plan.steps_mm[: self._at + 1]
+        came, came_mm = self.plan.states[: self._at + 1], self.plan.steps_mm[: self._at + 1]
         step = float(np.linalg.norm(state.lps_from_base[:3, 3] - came[-1, 9:12]))
-        history, ways = np.vstack([came, state.array]), np.append(steps, step)
-        self.plan = self._search.resume(history, ways)
+        history, steps_mm = np.vstack([came, state.array]), np.append(came_mm, step)
+        self.plan = self._search.resume(history, steps_mm)
         common = min(len(history), self.plan.count)
         same = (self.plan.states[:common] == history[:common]).all(axis=1)
         kept = common if same.all() else int(np.argmin(same))
         self._at = kept - 1
-        self._way_back, self._back_mm = history[kept:], ways[kept:]
-        return self._back(float(ways[kept:].sum())) if kept < len(history) else None
+        self._return_states, self._return_mm = history[kept:], steps_mm[kept:]
+        return self._back(float(steps_mm[kept:].sum())) if kept < len(history) else None

@@ -12,8 +12,8 @@ from lungaccess.problem.patients import load_patient
 from stages.scope.advisor.advisor import Advisor, start_state, why_stopped
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen, lumen_of_lung
-from stages.scope.advisor.navigation import entering_costs, goal_at, navigation_field
-from tests.stages.scope.advisor.test_navigation import dijkstra_of
+from stages.scope.advisor.nf1 import entering_costs, goal_at, navigation_field
+from tests.stages.scope.advisor.test_nf1 import dijkstra_of
 from tests.stages.scope.airways import wall_mm
 
 pytestmark = [pytest.mark.slow, pytest.mark.data]

@@ -37,18 +37,18 @@ def bend_axis(state, alpha):
 
 
 @inlined_kernel
-def move_base(state, link, kappa, way, alpha, out):
-    """Write the base pose of `state`, moved by `way` mm, into the first 12 numbers of `out`.
+def move_base(state, link, kappa, distance, alpha, out):
+    """Write the base pose of `state`, moved by `distance` mm, into the first 12 numbers of `out`.
 
     Lines 5 to 7 of Algorithm 1 multiplied out; the rotation by xi in its T_C cancels.  `state` may be `out`.
     """
     c = math.cos(alpha)
     s = math.sin(alpha)
-    turn = kappa * way
+    turn = kappa * distance
     ct = math.cos(turn)
     st = math.sin(turn)
-    aside = versine_length(kappa, way) - 0.5 * link * st
-    back = -sine_length(kappa, way) - 0.5 * link * (1.0 - ct)
+    aside = versine_length(kappa, distance) - 0.5 * link * st
+    back = -sine_length(kappa, distance) - 0.5 * link * (1.0 - ct)
     for row in range(3):
         x, y, z = state[3 * row], state[3 * row + 1], state[3 * row + 2]
         across = c * x + s * y
@@ -122,10 +122,10 @@ def bodies(states, link, links, joints, frames):
 
 
 @numba.njit(cache=True)
-def advance(state, link, links, way, alpha, beta):
-    """Return the state after Algorithm 1: advanced by `way` mm with a new twist and bend."""
+def advance(state, link, links, distance, alpha, beta):
+    """Algorithm 1: return the state advanced by `distance` mm with a new twist and bend."""
     out = np.zeros(STATE)
-    move_base(state, link, circle_curvature(link, links, beta), way, alpha, out)
+    move_base(state, link, circle_curvature(link, links, beta), distance, alpha, out)
     out[12] = alpha
     out[13] = beta
     return out

@@ -1,4 +1,4 @@
-"""Best motion and path of the scope: eqs. 3 to 9 and Algorithm 2 of [Rosell2012]."""
+"""Algorithm 2 of [Rosell2012], and eqs. 3 to 9: the path of the scope and its best motion."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ REACHED, STUCK, FULL = 0, 1, 2
 
 
 @inlined_kernel
-def clearance_gradient(space, voxel, out):
-    """Fill `out` (3,) with the gradient of eq. 5, wall voxels having no clearance."""
+def clearance_gradient(lumen, voxel, out):
+    """Fill `out` (3,) with the gradient of the clearance (eq. 5); the clearance of wall voxels is 0."""
     for row in range(3):
         out[row] = 0.0
-    here = space.clearance[voxel]
-    i, j, k = space.voxels[voxel, 0], space.voxels[voxel, 1], space.voxels[voxel, 2]
-    ni, nj, nk = space.numbers.shape
+    here = lumen.clearance[voxel]
+    i, j, k = lumen.voxels[voxel, 0], lumen.voxels[voxel, 1], lumen.voxels[voxel, 2]
+    ni, nj, nk = lumen.numbers.shape
     for di in range(-1, 2):
         for dj in range(-1, 2):
             for dk in range(-1, 2):
                 a, b, c = i + di, j + dj, k + dk
                 there = 0.0
-                if 0 <= a < ni and 0 <= b < nj and 0 <= c < nk and space.numbers[a, b, c] >= 0:
-                    there = space.clearance[space.numbers[a, b, c]]
+                if 0 <= a < ni and 0 <= b < nj and 0 <= c < nk and lumen.numbers[a, b, c] >= 0:
+                    there = lumen.clearance[lumen.numbers[a, b, c]]
                 for row in range(3):
-                    m = space.lps_from_ijk[row]
+                    m = lumen.lps_from_ijk[row]
                     out[row] += (m[0] * di + m[1] * dj + m[2] * dk) * (there - here)
 
 
@@ -66,46 +66,46 @@ def twist_cost(scope, alpha, beta, alpha_now):
 
 
 @inlined_kernel
-def judge(space, scope, state, way, alpha, beta, voxel, gradient, row, scratch, joints):
-    """Fill `row` with verdict, potential, cg (eq. 6) and look-at point of one motion."""
+def evaluate_motion(lumen, scope, state, distance, alpha, beta, voxel, gradient, row, scratch, joints):
+    """Fill `row` with the verdict, the potential, cg (eq. 6) and the look-at point of one motion."""
     row[TWIST] = alpha
     row[BEND] = beta
     row[POTENTIAL] = np.inf
     for column in range(GRADIENT, COST):
         row[column] = 0.0
     row[COST] = np.inf
-    move_base(state, scope.link, circle_curvature(scope.link, scope.links, beta), way, alpha, scratch)
+    move_base(state, scope.link, circle_curvature(scope.link, scope.links, beta), distance, alpha, scratch)
     x, y, z = tip_of(scratch, scope.link, scope.links, alpha, beta)
     row[LOOK_X], row[LOOK_X + 1], row[LOOK_X + 2] = x, y, z
-    there = voxel_of(space, x, y, z)
+    there = voxel_of(lumen, x, y, z)
     if there < 0:
         row[VERDICT] = COLLIDES
         return
-    row[POTENTIAL] = space.potential[there]
-    if not row[POTENTIAL] < space.potential[voxel]:
+    row[POTENTIAL] = lumen.potential[there]
+    if not row[POTENTIAL] < lumen.potential[voxel]:
         row[VERDICT] = RISES
         return
     row[VERDICT] = COLLIDES
-    if not body_fits(space, scope, scratch, alpha, beta, joints):
+    if not body_fits(lumen, scope, scratch, alpha, beta, joints):
         return
-    if scope.radius > 0.0 and not base_fits(space, scope, state, alpha, beta, way, scratch):
+    if scope.radius > 0.0 and not base_fits(lumen, scope, state, alpha, beta, distance, scratch):
         return
     row[VERDICT] = VALID
     norm = 0.0
     dot = 0.0
     for axis in range(3):
-        m = space.lps_from_ijk[axis]
+        m = lumen.lps_from_ijk[axis]
         d = 0.0
         for b in range(3):
-            d += m[b] * (space.voxels[there, b] - space.voxels[voxel, b])
+            d += m[b] * (lumen.voxels[there, b] - lumen.voxels[voxel, b])
         norm += d * d
         dot += d * gradient[axis]
     row[GRADIENT] = max(dot / math.sqrt(norm), 0.0) if norm > 0.0 else 0.0
 
 
 @inlined_kernel
-def weigh(scope, table, count, weights, alpha_now):
-    """Fill the costs of the valid rows; the extremes of the first `count` normalise."""
+def fill_costs(scope, table, count, weights, alpha_now):
+    """Fill the costs of the valid rows (eqs. 4 and 7 to 9); the extremes of the first `count` normalise."""
     low_p, high_p, low_g, high_g = np.inf, -np.inf, np.inf, -np.inf
     for n in range(count):
         if table[n, VERDICT] == VALID:
@@ -137,20 +137,20 @@ def best_of(table, count):
 
 
 @inner_kernel
-def candidates(space, scope, state, way, weights, offsets, table, gradient, scratch, joints):
+def evaluate_candidates(lumen, scope, state, look_ahead, weights, offsets, table, gradient, scratch, joints):
     """Fill the table of all candidates (eq. 3) and return the best one, -1 if none is valid.
 
     `offsets` (121, 2) are shares, from -0.5 to 0.5, of the spacing of twist and bend.  A row beyond the
-    candidates, if there is one, holds the twist and bend of a motion to be judged and weighed like them.
+    candidates, if there is one, holds the twist and bend of a motion that is evaluated like them.
     """
     x, y, z = tip_of(state, scope.link, scope.links, state[12], state[13])
-    voxel = voxel_of(space, x, y, z)
+    voxel = voxel_of(lumen, x, y, z)
     for n in range(table.shape[0]):
         table[n, VERDICT] = OUT_OF_RANGE
         table[n, COST] = np.inf
     if voxel < 0:
         return -1
-    clearance_gradient(space, voxel, gradient)
+    clearance_gradient(lumen, voxel, gradient)
     twist_step = (scope.twist_high - scope.twist_low) / (2.0 * REACH)
     n = -1
     for i in range(-REACH, REACH + 1):
@@ -167,47 +167,53 @@ def candidates(space, scope, state, way, weights, offsets, table, gradient, scra
             table[n, TWIST] = alpha
             table[n, BEND] = beta
             if inside:
-                judge(space, scope, state, way, alpha, beta, voxel, gradient, table[n], scratch, joints)
+                evaluate_motion(
+                    lumen, scope, state, look_ahead, alpha, beta, voxel, gradient, table[n], scratch, joints
+                )
     for n in range(CANDIDATES, table.shape[0]):
         alpha, beta = table[n, TWIST], table[n, BEND]
-        judge(space, scope, state, way, alpha, beta, voxel, gradient, table[n], scratch, joints)
-    weigh(scope, table, CANDIDATES, weights, state[12])
+        evaluate_motion(
+            lumen, scope, state, look_ahead, alpha, beta, voxel, gradient, table[n], scratch, joints
+        )
+    fill_costs(scope, table, CANDIDATES, weights, state[12])
     return best_of(table, CANDIDATES)
 
 
 @numba.njit(cache=True)
-def best_motion(space, scope, state, way, weights, offsets, table):
-    """Call `candidates` from Python."""
+def best_motion(lumen, scope, state, look_ahead, weights, offsets, table):
+    """Call `evaluate_candidates` from Python."""
     scratch = np.zeros(14)
     joints = np.zeros((scope.links + 1, 3))
-    return candidates(space, scope, state, way, weights, offsets, table, np.zeros(3), scratch, joints)
+    return evaluate_candidates(
+        lumen, scope, state, look_ahead, weights, offsets, table, np.zeros(3), scratch, joints
+    )
 
 
 @inner_kernel
-def take(space, scope, state, way, step, row, looks, out, joints):
+def take_sub_step(lumen, scope, state, look_ahead, step, row, looks, out, joints):
     """Write the state after a sub-step towards a candidate; tell whether every pose looked at is free.
 
     `looks` poses are looked at, evenly spaced in time, the last one being `out`.
     """
-    part = step / way
+    part = step / look_ahead
     alpha = state[12] + (row[TWIST] - state[12]) * part
     beta = state[13] + (row[BEND] - state[13]) * part
     kappa = circle_curvature(scope.link, scope.links, beta)
-    if scope.radius > 0.0 and not base_fits(space, scope, state, alpha, beta, step, out):
+    if scope.radius > 0.0 and not base_fits(lumen, scope, state, alpha, beta, step, out):
         return False
     for n in range(1, looks + 1):
         f = n / looks
         move_base(state, scope.link, kappa, f * step, alpha, out)
         out[12] = state[12] + f * (alpha - state[12])
         out[13] = state[13] + f * (beta - state[13])
-        if not body_fits(space, scope, out, out[12], out[13], joints):
+        if not body_fits(lumen, scope, out, out[12], out[13], joints):
             return False
     return True
 
 
 @numba.njit(cache=True, nogil=True)
-def compute_path(space, scope, weights, goal, steps, randomness, looks, states, info):
-    """Follow the best motions from `states[0]` (Algorithm 2) and return the number of states and the end.
+def compute_path(lumen, scope, weights, goal, steps, randomness, looks, states, info):
+    """Algorithm 2: follow the best motions from `states[0]`; return the number of states and the end.
 
     `steps` is (4,): look-ahead (with a true radius not beyond the goal), sub-step, the least look-ahead that
     is tried when there is no valid candidate, and how far the scope may advance at most, mm.  `randomness`
@@ -225,8 +231,8 @@ def compute_path(space, scope, weights, goal, steps, randomness, looks, states, 
     while True:
         state = states[count - 1]
         x, y, z = tip_of(state, scope.link, scope.links, state[12], state[13])
-        here = voxel_of(space, x, y, z)
-        info[count - 1, 3] = space.potential[here] if here >= 0 else np.inf
+        here = voxel_of(lumen, x, y, z)
+        info[count - 1, 3] = lumen.potential[here] if here >= 0 else np.inf
         if here == goal:
             return count, REACHED
         if left <= 0.0 or count == states.shape[0]:
@@ -235,26 +241,30 @@ def compute_path(space, scope, weights, goal, steps, randomness, looks, states, 
             for n in range(CANDIDATES):
                 offsets[n, 0] = uniform(randomness) - 0.5
                 offsets[n, 1] = uniform(randomness) - 0.5
-        way = steps[0]
+        look_ahead = steps[0]
         if scope.radius > 0.0:
-            way = min(way, max(distance_to(space, goal, x, y, z), steps[2]))
+            look_ahead = min(look_ahead, max(distance_to(lumen, goal, x, y, z), steps[2]))
         moved = False
         while not moved:
-            best = candidates(space, scope, state, way, weights, offsets, table, gradient, scratch, joints)
-            step = min(steps[1], way)
+            best = evaluate_candidates(
+                lumen, scope, state, look_ahead, weights, offsets, table, gradient, scratch, joints
+            )
+            step = min(steps[1], look_ahead)
             while best >= 0 and not moved:
-                if take(space, scope, state, way, step, table[best], looks, states[count], joints):
+                if take_sub_step(
+                    lumen, scope, state, look_ahead, step, table[best], looks, states[count], joints
+                ):
                     moved = True
                 else:
                     table[best, VERDICT] = COLLIDES
                     best = best_of(table, CANDIDATES)
             if moved:
                 info[count, 0] = table[best, COST]
-                info[count, 1] = way
+                info[count, 1] = look_ahead
                 info[count, 2] = step
                 left -= step
-            elif way <= steps[2]:
+            elif look_ahead <= steps[2]:
                 return count, STUCK
             else:
-                way = max(0.5 * way, steps[2])
+                look_ahead = max(0.5 * look_ahead, steps[2])
         count += 1

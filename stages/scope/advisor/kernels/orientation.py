@@ -7,11 +7,11 @@ import numpy as np
 
 from anatomy.kernels.field import MIN_GAP_MM
 from stages.scope.advisor.kernels.chain import tip_of
-from stages.scope.advisor.kernels.collision import body_fits, room
+from stages.scope.advisor.kernels.collision import body_fits, clearance_beyond
 
 
 @numba.njit(cache=True)
-def pointable(space, scope, bases, tips, shaft, twists, bends, fits):
+def pointable(lumen, scope, bases, tips, shaft, twists, bends, fits):
     """Fill `fits` (A, B): whether some body with the tip at one of `tips` (T, 3) has a twist and a bend.
 
     `bases` (K, 9) are rotation matrices of the base that are tried; behind it the body is straight for
@@ -32,12 +32,12 @@ def pointable(space, scope, bases, tips, shaft, twists, bends, fits):
                     state[9] = tips[t, 0] - x
                     state[10] = tips[t, 1] - y
                     state[11] = tips[t, 2] - z
-                    if not body_fits(space, scope, state, twists[a], bends[b], joints):
+                    if not body_fits(lumen, scope, state, twists[a], bends[b], joints):
                         continue
                     done = 0.0
                     while True:
-                        gap = room(
-                            space,
+                        gap = clearance_beyond(
+                            lumen,
                             scope.radius,
                             state[9] + done * state[2],
                             state[10] + done * state[5],

@@ -13,12 +13,12 @@ from anatomy.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, start_state, why_stopped
 from stages.scope.advisor.best_motion import Motion
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.fly_through import camera_flight
 from stages.scope.advisor.instructions import instructions_along, instructions_json
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, advanced, straight_state, tip_frames
 from stages.scope.advisor.lumen import Lumen
-from stages.scope.advisor.navigation import goal_at
+from stages.scope.advisor.nf1 import goal_at
 from stages.scope.advisor.path import ScopePath
 from stages.scope.advisor.path_search import PathSettings
 from stages.scope.advisor.session import ON_THE_WAY_MM, Session
@@ -53,7 +53,7 @@ def test_every_branch_is_reached_and_no_pose_touches_the_wall(
     for number in range(path.count):
         assert wall_mm(lumen, path.body(number), 4.0).min() >= MODEL.radius_mm
     between = [path.between(number, f) for number in range(1, path.count) for f in (0.25, 0.5, 0.75)]
-    assert advisor.scene.fits(np.array(between)).all(), "not between the states either"
+    assert advisor.environment.fits(np.array(between)).all(), "not between the states either"
 
 
 def test_states_follow_from_one_another(forked: tuple[Lung, Lumen]) -> None:
@@ -103,7 +103,7 @@ def test_reproduction_obeys_equation_1_and_stops_where_the_paper_stops(forked: t
         path = advisor.path(start, seed=seed)
         assert path.reproduction
         assert path.retreats == 0
-        assert advisor.scene.fits(path.states).all()
+        assert advisor.environment.fits(path.states).all()
         assert (path.steps_mm[1:] == 1.0).all()
         assert path.potentials[path.nearest] == path.potentials.min()
         if not path.reached:
@@ -162,7 +162,7 @@ def test_a_session_leads_to_the_goal(forked: tuple[Lung, Lumen], target: np.ndar
     tip = tip_frames(MODEL, way[-1].array)[0][:3, 3]
     assert np.linalg.norm(tip - session.plan.lps_from_tip[:3, 3]) <= ON_THE_WAY_MM
     thinner = replace(MODEL, radius_mm=MODEL.radius_mm - ON_THE_WAY_MM)
-    strayed = Scene(model=thinner, field=advisor.field)
+    strayed = ScopeEnvironment(model=thinner, field=advisor.field)
     assert strayed.fits(np.array([state.array for state in way])).all()
 
 
@@ -265,5 +265,5 @@ def test_a_straight_tube_needs_no_bend() -> None:
     path = advisor.path(start_state(lumen, tree, MODEL))
     assert path.reached
     assert path.length_mm < 60.0
-    strict = Scene(model=MODEL, field=advisor.field)
+    strict = ScopeEnvironment(model=MODEL, field=advisor.field)
     assert strict.fits(path.states).all()

@@ -12,10 +12,10 @@ from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import CANDIDATES, VERDICTS, Motion, Weights, best_motion, offsets
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, advanced, tool_frames
 from stages.scope.advisor.lumen import Lumen
-from stages.scope.advisor.navigation import goal_at, navigation_field
+from stages.scope.advisor.nf1 import goal_at, navigation_field
 from stages.scope.advisor.path_search import PathSettings
 from tests.stages.scope.airways import LINES
 
@@ -23,11 +23,11 @@ WEIGHTS = Weights(nf1=0.5, clearance=0.3, twist=0.2)
 OUT, AWAY, COLLIDES, VALID = range(4)
 
 
-def scene_of(lumen: Lumen, *, reproduction: bool, model: ScopeModel | None = None) -> Scene:
+def scene_of(lumen: Lumen, *, reproduction: bool, model: ScopeModel | None = None) -> ScopeEnvironment:
     goal = goal_at(lumen, LINES[3][1])
     metric = "voxels" if reproduction else "mm"
     field = navigation_field(lumen, goal.voxel, metric=metric)
-    return Scene(model=model or ScopeModel(), field=field, reproduction=reproduction)
+    return ScopeEnvironment(model=model or ScopeModel(), field=field, reproduction=reproduction)
 
 
 def states_on_the_way(forked: tuple[Lung, Lumen]) -> list[ScopeState]:
@@ -44,12 +44,14 @@ def states(forked: tuple[Lung, Lumen]) -> list[ScopeState]:
     return states_on_the_way(forked)
 
 
-def by_the_paper(scene: Scene, state: ScopeState, dz: float, moved: np.ndarray) -> dict[str, np.ndarray]:
+def by_the_paper(
+    environment: ScopeEnvironment, state: ScopeState, dz: float, moved: np.ndarray
+) -> dict[str, np.ndarray]:
     """Eqs. 3 to 9 as printed, with the readings of docs/deviations.md."""
-    model, lumen, field = scene.model, scene.lumen, scene.field
+    model, lumen, field = environment.model, environment.lumen, environment.field
     low, high = np.radians([model.twist_low_deg, model.twist_high_deg])
     least, most = np.radians([model.bend_low_deg, model.bend_high_deg])
-    middle = 0.0 if scene.reproduction else 0.5 * (low + high)
+    middle = 0.0 if environment.reproduction else 0.5 * (low + high)
     now = lumen.voxel_at(tool_frames(model, state.array)[0][:3, 3])
     gradient = np.zeros(3)
     for di in (-1, 0, 1):
@@ -86,7 +88,7 @@ def by_the_paper(scene: Scene, state: ScopeState, dz: float, moved: np.ndarray) 
             if nf1[n] >= field.potential[now]:
                 verdict[n] = AWAY
             else:
-                verdict[n] = VALID if scene.fits(there.array)[0] else COLLIDES
+                verdict[n] = VALID if environment.fits(there.array)[0] else COLLIDES
             if voxel != now:
                 q = lumen.centres(voxel) - lumen.centres(now)
                 cg[n] = max(float(q @ gradient) / np.linalg.norm(q), 0.0)
@@ -105,13 +107,13 @@ def by_the_paper(scene: Scene, state: ScopeState, dz: float, moved: np.ndarray) 
 def test_the_table_is_that_of_the_paper(
     forked: tuple[Lung, Lumen], states: list[ScopeState], seed: int | None
 ) -> None:
-    scene = scene_of(forked[1], reproduction=True)
+    environment = scene_of(forked[1], reproduction=True)
     counted = np.zeros(4, dtype=int)
     for state in states:
         rng = None if seed is None else np.random.default_rng(seed)
         moved = offsets(None if seed is None else np.random.default_rng(seed))
-        found, _ = best_motion(scene, state, 5.0, WEIGHTS, rng=rng)
-        expected = by_the_paper(scene, state, 5.0, moved)
+        found, _ = best_motion(environment, state, 5.0, WEIGHTS, rng=rng)
+        expected = by_the_paper(environment, state, 5.0, moved)
         counted += np.bincount(expected["verdict"], minlength=4)
         np.testing.assert_array_equal(found.verdict, expected["verdict"])
         inside = found.verdict != OUT
@@ -131,11 +133,11 @@ def test_the_true_radius_only_takes_candidates_away(
     forked: tuple[Lung, Lumen], states: list[ScopeState]
 ) -> None:
     """The twists cover their whole range; valid is what fits after the look-ahead, and whose shaft does."""
-    scene = scene_of(forked[1], reproduction=False, model=ScopeModel(radius_mm=2.0))
+    environment = scene_of(forked[1], reproduction=False, model=ScopeModel(radius_mm=2.0))
     valid = 0
     for state in states:
-        found, _ = best_motion(scene, state, 5.0, WEIGHTS)
-        expected = by_the_paper(scene, state, 5.0, offsets(None))
+        found, _ = best_motion(environment, state, 5.0, WEIGHTS)
+        expected = by_the_paper(environment, state, 5.0, offsets(None))
         assert ((found.verdict == VALID) <= (expected["verdict"] == VALID)).all()
         np.testing.assert_array_equal(found.verdict == AWAY, expected["verdict"] == AWAY)
         assert found.twist_rad[[0, -1]] == pytest.approx(np.radians([-60.0, 90.0]))
@@ -146,10 +148,10 @@ def test_the_true_radius_only_takes_candidates_away(
 def test_random_offsets_stay_within_their_spacing_and_their_range(
     forked: tuple[Lung, Lumen], states: list[ScopeState]
 ) -> None:
-    scene = scene_of(forked[1], reproduction=False)
-    plain, _ = best_motion(scene, states[1], 5.0, WEIGHTS)
-    moved, _ = best_motion(scene, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
-    again, _ = best_motion(scene, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
+    environment = scene_of(forked[1], reproduction=False)
+    plain, _ = best_motion(environment, states[1], 5.0, WEIGHTS)
+    moved, _ = best_motion(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
+    again, _ = best_motion(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
     np.testing.assert_array_equal(moved.cost, again.cost)
     twist, bend = moved.twist_rad - plain.twist_rad, moved.bend_rad - plain.bend_rad
     assert np.abs(twist).max() <= math.radians(7.5) + 1e-12
@@ -163,8 +165,8 @@ def test_random_offsets_stay_within_their_spacing_and_their_range(
 
 def test_ties_and_ranges_of_nothing_are_defined(forked: tuple[Lung, Lumen], states: list[ScopeState]) -> None:
     stiff = ScopeModel(twist_low_deg=0.0, twist_high_deg=0.0, bend_low_deg=0.0, bend_high_deg=0.0)
-    scene = scene_of(forked[1], reproduction=False, model=stiff)
-    found, _ = best_motion(scene, replace(states[0], bend_rad=0.0, twist_rad=0.0), 5.0, WEIGHTS)
+    environment = scene_of(forked[1], reproduction=False, model=stiff)
+    found, _ = best_motion(environment, replace(states[0], bend_rad=0.0, twist_rad=0.0), 5.0, WEIGHTS)
     valid = np.flatnonzero(found.verdict == VALID)
     assert len(valid) == 11, "bends other than 0 are out of range, the twists are all the same"
     assert (found.cost[valid] == 0.0).all(), "all equal in potential and clearance, no twist"
@@ -174,13 +176,13 @@ def test_ties_and_ranges_of_nothing_are_defined(forked: tuple[Lung, Lumen], stat
 def test_ones_own_motion_costs_what_the_candidate_costs(
     forked: tuple[Lung, Lumen], states: list[ScopeState]
 ) -> None:
-    scene = scene_of(forked[1], reproduction=False)
-    table, _ = best_motion(scene, states[2], 5.0, WEIGHTS)
+    environment = scene_of(forked[1], reproduction=False)
+    table, _ = best_motion(environment, states[2], 5.0, WEIGHTS)
     verdicts = set()
     for row in range(CANDIDATES):
         if table.verdict[row] == OUT:
             continue
-        again, own = best_motion(scene, states[2], 5.0, WEIGHTS, own=table.motion(row))
+        again, own = best_motion(environment, states[2], 5.0, WEIGHTS, own=table.motion(row))
         assert own is not None
         assert own.verdict == VERDICTS[table.verdict[row]]
         assert own.cost == table.cost[row]
@@ -188,7 +190,7 @@ def test_ones_own_motion_costs_what_the_candidate_costs(
         verdicts.add(own.verdict)
     assert "valid" in verdicts
     _, beyond = best_motion(
-        scene, states[2], 5.0, WEIGHTS, own=Motion(advance_mm=5.0, twist_rad=2.0, bend_rad=0.0)
+        environment, states[2], 5.0, WEIGHTS, own=Motion(advance_mm=5.0, twist_rad=2.0, bend_rad=0.0)
     )
     assert beyond is not None
     assert (beyond.verdict, beyond.cost) == ("out of range", math.inf)

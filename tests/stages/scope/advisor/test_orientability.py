@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from anatomy.lung import Lung
-from stages.scope.advisor.collision import Scene
-from stages.scope.advisor.kinematics import ScopeModel
-from stages.scope.advisor.lumen import Lumen
-from stages.scope.advisor.navigation import navigation_field
+from stages.scope.advisor.environment import ScopeEnvironment
+from stages.scope.advisor.kinematics import ScopeModel, model_of
+from stages.scope.advisor.lumen import Lumen, lumen_of_lung
+from stages.scope.advisor.nf1 import navigation_field
 from stages.scope.advisor.orientability import BEND_STEP_RAD, Orientability, measure_orientability
+from stages.scope.device import Bronchoscope
+from stages.scope.sites import find_sites
 from tests.stages.scope.airways import tube
 
 RANGES = {"twist_low_deg": -90.0, "bend_low_deg": -120.0}
@@ -21,7 +23,7 @@ RANGES = {"twist_low_deg": -90.0, "bend_low_deg": -120.0}
 def in_tube(radius_mm: float, scope_mm: float, **more: float) -> Orientability:
     lumen, tree = tube(radius_mm, 50.0, 0.5)
     model = ScopeModel(radius_mm=scope_mm, **{**RANGES, **more})  # type: ignore[arg-type]
-    return measure_orientability(Scene(model=model, field=navigation_field(lumen, 0)), tree, 60)
+    return measure_orientability(ScopeEnvironment(model=model, field=navigation_field(lumen, 0)), tree, 60)
 
 
 def test_a_wide_tube_leaves_every_bend_a_narrow_one_none() -> None:
@@ -52,9 +54,11 @@ def test_the_chord_of_the_bend_must_fit_across_the_tube() -> None:
 
 def test_directions_are_where_the_tip_looks(forked: tuple[Lung, Lumen]) -> None:
     lung, lumen = forked
-    scene = Scene(model=ScopeModel(radius_mm=1.5, **RANGES), field=navigation_field(lumen, 0))
+    environment = ScopeEnvironment(
+        model=ScopeModel(radius_mm=1.5, **RANGES), field=navigation_field(lumen, 0)
+    )
     for point in (40, 110, 150):
-        found = measure_orientability(scene, lung.tree, point)
+        found = measure_orientability(environment, lung.tree, point)
         assert np.linalg.norm(found.directions, axis=1) == pytest.approx(1.0)
         assert found.angle_rad(found.forward) < math.radians(25.0)
         best = found.directions[found.possible][0]
@@ -68,14 +72,34 @@ def test_a_wider_scope_points_nowhere_where_a_thinner_one_cannot(forked: tuple[L
     sizes = (1.0, 2.0, 3.0, 6.0)
     bends = []
     for radius in sizes:
-        scene = Scene(model=ScopeModel(radius_mm=radius, **RANGES), field=field)
-        bends.append(int(measure_orientability(scene, lung.tree, 130).possible.sum()))
+        environment = ScopeEnvironment(model=ScopeModel(radius_mm=radius, **RANGES), field=field)
+        bends.append(int(measure_orientability(environment, lung.tree, 130).possible.sum()))
     assert bends[0] > bends[1] > bends[2] > bends[3] == 0
     nowhere = measure_orientability(
-        Scene(model=ScopeModel(radius_mm=6.0, **RANGES), field=field), lung.tree, 130
+        ScopeEnvironment(model=ScopeModel(radius_mm=6.0, **RANGES), field=field), lung.tree, 130
     )
     assert nowhere.largest_bend_rad == 0.0
     assert not nowhere.allows(nowhere.forward, math.pi)
+
+
+def test_the_tip_can_look_along_most_sites(small_lung: Lung) -> None:
+    scope = Bronchoscope(
+        name="thin",
+        outer_diameter_mm=3.0,
+        channel_diameter_mm=1.2,
+        lumen_margin_mm=0.1,
+        bend_up_deg=180.0,
+        bend_down_deg=130.0,
+    )
+    sites = find_sites(small_lung, scope, reach_mm=30.0, turning=False)
+    field = navigation_field(lumen_of_lung(small_lung), 0)
+    environment = ScopeEnvironment(model=model_of(scope), field=field)
+    misses = []
+    for site in range(0, sites.count, max(1, sites.count // 12)):
+        found = measure_orientability(environment, small_lung.tree, int(sites.tree_point[site]))
+        misses.append(found.angle_rad(sites.poses[site, 3:]))
+    assert np.median(misses) < math.radians(10.0)
+    assert all(0.0 <= miss <= math.pi for miss in misses)
 
 
 def test_the_papers_twists_leave_a_sector_out() -> None:

@@ -1,4 +1,4 @@
-"""Potentials on the interior voxels of a lumen: shortest and widest ways, exactly.
+"""Potentials on the interior voxels of a lumen: the shortest and the widest paths, exactly.
 
 Legend: N interior voxels, numbered in raster order (k fastest).  `neighbours` is `(N, 6)` int32: the voxels
 before and after along i, j and k, -1 for wall.  `steps` is `(3,)` float64: what a step along an axis counts.
@@ -67,7 +67,7 @@ def number_component(inside, seed, stack, index):
 def clearance_l1(neighbours, steps, out):
     """Fill `out` (N,) with the L1 distance to the nearest voxel of wall.
 
-    Two sweeps are exact: the shortest way to the nearest wall never turns back along an axis, and the
+    Two sweeps are exact: the shortest path to the nearest wall never turns back along an axis, and the
     steps of one sign can all be taken last.
     """
     count = neighbours.shape[0]
@@ -89,8 +89,8 @@ def clearance_l1(neighbours, steps, out):
 
 
 @numba.njit(cache=True)
-def shortest_ways(neighbours, steps, weights, extremes, goal, out):
-    """Fill `out` (N,) with the cost of the cheapest way from voxel `goal`, infinity where there is none.
+def shortest_paths(neighbours, steps, weights, extremes, goal, out):
+    """Fill `out` (N,) with the cost of the shortest path from voxel `goal`, infinity where there is none.
 
     A step along axis `a` into voxel `n` costs `steps[a] * weights[n]`, above 0; `extremes` (2,) are the least
     and the largest such cost.  Dijkstra's algorithm with buckets half as wide as the cheapest step: no voxel
@@ -152,10 +152,10 @@ def shortest_ways(neighbours, steps, weights, extremes, goal, out):
 
 
 @numba.njit(cache=True)
-def widest_ways(neighbours, depth, start, out):
-    """Fill `out` (N,) int64 with the narrowest depth on the widest way from voxel `start`, -1 if none.
+def widest_paths(neighbours, depth, start, out):
+    """Fill `out` (N,) int64 with the narrowest depth on the widest path from voxel `start`, -1 if none.
 
-    `depth` (N,) int64 is not negative.  Voxels are taken by decreasing width, so that the first way found
+    `depth` (N,) int64 is not negative.  Voxels are taken by decreasing width, so that the first path found
     to a voxel is the widest.
     """
     count = neighbours.shape[0]

@@ -1,4 +1,4 @@
-"""What the scope may touch: its true radius in the depth field, or eq. 1 of [Rosell2012] as printed.
+"""The environment of the scope: the true radius in the depth field, or eq. 1 of [Rosell2012] as printed.
 
 Eq. 1 compares an L1 distance, which is up to sqrt(3) times the Euclidean one, in units of the largest voxel
 side, and looks at the joints alone: it lets a scope touch the wall.  It is there for reproduction only.
@@ -16,12 +16,12 @@ from anatomy.typed import Bool, Float
 from stages.scope.advisor.kernels import collision as kernel
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen
-from stages.scope.advisor.navigation import NavigationField
+from stages.scope.advisor.nf1 import NavigationField
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
-    """A scope in a lumen with a goal: what the kernels look at.
+class ScopeEnvironment:
+    """A scope in a lumen with a goal: what the scope collides with, and where it is to go.
 
     Parameters
     ----------
@@ -43,10 +43,10 @@ class Scene:
         return self.field.lumen
 
     @cached_property
-    def space(self) -> kernel.Space:
+    def arrays(self) -> kernel.LumenArrays:
         """The arrays of the lumen and the field."""
         lumen = self.lumen
-        return kernel.Space(
+        return kernel.LumenArrays(
             numbers=lumen.index,
             geometry=lumen.geometry,
             lps_from_ijk=np.ascontiguousarray(lumen.grid.lps_from_ijk[:3]),
@@ -92,5 +92,5 @@ class Scene:
     def _measure(self, states: Float) -> tuple[Bool, Float]:
         rows = np.ascontiguousarray(np.atleast_2d(states))
         fits, distances = np.zeros(len(rows), dtype=bool), np.zeros(len(rows))
-        kernel.measure(self.space, self.scope, rows, fits, distances)
+        kernel.measure(self.arrays, self.scope, rows, fits, distances)
         return fits, distances

@@ -1,4 +1,4 @@
-"""Navigation functions on the lumen: which way leads to the goal, keeping to the middle [Rosell2012, V-A].
+"""NF1 and the clearance-based NF1 (eq. 2): navigation functions on the lumen [Rosell2012, sec. V-A].
 
 Eq. 2 revisits a voxel whenever a neighbour offers a lower potential: that is the shortest-path problem whose
 edges cost what entering a voxel costs, and it is solved as such.  All edges cost more than 0, so a voxel
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from anatomy.errors import TargetError
 from anatomy.grid import read_only
 from anatomy.typed import Bool, Float
-from stages.scope.advisor.kernels.field import shortest_ways
+from stages.scope.advisor.kernels.voxel_graph import shortest_paths
 from stages.scope.advisor.lumen import Lumen
 
 Metric = Literal["mm", "voxels"]
@@ -127,13 +127,13 @@ class NavigationField:
     potential: Float
 
     def route(self, voxel: int) -> Float:
-        """Return the centres `(M, 3)` LPS mm of the steepest way down from a voxel to the goal."""
-        way = [int(voxel)]
-        while way[-1] != self.goal:
-            others = self.lumen.neighbours[way[-1]]
+        """Return the centres `(M, 3)` LPS mm of the steepest descent from a voxel to the goal."""
+        route = [int(voxel)]
+        while route[-1] != self.goal:
+            others = self.lumen.neighbours[route[-1]]
             others = others[others >= 0]
-            way.append(int(others[np.argmin(self.potential[others])]))
-        return self.lumen.centres(way)
+            route.append(int(others[np.argmin(self.potential[others])]))
+        return self.lumen.centres(route)
 
 
 def navigation_field(
@@ -144,7 +144,7 @@ def navigation_field(
     metric: Metric = "mm",
     largest_clearance: float | None = None,
 ) -> NavigationField:
-    """Compute NF1 or clearance-based NF1 (eq. 2) from a goal voxel.
+    """Compute NF1, or the clearance-based NF1 (eq. 2), from a goal voxel.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def navigation_field(
     weights = entering_costs(clearance, most) if kind == "clearance" else np.ones(lumen.count)
     potential = np.zeros(lumen.count)
     extremes = np.array([steps.min() * weights.min(), steps.max() * weights.max()])
-    shortest_ways(lumen.neighbours, steps, weights, extremes, goal, potential)
+    shortest_paths(lumen.neighbours, steps, weights, extremes, goal, potential)
     return NavigationField(
         lumen=lumen,
         goal=int(goal),

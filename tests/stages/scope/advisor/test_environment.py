@@ -9,10 +9,10 @@ import pytest
 
 from anatomy.kernels.field import MIN_GAP_MM
 from anatomy.lung import Lung
-from stages.scope.advisor.collision import Scene
+from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, joints
 from stages.scope.advisor.lumen import Lumen
-from stages.scope.advisor.navigation import navigation_field
+from stages.scope.advisor.nf1 import navigation_field
 from tests.stages.scope.airways import tube, wall_mm
 
 
@@ -42,9 +42,9 @@ def test_the_true_radius_is_kept_along_every_link(forked: tuple[Lung, Lumen], ra
     """What fits keeps its radius from every box; what does not fit lacks it, but for the least gap."""
     _lung, lumen = forked
     model = ScopeModel(radius_mm=radius)
-    scene = Scene(model=model, field=navigation_field(lumen, 0))
+    environment = ScopeEnvironment(model=model, field=navigation_field(lumen, 0))
     states = random_states(lumen, model, np.random.default_rng(7), 400)
-    fits = scene.fits(states)
+    fits = environment.fits(states)
     nearest = np.array([wall_mm(lumen, chain_points(model, state)).min() for state in states])
     assert (nearest[fits] >= radius).all()
     assert (nearest[~fits] < radius + MIN_GAP_MM + 1e-9).all()
@@ -55,10 +55,12 @@ def test_the_true_radius_is_kept_along_every_link(forked: tuple[Lung, Lumen], ra
 def test_equation_1_looks_at_the_joints_alone(forked: tuple[Lung, Lumen]) -> None:
     _lung, lumen = forked
     model = ScopeModel()
-    scene = Scene(model=model, field=navigation_field(lumen, 0, metric="voxels"), reproduction=True)
+    environment = ScopeEnvironment(
+        model=model, field=navigation_field(lumen, 0, metric="voxels"), reproduction=True
+    )
     states = random_states(lumen, model, np.random.default_rng(3), 300)
     limit = model.link_mm / lumen.grid.spacing_mm.max()
-    fits, distances = scene.fits(states), scene.distances(states)
+    fits, distances = environment.fits(states), environment.distances(states)
     for n, points in enumerate(joints(model, states)):
         voxels = [lumen.voxel_at(point) for point in points]
         clearances = np.array([lumen.steps_to_wall[v] if v >= 0 else 0.0 for v in voxels])
@@ -72,7 +74,10 @@ def test_equation_1_lets_a_scope_touch_the_wall() -> None:
     lumen, _tree = tube(2.0, 30.0, 0.5)
     model = ScopeModel(link_mm=0.9, radius_mm=0.9)
     field = navigation_field(lumen, 0, metric="voxels")
-    printed, strict = Scene(model=model, field=field, reproduction=True), Scene(model=model, field=field)
+    printed, strict = (
+        ScopeEnvironment(model=model, field=field, reproduction=True),
+        ScopeEnvironment(model=model, field=field),
+    )
     touching = 0
     for angle in np.linspace(0.0, 2.0 * math.pi, 40, endpoint=False):
         for away in np.linspace(0.6, 1.2, 7):
@@ -88,8 +93,8 @@ def test_equation_1_lets_a_scope_touch_the_wall() -> None:
 
 def test_nothing_fits_beyond_the_grid(forked: tuple[Lung, Lumen]) -> None:
     _lung, lumen = forked
-    scene = Scene(model=ScopeModel(), field=navigation_field(lumen, 0))
+    environment = ScopeEnvironment(model=ScopeModel(), field=navigation_field(lumen, 0))
     frame = np.eye(4)
     frame[:3, 3] = 1e4, 0.0, 0.0
-    assert not scene.fits(ScopeState(lps_from_base=frame).array)[0]
-    assert scene.distances(ScopeState(lps_from_base=frame).array)[0] == 0.0
+    assert not environment.fits(ScopeState(lps_from_base=frame).array)[0]
+    assert environment.distances(ScopeState(lps_from_base=frame).array)[0] == 0.0

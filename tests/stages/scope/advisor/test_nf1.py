@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 from anatomy.errors import AnatomyError, TargetError
 from anatomy.grid import Grid, Volume
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
-from stages.scope.advisor.navigation import Kind, entering_costs, goal_at, navigation_field
+from stages.scope.advisor.nf1 import Kind, entering_costs, goal_at, navigation_field
 from tests.stages.scope.airways import tube, wall_mm
 
 SIDES = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))

@@ -21,7 +21,7 @@ from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import goal_at
 from stages.scope.advisor.path import ScopePath
 from stages.scope.advisor.path_search import PathSettings
-from stages.scope.advisor.session import ON_THE_WAY_MM, Session
+from stages.scope.advisor.session import SAME_STATE_MM, Session
 from tests.stages.scope.airways import CARINA, LEFT, LINES, RIGHT, tube, wall_mm
 
 MODEL = ScopeModel(radius_mm=1.5, twist_low_deg=-90.0, bend_low_deg=-120.0)
@@ -160,14 +160,14 @@ def test_a_session_leads_to_the_goal(forked: tuple[Lung, Lumen], target: np.ndar
     assert action == "arrived"
     assert session.plan.reached
     tip = tip_frames(MODEL, way[-1].array)[0][:3, 3]
-    assert np.linalg.norm(tip - session.plan.lps_from_tip[:3, 3]) <= ON_THE_WAY_MM
-    thinner = replace(MODEL, radius_mm=MODEL.radius_mm - ON_THE_WAY_MM)
+    assert np.linalg.norm(tip - session.plan.lps_from_tip[:3, 3]) <= SAME_STATE_MM
+    thinner = replace(MODEL, radius_mm=MODEL.radius_mm - SAME_STATE_MM)
     strayed = ScopeEnvironment(model=thinner, field=advisor.field)
     assert strayed.fits(np.array([state.array for state in way])).all()
 
 
 def test_a_session_leads_back_out_of_the_wrong_airway(forked: tuple[Lung, Lumen]) -> None:
-    """Down the right bronchus against all advice, then as told: back to the carina, into the left one."""
+    """Down the right bronchus against all advice, then as advised: back to the carina, into the left one."""
     _right, wrong = path_to(forked, RIGHT)
     advisor, _path = path_to(forked, GOALS[1])
     session = Session(advisor, wrong.state(0), seed=3)
@@ -179,7 +179,7 @@ def test_a_session_leads_back_out_of_the_wrong_airway(forked: tuple[Lung, Lumen]
     assert action == "arrived"
     assert session.plan.reached
     tip = tip_frames(MODEL, way[-1].array)[0][:3, 3]
-    assert np.linalg.norm(tip - advisor.goal.centre_lps) <= ON_THE_WAY_MM + 1.0
+    assert np.linalg.norm(tip - advisor.goal.centre_lps) <= SAME_STATE_MM + 1.0
 
 
 def test_best_motions_lead_on_or_end_with_a_word(forked: tuple[Lung, Lumen]) -> None:
@@ -222,16 +222,16 @@ def test_a_tip_outside_the_lumen_gets_no_advice(forked: tuple[Lung, Lumen]) -> N
 def test_instructions_name_every_bifurcation(forked: tuple[Lung, Lumen]) -> None:
     lung, _lumen = forked
     _advisor, path = path_to(forked, GOALS[1])
-    told = instructions_along(path, lung.tree)
-    assert [one.branch for one in told] == [0, 1, 3]
-    assert [one.generation for one in told] == [0, 1, 2]
-    assert told[1].from_carina_mm == pytest.approx(0.0, abs=0.6)
-    assert told[2].from_carina_mm == pytest.approx(np.linalg.norm(LEFT - CARINA), abs=1.0)
-    assert sum(one.advance_mm for one in told) == pytest.approx(path.length_mm)
-    assert told[1].heading == "to the patient's left"
-    twists = np.cumsum([one.rotate_deg for one in told])
-    np.testing.assert_allclose(twists, [one.twist_deg for one in told], atol=1e-9)
-    stored = json.loads(instructions_json(told))
+    instructions = instructions_along(path, lung.tree)
+    assert [one.branch for one in instructions] == [0, 1, 3]
+    assert [one.generation for one in instructions] == [0, 1, 2]
+    assert instructions[1].from_carina_mm == pytest.approx(0.0, abs=0.6)
+    assert instructions[2].from_carina_mm == pytest.approx(np.linalg.norm(LEFT - CARINA), abs=1.0)
+    assert sum(one.advance_mm for one in instructions) == pytest.approx(path.length_mm)
+    assert instructions[1].heading == "to the patient's left"
+    twists = np.cumsum([one.rotate_deg for one in instructions])
+    np.testing.assert_allclose(twists, [one.twist_deg for one in instructions], atol=1e-9)
+    stored = json.loads(instructions_json(instructions))
     assert [one["generation"] for one in stored] == [0, 1, 2]
     assert "into generation 2" in stored[2]["text"]
     assert "At the carina" in stored[1]["text"]

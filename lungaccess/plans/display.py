@@ -7,12 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy.display import AXIAL, CORONAL, Drawing, point, side_by_side, table
-from lungaccess.plans.curves import courses
+from lungaccess.plans.curves import device_curves
 
 if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
 
 TARGET_COLOUR, EXIT_COLOUR = "#2ca02c", "#d62728"
+STEP_MM = 1.0
+"""Spacing of the drawn poses: the drawings are small, and finer ones only make the notebook larger."""
+LEAST_WIDTH_MM = 1.5
+"""A thinner device is drawn this wide, so that it can be seen."""
 
 
 def plan_html(plan: Plan) -> str:
@@ -56,10 +60,10 @@ def _rows(plan: Plan) -> list[tuple[str, str]]:
 
 def _drawing(plan: Plan, view: str) -> Drawing:
     drawing = Drawing(view)
-    for course in courses(plan):
-        red, green, blue = (round(255 * c) for c in course.colour)
-        width_mm = max(2.0 * float(course.radius_mm.max()), 1.5)
-        drawing.line(course.points_lps, f"#{red:02x}{green:02x}{blue:02x}", width_mm)
+    for curve in device_curves(plan, STEP_MM):
+        red, green, blue = (round(255 * c) for c in curve.colour)
+        width_mm = max(2.0 * float(curve.radius_mm.max()), LEAST_WIDTH_MM)
+        drawing.line(curve.points_lps, f"#{red:02x}{green:02x}{blue:02x}", width_mm)
     drawing.mark(plan.tube.exit.point_lps, EXIT_COLOUR)
     drawing.mark(plan.target_lps, TARGET_COLOUR)
     return drawing

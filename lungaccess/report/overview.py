@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from anatomy.typed import Float
+from lungaccess.plans.curves import needle_curve, tube_curve
 from lungaccess.report import drawing, panels, style, zoom
-from lungaccess.report.geometry import needle_polyline, tube_centreline
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import STANDARD, View
 
@@ -92,8 +92,8 @@ def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
 
 
 def _stages(axes: Axes, plan: Plan, view: View, scope: Float) -> None:
-    tube, _ = tube_centreline(plan)
-    needle, _ = needle_polyline(plan.needle)
+    tube = tube_curve(plan).points_lps
+    needle = needle_curve(plan).points_lps
     drawing.curve(axes, scope, style.SCOPE, 3.4, 6)
     drawing.curve(axes, view.project(tube), style.TUBE, 3.0, 7)
     drawing.curve(axes, view.project(needle), style.NEEDLE, 2.2, 8)

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from anatomy.typed import Float
+from lungaccess.plans.curves import needle_curve, tube_curve
 from lungaccess.report import drawing, style
-from lungaccess.report.geometry import needle_polyline, tube_centreline
 from stages.needle import TERMS, Objective
 
 if TYPE_CHECKING:
@@ -29,10 +29,10 @@ LEAST_TOP_MM, MOST_TOP_MM = 4.0, 15.0
 
 def clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:
     """Plot the distance of tube and needle axis to each structure, and what is required."""
-    tube, tube_arc = tube_centreline(plan)
-    needle, needle_arc = needle_polyline(plan.needle)
-    lps = np.concatenate([tube, needle[1:]])
-    along = np.concatenate([tube_arc - tube_arc[-1], needle_arc[1:]])
+    tube, needle = tube_curve(plan), needle_curve(plan)
+    tube_arc = tube.arc_length_mm
+    lps = np.concatenate([tube.points_lps, needle.points_lps[1:]])
+    along = np.concatenate([tube_arc - tube_arc[-1], needle.arc_length_mm[1:]])
     highest = LEAST_TOP_MM
     for name, (label, colour, dashes) in CURVES.items():
         if name not in lung.fields or (name == "fissure" and not lung.has_fissures):

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from anatomy.typed import Float
+from lungaccess.plans.curves import SHORTEST_MM, needle_curve, tube_curve
 from lungaccess.report import drawing, style
-from lungaccess.report.geometry import needle_polyline, tube_centreline
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import View, plane_view
 
@@ -33,7 +33,7 @@ PAINT = (
 
 def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
     """Draw where the tube leaves the airway, in the plane in which the tube bends."""
-    tube, _ = tube_centreline(plan)
+    tube = tube_curve(plan).points_lps
     exit_lps = np.asarray(plan.tube.exit.point_lps)
     view = plane_view(_bending_plane(plan, tube), "")
     shown = np.concatenate([tube, exit_lps[None]])
@@ -45,7 +45,7 @@ def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
 
 def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
     """Draw the needle's way, in the plane that fits it best."""
-    needle, _ = needle_polyline(plan.needle)
+    needle = needle_curve(plan).points_lps
     target = np.asarray(plan.target_lps)
     view = plane_view(needle, "")
     shown = np.concatenate([needle, target[None]])
@@ -78,15 +78,14 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     """Draw scope, tubes and needle as bands of their own width."""
     system = plan.system
     limits = axes.get_xlim(), axes.get_ylim()
-    tube, arc = tube_centreline(plan)
-    needle, _ = needle_polyline(plan.needle)
+    tube, needle = tube_curve(plan), needle_curve(plan)
     scope = view.project(np.asarray(plan.scope.points_lps))
-    tube_uv, needle_uv = view.project(tube), view.project(needle)
-    outer = tube_uv[arc <= plan.tube.outer_insertion_mm + 1e-6]
-    drawing.ribbon(axes, scope, system.scope.outer_diameter_mm / 2, style.SCOPE, fill=0.35, order=6)
-    drawing.ribbon(axes, outer, system.tubes.outer.outer_diameter_mm / 2, style.TUBE, fill=0.45, order=7)
-    drawing.ribbon(axes, tube_uv, system.tubes.inner.outer_diameter_mm / 2, style.TUBE, fill=0.9, order=8)
-    drawing.ribbon(axes, needle_uv, system.needle.diameter_mm / 2, style.NEEDLE, fill=0.9, order=9)
+    tube_uv, needle_uv = view.project(tube.points_lps), view.project(needle.points_lps)
+    outer = tube_uv[tube.arc_length_mm <= plan.tube.outer_insertion_mm + SHORTEST_MM]
+    drawing.ribbon(axes, scope, system.scope.radius_mm, style.SCOPE, fill=0.35, order=6)
+    drawing.ribbon(axes, outer, system.tubes.outer.radius_mm, style.TUBE, fill=0.45, order=7)
+    drawing.ribbon(axes, tube_uv, system.tubes.inner.radius_mm, style.TUBE, fill=0.9, order=8)
+    drawing.ribbon(axes, needle_uv, system.needle.radius_mm, style.NEEDLE, fill=0.9, order=9)
     required = plan.required_clearance_mm
     drawing.dashed_band(axes, outer, required["outer_tube"], 5)
     drawing.dashed_band(axes, tube_uv[len(outer) - 1 :], required["inner_tube"], 5)

@@ -13,13 +13,11 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import read_text
-from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, quantity, settings
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel
-from stages.tube import tube_constants
-from stages.tube.kernels import deployment as tube_kernel
+from stages.tube import tube_arcs
 
 CURVATURE = "needle_curvature"
 
@@ -265,13 +263,18 @@ def _rotated(direction: Float, vectors: Float) -> Float:
 def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     """Return the arcs `(N, 4 + A, 4)` of tubes and needle, see `lungaccess.risk.kernels.deviation`.
 
-    The tubes are the closed form of `stages.tube.kernels.deployment`, their radius with the sideways
-    sweep of the plan.  Neither tube goes back behind the scope tip, nor the inner behind the outer, nor
-    the needle behind the end of an arc.
+    The radius of the tubes includes the sideways sweep of the plan.  Neither tube goes back behind the
+    scope tip, nor the inner behind the outer, nor the needle behind the end of an arc.
     """
     arcs = plan.needle.arcs
     pieces = np.zeros((deviations.count, TUBE_PIECES + len(arcs), kernel.N_PIECE))
-    _fill_tubes(pieces, plan, deviations)
+    outer = np.maximum(plan.tube.outer_insertion_mm + deviations.insertion_mm[:, 0], 0.0)
+    inner = np.maximum(plan.tube.inner_insertion_mm + deviations.insertion_mm[:, 1], outer)
+    tubes = tube_arcs(plan.system.tubes, outer, inner)
+    pieces[:, :TUBE_PIECES, kernel.LENGTH] = tubes.length_mm
+    pieces[:, 0, kernel.ROLL] = plan.tube.rotation_rad + deviations.rotation_rad
+    pieces[:, :TUBE_PIECES, kernel.CURVATURE] = tubes.curvature_per_mm
+    pieces[:, :TUBE_PIECES, kernel.RADIUS] = tubes.radius_mm + plan.tube.lateral_sweep_mm
     pieces[:, TUBE_PIECES:, kernel.RADIUS] = plan.system.needle.radius_mm
     ends = np.cumsum([arc.length_mm for arc in arcs]) + deviations.stop_mm
     ends = np.maximum.accumulate(np.maximum(ends, 0.0), axis=1)
@@ -281,17 +284,3 @@ def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     bends = np.array([arc.curvature_per_mm for arc in arcs])
     pieces[:, TUBE_PIECES:, kernel.CURVATURE] = deviations.factor[:, None] * bends
     return pieces
-
-
-def _fill_tubes(pieces: Float, plan: Plan, deviations: Deviations) -> None:
-    constants = tube_constants(plan.system.tubes, Margins())
-    outer = np.maximum(plan.tube.outer_insertion_mm + deviations.insertion_mm[:, 0], 0.0)
-    inner = np.maximum(plan.tube.inner_insertion_mm + deviations.insertion_mm[:, 1], outer)
-    straight = np.maximum(inner - constants[tube_kernel.CURVED_LENGTH], 0.0)
-    ends = np.stack([np.minimum(straight, outer), outer, np.maximum(straight, outer), inner], axis=1)
-    pieces[:, :TUBE_PIECES, kernel.LENGTH] = np.diff(ends, axis=1, prepend=0.0)
-    pieces[:, 0, kernel.ROLL] = plan.tube.rotation_rad + deviations.rotation_rad
-    pieces[:, 1, kernel.CURVATURE] = constants[tube_kernel.OVERLAP_CURVATURE]
-    pieces[:, 3, kernel.CURVATURE] = constants[tube_kernel.INNER_CURVATURE]
-    radii = constants[[tube_kernel.OUTER_RADIUS] * 2 + [tube_kernel.INNER_RADIUS] * 2]
-    pieces[:, :TUBE_PIECES, kernel.RADIUS] = radii + plan.tube.lateral_sweep_mm

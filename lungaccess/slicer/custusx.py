@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lungaccess.plans.curves import Course
+from lungaccess.plans.curves import DeviceCurve
 from lungaccess.plans.plan import Plan
 
 ROUTE, BRANCHING, BEYOND = 0, 1, 2
@@ -14,21 +14,21 @@ _HEADING = (
 )
 
 
-def route_text(plan: Plan, courses: tuple[Course, Course, Course]) -> str:
+def route_text(plan: Plan, curves: tuple[DeviceCurve, DeviceCurve, DeviceCurve]) -> str:
     """Return the route of a plan as text, LPS mm, one point a line.
 
     Flags are 0 along the airway, 1 where one branch ends and the next begins, 2 for tubes and needle.
     """
-    scope, tubes, needle = courses
+    scope, tubes, needle = curves
     inside = _with_flags(plan, scope)
-    beyond = [(point, BEYOND) for course in (tubes, needle) for point in course.points_lps[1:].tolist()]
+    beyond = [(point, BEYOND) for curve in (tubes, needle) for point in curve.points_lps[1:].tolist()]
     rows = [*inside, *beyond][::-1]
     lines = [_HEADING.format(count=len(rows))]
     lines += [f"{x:.4f} {y:.4f} {z:.4f} {flag}" for (x, y, z), flag in rows]
     return "\n".join([*lines, ""])
 
 
-def _with_flags(plan: Plan, scope: Course) -> list[tuple[list[float], int]]:
+def _with_flags(plan: Plan, scope: DeviceCurve) -> list[tuple[list[float], int]]:
     points, branches = np.asarray(plan.scope.points_lps), np.asarray(plan.scope.branches)
     ends = points[np.flatnonzero(np.diff(branches) != 0)]
     return [

@@ -13,10 +13,10 @@ from anatomy.io.centerlines import write_centerlines
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from lungaccess.checking import CheckReport, check
-from lungaccess.plans.curves import Course, courses
+from lungaccess.plans.curves import DeviceCurve, device_curves
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer.custusx import route_text
-from lungaccess.slicer.markups import TARGET_COLOUR, curve, points_of_interest
+from lungaccess.slicer.markups import TARGET_COLOUR, curve_markup, points_of_interest
 from lungaccess.slicer.models import device_surface, structure_surface, write_ply
 from lungaccess.slicer.readme import readme
 from lungaccess.slicer.scene import Item, scene
@@ -33,6 +33,9 @@ STRUCTURES: dict[str, tuple[tuple[float, float, float], float]] = {
     "nodule": (TARGET_COLOUR, 0.8),
 }
 """Models of the anatomy: colour and opacity."""
+
+STEP_MM = 1.0
+"""Spacing of the control points of tubes and needle: fine enough to measure, few enough to read."""
 
 Progress = Callable[[str, float], None]
 
@@ -92,7 +95,7 @@ def export_slicer(
     tell = progress or (lambda _step, _share: None)
     tell("checking the plan", 0.0)
     report = check(plan, lung)
-    devices = courses(plan)
+    devices = device_curves(plan, STEP_MM)
     items = _write_devices(plan, devices, target, refused=not report.accepted)
     items += _write_anatomy(lung, target, tell)
     _write_text(target / SCENE_FILE, scene(items))
@@ -104,17 +107,19 @@ def export_slicer(
     return Exported(files=files, report=report)
 
 
-def _write_devices(plan: Plan, devices: tuple[Course, ...], folder: Path, *, refused: bool) -> list[Item]:
+def _write_devices(
+    plan: Plan, devices: tuple[DeviceCurve, ...], folder: Path, *, refused: bool
+) -> list[Item]:
     """Write curves, tubes and points; a refused plan is named so wherever its devices show."""
     prefix = "REFUSED by the check: " if refused else ""
     items = []
-    for course in devices:
-        curve_file, model_file = f"{course.name}.mrk.json", f"{course.name}.ply"
-        _write_json(folder / curve_file, _named(curve(course), prefix))
-        write_ply(folder / model_file, device_surface(course))
-        name = f"{prefix}{course.name}"
-        items.append(Item(kind="MarkupsCurve", name=name, file=curve_file, colour=course.colour))
-        items.append(Item(kind="Model", name=f"{name} surface", file=model_file, colour=course.colour))
+    for curve in devices:
+        curve_file, model_file = f"{curve.name}.mrk.json", f"{curve.name}.ply"
+        _write_json(folder / curve_file, _named(curve_markup(curve), prefix))
+        write_ply(folder / model_file, device_surface(curve))
+        name = f"{prefix}{curve.name}"
+        items.append(Item(kind="MarkupsCurve", name=name, file=curve_file, colour=curve.colour))
+        items.append(Item(kind="Model", name=f"{name} surface", file=model_file, colour=curve.colour))
     _write_json(folder / POINTS_FILE, _named(points_of_interest(plan), prefix))
     points = Item(kind="MarkupsFiducial", name=f"{prefix}points", file=POINTS_FILE, colour=TARGET_COLOUR)
     return [*items, points]

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
-from lungaccess.plans.curves import Course
+from lungaccess.plans.curves import DeviceCurve
 from lungaccess.plans.plan import Plan
 from stages.scope.advisor import MARKUPS_SCHEMA
 
 TARGET_COLOUR = (0.17, 0.63, 0.17)
 
 
-def curve(course: Course) -> dict[str, Any]:
+def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
     """Return the content of a `.mrk.json` file: an open curve in LPS mm.
 
     `orientation` holds the pose of the device at each point, row by row: its columns are the x, y and z
     axes of the device.  `Radius` is the radius of the device at each point.
     """
     points = [
-        _point(number, f"{course.name} {along:.1f} mm", frame)
+        _point(number, f"{curve.name} {along:.1f} mm", frame)
         for number, (frame, along) in enumerate(
-            zip(course.lps_from_device, course.along_mm.tolist(), strict=True), start=1
+            zip(curve.lps_from_device, curve.arc_length_mm.tolist(), strict=True), start=1
         )
     ]
     radius = {
@@ -28,9 +28,9 @@ def curve(course: Course) -> dict[str, Any]:
         "enabled": True,
         "units": "mm",
         "description": "outer radius of the device",
-        "controlPointValues": course.radius_mm.tolist(),
+        "controlPointValues": curve.radius_mm.tolist(),
     }
-    return _file("Curve", course.name, points, course.colour, labels=False, measurements=[radius])
+    return _file("Curve", curve.name, points, curve.colour, labels=False, measurements=[radius])
 
 
 def points_of_interest(plan: Plan) -> dict[str, Any]:

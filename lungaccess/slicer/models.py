@@ -12,7 +12,7 @@ from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, smooth_surface
 from anatomy.typed import Float
-from lungaccess.plans.curves import Course
+from lungaccess.plans.curves import DeviceCurve
 
 MOST_TRIANGLES = 150_000
 SIDES = 16
@@ -71,14 +71,14 @@ def merged(mesh: SurfaceMesh, cell_mm: float) -> SurfaceMesh:
     )
 
 
-def device_surface(course: Course) -> SurfaceMesh:
+def device_surface(curve: DeviceCurve) -> SurfaceMesh:
     """Return a device as a closed tube of its outer radius: a ring of `SIDES` corners at every pose.
 
     The corners lie on the true surface; the flat sides between them run up to 2 % of the radius inside it.
     """
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(SIDES)], axis=1)
-    frames, radius = _stepped(course)
+    frames, radius = _stepped(curve)
     rings = radius[:, None, None] * np.einsum("nij,kj->nki", frames[:, :3, :3], ring)
     rings += frames[:, None, :3, 3]
     count = len(frames)
@@ -97,13 +97,13 @@ def device_surface(course: Course) -> SurfaceMesh:
     return SurfaceMesh(
         vertices_lps=np.concatenate([rings.reshape(-1, 3), ends]),
         faces=np.concatenate(faces),
-        bound_mm=float(course.radius_mm.max()) * (1.0 - np.cos(np.pi / SIDES)),
+        bound_mm=float(curve.radius_mm.max()) * (1.0 - np.cos(np.pi / SIDES)),
     )
 
 
-def _stepped(course: Course) -> tuple[Float, Float]:
+def _stepped(curve: DeviceCurve) -> tuple[Float, Float]:
     """Return poses and radii with a pose twice where the radius jumps, and without rolls between poses."""
-    frames, radius = _untwisted(course.lps_from_device), np.asarray(course.radius_mm)
+    frames, radius = _untwisted(curve.lps_from_device), np.asarray(curve.radius_mm)
     jumps = np.flatnonzero(np.diff(radius) != 0.0)
     return np.insert(frames, jumps + 1, frames[jumps], axis=0), np.insert(
         radius, jumps + 1, radius[jumps + 1]

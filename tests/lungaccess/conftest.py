@@ -23,7 +23,7 @@ from lungaccess.plans.plan import (
     WallExit,
 )
 from lungaccess.problem.system import load_system, system_fingerprint
-from lungaccess.report.geometry import arc_step
+from stages.needle import arc_transform
 
 LEFT_LUNG_LPS = np.array([60.0, 0.0, 0.0])
 RIGHT_LUNG_LPS = np.array([-60.0, 0.0, 0.0])
@@ -126,15 +126,9 @@ def _pose(position: Any, forward: Any) -> np.ndarray:
 
 
 def _advance(pose: np.ndarray, pieces: list[tuple[float, float, float]]) -> np.ndarray:
-    for length, curvature, direction in pieces:
-        pose = pose @ arc_step(curvature, length, direction)
+    for length, roll, curvature in pieces:
+        pose = pose @ arc_transform(length, roll, curvature)
     return pose
-
-
-def _rolled(pose: np.ndarray, angle: float) -> np.ndarray:
-    roll = np.eye(4)
-    roll[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    return pose @ roll
 
 
 def make_plan() -> Plan:
@@ -150,14 +144,12 @@ def make_plan() -> Plan:
     share = inner.bending_stiffness_n_mm2 / (inner.bending_stiffness_n_mm2 + outer.bending_stiffness_n_mm2)
     bend = 2.3
     curvature = inner.precurvature_per_mm
-    start = _advance(tip, [(12.0, share * curvature, bend), (12.0, curvature, bend)])
+    start = _advance(tip, [(12.0, bend, share * curvature), (12.0, 0.0, curvature), (0.0, -bend, 0.0)])
     arcs = tuple(
         NeedleArc(length_mm=10.0, roll_rad=roll, curvature_per_mm=k)
         for roll, k in ((0.4, 0.008), (1.0, 0.0), (-0.5, 0.006))
     )
-    end = start
-    for arc in arcs:
-        end = _rolled(end, arc.roll_rad) @ arc_step(arc.curvature_per_mm, arc.length_mm)
+    end = _advance(start, [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in arcs])
     return Plan(
         software_version="0",
         patient_name="Toy",

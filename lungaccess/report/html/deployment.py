@@ -8,11 +8,18 @@ import numpy as np
 
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
-from lungaccess.checking import shapes
 from lungaccess.plans.costs import obstacle_clearance_mm
-from lungaccess.report.geometry import needle_polyline, tube_centreline
+from lungaccess.plans.curves import (
+    SHORTEST_MM,
+    arc_lengths,
+    needle_curve,
+    needle_path,
+    tube_curve,
+    tube_path,
+)
 from lungaccess.report.html.pack import Packed, pack
 from stages.needle import Objective
+from stages.tube import centreline
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -20,12 +27,19 @@ if TYPE_CHECKING:
 
 
 TUBE_STEP_MM = 1.0
+"""Insertion between two stored shapes of the tubes; the page interpolates, and the bend opens slowly."""
 TUBE_POINTS = 40
+"""Points of a stored shape: 1 to 2 mm apart on tubes of a usual length, too near to see the corners."""
+SCOPE_POINTS_SHOWN = 20
+"""Points of the route before the tip that a view of the devices shows: about 15 mm."""
 SMOOTH_MM = 3.0
+"""Smoothing of the camera's direction: a few points of the route, so that the picture does not shake."""
 BLEND_MM = 8.0
+"""Over this last length the camera turns into the direction of the tip; about the bending part of a scope."""
 CAP_MM = 15.0
-"""Clearances are measured up to this distance."""
+"""Clearances are measured up to this distance: farther than any margin, and where the plot ends."""
 NOT_MEASURED = -1.0
+"""Stands where no clearance to the airway is asked for; no distance is negative."""
 FLOOR_MM = 0.1
 """1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1]."""
 
@@ -37,10 +51,10 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
         "digest": plan.digest,
         "target_lps": plan.target_lps.tolist(),
         "radius_mm": {
-            "scope": 0.5 * plan.system.scope.outer_diameter_mm,
-            "outer": 0.5 * plan.system.tubes.outer.outer_diameter_mm,
-            "inner": 0.5 * plan.system.tubes.inner.outer_diameter_mm,
-            "needle": 0.5 * plan.system.needle.diameter_mm,
+            "scope": plan.system.scope.radius_mm,
+            "outer": plan.system.tubes.outer.radius_mm,
+            "inner": plan.system.tubes.inner.radius_mm,
+            "needle": plan.system.needle.radius_mm,
         },
         "scope": _scope(plan),
         "tubes": _tubes(plan),
@@ -54,9 +68,8 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
 
 def device_points(plan: Plan) -> Float:
     """Return points `(N, 3)`, LPS mm, of the last part of the scope, the tubes and the needle."""
-    tube, _ = tube_centreline(plan)
-    needle, _ = needle_polyline(plan.needle)
-    return np.concatenate([np.asarray(plan.scope.points_lps)[-20:], tube, needle])
+    scope = np.asarray(plan.scope.points_lps)[-SCOPE_POINTS_SHOWN:]
+    return np.concatenate([scope, tube_curve(plan).points_lps, needle_curve(plan).points_lps])
 
 
 def _scope(plan: Plan) -> Packed:
@@ -64,17 +77,12 @@ def _scope(plan: Plan) -> Packed:
     forward, up = camera_axes(points, plan.scope.lps_from_scope_tip)
     return {
         "points": pack(points, "f4"),
-        "along_mm": pack(arc_lengths(points), "f4"),
+        "arc_length_mm": pack(arc_lengths(points), "f4"),
         "forward": pack(forward, "f4"),
         "up": pack(up, "f4"),
         "lumen_radius_mm": pack(plan.scope.lumen_radius_mm, "f4"),
         "from_carina_mm": float(plan.scope.length_from_carina_mm),
     }
-
-
-def arc_lengths(points: Float) -> Float:
-    """Return the arc length `(N,)` in mm at each of the points `(N, 3)`."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
 def camera_axes(points: Float, lps_from_scope_tip: Float) -> tuple[Float, Float]:
@@ -108,27 +116,32 @@ def _unit(vectors: Float, otherwise: Float) -> Float:
 
 def _tubes(plan: Plan) -> Packed:
     """Return the tubes at every step of their deployment, each as `TUBE_POINTS` points of equal distance."""
-    tube, pose = plan.tube, plan.scope.lps_from_scope_tip
-    outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
-    bends = shapes.deployment_bends(plan.system.tubes, outer, inner, TUBE_STEP_MM)
-    shapes_lps = [np.repeat(np.asarray(pose)[None, :3, 3], TUBE_POINTS, axis=0)]
-    lengths = [0.0]
-    for bend in bends:
-        curve = shapes.tube_curve(pose, tube.rotation_rad, bend)
-        share = np.linspace(0.0, curve.arc_mm[-1], TUBE_POINTS)
-        columns = [np.interp(share, curve.arc_mm, curve.points[:, axis]) for axis in range(3)]
-        shapes_lps.append(np.stack(columns, axis=1))
-        lengths.append(float(curve.arc_mm[-1]))
+    tube, pose = plan.tube, np.asarray(plan.scope.lps_from_scope_tip)
+    inner = _insertions(tube.outer_insertion_mm, tube.inner_insertion_mm)
+    outer = np.minimum(inner, tube.outer_insertion_mm)
+    shapes_lps = [
+        centreline(plan.system.tubes, pose, tube.rotation_rad, o, i, np.linspace(0.0, i, TUBE_POINTS))
+        for o, i in zip(outer.tolist(), inner.tolist(), strict=True)
+    ]
     return {
         "points": pack(np.array(shapes_lps), "f4"),
-        "inner_mm": pack(lengths, "f4"),
-        "outer_mm": pack(np.minimum(lengths, outer), "f4"),
+        "inner_mm": pack(inner, "f4"),
+        "outer_mm": pack(outer, "f4"),
     }
 
 
+def _insertions(outer_mm: float, inner_mm: float) -> Float:
+    """Return the insertions of the inner tube on the way [Kuntz2015]: with the outer tube, then alone."""
+    parts = [np.zeros(1)]
+    for begin, end in ((0.0, outer_mm), (outer_mm, inner_mm)):
+        count = max(int(np.ceil((end - begin) / TUBE_STEP_MM)), 1)
+        parts.append(np.linspace(begin, end, count + 1)[1:])
+    return np.unique(np.concatenate(parts))
+
+
 def _needle(plan: Plan) -> Packed:
-    points, along = needle_polyline(plan.needle)
-    return {"points": pack(points, "f4"), "along_mm": pack(along, "f4")}
+    needle = needle_curve(plan)
+    return {"points": pack(needle.points_lps, "f4"), "arc_length_mm": pack(needle.arc_length_mm, "f4")}
 
 
 def profile(plan: Plan, lung: Lung) -> Packed:
@@ -138,11 +151,10 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     `CAP_MM`; for "airway" the pierced branch is passed over as long as it is exempt, and up to the exit
     there is only `NOT_MEASURED`.  "margin_mm" is the least of them against "required_mm" on the needle.
     """
-    tube, tube_arc = tube_centreline(plan)
-    needle, needle_arc = needle_polyline(plan.needle)
-    points = np.concatenate([tube, needle[1:]])
-    along = np.concatenate([tube_arc, tube_arc[-1] + needle_arc[1:]])
-    start = float(tube_arc[-1])
+    tube, needle = tube_curve(plan), needle_curve(plan)
+    start = float(tube.arc_length_mm[-1])
+    points = np.concatenate([tube.points_lps, needle.points_lps[1:]])
+    along = np.concatenate([tube.arc_length_mm, start + needle.arc_length_mm[1:]])
     clearances = _clearances(plan, lung, points, along <= start + plan.exemption.needle_length_mm)
     clearances["airway"][along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
     outer = plan.tube.outer_insertion_mm
@@ -150,10 +162,10 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     required = np.where(
         along <= outer, needed["outer_tube"], np.where(along <= start, needed["inner_tube"], needed["needle"])
     )
-    judged = [v for k, v in clearances.items() if k != "fissure" or plan.fissures_are_obstacles]
-    margin = np.min(judged, axis=0) - required
+    limited = [v for k, v in clearances.items() if k != "fissure" or plan.fissures_are_obstacles]
+    margin = np.min(limited, axis=0) - required
     return {
-        "along_mm": pack(along, "f4"),
+        "arc_length_mm": pack(along, "f4"),
         "tube_mm": start,
         "exit_mm": float(plan.tube.exit.arc_length_mm),
         "exempt_to_mm": start + float(plan.exemption.needle_length_mm),
@@ -161,8 +173,8 @@ def profile(plan: Plan, lung: Lung) -> Packed:
         "cap_mm": CAP_MM,
         "clearance_mm": {name: pack(values, "f4") for name, values in clearances.items()},
         "required_mm": pack(required, "f4"),
-        "margin_mm": pack(margin[-len(needle_arc) :], "f4"),
-        "curvature_per_mm": pack(_curvature(plan, along, start), "f4"),
+        "margin_mm": pack(margin[-len(needle.arc_length_mm) :], "f4"),
+        "curvature_per_mm": pack(_curvature(plan, along), "f4"),
         "most_curvature_per_mm": 1.0 / plan.system.needle.min_radius_of_curvature_mm,
         "cost": _cost_so_far(plan, lung),
     }
@@ -180,17 +192,16 @@ def _clearances(plan: Plan, lung: Lung, points: Float, exempt: Bool) -> dict[str
     return found
 
 
-def _curvature(plan: Plan, along: Float, start: float) -> Float:
-    bend = shapes.bend_of(plan.system.tubes, plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm)
-    edges = np.concatenate([bend.edges_mm, start + np.cumsum([arc.length_mm for arc in plan.needle.arcs])])
-    values = np.array([*bend.per_mm, *(arc.curvature_per_mm for arc in plan.needle.arcs)])
-    place = np.clip(np.searchsorted(edges, along, side="left") - 1, 0, len(values) - 1)
-    return np.asarray(np.abs(values[place]))
+def _curvature(plan: Plan, along: Float) -> Float:
+    lengths, _rolls, curvatures = np.concatenate([tube_path(plan).arcs, needle_path(plan).arcs]).T
+    place = np.searchsorted(np.cumsum(lengths), along - SHORTEST_MM)
+    return np.asarray(np.abs(curvatures[np.minimum(place, len(curvatures) - 1)]))
 
 
 def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
     """Return the integral of 1 / clearance up to each point of the needle, and of the cost map if any."""
-    points, along = needle_polyline(plan.needle)
+    needle = needle_curve(plan)
+    points = needle.points_lps
     clearance = obstacle_clearance_mm(lung, points, with_fissures=plan.fissures_are_obstacles)
     rates = {"inverse_clearance": 1.0 / np.maximum(clearance, FLOOR_MM)}
     if lung.cost is not None:
@@ -199,7 +210,7 @@ def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
         values = np.asarray(lung.cost.array, dtype=np.float64)[tuple(ijk.T)]
         if np.isfinite(values).all():
             rates["cost_map"] = values
-    steps = np.diff(along)
+    steps = np.diff(needle.arc_length_mm)
     return {
         key: pack(np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * steps)]), "f4")
         for key, rate in rates.items()

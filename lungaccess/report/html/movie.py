@@ -11,7 +11,8 @@ import numpy as np
 from anatomy.io.files import atomic_write
 from anatomy.structures import LUMEN
 from anatomy.typed import Array, Float, UInt8
-from lungaccess.report.html.deployment import arc_lengths, camera_axes
+from lungaccess.plans.curves import arc_lengths
+from lungaccess.report.html.deployment import camera_axes
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

@@ -22,8 +22,8 @@ export class Motion {
       motion.route, motion.routeMm, motion.forward, motion.up, motion.tubes, motion.innerMm, motion.outerMm,
       motion.needle, motion.needleMm, motion.margin,
     ] = await Promise.all([
-      scope.points, scope.along_mm, scope.forward, scope.up, tubes.points, tubes.inner_mm, tubes.outer_mm,
-      needle.points, needle.along_mm, profile.margin_mm,
+      scope.points, scope.arc_length_mm, scope.forward, scope.up, tubes.points, tubes.inner_mm, tubes.outer_mm,
+      needle.points, needle.arc_length_mm, profile.margin_mm,
     ].map(unpack));
     motion.tubePoints = tubes.points.shape[1];
     const last = (array) => array[array.length - 1];

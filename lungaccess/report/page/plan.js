@@ -221,7 +221,7 @@ class PlanPage {
 
   async drawCharts() {
     const { profile, costs, objective } = this.motion.plan;
-    const along = await unpack(profile.along_mm);
+    const along = await unpack(profile.arc_length_mm);
     const x = { name: "mm beyond the tip of the scope" };
     const marks = [{ at: profile.exit_mm, name: "exit" }, { at: profile.tube_mm, name: "needle" }];
     const clearances = await Promise.all(Object.entries(profile.clearance_mm).map(async ([key, packed]) => {
@@ -231,7 +231,7 @@ class PlanPage {
     const required = { name: "required", colour: "currentColor", xs: along, ys: await unpack(profile.required_mm), stairs: true, width: 1.8 };
     const cost = await Promise.all(Object.entries(profile.cost).map(async ([key, packed], n) => ({
       name: key === "cost_map" ? "cost map" : "1/clearance", colour: COSTS[n][0], dash: COSTS[n][1],
-      xs: Array.from(await unpack(this.motion.plan.needle.along_mm), (mm) => mm + profile.tube_mm), ys: await unpack(packed),
+      xs: Array.from(await unpack(this.motion.plan.needle.arc_length_mm), (mm) => mm + profile.tube_mm), ys: await unpack(packed),
     })));
     const bend = { name: "curvature", colour: "#0072B2", xs: along, ys: await unpack(profile.curvature_per_mm), stairs: true };
     const limit = { name: "limit of the needle", colour: "currentColor", dash: "6 4", width: 1.6,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +16,6 @@ from anatomy.errors import FileError
 from anatomy.grid import Grid, Volume
 from lungaccess import report
 from lungaccess.report import views
-from lungaccess.report.geometry import arc_step, needle_polyline, tube_centreline
 from lungaccess.report.layers import Layers
 from lungaccess.report.panels import key_numbers
 
@@ -126,35 +124,6 @@ def test_a_cut_beyond_the_image_is_outside(toy_lung: Any) -> None:
     layers = Layers(toy_lung)
     assert layers.cut("outside", far).tolist() == [True, False]
     assert layers.cut("lung", far).tolist() == [False, True]
-
-
-# Geometry ----------------------------------------------------------------------------------------
-
-
-def test_the_drawn_needle_ends_where_the_plan_says(toy_plan: Any) -> None:
-    points, along = needle_polyline(toy_plan.needle)
-    np.testing.assert_allclose(points[-1], toy_plan.needle.end_lps, atol=1e-9)
-    assert along[-1] == pytest.approx(toy_plan.needle.length_mm)
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    assert steps.sum() == pytest.approx(toy_plan.needle.length_mm, rel=1e-4)
-
-
-def test_the_drawn_tube_ends_where_the_plan_says(toy_plan: Any) -> None:
-    points, along = tube_centreline(toy_plan)
-    np.testing.assert_allclose(points[0], toy_plan.scope.points_lps[-1])
-    np.testing.assert_allclose(points[-1], toy_plan.tube.lps_from_tip[:3, 3], atol=1e-9)
-    assert along[-1] == pytest.approx(toy_plan.tube.inner_insertion_mm)
-
-
-@given(st.floats(-0.05, 0.05), st.floats(0.1, 60.0), st.floats(-math.pi, math.pi))
-def test_an_arc_keeps_its_length_and_its_plane(curvature: float, length: float, direction: float) -> None:
-    pose = arc_step(curvature, length, direction)
-    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
-    assert pose[2, 2] == pytest.approx(math.cos(curvature * length), abs=1e-12)
-    normal = np.array([-math.sin(direction), math.cos(direction), 0.0])
-    assert normal @ pose[:3, 3] == pytest.approx(0.0, abs=1e-9)
-    halves = arc_step(curvature, length / 2, direction) @ arc_step(curvature, length / 2, direction)
-    np.testing.assert_allclose(halves, pose, atol=1e-8)
 
 
 # Files -------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.structures import VESSEL
 from lungaccess.cli.app import BAD_INPUT, OK, main
+from lungaccess.plans.curves import arc_lengths
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import (
     deployment,
@@ -209,7 +210,9 @@ def test_the_data_decode_to_the_points_of_the_plans(data: dict[str, Any], plans:
         np.testing.assert_allclose(tubes[-1, -1], plan.tube.lps_from_tip[:3, 3], atol=1e-3)
         np.testing.assert_allclose(needle[0], plan.needle.lps_from_start[:3, 3], atol=1e-4)
         np.testing.assert_allclose(needle[-1], plan.needle.end_lps, atol=1e-3)
-        assert pack.unpack(stored["needle"]["along_mm"])[-1] == pytest.approx(plan.needle.length_mm, abs=1e-4)
+        assert pack.unpack(stored["needle"]["arc_length_mm"])[-1] == pytest.approx(
+            plan.needle.length_mm, abs=1e-4
+        )
         assert stored["target_lps"] == plan.target_lps.tolist()
         assert stored["accepted"]
 
@@ -235,7 +238,7 @@ def test_the_profile_agrees_with_the_plan_and_with_exact_distances(
 ) -> None:
     for plan in plans:
         profile = deployment.profile(plan, small_lung)
-        along = pack.unpack(profile["along_mm"])
+        along = pack.unpack(profile["arc_length_mm"])
         found = {name: pack.unpack(each) for name, each in profile["clearance_mm"].items()}
         assert set(found) == STRUCTURES
         needle = along > profile["tube_mm"] + 1e-6
@@ -541,8 +544,8 @@ def test_edges_of_the_page_grid_are_those_of_the_lung() -> None:
 
 def test_arc_lengths_add_up() -> None:
     points = np.array([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
-    assert deployment.arc_lengths(points).tolist() == [0.0, 5.0, 17.0]
-    assert all(a <= b for a, b in pairwise(deployment.arc_lengths(points)))
+    assert arc_lengths(points).tolist() == [0.0, 5.0, 17.0]
+    assert all(a <= b for a, b in pairwise(arc_lengths(points)))
 
 
 def test_a_lung_without_nodules_and_fissures_has_fewer_surfaces(bare_lung: Any) -> None:

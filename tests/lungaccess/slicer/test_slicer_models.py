@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 
 from anatomy.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.meshes import smooth_surface
-from lungaccess.plans.curves import Course, courses, needle_course, scope_course
-from lungaccess.plans.plan import NeedleArc, Plan
+from lungaccess.plans.curves import device_curves
+from lungaccess.plans.plan import Plan
 from lungaccess.slicer.models import device_surface, merged, structure_surface, write_ply
 
 
@@ -28,53 +26,15 @@ def ball(radius_mm: float = 8.0) -> Volume:
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_a_device_is_a_closed_tube_of_its_radius(number: int, toy_plan: Plan) -> None:
-    course = courses(toy_plan)[number]
-    mesh = device_surface(course).to_trimesh()
+    curve = device_curves(toy_plan)[number]
+    mesh = device_surface(curve).to_trimesh()
     assert mesh.is_watertight
-    lengths, radii = np.diff(course.along_mm), np.asarray(course.radius_mm)
+    lengths, radii = np.diff(curve.arc_length_mm), np.asarray(curve.radius_mm)
     solid = np.pi * float((lengths * radii[1:] ** 2).sum())
     # A prism of 16 sides holds 97.4 % of its cylinder; positive: the faces look outwards.
     assert 0.94 * solid < mesh.volume < 1.01 * solid
-    gap = np.linalg.norm(mesh.vertices[:, None, :] - course.points_lps[None], axis=2).min(axis=1)
+    gap = np.linalg.norm(mesh.vertices[:, None, :] - curve.points_lps[None], axis=2).min(axis=1)
     assert gap.max() < radii.max() + 1e-6
-
-
-@given(st.lists(st.tuples(st.floats(1.0, 30.0), st.floats(-3.1, 3.1), st.floats(0.0, 0.02)), max_size=5))
-def test_any_needle_ends_where_its_arcs_lead(arcs: list[tuple[float, float, float]]) -> None:
-    from stages.needle.path import ArcPath
-
-    plan = _PLAN[0]
-    path = ArcPath(lps_from_start=plan.needle.lps_from_start, arcs=np.array(arcs).reshape(-1, 3))
-    needle = replace(
-        plan.needle,
-        arcs=tuple(NeedleArc(length_mm=a, roll_rad=b, curvature_per_mm=c) for a, b, c in arcs),
-    )
-    course = needle_course(replace(plan, needle=needle))
-    assert np.allclose(course.lps_from_device[-1], path.frames()[-1], atol=1e-6)
-    assert course.along_mm[-1] == pytest.approx(path.length_mm)
-    assert (np.diff(course.along_mm) > 0.0).all()
-    assert np.diff(course.along_mm).max(initial=0.0) <= 1.06
-
-
-_PLAN: list[Plan] = []
-
-
-@pytest.fixture(autouse=True)
-def _keep_the_plan(toy_plan: Plan) -> None:
-    _PLAN[:] = [toy_plan]
-
-
-def test_a_scope_that_stands_still_has_no_pose_twice(toy_plan: Plan) -> None:
-    scope = toy_plan.scope
-    twice = replace(
-        scope,
-        points_lps=np.repeat(scope.points_lps, 2, axis=0),
-        lumen_radius_mm=np.repeat(scope.lumen_radius_mm, 2),
-        branches=np.repeat(scope.branches, 2),
-    )
-    course: Course = scope_course(replace(toy_plan, scope=twice))
-    assert np.isfinite(course.lps_from_device).all()
-    assert np.array_equal(course.points_lps, scope_course(toy_plan).points_lps)
 
 
 @pytest.mark.parametrize("cell_mm", [1.5, 3.0])

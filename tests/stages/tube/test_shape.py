@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.shape import centreline
+from stages.tube.shape import centreline, tube_arcs
 
 OUTER = Tube(outer_diameter_mm=1.6, inner_diameter_mm=1.38, length_mm=640.0)
 INNER = Tube(
@@ -66,3 +66,25 @@ def test_ends() -> None:
     aside = (1 - math.cos(0.5)) / 0.025
     assert np.allclose(local, [aside * math.cos(0.4), aside * math.sin(0.4), math.sin(0.5) / 0.025])
     assert centreline(TUBES, frame, 0.4, 0.0, 20.0, 7.0).shape == (1, 3)
+
+
+@given(
+    insertions=st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 1.0)), min_size=1, max_size=4),
+)
+def test_arcs_lead_along_the_centreline(insertions: list[tuple[float, float]]) -> None:
+    inner = np.array([each for each, _share in insertions])
+    outer = inner * [share for _each, share in insertions]
+    arcs = tube_arcs(TUBES, outer, inner)
+    assert arcs.length_mm.shape == (len(inner), 4)
+    assert np.allclose(arcs.length_mm.sum(axis=1), inner) and (arcs.length_mm >= 0.0).all()
+    assert np.allclose(arcs.length_mm[:, :2].sum(axis=1), outer)
+    for lengths, out, whole in zip(arcs.length_mm, outer, inner, strict=True):
+        at, heading = np.zeros(2), 0.0
+        for length, curvature in zip(lengths, arcs.curvature_per_mm, strict=True):
+            half = 0.5 * curvature * length
+            at = at + length * np.sinc(half / np.pi) * np.array(
+                [np.sin(heading + half), np.cos(heading + half)]
+            )
+            heading += 2.0 * half
+        end = centreline(TUBES, np.eye(4), 0.0, out, whole, whole)[0]
+        assert np.allclose(end, [at[0], 0.0, at[1]], atol=1e-9)

@@ -34,7 +34,6 @@ from experiments.support.workspace_rejection import PAPER_S as PAPER_PATHS_S
 from lungaccess.coupled.alternatives import Alternative, alternatives
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.plans.assemble import Task
-from lungaccess.plans.curves import needle_curve
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from lungaccess.report import style
@@ -181,7 +180,7 @@ def draw_menu(axes: Axes, menu: tuple[Alternative, ...], atlas: Atlas) -> None:
         points = tree.points_lps[begin:end]
         axes.plot(points[:, 0], points[:, 2], color=style.AIRWAY, linewidth=0.8)
     for each in menu:
-        needle = needle_curve(each.plan).points_lps
+        needle = each.plan.curves().needle.points_lps
         axes.plot(needle[:, 0], needle[:, 2], color=style.TUBE, linewidth=1.0)
     goal = menu[0].plan.target_lps
     axes.plot(goal[0], goal[2], "o", color=style.NODULE, markersize=5)

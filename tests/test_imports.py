@@ -17,6 +17,8 @@ KERNELS_MAY_USE = {"__future__", "collections", "math", "numba", "numpy", "typin
 CHECK_MAY_USE = (
     "anatomy.*",
     "stages.*.device",
+    "lungaccess.plans.file",
+    "lungaccess.plans.parts",
     "lungaccess.plans.plan",
     "lungaccess.problem.system",
     "lungaccess.checking*",

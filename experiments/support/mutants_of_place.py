@@ -10,7 +10,8 @@ import numpy as np
 from anatomy.typed import Float
 from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, far, rotation, signed, way
 from experiments.support.mutants_of_motion import end_of
-from lungaccess.plans.plan import NeedleArc, Plan
+from lungaccess.plans.parts import NeedleArc
+from lungaccess.plans.plan import Plan
 
 PIECES = ("scope", "tube", "needle", "exit", "target")
 

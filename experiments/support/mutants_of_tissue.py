@@ -9,7 +9,8 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float
 from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, way
-from lungaccess.plans.plan import NeedleArc, Plan
+from lungaccess.plans.parts import NeedleArc
+from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath, direct_path
 from stages.tube.shape import centreline
 

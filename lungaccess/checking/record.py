@@ -13,7 +13,8 @@ from anatomy.errors import LungaccessError
 from anatomy.settings import to_mapping
 from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
-from lungaccess.plans.plan import SCHEMA, Plan
+from lungaccess.plans.file import SCHEMA
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, load_system, preset_names, system_fingerprint
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
 from lungaccess.checking.scene import AirwayAxis, Scene
 from lungaccess.checking.space import labels_at, not_lumen
-from lungaccess.plans.plan import Plan, ScopeRoute
+from lungaccess.plans.parts import ScopeRoute
+from lungaccess.plans.plan import Plan
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree

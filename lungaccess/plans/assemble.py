@@ -15,15 +15,8 @@ from anatomy.lung import Lung
 from anatomy.structures import BITS
 from anatomy.typed import Float
 from lungaccess.plans import costs
-from lungaccess.plans.plan import (
-    Exemption,
-    NeedleArc,
-    NeedlePath,
-    Plan,
-    ScopeRoute,
-    TubeDeployment,
-    WallExit,
-)
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.target import Target
 from stages.needle import ArcPath, Objective

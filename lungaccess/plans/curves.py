@@ -1,20 +1,22 @@
-"""The three devices of a plan as curves: poses along their axes, from the kinematics of the stages.
+"""The three devices of a plan as curves: poses along their axes, in closed form.
 
-Reports, exports and the risk use these curves.  The independent check integrates the devices by itself.
+Reports and exports use these curves.  The independent check integrates the devices by itself.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from anatomy.grid import read_only
+from anatomy.poses import poses_on_arc
 from anatomy.typed import Float
-from lungaccess.plans.plan import Plan
-from stages.needle import ArcPath, arc_transform
-from stages.tube import tube_arcs
+from lungaccess.plans.parts import NeedlePath, ScopeRoute, TubeDeployment
+from lungaccess.problem.system import System
+from stages.tube.device import ConcentricTubes
 
 STEP_MM = 0.25
 """Largest distance between the poses of tubes and needle: the chord of a 40 mm arc is off by 0.2 um."""
@@ -60,70 +62,71 @@ class DeviceCurve:
         return self.lps_from_device[:, :3, 3]
 
 
-def device_curves(plan: Plan, step_mm: float = STEP_MM) -> tuple[DeviceCurve, DeviceCurve, DeviceCurve]:
-    """Return scope, tubes and needle of a plan; `step_mm` is the largest distance between poses."""
-    return scope_curve(plan), tube_curve(plan, step_mm), needle_curve(plan, step_mm)
+class DeviceCurves(NamedTuple):
+    """Scope, tubes and needle of a plan."""
+
+    scope: DeviceCurve
+    tubes: DeviceCurve
+    needle: DeviceCurve
 
 
-def scope_curve(plan: Plan) -> DeviceCurve:
-    """Return the route of the bronchoscope; its poses turn as little as possible, the last is the tip's."""
-    points = np.asarray(plan.scope.points_lps)
+def device_curves(
+    scope: ScopeRoute, tube: TubeDeployment, needle: NeedlePath, system: System, step_mm: float = STEP_MM
+) -> DeviceCurves:
+    """Return the curves of the three devices, poses of tubes and needle at most `step_mm` apart.
+
+    Poses turn as little as possible along the scope; on tubes and needle +x is the direction of the bend.
+    Where two arcs of the needle meet, the pose is that at the end of the first, before the turn.
+    """
+    tubes = system.tubes
+    tube_poses, tube_mm = _poses(scope.lps_from_scope_tip, tube_pieces(tube, tubes), step_mm)
+    needle_poses, needle_mm = _poses(needle.lps_from_start, needle_pieces(needle), step_mm)
+    in_outer = tube_mm <= tube.outer_insertion_mm + SHORTEST_MM
+    return DeviceCurves(
+        scope=_scope_curve(scope, system.scope.radius_mm),
+        tubes=DeviceCurve(
+            name="tubes",
+            lps_from_device=tube_poses,
+            radius_mm=np.where(in_outer, tubes.outer.radius_mm, tubes.inner.radius_mm),
+            arc_length_mm=tube_mm,
+            colour=(1.0, 0.5, 0.05),
+        ),
+        needle=DeviceCurve(
+            name="needle",
+            lps_from_device=needle_poses,
+            radius_mm=np.full(len(needle_mm), system.needle.radius_mm),
+            arc_length_mm=needle_mm,
+            colour=(0.1, 0.1, 0.1),
+        ),
+    )
+
+
+def _scope_curve(scope: ScopeRoute, radius_mm: float) -> DeviceCurve:
+    points = np.asarray(scope.points_lps)
     distinct = np.linalg.norm(np.diff(points, axis=0), axis=1) > SHORTEST_MM
     points = points[np.append(distinct, True)]
     return DeviceCurve(
         name="scope",
-        lps_from_device=_carried_back(points, np.asarray(plan.scope.lps_from_scope_tip)),
-        radius_mm=np.full(len(points), plan.system.scope.radius_mm),
+        lps_from_device=_carried_back(points, np.asarray(scope.lps_from_scope_tip)),
+        radius_mm=np.full(len(points), radius_mm),
         arc_length_mm=arc_lengths(points),
         colour=(0.12, 0.47, 0.71),
     )
 
 
-def tube_curve(plan: Plan, step_mm: float = STEP_MM) -> DeviceCurve:
-    """Return the axis of the tubes beyond the scope tip; the radius is the outer tube's up to its end."""
-    tubes = plan.system.tubes
-    frames, lengths = _poses(tube_path(plan), step_mm)
-    in_outer = lengths <= plan.tube.outer_insertion_mm + SHORTEST_MM
-    return DeviceCurve(
-        name="tubes",
-        lps_from_device=frames,
-        radius_mm=np.where(in_outer, tubes.outer.radius_mm, tubes.inner.radius_mm),
-        arc_length_mm=lengths,
-        colour=(1.0, 0.5, 0.05),
-    )
+def tube_pieces(tube: TubeDeployment, tubes: ConcentricTubes) -> Float:
+    """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of each arc of the tubes."""
+    arcs = tubes.arcs(tube.outer_insertion_mm, tube.inner_insertion_mm)
+    pieces = np.stack([arcs.length_mm[0], np.zeros(4), arcs.curvature_per_mm], axis=1)
+    pieces = pieces[pieces[:, 0] > SHORTEST_ARC_MM]
+    pieces[:1, 1] = tube.rotation_rad
+    return pieces
 
 
-def needle_curve(plan: Plan, step_mm: float = STEP_MM) -> DeviceCurve:
-    """Return the axis of the needle from the tip of the tubes; each arc bends towards +x of its poses.
-
-    Where two arcs meet, the pose is that at the end of the first, before the turn.
-    """
-    frames, lengths = _poses(needle_path(plan), step_mm)
-    return DeviceCurve(
-        name="needle",
-        lps_from_device=frames,
-        radius_mm=np.full(len(lengths), plan.system.needle.radius_mm),
-        arc_length_mm=lengths,
-        colour=(0.1, 0.1, 0.1),
-    )
-
-
-def tube_path(plan: Plan) -> ArcPath:
-    """Return the axis of the tubes as arcs; the first one is rolled towards the bend."""
-    tube = plan.tube
-    arcs = tube_arcs(plan.system.tubes, tube.outer_insertion_mm, tube.inner_insertion_mm)
-    kept = arcs.length_mm[0] > SHORTEST_ARC_MM
-    length, curvature = arcs.length_mm[0][kept], arcs.curvature_per_mm[kept]
-    roll = np.where(np.arange(len(length)) == 0, tube.rotation_rad, 0.0)
-    return ArcPath(
-        lps_from_start=plan.scope.lps_from_scope_tip, arcs=np.stack([length, roll, curvature], axis=1)
-    )
-
-
-def needle_path(plan: Plan) -> ArcPath:
-    """Return the axis of the needle as arcs."""
-    arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in plan.needle.arcs]
-    return ArcPath(lps_from_start=plan.needle.lps_from_start, arcs=np.array(arcs))
+def needle_pieces(needle: NeedlePath) -> Float:
+    """Return length in mm, roll before it in rad and curvature in 1/mm `(A, 3)` of each arc of the needle."""
+    arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in needle.arcs]
+    return np.array(arcs, dtype=np.float64).reshape(-1, 3)
 
 
 def arc_lengths(points: Float) -> Float:
@@ -131,16 +134,14 @@ def arc_lengths(points: Float) -> Float:
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
 
 
-def _poses(path: ArcPath, step_mm: float) -> tuple[Float, Float]:
+def _poses(lps_from_start: Float, pieces: Float, step_mm: float) -> tuple[Float, Float]:
     """Return poses `(N, 4, 4)` at the ends of arcs and between them, and their arc lengths `(N,)`."""
-    poses, lengths, done = [path.lps_from_start], [0.0], 0.0
-    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
-        count = max(1, math.ceil(length / step_mm))
-        for at in length * np.arange(1, count + 1) / count:
-            poses.append(frame @ arc_transform(at, roll, curvature))
-            lengths.append(done + at)
-        done += length
-    return np.stack(poses), np.array(lengths)
+    poses, lengths = [np.asarray(lps_from_start)[None]], [np.zeros(1)]
+    for length, roll, curvature in pieces:
+        at = length * np.linspace(0.0, 1.0, max(1, math.ceil(length / step_mm)) + 1)[1:]
+        poses.append(poses_on_arc(poses[-1][-1], roll, curvature, at))
+        lengths.append(lengths[-1][-1] + at)
+    return np.concatenate(poses), np.concatenate(lengths)
 
 
 def _carried_back(points: Float, lps_from_tip: Float) -> Float:

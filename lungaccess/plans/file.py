@@ -18,14 +18,17 @@ import numpy as np
 
 from anatomy.errors import PlanFileError, SettingsError
 from anatomy.settings import parse, to_mapping
-from lungaccess.plans.plan import SCHEMA, Plan
+from lungaccess.plans.record import Record
 from lungaccess.problem.system import System
 
-P = TypeVar("P", bound=Plan)
+SCHEMA = "lungaccess-plan-1"
+"""Name and version of the file format; a reader refuses any other."""
+
+P = TypeVar("P", bound=Record)
 _REMEDY = "Run `lungaccess plan` again"
 
 
-def digest(plan: Plan) -> str:
+def digest(plan: Record) -> str:
     """Return the SHA-256 (hex) of the canonical JSON of `plan` without `timing`."""
     return _digest(_encode(plan, "plan"))
 
@@ -36,7 +39,7 @@ def _digest(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(canonical.encode("ascii")).hexdigest()
 
 
-def to_json(plan: Plan) -> str:
+def to_json(plan: Record) -> str:
     """Return the plan as JSON text, one list of numbers a line, ending with its digest."""
     content = _encode(plan, "plan")
     content["digest"] = _digest(content)
@@ -58,7 +61,7 @@ def from_json(cls: type[P], text: str) -> P:
         )
     stated = content.pop("digest", None)
     plan = _decode(cls, content, "plan")
-    if stated != plan.digest:
+    if stated != digest(plan):
         raise PlanFileError(
             "The plan does not match its own digest: it was edited or damaged",
             expected=str(stated),
@@ -67,7 +70,7 @@ def from_json(cls: type[P], text: str) -> P:
     return typing.cast(P, plan)
 
 
-def save(plan: Plan, path: str | os.PathLike[str]) -> None:
+def save(plan: Record, path: str | os.PathLike[str]) -> None:
     """Write `plan` beside `path` under a temporary name, then put it in place."""
     from anatomy.io.files import atomic_write
 

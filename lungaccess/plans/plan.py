@@ -4,203 +4,27 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from types import MappingProxyType
-from typing import Any, Self
+from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 
-from anatomy.errors import PlanFileError
-from anatomy.grid import read_only
-from anatomy.typed import Array, Float, Int
+from anatomy.typed import Float
+from lungaccess.plans import file as plan_file
+from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
+from lungaccess.plans.parts import Exemption, NeedlePath, ScopeRoute, TubeDeployment
+from lungaccess.plans.record import Record, shaped
 from lungaccess.problem.system import System
 
-SCHEMA = "lungaccess-plan-1"
-"""Name and version of the file format; a reader refuses any other."""
-
-_POSE: dict[str, Any] = {"shape": (4, 4)}
-_POINT: dict[str, Any] = {"shape": (3,)}
-
-
-class _Record:
-    """Makes arrays read-only float64 (or int64) of the declared shape, and mappings read-only and sorted."""
-
-    def __post_init__(self) -> None:
-        for item in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, item.name)
-            if "shape" in item.metadata:
-                dtype = item.metadata.get("dtype", np.float64)
-                value = _frozen_array(value, item.metadata["shape"], dtype, item.name)
-            elif isinstance(value, Mapping):
-                value = _frozen_mapping(value)
-            else:
-                continue
-            object.__setattr__(self, item.name, value)
-
-
-def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: str) -> Array:
-    try:
-        array: Array = np.array(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise PlanFileError(f"{name} of a plan is not an array of numbers ({error})") from error
-    if array.ndim == 1 and array.size == 0:
-        array = array.reshape(tuple(n or 0 for n in shape))
-    wanted = tuple(n if m is None else m for n, m in zip(array.shape, shape, strict=False))
-    if array.ndim != len(shape) or array.shape != wanted:
-        raise PlanFileError(
-            f"{name} of a plan has the shape {array.shape}",
-            expected="(" + ", ".join("N" if n is None else str(n) for n in shape) + ")",
-        )
-    return read_only(array)
-
-
-def _frozen_mapping(value: Mapping[str, Any]) -> Mapping[str, Any]:
-    return MappingProxyType(
-        {key: _frozen_mapping(v) if isinstance(v, Mapping) else v for key, v in sorted(value.items())}
-    )
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ScopeRoute(_Record):
-    """Where the bronchoscope runs and where its tip stands.
-
-    Parameters
-    ----------
-    points_lps : (M, 3) float64, LPS mm
-        Route along the airway tree from its root in the trachea to the site.
-    lumen_radius_mm : (M,) float64
-        Distance from each point to the border of the lumen.
-    branches : (M,) int64
-        Branch of the airway tree at each point.
-    lps_from_scope_tip : (4, 4) float64
-        Pose of the tip at the last point; +z is forward.
-    site_point : int
-        Index of the tree point of the site, -1 if it lies between tree points.
-    generation : int
-        Generation of the last branch; the trachea is 0.
-    length_mm, length_from_carina_mm : float
-        Length of the route, in all and beyond the carina.
-    min_lumen_margin_mm : float
-        Smallest lumen radius along the route minus the radius of the scope.
-    """
-
-    points_lps: Float = field(metadata={"shape": (None, 3)})
-    lumen_radius_mm: Float = field(metadata={"shape": (None,)})
-    branches: Int = field(metadata={"shape": (None,), "dtype": np.int64})
-    lps_from_scope_tip: Float = field(metadata=_POSE)
-    site_point: int
-    generation: int
-    length_mm: float
-    length_from_carina_mm: float
-    min_lumen_margin_mm: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WallExit(_Record):
-    """Where the axis of the tube leaves the airway lumen.
-
-    Parameters
-    ----------
-    branch : int
-        Branch whose wall is pierced.
-    point_lps : (3,) float64, LPS mm
-    arc_length_mm : float
-        Length of tube between the tip of the scope and that point.
-    wall_angle_rad : float
-        Angle between tube and wall; pi/2 is perpendicular.
-    """
-
-    branch: int
-    point_lps: Float = field(metadata=_POINT)
-    arc_length_mm: float
-    wall_angle_rad: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TubeDeployment(_Record):
-    """How the concentric tubes are turned and inserted, and what that does.
-
-    Parameters
-    ----------
-    rotation_rad : float
-        Both tubes are turned by this; the inner one bends towards local (cos, sin) of the scope tip.
-    outer_insertion_mm, inner_insertion_mm : float
-        Lengths of outer and inner tube beyond the tip of the scope.
-    lps_from_tip : (4, 4) float64
-        Pose of the tip of the inner tube; +z is forward.
-    exit : WallExit
-    lateral_sweep_mm : float
-        Largest sideways motion of the tubes while they are deployed.
-    follow_the_leader_error_mm : float
-        Largest distance between the path of the tip and the final shape.
-    """
-
-    rotation_rad: float
-    outer_insertion_mm: float
-    inner_insertion_mm: float
-    lps_from_tip: Float = field(metadata=_POSE)
-    exit: WallExit
-    lateral_sweep_mm: float
-    follow_the_leader_error_mm: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NeedleArc(_Record):
-    """One arc: turn by `roll_rad` about the axis, then insert `length_mm`, bending towards local +x.
-
-    The turn stays in the frame: the next roll starts from it.
-    """
-
-    length_mm: float
-    roll_rad: float
-    curvature_per_mm: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NeedlePath(_Record):
-    """The arcs of the steerable needle, from the tip of the tube to the target.
-
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-        Pose of the needle where it leaves the tube.
-    arcs : tuple of NeedleArc
-    end_lps : (3,) float64, LPS mm
-    length_mm : float
-    max_angle_from_start_rad : float
-        Largest angle between the needle and its start direction.
-    accumulated_turn_rad : float
-        Sum of the angles of all arcs.
-    """
-
-    lps_from_start: Float = field(metadata=_POSE)
-    arcs: tuple[NeedleArc, ...]
-    end_lps: Float = field(metadata=_POINT)
-    length_mm: float
-    max_angle_from_start_rad: float
-    accumulated_turn_rad: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Exemption(_Record):
-    """The one obstacle that may be touched: the wall of the pierced branch.
-
-    It holds for the tube and for the first `needle_length_mm` of the needle.
-    """
-
-    branch: int
-    exit_point_lps: Float = field(metadata=_POINT)
-    needle_length_mm: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Plan(_Record):
+class Plan(Record):
     """One plan: scope route, tube deployment and needle arcs, with costs, margins and provenance.
 
     Parameters
     ----------
     schema : str
-        `SCHEMA`.
+        `lungaccess.plans.file.SCHEMA`.
     software_version : str
     patient_name, lung_key : str
         The patient, and the content hash of the lung planned on.
@@ -234,7 +58,7 @@ class Plan(_Record):
         Seconds; the only values that differ between two equal runs.
     """
 
-    schema: str = SCHEMA
+    schema: str = plan_file.SCHEMA
     software_version: str
     patient_name: str
     lung_key: str
@@ -242,7 +66,7 @@ class Plan(_Record):
     breath_hold: str | None
     system: System
     system_fingerprint: str
-    target_lps: Float = field(metadata=_POINT)
+    target_lps: Float = field(metadata=shaped(3))
     target_origin: str
     fissures_are_obstacles: bool
     objective: str
@@ -259,10 +83,57 @@ class Plan(_Record):
     timing: Mapping[str, float]
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
+        """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
         from lungaccess.plans.display import plan_html
 
-        return plan_html(self)
+        heading = f"Plan for {self.patient_name}, {self.system.name}"
+        return plan_html(heading, self.figures(), self.curves(), self.tube.exit.point_lps, self.target_lps)
+
+    def figures(self) -> list[tuple[str, str]]:
+        """Return what the plan says of devices, distances and costs, as names and values with units."""
+        tube, needle = self.tube, self.needle
+        x, y, z = self.target_lps
+        rows = [
+            ("target, LPS mm", f"{x:.1f}, {y:.1f}, {z:.1f} ({self.target_origin})"),
+            (
+                "scope",
+                f"{self.scope.length_from_carina_mm:.1f} mm beyond the carina, to generation "
+                f"{self.scope.generation}",
+            ),
+            (
+                "tubes",
+                f"turn to {np.degrees(tube.rotation_rad):.1f}°, outer {tube.outer_insertion_mm:.1f} mm, "
+                f"inner {tube.inner_insertion_mm:.1f} mm",
+            ),
+            (
+                "exit",
+                f"branch {tube.exit.branch}, at {np.degrees(tube.exit.wall_angle_rad):.0f}° to the wall",
+            ),
+            (
+                "needle",
+                f"{needle.length_mm:.1f} mm in {len(needle.arcs)} arc(s), at most "
+                f"{np.degrees(needle.max_angle_from_start_rad):.1f}° from its start",
+            ),
+        ]
+        for device, distances in self.clearance_mm.items():
+            words = ", ".join(f"{name} {value:.2f}" for name, value in distances.items())
+            least = f"{self.least_required_clearance_mm(device):.2f}"
+            rows.append((f"{device}: distance, mm", f"{words}; at least {least}"))
+        costs = ", ".join(f"{name} {value:.4g}" for name, value in self.costs.items())
+        return [
+            *rows,
+            ("costs", f"{costs}; made small: {self.objective}"),
+            ("made by", f"{self.method}, seed {self.seed}, {self.iterations} iterations"),
+            ("digest", self.digest[:16]),
+        ]
+
+    def least_required_clearance_mm(self, device: str) -> float:
+        """Return the clearance that all of "tube" or "needle" keeps: of the tubes, that of the inner one."""
+        return self.required_clearance_mm[{"tube": "inner_tube"}.get(device, device)]
+
+    def curves(self, step_mm: float = STEP_MM) -> DeviceCurves:
+        """Return the three devices as curves; the poses of tubes and needle are at most `step_mm` apart."""
+        return device_curves(self.scope, self.tube, self.needle, self.system, step_mm)
 
     @property
     def cost(self) -> float:
@@ -272,8 +143,6 @@ class Plan(_Record):
     @property
     def digest(self) -> str:
         """SHA-256 (hex) of the canonical JSON of everything except `timing`."""
-        from lungaccess.plans import file as plan_file
-
         return plan_file.digest(self)
 
     def to_json(self) -> str:
@@ -284,8 +153,6 @@ class Plan(_Record):
         PlanFileError
             If a number is not finite.
         """
-        from lungaccess.plans import file as plan_file
-
         return plan_file.to_json(self)
 
     @classmethod
@@ -297,8 +164,6 @@ class Plan(_Record):
         PlanFileError
             If the text is no JSON, of another schema, incomplete, or not what its digest was made from.
         """
-        from lungaccess.plans import file as plan_file
-
         return plan_file.from_json(cls, text)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -311,8 +176,6 @@ class Plan(_Record):
         PlanFileError
             If a number is not finite.
         """
-        from lungaccess.plans import file as plan_file
-
         plan_file.save(self, path)
 
     @classmethod
@@ -324,6 +187,4 @@ class Plan(_Record):
         PlanFileError
             If there is no such file or it is not an intact plan.
         """
-        from lungaccess.plans import file as plan_file
-
         return plan_file.load(cls, path)

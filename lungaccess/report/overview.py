@@ -12,7 +12,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from anatomy.typed import Float
-from lungaccess.plans.curves import needle_curve, tube_curve
 from lungaccess.report import drawing, panels, style, zoom
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import STANDARD, View
@@ -92,11 +91,10 @@ def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
 
 
 def _stages(axes: Axes, plan: Plan, view: View, scope: Float) -> None:
-    tube = tube_curve(plan).points_lps
-    needle = needle_curve(plan).points_lps
+    _scope, tubes, needle = plan.curves()
     drawing.curve(axes, scope, style.SCOPE, 3.4, 6)
-    drawing.curve(axes, view.project(tube), style.TUBE, 3.0, 7)
-    drawing.curve(axes, view.project(needle), style.NEEDLE, 2.2, 8)
+    drawing.curve(axes, view.project(tubes.points_lps), style.TUBE, 3.0, 7)
+    drawing.curve(axes, view.project(needle.points_lps), style.NEEDLE, 2.2, 8)
 
 
 def _nodule(axes: Axes, layers: Layers, view: View) -> None:

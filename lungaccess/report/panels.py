@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from anatomy.typed import Float
-from lungaccess.plans.curves import needle_curve, tube_curve
 from lungaccess.report import drawing, style
 from stages.needle import TERMS, Objective
 
@@ -29,7 +28,7 @@ LEAST_TOP_MM, MOST_TOP_MM = 4.0, 15.0
 
 def clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:
     """Plot the distance of tube and needle axis to each structure, and what is required."""
-    tube, needle = tube_curve(plan), needle_curve(plan)
+    _scope, tube, needle = plan.curves()
     tube_arc = tube.arc_length_mm
     lps = np.concatenate([tube.points_lps, needle.points_lps[1:]])
     along = np.concatenate([tube_arc - tube_arc[-1], needle.arc_length_mm[1:]])

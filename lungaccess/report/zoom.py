@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from anatomy.typed import Float
-from lungaccess.plans.curves import SHORTEST_MM, needle_curve, tube_curve
+from lungaccess.plans.curves import SHORTEST_MM
 from lungaccess.report import drawing, style
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import View, plane_view
@@ -33,7 +33,7 @@ PAINT = (
 
 def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
     """Draw where the tube leaves the airway, in the plane in which the tube bends."""
-    tube = tube_curve(plan).points_lps
+    tube = plan.curves().tubes.points_lps
     exit_lps = np.asarray(plan.tube.exit.point_lps)
     view = plane_view(_bending_plane(plan, tube), "")
     shown = np.concatenate([tube, exit_lps[None]])
@@ -45,7 +45,7 @@ def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
 
 def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
     """Draw the needle's way, in the plane that fits it best."""
-    needle = needle_curve(plan).points_lps
+    needle = plan.curves().needle.points_lps
     target = np.asarray(plan.target_lps)
     view = plane_view(needle, "")
     shown = np.concatenate([needle, target[None]])
@@ -78,7 +78,7 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     """Draw scope, tubes and needle as bands of their own width."""
     system = plan.system
     limits = axes.get_xlim(), axes.get_ylim()
-    tube, needle = tube_curve(plan), needle_curve(plan)
+    _scope, tube, needle = plan.curves()
     scope = view.project(np.asarray(plan.scope.points_lps))
     tube_uv, needle_uv = view.project(tube.points_lps), view.project(needle.points_lps)
     outer = tube_uv[tube.arc_length_mm <= plan.tube.outer_insertion_mm + SHORTEST_MM]

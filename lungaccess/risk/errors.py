@@ -17,7 +17,6 @@ from anatomy.settings import impossible, parse, quantity, settings
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel
-from stages.tube import tube_arcs
 
 CURVATURE = "needle_curvature"
 
@@ -270,7 +269,7 @@ def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     pieces = np.zeros((deviations.count, TUBE_PIECES + len(arcs), kernel.N_PIECE))
     outer = np.maximum(plan.tube.outer_insertion_mm + deviations.insertion_mm[:, 0], 0.0)
     inner = np.maximum(plan.tube.inner_insertion_mm + deviations.insertion_mm[:, 1], outer)
-    tubes = tube_arcs(plan.system.tubes, outer, inner)
+    tubes = plan.system.tubes.arcs(outer, inner)
     pieces[:, :TUBE_PIECES, kernel.LENGTH] = tubes.length_mm
     pieces[:, 0, kernel.ROLL] = plan.tube.rotation_rad + deviations.rotation_rad
     pieces[:, :TUBE_PIECES, kernel.CURVATURE] = tubes.curvature_per_mm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lungaccess.plans.curves import DeviceCurve
+from lungaccess.plans.curves import DeviceCurve, DeviceCurves
 from lungaccess.plans.plan import Plan
 
 ROUTE, BRANCHING, BEYOND = 0, 1, 2
@@ -14,7 +14,7 @@ _HEADING = (
 )
 
 
-def route_text(plan: Plan, curves: tuple[DeviceCurve, DeviceCurve, DeviceCurve]) -> str:
+def route_text(plan: Plan, curves: DeviceCurves) -> str:
     """Return the route of a plan as text, LPS mm, one point a line.
 
     Flags are 0 along the airway, 1 where one branch ends and the next begins, 2 for tubes and needle.

@@ -13,7 +13,7 @@ from anatomy.io.centerlines import write_centerlines
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from lungaccess.checking import CheckReport, check
-from lungaccess.plans.curves import DeviceCurve, device_curves
+from lungaccess.plans.curves import DeviceCurves
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer.custusx import route_text
 from lungaccess.slicer.markups import TARGET_COLOUR, curve_markup, points_of_interest
@@ -95,7 +95,7 @@ def export_slicer(
     tell = progress or (lambda _step, _share: None)
     tell("checking the plan", 0.0)
     report = check(plan, lung)
-    devices = device_curves(plan, STEP_MM)
+    devices = plan.curves(STEP_MM)
     items = _write_devices(plan, devices, target, refused=not report.accepted)
     items += _write_anatomy(lung, target, tell)
     _write_text(target / SCENE_FILE, scene(items))
@@ -107,9 +107,7 @@ def export_slicer(
     return Exported(files=files, report=report)
 
 
-def _write_devices(
-    plan: Plan, devices: tuple[DeviceCurve, ...], folder: Path, *, refused: bool
-) -> list[Item]:
+def _write_devices(plan: Plan, devices: DeviceCurves, folder: Path, *, refused: bool) -> list[Item]:
     """Write curves, tubes and points; a refused plan is named so wherever its devices show."""
     prefix = "REFUSED by the check: " if refused else ""
     items = []

@@ -66,11 +66,7 @@ class ArcPath:
         for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
             count = max(1, math.ceil(length / step_mm))
             s = length * np.arange(1, count + 1) / count
-            half = 0.5 * curvature * s
-            ahead = s * np.sinc(2.0 * half / np.pi)
-            aside = s * np.sin(half) * np.sinc(half / np.pi)
-            bend = bend_direction(frame, roll)
-            points.append(frame[:3, 3] + ahead[:, None] * frame[:3, 2] + aside[:, None] * bend)
+            points.append(frames.poses_on_arc(frame, roll, curvature, s)[:, :3, 3])
             lengths.append(lengths[-1][-1] + s)
         return np.concatenate(points), np.concatenate(lengths)
 

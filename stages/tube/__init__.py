@@ -34,6 +34,5 @@ if TYPE_CHECKING:
     from stages.tube.proposals import propose_designs as propose_designs
     from stages.tube.sequences import kuntz2015 as kuntz2015
     from stages.tube.shape import centreline as centreline
-    from stages.tube.shape import tube_arcs as tube_arcs
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

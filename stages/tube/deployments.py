@@ -130,14 +130,10 @@ def scene_of(lung: Lung, *, with_fissures: bool) -> Scene:
 
 
 def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
-    """Return the `(10,)` array of `stages.tube.kernels.deployment`, lengths in mm, angles in rad.
-
-    Inside the outer tube the precurvature is shared in proportion to bending stiffness [Rucker2010].
-    """
+    """Return the `(10,)` array of `stages.tube.kernels.deployment`, lengths in mm, angles in rad."""
     constants = np.zeros(kernels.N_TUBES)
     inner, outer = tubes.inner, tubes.outer
-    share = inner.bending_stiffness_n_mm2 / (inner.bending_stiffness_n_mm2 + outer.bending_stiffness_n_mm2)
-    constants[kernels.OVERLAP_CURVATURE] = inner.precurvature_per_mm * share
+    constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
     constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
     constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
     constants[kernels.OUTER_RADIUS] = outer.radius_mm

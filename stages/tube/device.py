@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from typing import Annotated, NamedTuple
 
+import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from anatomy.settings import impossible, quantity, settings
+from anatomy.typed import Float
 
 
 @settings
@@ -162,6 +165,24 @@ class Tube:
         return self.max_precurvature_per_mm * self.radius_mm
 
 
+class TubeArcs(NamedTuple):
+    """The four arcs of N deployed pairs of tubes, in one plane, from the scope tip on.
+
+    They are straight in the outer tube, bent in the outer tube, straight beyond it and bent beyond it; a
+    deployment that lacks one of them has it with the length 0.
+
+    Parameters
+    ----------
+    length_mm : (N, 4) float64
+    curvature_per_mm, radius_mm : (4,) float64
+        The radius is that of the outermost tube.
+    """
+
+    length_mm: Float
+    curvature_per_mm: Float
+    radius_mm: Float
+
+
 @settings
 class ConcentricTubes:
     """A straight outer tube and a precurved inner tube, and the limits of their deployment.
@@ -259,3 +280,24 @@ class ConcentricTubes:
     def max_inner_protrusion_mm(self) -> float:
         """Length of inner tube that can be ahead of the outer one, mm, the rear ends being in order."""
         return self.inner.length_mm - self.outer.length_mm
+
+    @property
+    def overlap_curvature_per_mm(self) -> float:
+        """Curvature of the inner tube's bent part inside the straight outer tube, 1/mm.
+
+        The two share the precurvature in proportion to their bending stiffness [Rucker2010].
+        """
+        inner, outer = self.inner.bending_stiffness_n_mm2, self.outer.bending_stiffness_n_mm2
+        return self.inner.precurvature_per_mm * (inner / (inner + outer))
+
+    def arcs(self, outer_mm: ArrayLike, inner_mm: ArrayLike) -> TubeArcs:
+        """Return the arcs for insertions `(N,)` in mm, 0 <= outer <= inner [Kuntz2015, sec. IV-B]."""
+        outer, inner = (np.array(insertion, dtype=np.float64, ndmin=1) for insertion in (outer_mm, inner_mm))
+        straight = np.maximum(inner - self.inner.curved_length_mm, 0.0)
+        ends = np.stack([np.minimum(straight, outer), outer, np.maximum(straight, outer), inner], axis=1)
+        bent = (self.overlap_curvature_per_mm, self.inner.precurvature_per_mm)
+        return TubeArcs(
+            length_mm=np.diff(ends, axis=1, prepend=0.0),
+            curvature_per_mm=np.array([0.0, bent[0], 0.0, bent[1]]),
+            radius_mm=np.array([self.outer.radius_mm] * 2 + [self.inner.radius_mm] * 2),
+        )

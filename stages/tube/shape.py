@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,40 +11,6 @@ from anatomy.typed import Float
 from stages.tube.deployments import tube_constants
 from stages.tube.device import ConcentricTubes
 from stages.tube.kernels import deployment as kernels
-
-
-class TubeArcs(NamedTuple):
-    """The four arcs of N deployed pairs of tubes, in one plane, from the scope tip on.
-
-    They are straight in the outer tube, bent in the outer tube, straight beyond it and bent beyond it; a
-    deployment that lacks one of them has it with the length 0.
-
-    Parameters
-    ----------
-    length_mm : (N, 4) float64
-    curvature_per_mm : (4,) float64
-        Of the two tubes together, by their bending stiffness, and beyond the outer tube of the inner one.
-    radius_mm : (4,) float64
-        Radius of the outermost tube.
-    """
-
-    length_mm: Float
-    curvature_per_mm: Float
-    radius_mm: Float
-
-
-def tube_arcs(tubes: ConcentricTubes, outer_mm: ArrayLike, inner_mm: ArrayLike) -> TubeArcs:
-    """Return the arcs for insertions `(N,)` in mm, 0 <= outer <= inner [Kuntz2015, sec. IV-B]."""
-    constants = tube_constants(tubes, Margins())
-    outer, inner = (np.array(insertion, dtype=np.float64, ndmin=1) for insertion in (outer_mm, inner_mm))
-    straight = np.maximum(inner - constants[kernels.CURVED_LENGTH], 0.0)
-    ends = np.stack([np.minimum(straight, outer), outer, np.maximum(straight, outer), inner], axis=1)
-    return TubeArcs(
-        length_mm=np.diff(ends, axis=1, prepend=0.0),
-        curvature_per_mm=constants[[kernels.OVERLAP_CURVATURE, kernels.INNER_CURVATURE]].repeat(2)
-        * [0.0, 1.0, 0.0, 1.0],
-        radius_mm=constants[[kernels.OUTER_RADIUS, kernels.INNER_RADIUS]].repeat(2),
-    )
 
 
 def centreline(

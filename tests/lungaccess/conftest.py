@@ -13,15 +13,8 @@ import pytest
 from scipy import ndimage
 
 from anatomy.grid import Grid, Volume
-from lungaccess.plans.plan import (
-    Exemption,
-    NeedleArc,
-    NeedlePath,
-    Plan,
-    ScopeRoute,
-    TubeDeployment,
-    WallExit,
-)
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 from stages.needle import arc_transform
 

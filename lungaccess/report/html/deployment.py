@@ -9,14 +9,7 @@ import numpy as np
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
 from lungaccess.plans.costs import obstacle_clearance_mm
-from lungaccess.plans.curves import (
-    SHORTEST_MM,
-    arc_lengths,
-    needle_curve,
-    needle_path,
-    tube_curve,
-    tube_path,
-)
+from lungaccess.plans.curves import SHORTEST_MM, arc_lengths, needle_pieces, tube_pieces
 from lungaccess.report.html.pack import Packed, pack
 from stages.needle import Objective
 from stages.tube import centreline
@@ -69,7 +62,8 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
 def device_points(plan: Plan) -> Float:
     """Return points `(N, 3)`, LPS mm, of the last part of the scope, the tubes and the needle."""
     scope = np.asarray(plan.scope.points_lps)[-SCOPE_POINTS_SHOWN:]
-    return np.concatenate([scope, tube_curve(plan).points_lps, needle_curve(plan).points_lps])
+    _scope, tubes, needle = plan.curves()
+    return np.concatenate([scope, tubes.points_lps, needle.points_lps])
 
 
 def _scope(plan: Plan) -> Packed:
@@ -140,7 +134,7 @@ def _insertions(outer_mm: float, inner_mm: float) -> Float:
 
 
 def _needle(plan: Plan) -> Packed:
-    needle = needle_curve(plan)
+    needle = plan.curves().needle
     return {"points": pack(needle.points_lps, "f4"), "arc_length_mm": pack(needle.arc_length_mm, "f4")}
 
 
@@ -151,7 +145,7 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     `CAP_MM`; for "airway" the pierced branch is passed over as long as it is exempt, and up to the exit
     there is only `NOT_MEASURED`.  "margin_mm" is the least of them against "required_mm" on the needle.
     """
-    tube, needle = tube_curve(plan), needle_curve(plan)
+    _scope, tube, needle = plan.curves()
     start = float(tube.arc_length_mm[-1])
     points = np.concatenate([tube.points_lps, needle.points_lps[1:]])
     along = np.concatenate([tube.arc_length_mm, start + needle.arc_length_mm[1:]])
@@ -193,14 +187,15 @@ def _clearances(plan: Plan, lung: Lung, points: Float, exempt: Bool) -> dict[str
 
 
 def _curvature(plan: Plan, along: Float) -> Float:
-    lengths, _rolls, curvatures = np.concatenate([tube_path(plan).arcs, needle_path(plan).arcs]).T
+    tubes = tube_pieces(plan.tube, plan.system.tubes)
+    lengths, _rolls, curvatures = np.concatenate([tubes, needle_pieces(plan.needle)]).T
     place = np.searchsorted(np.cumsum(lengths), along - SHORTEST_MM)
     return np.asarray(np.abs(curvatures[np.minimum(place, len(curvatures) - 1)]))
 
 
 def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
     """Return the integral of 1 / clearance up to each point of the needle, and of the cost map if any."""
-    needle = needle_curve(plan)
+    needle = plan.curves().needle
     points = needle.points_lps
     clearance = obstacle_clearance_mm(lung, points, with_fissures=plan.fissures_are_obstacles)
     rates = {"inverse_clearance": 1.0 / np.maximum(clearance, FLOOR_MM)}

@@ -13,7 +13,8 @@ import pytest
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume, transform_points
-from lungaccess.plans.plan import Exemption, NeedleArc, NeedlePath, Plan, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, load_system, system_fingerprint
 
 SPACING_MM = (1.0, 0.9, 1.1)

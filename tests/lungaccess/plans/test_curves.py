@@ -11,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lungaccess.checking import shapes
-from lungaccess.plans.curves import STEP_MM, device_curves, needle_curve, scope_curve, tube_curve
-from lungaccess.plans.plan import NeedleArc, Plan
+from lungaccess.plans.curves import STEP_MM
+from lungaccess.plans.parts import NeedleArc
+from lungaccess.plans.plan import Plan
 
 lengths_of_arcs = st.lists(
     st.tuples(st.floats(1.0, 30.0), st.floats(-3.1, 3.1), st.floats(0.0, 0.02)), max_size=5
@@ -20,7 +21,7 @@ lengths_of_arcs = st.lists(
 
 
 def test_tubes_and_needle_end_where_the_plan_says(toy_plan: Plan) -> None:
-    scope, tubes, needle = device_curves(toy_plan)
+    scope, tubes, needle = toy_plan.curves()
     np.testing.assert_allclose(scope.lps_from_device[-1], toy_plan.scope.lps_from_scope_tip, atol=1e-12)
     np.testing.assert_allclose(tubes.points_lps[0], toy_plan.scope.points_lps[-1])
     np.testing.assert_allclose(tubes.points_lps[-1], toy_plan.tube.lps_from_tip[:3, 3], atol=1e-9)
@@ -38,7 +39,7 @@ def test_any_needle_is_the_one_that_the_check_integrates(arcs: list[Any], toy_pl
         toy_plan.needle,
         arcs=tuple(NeedleArc(length_mm=a, roll_rad=b, curvature_per_mm=c) for a, b, c in arcs),
     )
-    curve = needle_curve(replace(toy_plan, needle=needle))
+    curve = replace(toy_plan, needle=needle).curves().needle
     pieces = [shapes.Piece(length_mm=a, roll_rad=b, curvature_per_mm=c) for a, b, c in arcs]
     integrated = shapes.integrate(needle.lps_from_start, pieces)
     np.testing.assert_allclose(curve.lps_from_device[-1], integrated.end, atol=1e-6)
@@ -51,7 +52,7 @@ def test_any_needle_is_the_one_that_the_check_integrates(arcs: list[Any], toy_pl
 @given(outer=st.floats(0.0, 40.0), more=st.floats(0.1, 30.0))
 def test_any_tubes_are_the_ones_that_the_check_integrates(outer: float, more: float, toy_plan: Plan) -> None:
     tube = replace(toy_plan.tube, outer_insertion_mm=outer, inner_insertion_mm=outer + more)
-    curve = tube_curve(replace(toy_plan, tube=tube))
+    curve = replace(toy_plan, tube=tube).curves().tubes
     bend = shapes.bend_of(toy_plan.system.tubes, outer, outer + more)
     integrated = shapes.tube_curve(toy_plan.scope.lps_from_scope_tip, tube.rotation_rad, bend)
     np.testing.assert_allclose(curve.lps_from_device[-1], integrated.end, atol=1e-6)
@@ -68,6 +69,6 @@ def test_a_scope_that_stays_in_one_place_has_no_pose_twice(toy_plan: Plan) -> No
         lumen_radius_mm=np.repeat(scope.lumen_radius_mm, 2),
         branches=np.repeat(scope.branches, 2),
     )
-    curve = scope_curve(replace(toy_plan, scope=twice))
+    curve = replace(toy_plan, scope=twice).curves().scope
     assert np.isfinite(curve.lps_from_device).all()
-    assert np.array_equal(curve.points_lps, scope_curve(toy_plan).points_lps)
+    assert np.array_equal(curve.points_lps, toy_plan.curves().scope.points_lps)

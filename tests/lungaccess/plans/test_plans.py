@@ -13,16 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from anatomy.errors import FileError, PlanFileError
-from lungaccess.plans.plan import (
-    SCHEMA,
-    Exemption,
-    NeedleArc,
-    NeedlePath,
-    Plan,
-    ScopeRoute,
-    TubeDeployment,
-    WallExit,
-)
+from lungaccess.plans.file import SCHEMA
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)

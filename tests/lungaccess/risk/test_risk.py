@@ -18,7 +18,8 @@ from anatomy.errors import FileError, PlanFileError, SettingsError
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.cli.app import BAD_INPUT, OK, main
-from lungaccess.plans.plan import NeedleArc, Plan
+from lungaccess.plans.parts import NeedleArc
+from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessment import RiskAssessor, Share, assess, safest
 from lungaccess.risk.errors import (
     CURVATURE,

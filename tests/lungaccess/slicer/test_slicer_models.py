@@ -13,7 +13,6 @@ from anatomy.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.meshes import smooth_surface
-from lungaccess.plans.curves import device_curves
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer.models import device_surface, merged, structure_surface, write_ply
 
@@ -26,7 +25,7 @@ def ball(radius_mm: float = 8.0) -> Volume:
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_a_device_is_a_closed_tube_of_its_radius(number: int, toy_plan: Plan) -> None:
-    curve = device_curves(toy_plan)[number]
+    curve = toy_plan.curves()[number]
     mesh = device_surface(curve).to_trimesh()
     assert mesh.is_watertight
     lengths, radii = np.diff(curve.arc_length_mm), np.asarray(curve.radius_mm)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.shape import centreline, tube_arcs
+from stages.tube.shape import centreline
 
 OUTER = Tube(outer_diameter_mm=1.6, inner_diameter_mm=1.38, length_mm=640.0)
 INNER = Tube(
@@ -74,7 +74,7 @@ def test_ends() -> None:
 def test_arcs_lead_along_the_centreline(insertions: list[tuple[float, float]]) -> None:
     inner = np.array([each for each, _share in insertions])
     outer = inner * [share for _each, share in insertions]
-    arcs = tube_arcs(TUBES, outer, inner)
+    arcs = TUBES.arcs(outer, inner)
     assert arcs.length_mm.shape == (len(inner), 4)
     assert np.allclose(arcs.length_mm.sum(axis=1), inner) and (arcs.length_mm >= 0.0).all()
     assert np.allclose(arcs.length_mm[:, :2].sum(axis=1), outer)

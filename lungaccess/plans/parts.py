@@ -1,0 +1,143 @@
+"""The parts of a plan: what each of the three devices does, and the one wall that they may touch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from anatomy.typed import Float, Int
+from lungaccess.plans.record import Record, shaped
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScopeRoute(Record):
+    """Where the bronchoscope runs and where its tip stands.
+
+    Parameters
+    ----------
+    points_lps : (M, 3) float64, LPS mm
+        Route along the airway tree from its root in the trachea to the site.
+    lumen_radius_mm : (M,) float64
+        Distance from each point to the border of the lumen.
+    branches : (M,) int64
+        Branch of the airway tree at each point.
+    lps_from_scope_tip : (4, 4) float64
+        Pose of the tip at the last point; +z is forward.
+    site_point : int
+        Index of the tree point of the site, -1 if it lies between tree points.
+    generation : int
+        Generation of the last branch; the trachea is 0.
+    length_mm, length_from_carina_mm : float
+        Length of the route, in all and beyond the carina.
+    min_lumen_margin_mm : float
+        Smallest lumen radius along the route minus the radius of the scope.
+    """
+
+    points_lps: Float = field(metadata=shaped(None, 3))
+    lumen_radius_mm: Float = field(metadata=shaped(None))
+    branches: Int = field(metadata=shaped(None, dtype=np.int64))
+    lps_from_scope_tip: Float = field(metadata=shaped(4, 4))
+    site_point: int
+    generation: int
+    length_mm: float
+    length_from_carina_mm: float
+    min_lumen_margin_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WallExit(Record):
+    """Where the axis of the tube leaves the airway lumen.
+
+    Parameters
+    ----------
+    branch : int
+        Branch whose wall is pierced.
+    point_lps : (3,) float64, LPS mm
+    arc_length_mm : float
+        Length of tube between the tip of the scope and that point.
+    wall_angle_rad : float
+        Angle between tube and wall; pi/2 is perpendicular.
+    """
+
+    branch: int
+    point_lps: Float = field(metadata=shaped(3))
+    arc_length_mm: float
+    wall_angle_rad: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TubeDeployment(Record):
+    """How the concentric tubes are turned and inserted, and what that does.
+
+    Parameters
+    ----------
+    rotation_rad : float
+        Both tubes are turned by this; the inner one bends towards local (cos, sin) of the scope tip.
+    outer_insertion_mm, inner_insertion_mm : float
+        Lengths of outer and inner tube beyond the tip of the scope.
+    lps_from_tip : (4, 4) float64
+        Pose of the tip of the inner tube; +z is forward.
+    exit : WallExit
+    lateral_sweep_mm : float
+        Largest sideways motion of the tubes while they are deployed.
+    follow_the_leader_error_mm : float
+        Largest distance between the path of the tip and the final shape.
+    """
+
+    rotation_rad: float
+    outer_insertion_mm: float
+    inner_insertion_mm: float
+    lps_from_tip: Float = field(metadata=shaped(4, 4))
+    exit: WallExit
+    lateral_sweep_mm: float
+    follow_the_leader_error_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NeedleArc(Record):
+    """One arc: turn by `roll_rad` about the axis, then insert `length_mm`, bending towards local +x.
+
+    The turn stays in the frame: the next roll starts from it.
+    """
+
+    length_mm: float
+    roll_rad: float
+    curvature_per_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NeedlePath(Record):
+    """The arcs of the steerable needle, from the tip of the tube to the target.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+        Pose of the needle where it leaves the tube.
+    arcs : tuple of NeedleArc
+    end_lps : (3,) float64, LPS mm
+    length_mm : float
+    max_angle_from_start_rad : float
+        Largest angle between the needle and its start direction.
+    accumulated_turn_rad : float
+        Sum of the angles of all arcs.
+    """
+
+    lps_from_start: Float = field(metadata=shaped(4, 4))
+    arcs: tuple[NeedleArc, ...]
+    end_lps: Float = field(metadata=shaped(3))
+    length_mm: float
+    max_angle_from_start_rad: float
+    accumulated_turn_rad: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Exemption(Record):
+    """The one obstacle that may be touched: the wall of the pierced branch.
+
+    It holds for the tube and for the first `needle_length_mm` of the needle.
+    """
+
+    branch: int
+    exit_point_lps: Float = field(metadata=shaped(3))
+    needle_length_mm: float

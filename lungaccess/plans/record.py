@@ -1,0 +1,56 @@
+"""Records: immutable values of a plan, whose arrays have the declared shape and whose mappings are sorted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from anatomy.errors import PlanFileError
+from anatomy.grid import read_only
+from anatomy.typed import Array
+
+
+def shaped(*shape: int | None, dtype: type = np.float64) -> dict[str, Any]:
+    """Return the metadata that make a field of a `Record` an array; None stands for any length."""
+    return {"shape": shape, "dtype": dtype}
+
+
+class Record:
+    """Makes arrays read-only float64 (or int64) of the declared shape, and mappings read-only and sorted."""
+
+    def __post_init__(self) -> None:
+        for item in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, item.name)
+            if "shape" in item.metadata:
+                value = _frozen_array(value, item.metadata["shape"], item.metadata["dtype"], item.name)
+            elif isinstance(value, Mapping):
+                value = _frozen_mapping(value)
+            else:
+                continue
+            object.__setattr__(self, item.name, value)
+
+
+def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: str) -> Array:
+    try:
+        array: Array = np.array(value, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise PlanFileError(f"{name} of a plan is not an array of numbers ({error})") from error
+    if array.ndim == 1 and array.size == 0:
+        array = array.reshape(tuple(n or 0 for n in shape))
+    wanted = tuple(n if m is None else m for n, m in zip(array.shape, shape, strict=False))
+    if array.ndim != len(shape) or array.shape != wanted:
+        raise PlanFileError(
+            f"{name} of a plan has the shape {array.shape}",
+            expected="(" + ", ".join("N" if n is None else str(n) for n in shape) + ")",
+        )
+    return read_only(array)
+
+
+def _frozen_mapping(value: Mapping[str, Any]) -> Mapping[str, Any]:
+    return MappingProxyType(
+        {key: _frozen_mapping(v) if isinstance(v, Mapping) else v for key, v in sorted(value.items())}
+    )

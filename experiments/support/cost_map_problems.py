@@ -61,15 +61,15 @@ def candidates(case: Case, rng: np.random.Generator) -> Iterator[Query]:
     depth = edt.edt(lung, anisotropy=tuple(environment.grid.spacing_mm), order="F")
     tissue = np.argwhere(depth > PLEURA_MM)
     while True:
-        way = unit(rng.normal(size=3))
-        start = inner[rng.integers(len(inner))] + rng.uniform(*EXIT_MM) * way
+        outward = unit(rng.normal(size=3))
+        start = inner[rng.integers(len(inner))] + rng.uniform(*EXIT_MM) * outward
         goal = environment.grid.lps(tissue[rng.integers(len(tissue))] + rng.uniform(-0.5, 0.5, 3))
         ahead = goal - start
         distance = float(np.linalg.norm(ahead))
-        tangent = unit(way + rng.normal(scale=0.3, size=3))
+        tangent = unit(outward + rng.normal(scale=0.3, size=3))
         if (
             not TARGET_MM[0] <= distance <= TARGET_MM[1]
-            or ahead @ way < math.cos(math.radians(MAX_EXIT_ANGLE_DEG)) * distance
+            or ahead @ outward < math.cos(math.radians(MAX_EXIT_ANGLE_DEG)) * distance
         ):
             continue
         query = Query(lps_from_start=_pose(start, tangent), target=goal)

@@ -82,7 +82,7 @@ def run_all(
         INTENSITY: (on_intensity, Objective(voxel_sum=1.0)),
     }
     for where, objective in searched.values():
-        # What is compiled or loaded now is not counted; ways on lattices come after the first path.
+        # What is compiled or loaded now is not counted; guide paths come after the first path.
         warm = PortfolioSearch(where, scenario.query, objective=objective)
         while warm.iterations < WARM_ITERATIONS:
             warm.advance(SLICE_ITERATIONS)

@@ -176,7 +176,7 @@ def generated_queries(obstacles: Obstacles, tree: AirwayTree, count: int, seed: 
         aside /= np.linalg.norm(aside)
         angle, far = rng.uniform(0.0, GENERATED_CONE_RAD), rng.uniform(*GENERATED_MM)
         target = tree.points_lps[point] + far * (np.cos(angle) * along + np.sin(angle) * aside)
-        if not _has_room(obstacles, target):
+        if not _has_clearance(obstacles, target):
             continue
         start = np.eye(4)
         start[:3, :3] = np.stack([aside, np.cross(along, aside), along], axis=1)
@@ -191,7 +191,7 @@ def generated_queries(obstacles: Obstacles, tree: AirwayTree, count: int, seed: 
     return queries
 
 
-def _has_room(obstacles: Obstacles, target: Float) -> bool:
+def _has_clearance(obstacles: Obstacles, target: Float) -> bool:
     low = np.floor(obstacles.grid.ijk(target)).astype(int) - ROOM_VOXELS
     high = low + 2 * ROOM_VOXELS + 2
     if (low < 0).any() or (high > obstacles.grid.shape).any():

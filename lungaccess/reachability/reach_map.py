@@ -21,7 +21,15 @@ from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.reachability.layers import LayerStore, counted_voxels, scan_layers
 from lungaccess.reachability.regions import Regions, lung_regions
-from stages.needle import DEFAULT_ARCS, DIRECT, NO_ROOM, SEARCHED, UNREACHED, ReachScan, needle_environment
+from stages.needle import (
+    DEFAULT_ARCS,
+    DIRECT,
+    NO_CLEARANCE,
+    SEARCHED,
+    UNREACHED,
+    ReachScan,
+    needle_environment,
+)
 
 DEFAULT_SPACING_MM = 3.0
 FORMAT = b"lungaccess-reach-1"
@@ -31,7 +39,7 @@ KINDS: dict[str, int] = {
     "direct arc": DIRECT,
     "search": SEARCHED,
     "not reached": UNREACHED,
-    "no room": NO_ROOM,
+    "no clearance": NO_CLEARANCE,
 }
 """What the voxels of a map say; `NOT_COUNTED` is outside the lung or in an obstacle."""
 

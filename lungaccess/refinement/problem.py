@@ -18,7 +18,7 @@ from lungaccess.refinement import boxes as fields
 from lungaccess.refinement.axis import axis_of, standing_still
 from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_WAY_MM, Layout, Numbers
-from stages.needle import CURVATURE, Query, map_integral, needle_environment, objection
+from stages.needle import CURVATURE, Query, map_integral, needle_environment, violation
 from stages.scope import ScopeTip, Sites
 from stages.tube import Deployment, TubeJudge, centreline, tracking_length_mm, tube_constants
 from stages.tube.kernels import deployment as index
@@ -104,7 +104,7 @@ class Court:
         tightest = candidate.path.arcs[:, CURVATURE].max()
         if tightest > self.task.system.needle.max_curvature_per_mm:
             return False
-        if objection(self._environment, query, candidate.path):
+        if violation(self._environment, query, candidate.path):
             return False
         return math.isfinite(map_integral(self.task.lung.cost, candidate.path))
 

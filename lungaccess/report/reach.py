@@ -38,7 +38,7 @@ COLOURS: dict[str, str] = {
     "direct arc": "#009E73",
     "search": "#56B4E9",
     "not reached": "#D55E00",
-    "no room": "#C4C4C4",
+    "no clearance": "#C4C4C4",
 }
 
 

@@ -13,11 +13,11 @@ from lungaccess.one_stage.needle import OMPL_TOLERANCE_MM, plan_needle
 from lungaccess.problem.target import point_target
 from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
 from lungaccess.study.runs import Run
-from stages.needle import Query, objection
+from stages.needle import Query, violation
 
 
 def needle_answer(run: Run, lung: Lung) -> Answer:
-    """Search for a needle path and let `stages.needle.violations.objection` look at it.
+    """Search for a needle path and let `stages.needle.violations.violation` look at it.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
     text = json.dumps(record, sort_keys=True)
     query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
     tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.environment.goal_tolerance_mm
-    why = objection(found.environment, query, found.path, goal_tolerance_mm=tolerance_mm)
+    why = violation(found.environment, query, found.path, goal_tolerance_mm=tolerance_mm)
     return Answer(
         key=run.key,
         outcome=PATH,

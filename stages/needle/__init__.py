@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from stages.needle.path import direct_path as direct_path
     from stages.needle.reach import DEFAULT_ARCS as DEFAULT_ARCS
     from stages.needle.reach import DIRECT as DIRECT
-    from stages.needle.reach import NO_ROOM as NO_ROOM
+    from stages.needle.reach import NO_CLEARANCE as NO_CLEARANCE
     from stages.needle.reach import SEARCHED as SEARCHED
     from stages.needle.reach import UNREACHED as UNREACHED
     from stages.needle.reach import Reached as Reached
@@ -40,6 +40,6 @@ if TYPE_CHECKING:
     from stages.needle.search.portfolio import PortfolioSearch as PortfolioSearch
     from stages.needle.search.successive_halving import successive_halving as successive_halving
     from stages.needle.start_index import StartIndex as StartIndex
-    from stages.needle.violations import objection as objection
+    from stages.needle.violations import violation as violation
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -15,7 +15,12 @@ from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.search.base import RANDOM_SHARE
 
-DIRECT, SEARCHED, UNREACHED, NO_ROOM = kernel.DIRECT, kernel.SEARCHED, kernel.UNREACHED, kernel.NO_ROOM
+DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
+    kernel.DIRECT,
+    kernel.SEARCHED,
+    kernel.UNREACHED,
+    kernel.NO_CLEARANCE,
+)
 
 DEFAULT_ARCS = 4
 RRT_ITERATIONS = 200
@@ -30,8 +35,8 @@ class Reached:
     ----------
     kinds : (N,) uint8
         `DIRECT`: a single arc is proved clear.  `SEARCHED`: a path of several arcs is.  `UNREACHED`: no
-        single arc is, and the search, if there was one, found nothing.  `NO_ROOM`: the same, and the point
-        is nearer to an obstacle than the needle's axis may be.
+        single arc is, and the search, if there was one, found nothing.  `NO_CLEARANCE`: the same, and the
+        point is nearer to an obstacle than the needle's axis may be.
     cost : (N,) float64
         Estimated integral of 1 / clearance of the path found; 0 where there is none.
     clearance_mm : (N,) float64

@@ -19,7 +19,7 @@ SAME_RAD = 1e-6
 """Rounding that is forgiven."""
 
 
-def objection(
+def violation(
     environment: NeedleEnvironment, query: Query, path: ArcPath, *, goal_tolerance_mm: float = 0.0
 ) -> str:
     """Tell why a path is no answer to a query; "" if it is one.

@@ -13,7 +13,7 @@ from anatomy.poses import pose
 from lungaccess.one_stage.needle import plan_needle
 from lungaccess.problem.target import point_target
 from stages.needle.search.base import Query
-from stages.needle.violations import objection
+from stages.needle.violations import violation
 from tests.scenarios.cases import (
     NEEDLE_DEVICE,
     NEEDLE_ITERATIONS,
@@ -96,7 +96,7 @@ def needle_answers(
             answers.append(Answer(cost=None, digest=found.outcome))
             continue
         asked = Query(lps_from_start=np.array(start), target=target.lps_mm, branch=found.branch)
-        wrong = objection(found.environment, asked, found.path)
+        wrong = violation(found.environment, asked, found.path)
         answers.append(
             Answer(cost=found.cost, digest=found.path.arcs.tobytes().hex(), faults=(wrong,) if wrong else ())
         )

@@ -21,7 +21,7 @@ from stages.needle import (
     Query,
     map_integral,
     needle_environment,
-    objection,
+    violation,
     workspace_lengths,
 )
 from stages.tube import Deployment
@@ -81,7 +81,7 @@ class NeedleDesk:
         """
         if path.arcs[:, CURVATURE].max() > self.task.system.needle.max_curvature_per_mm:
             return False
-        if objection(self.environment, self.query(deployment), path):
+        if violation(self.environment, self.query(deployment), path):
             return False
         return math.isfinite(map_integral(self.task.lung.cost, path))
 

@@ -4,7 +4,7 @@ First, cubes that lie between start and target and are not certainly blocked are
 that does not part start and target, planes perpendicular to the line between them cut every path.  On each
 plane the states, position times direction, lie in cells.  From one plane to the next the cells spread as far
 as curvature allows and more by what a cell is wide; cells vanish from which obstacles, or the places of start
-and target, leave no way.  If none is left on a plane, no path exists: none can slip through, since every step
+and target, leave no path.  If none is left on a plane, no path exists: none is missed, since every step
 over-estimates.  If some are left, those that lie on a chain of cells from start to target are cut into
 smaller ones and the same is done again.  docs/certificate.md has the inequalities.
 """
@@ -21,7 +21,7 @@ from anatomy.errors import SettingsError
 from anatomy.typed import Float, Int, UInt64
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
-from stages.needle.infeasibility.kernels import reachability_pruning as hopes
+from stages.needle.infeasibility.kernels import reachability_pruning as pruning
 from stages.needle.infeasibility.kernels import reachable_sets as sets
 from stages.needle.kernels import limits as index
 from stages.needle.search.base import Query
@@ -42,7 +42,7 @@ SLACKS = 48
 LARGEST_DEPTH_MM = 12.5
 LEAST_KAPPA = 1e-5
 """In 1/mm; what bends less is taken to bend so much, for the sake of rounding."""
-LEAST_WAY_MM = 1e-3
+LEAST_DISTANCE_MM = 1e-3
 ROUNDING = 1e-8
 STEEPEST = 0.995
 """Largest sine of the angle between paths and the planes' normal for which planes are tried."""
@@ -176,7 +176,7 @@ class NoPathProof:
             self._end("undecided", "paths of this environment need not be clear")
         elif turn > math.pi * (1.0 + ROUNDING):
             self._end("undecided", "the needle may turn by more than 180 degrees in all")
-        elif total <= self._tolerance + LEAST_WAY_MM:
+        elif total <= self._tolerance + LEAST_DISTANCE_MM:
             self._end("undecided", "the target lies at the start")
         elif total - self._tolerance > length:
             self._end("no path", "the target is farther than the needle is long")
@@ -185,7 +185,7 @@ class NoPathProof:
         else:
             ahead = float(chord @ forward)
             aside = math.sqrt(max(total**2 - ahead**2, 0.0))
-            if hopes.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_WAY_MM:
+            if pruning.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_DISTANCE_MM:
                 self._end("no path", "the target lies outside the workspace of the start")
         if self.outcome == "running":
             normal = chord / total
@@ -295,7 +295,7 @@ class NoPathProof:
     def _forward(self, number: int) -> None:
         """Add a plane: the states reached from the plane before, or the start."""
         plane = self._allowed(number)
-        hopes.keep_hopeful(
+        pruning.prune_unreachable(
             plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
             float(self._environment.limits[index.MAX_ANGLE]),
         )  # fmt: skip
@@ -352,10 +352,10 @@ class NoPathProof:
         self._require(8 * math.prod(int(n) for n in shape))
         return Plane(np.full(tuple(shape), bitmaps.ALL, dtype=np.uint64), low)
 
-    def _reached(self, low: Int, high: Int, way: int, number: int) -> tuple[Int, Int]:
+    def _reached(self, low: Int, high: Int, direction: int, number: int) -> tuple[Int, Int]:
         """Return the first and last cell numbers on a plane that states between others may reach.
 
-        `way` is 1 from the plane before and -1 from the one after.
+        `direction` is 1 from the plane before and -1 from the one after.
         """
         scale = self._scale
         reach = bounds.largest_reach(scale, self._depth, 2.0, low, *(high - low + 1)[:2])
@@ -369,7 +369,7 @@ class NoPathProof:
             most[axis] = max(
                 min(high[axis] + reach, math.ceil((steep - first) / self.slope_cell) + 1), least[axis]
             )
-            moves = way * (low[axis] + least[axis]), way * (high[axis] + most[axis])
+            moves = direction * (low[axis] + least[axis]), direction * (high[axis] + most[axis])
             least[axis + 2] += min(moves) - aside
             most[axis + 2] += max(moves) + aside
             middle = number * self._depth * first
@@ -384,7 +384,7 @@ class NoPathProof:
         if used + size > self._max_bytes:
             raise _TooMuchError
 
-    def _step(self, plane: Plane, way: int, other: Plane, blur: float) -> None:
+    def _step(self, plane: Plane, direction: int, other: Plane, blur: float) -> None:
         """Keep of another plane what a plane's states reach, as many rows of directions at once as fit."""
         nv, nu, rows, words = other.bits.shape
         reach = bounds.largest_reach(self._scale, self._depth, blur, other.window, nv, nu)
@@ -407,7 +407,7 @@ class NoPathProof:
                 target[:] = 0
                 continue
             sets.step_sets(
-                source, plane.window + np.array([low, 0, 0, 0]), self._scale, self._depth, way, blur,
+                source, plane.window + np.array([low, 0, 0, 0]), self._scale, self._depth, direction, blur,
                 SLOPE_CHANGE_EDGES, target, other.window + np.array([first, 0, 0, 0]),
             )  # fmt: skip
 

@@ -34,7 +34,7 @@ from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH,
 DIRECT = 1
 SEARCHED = 2
 UNREACHED = 3
-NO_ROOM = 4
+NO_CLEARANCE = 4
 
 # Columns of `found`: estimated integral of 1 / clearance, least clearance beyond the exempt length (mm).
 COST = 0
@@ -200,7 +200,7 @@ def _improved(obstacles, limits, starts, branches, q, best, chosen, hints):
 
 
 @inner_kernel
-def _has_room(obstacles, limits, q, bits):
+def _has_clearance(obstacles, limits, q, bits):
     """Tell whether the needle's tip keeps the required clearance at a point."""
     _field, labels, geometry, _bits = obstacles
     required = limits[REQUIRED]
@@ -234,7 +234,7 @@ def reach_by_arcs(
     hints : (E,) float64, marks : (BLOCK,) uint8
         Scratch; `hints` starts at 0.5, and says where each arc was blocked the last time.
     kinds : (N,) int64
-        Receives DIRECT, UNREACHED or NO_ROOM.
+        Receives DIRECT, UNREACHED or NO_CLEARANCE.
     found : (N, 2) float64
         Receives cost and least clearance of what is reached.
     entries : (N,) int64
@@ -243,16 +243,16 @@ def reach_by_arcs(
     bits = obstacles[3]
     for n in range(points.shape[0]):
         q = (points[n, 0], points[n, 1], points[n, 2])
-        kinds[n] = NO_ROOM
+        kinds[n] = NO_CLEARANCE
         entries[n] = -1
         # At the exit the airway may be nearer.
-        if not _has_room(obstacles, limits, q, bits & ~AIRWAY):
+        if not _has_clearance(obstacles, limits, q, bits & ~AIRWAY):
             continue
         best, chosen = _best_of_mixed(
             obstacles, limits, starts, branches, order, mixed, q, wanted, hints, marks
         )
         if chosen < 0:
-            if _has_room(obstacles, limits, q, bits):
+            if _has_clearance(obstacles, limits, q, bits):
                 kinds[n] = UNREACHED
             continue
         for other in near[n]:

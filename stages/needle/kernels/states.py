@@ -75,7 +75,7 @@ def inserted_at(state, origin):
 
 @numba.njit(cache=True)
 def is_allowed(obstacles, limits, state, origin, branch):
-    """Tell whether a needle may stand at a state: clear, and within length and angle as far as it shows."""
+    """Tell whether a needle's tip may have a state: clear, and within length and angle as far as it shows."""
     length = inserted_at(state, origin)
     _ex, _ey, (tx, ty, tz) = axes(state)
     cosine = tx * origin[3] + ty * origin[4] + tz * origin[5]

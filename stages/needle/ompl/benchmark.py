@@ -84,7 +84,7 @@ def benchmark(
     def after(_planner: Any, _properties: Any) -> None:
         # The properties are a copy: what is set there is lost.
         path = problem.unproved_solution()
-        outcomes.append(Outcome(path=path, objection="" if path is None else problem.objection(path)))
+        outcomes.append(Outcome(path=path, violation="" if path is None else problem.violation(path)))
 
     bench = tools.Benchmark(problem.setup, "needle")
     for name in names:

@@ -16,7 +16,7 @@ from stages.needle.ompl.states import path_of, put_numbers
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query, Search
 from stages.needle.search.planners import PLANNERS
-from stages.needle.violations import objection
+from stages.needle.violations import violation
 
 util.setLogLevel(util.LogLevel.LOG_ERROR)
 
@@ -165,9 +165,9 @@ class NeedleProblem:
     def solution(self) -> ArcPath | None:
         """Return the path that `setup` found, proved; None if there is none or it is refused."""
         path = self.unproved_solution()
-        return None if path is None or self.objection(path) else path
+        return None if path is None or self.violation(path) else path
 
-    def objection(self, path: ArcPath) -> str:
+    def violation(self, path: ArcPath) -> str:
         """Tell why a path is no answer to the query posed last; "" if it is one.
 
         OMPL's states do not know how long the needle is or how much it has turned: see
@@ -176,7 +176,7 @@ class NeedleProblem:
         query = self._question.query
         if query is None:
             return "no query was posed"
-        return objection(self.environment, query, path, goal_tolerance_mm=self._tolerance_mm)
+        return violation(self.environment, query, path, goal_tolerance_mm=self._tolerance_mm)
 
     def unproved_solution(self) -> ArcPath | None:
         """Return the path that `setup` found, whether or not it is an answer; None if there is none."""

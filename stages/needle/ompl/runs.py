@@ -20,17 +20,17 @@ class Outcome:
     ----------
     path : ArcPath or None
         What the planner took for a solution.
-    objection : str
+    violation : str
         Why it is none: see `stages.needle.violations`.
     """
 
     path: ArcPath | None = None
-    objection: str = ""
+    violation: str = ""
 
     @property
     def proved_length_mm(self) -> float | None:
         """Length of the path if it is proved."""
-        return None if self.path is None or self.objection else self.path.length_mm
+        return None if self.path is None or self.violation else self.path.length_mm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +71,7 @@ def summary(name: str, times_s: Iterable[float], outcomes: Sequence[Outcome]) ->
         runs=len(outcomes),
         times_s=tuple(time for time, _length in proved),
         lengths_mm=tuple(length for _time, length in proved),
-        refusals=tuple(outcome.objection for outcome in outcomes if outcome.objection),
+        refusals=tuple(outcome.violation for outcome in outcomes if outcome.violation),
     )
 
 

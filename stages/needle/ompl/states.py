@@ -45,7 +45,7 @@ def put_numbers(state: Any, numbers: Sequence[float]) -> None:
 def path_of(solution: Any) -> ArcPath:
     """Return a `control.PathControl` as arcs, one for each run of controls that bend alike.
 
-    Nothing is proved here: see `NeedleProblem.objection`.
+    Nothing is proved here: see `NeedleProblem.violation`.
     """
     arcs: list[list[float]] = []
     before: tuple[float, float] | None = None

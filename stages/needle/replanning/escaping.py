@@ -17,7 +17,7 @@ from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import ObjectiveArrays
 from stages.needle.path import bend_direction
-from stages.needle.replanning.reaiming import Bend, Root, Source, Trials, as_point, pose_at, root_after
+from stages.needle.replanning.reaiming import Attempts, Bend, Root, Source, as_point, pose_at, root_after
 from stages.needle.search.base import Query
 
 ROLLS = 8
@@ -105,12 +105,12 @@ def roots_of_tip(
     near = with_limit(environment, index.REQUIRED, relaxed)
     roots = []
     for bend in _bends(environment, query):
-        length = _way_out(environment, query, pose, bend, longest_mm)
-        trials = Trials(near, objective, Root(query=query))
+        length = _length_to_clearance(environment, query, pose, bend, longest_mm)
+        attempts = Attempts(near, objective, Root(query=query))
         if length > 0.0:
-            trials.by_arc(bend, length, Source.REJOIN)
-        if trials.path is not None:
-            roots.append(root_after(query, trials.path, trials.cost))
+            attempts.by_arc(bend, length, Source.REJOIN)
+        if attempts.path is not None:
+            roots.append(root_after(query, attempts.path, attempts.cost))
     return sorted(roots, key=lambda root: root.away_mm), relaxed
 
 
@@ -123,7 +123,7 @@ def _bends(environment: NeedleEnvironment, query: Query) -> Iterator[Bend]:
         yield float(environment.limits[index.KAPPA]), *side
 
 
-def _way_out(
+def _length_to_clearance(
     environment: NeedleEnvironment, query: Query, pose: tuple[float, ...], bend: Bend, longest_mm: float
 ) -> float:
     """Return the length of an arc after which the required clearance is regained, 0 if never."""

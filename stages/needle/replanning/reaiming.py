@@ -1,4 +1,4 @@
-"""Ways from the tip of a needle to its target: along what is left of a plan, directly, or by a search."""
+"""Paths from the tip of a needle to its target: along what is left of a plan, directly, or by a search."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOOK_AHEADS_MM = (5.0, 10.0, 20.0, 40.0)
 """How far ahead the plan that is being followed is met again."""
 
 LEAST_GAIN = 0.1
-"""A way is given up for another one only if that is cheaper by this share: a needle that changes its mind
+"""A path is given up for another one only if that is cheaper by this share: a needle that changes its mind
 at every measurement wears out the tissue."""
 
 Ahead = tuple[float, Float]
@@ -43,7 +43,7 @@ class Source(StrEnum):
     ARRIVED = "arrived"
 
 
-Way = tuple[list[Float], Source]
+Waypoints = tuple[list[Float], Source]
 """Points to pass, and where they come from."""
 
 
@@ -101,7 +101,7 @@ def plan_ahead(plan: ArcPath, begin_mm: float) -> tuple[float, list[Ahead], list
     return turned, corners[:-1], meetings
 
 
-def ways_ahead(corners: list[Ahead], meetings: list[Ahead]) -> Iterator[Way]:
+def waypoints_ahead(corners: list[Ahead], meetings: list[Ahead]) -> Iterator[Waypoints]:
     """Yield what to pass on the way to the target, the rest of the plan first."""
     if corners:
         yield [point for _away, point in corners], Source.REST
@@ -123,8 +123,8 @@ def pose_at(frame: Float) -> tuple[float, ...]:
     return *as_point(frame[:3, 3]), *as_point(frame[:3, 2])
 
 
-class Trials:
-    """Ways that were tried from one root; the cheapest is kept.
+class Attempts:
+    """Paths that were tried from one root; the cheapest is kept.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ class Trials:
         See `stages.needle.kernels.cost`.
     root : Root
     most_points : int
-        Most points to pass on a way.
+        Most points to pass on a path.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class Trials:
 
     @property
     def wanted(self) -> float:
-        """What another way must cost less than."""
+        """What another path must cost less than."""
         return self.cost * (1.0 - LEAST_GAIN)
 
     def through(self, points: Sequence[Float], source: Source) -> None:
@@ -192,7 +192,7 @@ class Trials:
         self._keep(1, 1 + self._arc(1, bend, length, end), source)
 
     def search(self, iterations: int, seed: int, objective: Objective) -> int:
-        """Let the RRT look for cheaper ways; return the iterations spent."""
+        """Let the RRT look for cheaper paths; return the iterations spent."""
         rrt = RestartingRRT(self._environment, self.root.query, seed=seed, objective=objective)
         rrt.cost = self.wanted
         spent = 0
@@ -208,7 +208,7 @@ class Trials:
         return spent
 
     def _towards(self, count: int, point: tuple[float, float, float]) -> int:
-        """Go on from the last row to a point; return the new count, 0 if there is no way."""
+        """Go on from the last row to a point; return the new count, 0 if there is no path."""
         length, bend, _turn = arc_to_point(tree.pose_of(self._nodes[count - 1]), point)
         if length < index.MIN_ARC_MM:
             return count

@@ -28,13 +28,13 @@ from stages.needle.replanning.escaping import (
     with_limit,
 )
 from stages.needle.replanning.reaiming import (
+    Attempts,
     Root,
     Source,
-    Trials,
-    Way,
+    Waypoints,
     plan_ahead,
     pose_at,
-    ways_ahead,
+    waypoints_ahead,
 )
 from stages.needle.search.base import Query, root_of
 
@@ -255,12 +255,12 @@ class Replanner:
             reference=self._query.lps_from_start[:3, 2] if reference is None else reference,
         )
         self._replans += 1
-        found = self._find(query, list(ways_ahead(corners, meetings)))
+        found = self._find(query, list(waypoints_ahead(corners, meetings)))
         if found.path is not None:
             self.plan, self._begin_mm, self._turned_rad = found.path, inserted_mm, query.turned_rad
         return found
 
-    def _find(self, query: Query, ways: list[Way]) -> Replan:
+    def _find(self, query: Query, candidates: list[Waypoints]) -> Replan:
         away = float(np.linalg.norm(query.target - query.lps_from_start[:3, 3]))
         if away <= max(self._environment.goal_tolerance_mm, index.MIN_ARC_MM):
             return _arrived(query, away)
@@ -273,7 +273,7 @@ class Replanner:
         if failure is None:
             left = self._iterations
             for n, variant in enumerate(self._variants):
-                best, spent = self._try(variant, roots, ways, left // (len(self._variants) - n))
+                best, spent = self._try(variant, roots, candidates, left // (len(self._variants) - n))
                 if best is not None:
                     return self._found(best, query, relaxed)
                 left -= spent
@@ -283,35 +283,35 @@ class Replanner:
         return missed or Replan(path=None, failure=failure, why=why)
 
     def _try(
-        self, environment: NeedleEnvironment, roots: list[Root], ways: list[Way], iterations: int
-    ) -> tuple[Trials | None, int]:
-        """Try all ways from all roots, then search; return the best, and the iterations spent."""
+        self, environment: NeedleEnvironment, roots: list[Root], candidates: list[Waypoints], iterations: int
+    ) -> tuple[Attempts | None, int]:
+        """Try all waypoints from all roots, then search; return the best, and the iterations spent."""
         tried = []
-        most = max(len(points) for points, _source in ways)
+        most = max(len(points) for points, _source in candidates)
         for root in roots:
-            trials = Trials(environment, self._objective_arrays, root, most)
-            for points, source in ways:
-                trials.through(points, source)
-            trials.by_legs()
-            tried.append(trials)
-        tried.sort(key=lambda trials: trials.total)
+            attempts = Attempts(environment, self._objective_arrays, root, most)
+            for points, source in candidates:
+                attempts.through(points, source)
+            attempts.by_legs()
+            tried.append(attempts)
+        tried.sort(key=lambda attempts: attempts.total)
         to_search = tried[:1] if tried[0].path is not None else tried[:MAX_ESCAPES_SEARCHED]
         spent = 0
-        for n, trials in enumerate(to_search):
+        for n, attempts in enumerate(to_search):
             share = (iterations - spent) // (len(to_search) - n)
-            spent += trials.search(share, self._seed + self._replans, self._objective)
-        best = min(tried, key=lambda trials: trials.total)
+            spent += attempts.search(share, self._seed + self._replans, self._objective)
+        best = min(tried, key=lambda attempts: attempts.total)
         return (None if best.path is None else best), spent
 
-    def _found(self, trials: Trials, query: Query, relaxed: float) -> Replan:
-        root, path = trials.root, trials.path
+    def _found(self, attempts: Attempts, query: Query, relaxed: float) -> Replan:
+        root, path = attempts.root, attempts.path
         arcs = root.arcs if path is None else np.concatenate([root.arcs, path.arcs])
         whole = ArcPath(lps_from_start=query.lps_from_start, arcs=arcs)
         left = (1.0 - self._settings.curvature_reserve) * float(self._environment.limits[index.KAPPA])
         return Replan(
             path=whole,
-            cost=trials.total,
-            source=trials.source,
+            cost=attempts.total,
+            source=attempts.source,
             reserve_spent=bool((arcs[:, CURVATURE] > left * (1.0 + index.TINY)).any()),
             miss_mm=float(np.linalg.norm(whole.frames()[-1][:3, 3] - query.target)),
             relaxed_mm=root.away_mm,
@@ -320,18 +320,18 @@ class Replanner:
 
     def _near_miss(self, query: Query, roots: list[Root], relaxed: float, away: float) -> Replan | None:
         """Return the tightest arc towards the target if it passes near enough, or stay if the tip is."""
-        best: Trials | None = None
+        best: Attempts | None = None
         least = min(away, self._settings.largest_miss_mm)
         kappa = float(self._environment.limits[index.KAPPA])
         for root in roots:
-            trials = Trials(self._environment, self._objective_arrays, root)
+            attempts = Attempts(self._environment, self._objective_arrays, root)
             pose, target = pose_at(root.query.lps_from_start), query.goal
             turn, miss = nearest_turn(*seen_from(pose, target), kappa)
             if turn > index.MIN_ARC_MM * kappa and miss < least:
                 _length, bend, _turn = arc_to_point(pose, target)
-                trials.by_arc((kappa, *bend[1:]), turn / kappa, Source.NEAREST)
-                if trials.path is not None:
-                    best, least = trials, miss
+                attempts.by_arc((kappa, *bend[1:]), turn / kappa, Source.NEAREST)
+                if attempts.path is not None:
+                    best, least = attempts, miss
         if best is not None:
             return self._found(best, query, relaxed)
         return _arrived(query, away) if away <= self._settings.largest_miss_mm else None

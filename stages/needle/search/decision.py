@@ -21,7 +21,7 @@ STATES_PER_ITERATION = 400
 class Decision:
     """Looks for a path and for a proof that there is none in turns; see `stages.needle.search.base.Search`.
 
-    The resolution search finds narrow ways soonest; the optimal search goes on where that has ended.
+    The resolution search finds narrow passages soonest; the optimal search goes on where that has ended.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ class Resolution:
     Raises
     ------
     SettingsError
-        If a number is out of range, or coarse and fine are not a power of two apart.
+        If a number is out of range, or coarse and fine do not differ by a power of two.
     """
 
     coarse_mm: float = 16.0
@@ -78,7 +78,7 @@ class Resolution:
         ):
             if ratio != 2.0 ** round(math.log2(ratio)) or ratio > most:
                 raise SettingsError(
-                    f"The {name} of {self} are a factor of {ratio:g} apart",
+                    f"The {name} of {self} differ by a factor of {ratio:g}",
                     expected=f"a power of two, at most {most}",
                 )
         if self.fine_rolls > MOST_ROLLS:
@@ -95,10 +95,10 @@ class Resolution:
         The level counts how often length and roll are halved; the direction `fine_rolls` is straight.
         """
         halvings = [_halvings(self.steps, k) for k in range(1, self.steps + 1)]
-        apart = self.fine_rolls // self.coarse_rolls
+        between = self.fine_rolls // self.coarse_rolls
         by_level: dict[int, list[tuple[int, int]]] = {}
         for direction in (self.fine_rolls, *range(self.fine_rolls)):
-            rolled = 0 if direction == self.fine_rolls else _halvings(apart, direction % apart or apart)
+            rolled = 0 if direction == self.fine_rolls else _halvings(between, direction % between or between)
             for k, halved in enumerate(halvings, start=1):
                 by_level.setdefault(rolled + halved, []).append((direction, k))
         levels = [by_level[level] for level in sorted(by_level)]
@@ -116,7 +116,7 @@ class Cells:
     """Cells of poses: of all that fall into one cell, only the cheapest so far is followed.
 
     What a search with cells says holds up to them: a path that was not looked for leaves a cell in which
-    a pose at most as dear was followed, in place of its own.
+    a pose that costs no more was followed, in place of its own.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class Counts:
     nodes : int
         Poses reached by words that are proved clear.
     duplicates : int
-        Words dropped because another one, not dearer, ends there.
+        Words dropped because another one ends there at no greater cost.
     pruned : int
         Words dropped because no path within the limits leads on to the goal for less than the best.
     refused : int

@@ -23,7 +23,7 @@ from lungaccess.reachability.reach_map import KINDS, NOT_COUNTED, ReachMap, comp
 from lungaccess.reachability.regions import LEFT, RIGHT, lung_regions
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment
 from stages.needle.path import direct_path
-from stages.needle.reach import DIRECT, NO_ROOM, SEARCHED, UNREACHED, ReachScan
+from stages.needle.reach import DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED, ReachScan
 from tests.stages.scenes import Canvas
 
 SYSTEM = la.load_system("ultrathin")
@@ -69,11 +69,11 @@ def test_every_point_agrees_with_all_arcs_tried(
             ratios.append(float(reach.cost.array[tuple(ijk)]) / costs[clear].min())
             continue
         room = small_lung.exact_clearance_mm(point, OBSTACLES | FISSURE, cap_mm=2.0)[0]
-        assert (kind == NO_ROOM) == (room < environment.required_clearance_mm)
+        assert (kind == NO_CLEARANCE) == (room < environment.required_clearance_mm)
         assert reach.cost.array[tuple(ijk)] == reach.clearance_mm.array[tuple(ijk)] == 0.0
     assert min(ratios) >= 1.0 - 1e-6
     assert np.median(ratios) < 1.3
-    assert len(ratios) > 100 and {UNREACHED, NO_ROOM} <= set(reach.kinds.array.ravel().tolist())
+    assert len(ratios) > 100 and {UNREACHED, NO_CLEARANCE} <= set(reach.kinds.array.ravel().tolist())
 
 
 def test_counted_is_free_lung_tissue(reach: ReachMap, small_lung: Lung) -> None:

@@ -14,7 +14,7 @@ from stages.needle.device import Needle
 from stages.needle.environment import needle_environment
 from stages.needle.path import ArcPath
 from stages.needle.search.base import Query
-from stages.needle.violations import largest_angle_rad, objection
+from stages.needle.violations import largest_angle_rad, violation
 from tests.stages.scenes import Canvas
 
 AROUND = np.array([[20.0, math.pi / 2, 1 / 60], [35.0, math.pi, 1 / 60]])
@@ -38,7 +38,7 @@ def reason(path: ArcPath, *, needle: Any = None, asked: Any = None, tolerance_mm
     environment = needle_environment(canvas.lung(), device, Margins(), with_fissures=False)
     target = around().frames()[-1][:3, 3]
     query = Query(**{"lps_from_start": start(), "target": target, **(asked or {})})
-    return objection(environment, query, path, goal_tolerance_mm=tolerance_mm)
+    return violation(environment, query, path, goal_tolerance_mm=tolerance_mm)
 
 
 def test_a_path_within_all_limits_is_an_answer() -> None:

@@ -106,7 +106,7 @@ def dilate(target, source, box, square, disc, dy, dx, scratch, row):
     square, disc : float
     dy, dx : int
     scratch : (S,) uint64, row : (W,) uint64
-        Room to work in; see `spread`.
+        Workspace; see `spread`.
     """
     to_rows = target.shape[0]
     reach = int(math.floor(square + disc))

@@ -20,9 +20,9 @@ KAPPA = 4
 TOP_SINE = 5
 SCALE_SIZE = 6
 
-# What `ends` holds: distance from start to target, goal tolerance, longest way from start to target by way
-# of any point of a path; of the spindle the depth of its middle, how far aside of it the centres of its arcs
-# lie, and their radius (infinite: no spindle), all in mm.
+# What `ends` holds: distance from start to target, goal tolerance, longest detour from start to target
+# through any point of a path; of the spindle the depth of its middle, how far aside of it the centres of its
+# arcs lie, and their radius (infinite: no spindle), all in mm.
 TOTAL = 0
 TOLERANCE = 1
 LONGEST = 2

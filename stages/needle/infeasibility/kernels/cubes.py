@@ -8,7 +8,7 @@ import numba
 
 from stages.needle.infeasibility.kernels.blocked import clearance_above
 from stages.needle.infeasibility.kernels.bounds import SPARE, TOLERANCE, TOTAL
-from stages.needle.infeasibility.kernels.reachability_pruning import hope_of_place
+from stages.needle.infeasibility.kernels.reachability_pruning import place_margin
 
 
 @numba.njit(cache=True)
@@ -58,7 +58,7 @@ def flood(obstacles, required, exempt_branch, exempt_mm, scale, ends, frame, sid
                         continue
                     seen[a, b, c] = True
                     h, y, x = (a + corner[0]) * side, (b + corner[1]) * side, (c + corner[2]) * side
-                    if hope_of_place(h, y, x, scale, ends) + half < 0.0:
+                    if place_margin(h, y, x, scale, ends) + half < 0.0:
                         continue
                     exempt = exempt_branch if math.sqrt(h * h + y * y + x * x) - half < exempt_mm else -1
                     above = clearance_above(

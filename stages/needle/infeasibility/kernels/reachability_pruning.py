@@ -45,27 +45,27 @@ def escape_depth(rho, h, radius):
 
 
 @inner_kernel
-def hope_of_place(h, y, x, scale, ends):
-    """Return by how much a place may be moved before no path leads through it, in mm; below 0 if none does.
+def place_margin(h, y, x, scale, ends):
+    """Return a margin of a place in mm; if it is below 0, no path leads through the place.
 
-    It lies `h` mm deep, and (y, x) mm aside of the line from start to target.
+    The margin is 1-Lipschitz.  The place lies `h` mm deep, and (y, x) mm aside of the line to the target.
     """
     radius = 1.0 / scale[KAPPA]
     norm2 = 1.0 + scale[FIRST_V] ** 2 + scale[FIRST_U] ** 2
     ahead = (h + y * scale[FIRST_V] + x * scale[FIRST_U]) / math.sqrt(norm2)
     aside2 = y * y + x * x
     rho = math.sqrt(max(h * h + aside2 - ahead * ahead, 0.0))
-    hope = escape_depth(rho, ahead, radius)
-    way = math.sqrt(h * h + aside2) + math.sqrt((ends[TOTAL] - h) ** 2 + aside2)
-    hope = min(hope, 0.5 * (ends[LONGEST] - way))
+    margin = escape_depth(rho, ahead, radius)
+    detour = math.sqrt(h * h + aside2) + math.sqrt((ends[TOTAL] - h) ** 2 + aside2)
+    margin = min(margin, 0.5 * (ends[LONGEST] - detour))
     if ends[SPINDLE_RADIUS] < math.inf:
         from_centre = math.hypot(math.sqrt(aside2) + ends[SPINDLE_OFFSET], h - ends[SPINDLE_MIDDLE])
-        hope = min(hope, ends[SPINDLE_RADIUS] - from_centre)
-    return hope + SPARE
+        margin = min(margin, ends[SPINDLE_RADIUS] - from_centre)
+    return margin + SPARE
 
 
 @inner_kernel
-def _hope_of_state(h, y, x, slope_v, slope_u, blur, scale, ends):
+def _state_margin(h, y, x, slope_v, slope_u, blur, scale, ends):
     """Return the same for a state; `blur` is the angle between a cell's directions and its centre's."""
     radius = 1.0 / scale[KAPPA]
     norm = math.sqrt(1.0 + slope_v * slope_v + slope_u * slope_u)
@@ -74,17 +74,17 @@ def _hope_of_state(h, y, x, slope_v, slope_u, blur, scale, ends):
     sideways = y * slope_v + x * slope_u
     ahead = (left - sideways) / norm
     away2 = left * left + aside2
-    hope = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius)
-    hope += math.sqrt(away2) * blur + ends[TOLERANCE]
+    margin = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius)
+    margin += math.sqrt(away2) * blur + ends[TOLERANCE]
     # The same path backward leads to the start.
     ahead = (h + sideways) / norm
     away2 = h * h + aside2
     back = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius) + math.sqrt(away2) * blur
-    return min(hope, back) + HALF_DIAGONAL * scale[CELL] + SPARE
+    return min(margin, back) + HALF_DIAGONAL * scale[CELL] + SPARE
 
 
 @numba.njit(cache=True)
-def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
+def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
     """Remove the states of a plane from which the goal cannot be reached, or which the start cannot reach.
 
     Parameters
@@ -108,8 +108,8 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
         x = _FIRST_BIT
         while x < 64 * words:
             side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
-            hope = hope_of_place(depth, side_y, side_x, scale, ends) + HALF_DIAGONAL * cell
-            x = _set_run(possible[y], x, hope, cell)
+            margin = place_margin(depth, side_y, side_x, scale, ends) + HALF_DIAGONAL * cell
+            x = _set_run(possible[y], x, margin, cell)
     box = np.zeros(4, np.int64)
     row = np.zeros(words, np.uint64)
     for v in range(nv):
@@ -127,14 +127,14 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
                     states[v, u, y, w] &= possible[y, w]
             if not find_box(states[v, u], box):
                 continue
-            # All of the box may be decided by the hope at its middle.
+            # The margin at the middle of the box may decide all of it.
             middle_y = (0.5 * (box[0] + box[1]) + window[2]) * cell + depth * scale[FIRST_V]
             middle_x = (32.0 * (box[2] + box[3] + 1) - 0.5 + window[3]) * cell + depth * scale[FIRST_U]
             away = 0.5 * cell * math.hypot(box[1] - box[0], 64.0 * (box[3] - box[2] + 1))
-            hope = _hope_of_state(depth, middle_y, middle_x, slope_v, slope_u, blur, scale, ends)
-            if hope >= (1.0 + blur) * away:
+            margin = _state_margin(depth, middle_y, middle_x, slope_v, slope_u, blur, scale, ends)
+            if margin >= (1.0 + blur) * away:
                 continue
-            if hope < -(1.0 + blur) * away:
+            if margin < -(1.0 + blur) * away:
                 states[v, u] = 0
                 continue
             for y in range(box[0], box[1] + 1):
@@ -143,21 +143,21 @@ def keep_hopeful(states, window, scale, ends, depth, reference, max_angle):
                 x = 64 * box[2]
                 while x < 64 * (box[3] + 1):
                     side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
-                    hope = _hope_of_state(depth, side_y, side_x, slope_v, slope_u, blur, scale, ends)
-                    x = _set_run(row[: box[3] + 1], x, hope, (1.0 + blur) * cell)
+                    margin = _state_margin(depth, side_y, side_x, slope_v, slope_u, blur, scale, ends)
+                    x = _set_run(row[: box[3] + 1], x, margin, (1.0 + blur) * cell)
                 for w in range(box[2], box[3] + 1):
                     states[v, u, y, w] &= row[w]
 
 
 @inner_kernel
-def _set_run(row, x, hope, step):
-    """Set the bits from `x` on to whether there is hope, as far as its sign is sure; return where that ends.
+def _set_run(row, x, margin, step):
+    """Set the bits from `x` on if `margin` is not negative, as far as its sign is sure; return their end.
 
-    Hope changes by at most `step` from bit to bit.
+    The margin changes by at most `step` from bit to bit.
     """
-    run = min(max(int(math.ceil(abs(hope) / step)), 1), 64 * row.shape[0] - x)
+    run = min(max(int(math.ceil(abs(margin) / step)), 1), 64 * row.shape[0] - x)
     end = x + run
-    if hope < 0.0:
+    if margin < 0.0:
         return end
     for w in range(x // 64, (end - 1) // 64 + 1):
         value = ALL

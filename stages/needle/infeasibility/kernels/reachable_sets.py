@@ -43,7 +43,7 @@ def table_shape(now, reach):
 
 
 @numba.njit(cache=True)
-def step_sets(now, now_window, scale, depth, way, blur, edges, out, out_window):
+def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_window):
     """Keep of the states of the next plane, or the one before, those that a plane's states may reach.
 
     Obstacles are not looked at.  On a path x(h) over depth, x(h + d) - x(h) = d (x'(h) + x'(h + d)) / 2 + the
@@ -58,7 +58,7 @@ def step_sets(now, now_window, scale, depth, way, blur, edges, out, out_window):
     scale : (SCALE_SIZE,) float64
     depth : float
         Distance of the planes in mm.
-    way : int
+    direction : int
         1 to the next plane, -1 to the one before.
     blur : float
         2, or 1 if the one state in `now` is known exactly.
@@ -73,12 +73,12 @@ def step_sets(now, now_window, scale, depth, way, blur, edges, out, out_window):
     boxes = np.zeros((levels, nv, nu, 4), np.int64)
     boxes[..., 1] = -1
     # Half-way, states have moved by their own slope alone: by as many cells as the number of the slope says.
-    first_v = now_window[0] if way > 0 else -(now_window[0] + nv - 1)
-    first_u = now_window[1] if way > 0 else -(now_window[1] + nu - 1)
+    first_v = now_window[0] if direction > 0 else -(now_window[0] + nv - 1)
+    first_u = now_window[1] if direction > 0 else -(now_window[1] + nu - 1)
     for v in range(nv):
         for u in range(nu):
-            shift_y = v if way > 0 else nv - 1 - v
-            or_shifted(table[0, v, u], now[v, u], shift_y, u if way > 0 else nu - 1 - u)
+            shift_y = v if direction > 0 else nv - 1 - v
+            or_shifted(table[0, v, u], now[v, u], shift_y, u if direction > 0 else nu - 1 - u)
             find_box(table[0, v, u], boxes[0, v, u])
         for level in range(1, levels):
             span = 1 << (level - 1)
@@ -99,8 +99,8 @@ def step_sets(now, now_window, scale, depth, way, blur, edges, out, out_window):
         for tu in range(to_u):
             if not find_box(out[tv, tu], allowed):
                 continue
-            move_y = way * (tv + out_window[0]) + first_v + now_window[2] - out_window[2]
-            move_x = way * (tu + out_window[1]) + first_u + now_window[3] - out_window[3]
+            move_y = direction * (tv + out_window[0]) + first_v + now_window[2] - out_window[2]
+            move_x = direction * (tu + out_window[1]) + first_u + now_window[3] - out_window[3]
             slope_v, slope_u = slope_of(tv, tu, out_window, scale)
             sine = steepest_sine(slope_v, slope_u, scale)
             change = largest_slope_change(sine, scale, depth)

@@ -184,7 +184,7 @@ def _is_promising(nodes, vias, count, limits, rate, best):
 def _mutate(vias, trial, count, goal, limits, state):
     """Write a variation of via points to `trial`; return how many it has.
 
-    A point is moved, dropped, added or reached in the other way; the last point stays within the goal
+    A point is moved, dropped, added or reached by the other kind of leg; the last point stays within the goal
     tolerance.
     """
     for m in range(count):

@@ -265,7 +265,7 @@ def _push_level(
 
     Passed over are those from whose end no path within the limits leads to the goal for less than `most`,
     with all longer ones; those longer than a refused one; and, where a cell's poses count as one, those that
-    end in the cell of a node that is not dearer.  One like the primitive that led to the node is taken only
+    end in the cell of a node that costs no more.  One like the primitive that led to the node is taken only
     if that had the full length, so that each curve is one word.
     """
     nodes, links, proved, seen = store
@@ -445,7 +445,7 @@ def search_words(
         turn; primitives by level, (P, 2) int64, direction and steps, and the first of each level and the end,
         (levels + 1,) int64.
     merge : tuple of float, float, bool
-        Size of a cell of poses in mm and in components of the tangent; whether a node makes every dearer one
+        Size of a cell of poses in mm and in components of the tangent; whether a node makes each costlier one
         in its cell superfluous, or only equal ones that are in nothing better.
     store : tuple
         nodes (N, NODE_COLUMNS) float64, links (N, LINK_COLUMNS) int32, proved (N, n + 1, 2) uint8, and the
@@ -467,14 +467,14 @@ def search_words(
         SPENT, BETTER, EXHAUSTED, or which arrays have to grow; cost of the best path.
     """
     nodes, entries = store[0], queue[1]
-    room = words[3].shape[0] + 1
+    most_new = words[3].shape[0] + 1
     stop = counts[POPS] + pops
     better = False
     while counts[POPS] < stop and not better:
         # Beside the node that may be made, one row is for what is only looked at.
         if counts[NODES] + 2 > nodes.shape[0]:
             return FULL_OF_NODES, cost
-        if state[WAITING] + room > entries.shape[0]:
+        if state[WAITING] + most_new > entries.shape[0]:
             return FULL_OF_ENTRIES, cost
         most = cost * (1.0 - ROUNDING)
         at, level = counts[NODES] - 1, 0

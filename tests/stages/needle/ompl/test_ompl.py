@@ -185,12 +185,12 @@ def test_the_exemption_reaches_the_kernel(environment: NeedleEnvironment) -> Non
     frame[0, 3] = -1.0
     pierced = Query(lps_from_start=frame, target=np.array([12.0, 1.0, 0.0]), branch=0)
     path = require(problem.plan(pierced, seed=0, iterations=50))
-    assert handed_over(problem).check() and problem.objection(path) == ""
+    assert handed_over(problem).check() and problem.violation(path) == ""
     assert problem.plan(replace(pierced, branch=1), seed=0, iterations=50) is None
-    assert "airway" in problem.objection(path)
+    assert "airway" in problem.violation(path)
     # The wall is exempt at the exit alone, which lies behind a needle that is on its way.
     assert problem.plan(replace(pierced, inserted_mm=6.0), seed=0, iterations=50) is None
-    assert "airway" in problem.objection(path)
+    assert "airway" in problem.violation(path)
 
 
 def test_searches_are_chosen_by_name(environment: NeedleEnvironment) -> None:
@@ -441,7 +441,7 @@ def test_a_step_needs_half_of_what_an_arc_needs_to_spare(gap_mm: float, as_arc: 
     frame[0, 3] = -problem.environment.required_clearance_mm - gap_mm
     problem.pose(Query(lps_from_start=frame, target=frame[:3, 3] + [0.0, 0.0, 4.0]))
     assert (
-        problem.objection(ArcPath(lps_from_start=frame, arcs=np.array([[4.0, 0.0, 0.0]]))) == ""
+        problem.violation(ArcPath(lps_from_start=frame, arcs=np.array([[4.0, 0.0, 0.0]]))) == ""
     ) is as_arc
     state, u = problem.si.allocState(), problem.si.allocControl()
     write_state(state, frame)
@@ -497,11 +497,11 @@ def test_a_state_is_valid_only_within_the_angle_and_length(environment: NeedleEn
 def test_what_ompl_takes_for_a_solution_is_refused_if_it_is_none(environment: NeedleEnvironment) -> None:
     through = arcs_of((40.0, 0.0, 0.0))
     problem = NeedleProblem(environment, {"given": given(through)})
-    assert "no query" in problem.objection(through)
+    assert "no query" in problem.violation(through)
     problem.pose(query(through.frames()[-1][:3, 3]))
     assert problem.setup.solve(1.0).asString() == "Exact solution"
     assert problem.solution() is None
-    assert "vessel" in problem.objection(path_of(problem.setup.getSolutionPath()))
+    assert "vessel" in problem.violation(path_of(problem.setup.getSolutionPath()))
 
 
 def test_controls_that_bend_alike_become_one_arc(problem: NeedleProblem) -> None:
@@ -546,8 +546,8 @@ def test_a_converted_path_outlives_the_setup(environment: NeedleEnvironment) -> 
 
 def test_the_best_path_is_the_only_solution_of_the_problem_definition(environment: NeedleEnvironment) -> None:
     """OMPL would rank by the number of arcs, and put the first path before the cheaper second."""
-    dear, cheap = arcs_of((20.0, 0.0, 0.0)), arcs_of((8.0, 0.0, 0.01), (8.0, 1.0, 0.01), (4.0, 0.0, 0.0))
-    problem = NeedleProblem(environment, {"given": given(dear, cheap)})
+    costly, cheap = arcs_of((20.0, 0.0, 0.0)), arcs_of((8.0, 0.0, 0.01), (8.0, 1.0, 0.01), (4.0, 0.0, 0.0))
+    problem = NeedleProblem(environment, {"given": given(costly, cheap)})
     target = cheap.frames()[-1][:3, 3]
     problem.pose(query(target), goal_tolerance_mm=5.0)
     problem.planner.anytime = True
@@ -798,6 +798,6 @@ def test_the_example_of_the_documentation_runs(
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     exec(compile(code, str(page), "exec"), names)
-    assert names["problem"].objection(names["path"]) == ""
+    assert names["problem"].violation(names["path"]) == ""
     assert "Exact solution" in capsys.readouterr().out
     assert [file.name for file in tmp_path.iterdir()] == ["needle.log"]

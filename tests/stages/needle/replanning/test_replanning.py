@@ -21,7 +21,7 @@ from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path, direct_path
-from stages.needle.replanning.reaiming import LEAST_GAIN, Root, Source, Trials
+from stages.needle.replanning.reaiming import LEAST_GAIN, Attempts, Root, Source
 from stages.needle.replanning.replanner import Failure, Replan, Replanner, ReplanSettings, with_reserve
 from stages.needle.search.base import Query, RestartingRRT, root_of
 from tests.stages.scenes import Canvas, brute_clearance, line_tree
@@ -202,12 +202,12 @@ class TestFound:
         """The arc and straight to a point a little aside is shorter, but by less than the gain asked for."""
         target = TARGET + [12.0, 6.0, 0.0]
         found = replanner(ENVIRONMENTS["ball"], query(BESIDE, target)).replan(BESIDE, target, 0.0)
-        trials = Trials(
+        attempts = Attempts(
             ENVIRONMENTS["ball"], Objective(length=1.0).arrays(None), Root(query=query(BESIDE, target))
         )
-        trials.by_legs()
+        attempts.by_legs()
         assert found.source is Source.DIRECT
-        assert (1.0 - LEAST_GAIN) * found.cost < trials.cost < found.cost
+        assert (1.0 - LEAST_GAIN) * found.cost < attempts.cost < found.cost
 
     def test_the_same_calls_give_the_same_replans(self) -> None:
         def run(seed: int) -> list[Float]:
@@ -391,8 +391,8 @@ class TestLostClearance:
         needle = Needle(diameter_mm=1.0, max_curvature_per_mm=KAPPA)
         environment = needle_environment(canvas.lung(), needle, Margins(), with_fissures=False)
         tip = frame_at([0.2, 0.5, -28.0])
-        blind = replanner(environment, query(tip), iterations=0).replan(tip, TARGET, 0.0)
-        assert blind.failure is Failure.NOT_FOUND
+        unsearched = replanner(environment, query(tip), iterations=0).replan(tip, TARGET, 0.0)
+        assert unsearched.failure is Failure.NOT_FOUND
         found = replanner(environment, query(tip), iterations=6000).replan(tip, TARGET, 0.0)
         assert found.source is Source.SEARCH and found.relaxed_mm > 0.0
         gap, lengths = clearances(environment, require(found))

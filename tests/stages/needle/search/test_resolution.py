@@ -92,7 +92,7 @@ class TestResolution:
         ],
     )
     def test_impossible_ones(self, wrong: dict[str, Any]) -> None:
-        with pytest.raises(SettingsError, match=r"resolution|apart|rolls"):
+        with pytest.raises(SettingsError, match=r"resolution|factor|rolls"):
             Resolution(**wrong)
 
     def test_every_primitive_has_one_level_that_counts_its_halvings(self) -> None:
@@ -374,10 +374,10 @@ class TestAgainstEnumeration:
     @given(maze=crowded_mazes(), seed=st.integers(0, 2**32 - 1))
     @settings(max_examples=10)
     def test_the_same_least_cost_of_a_map(self, maze: Maze, seed: int) -> None:
-        """Blocks of 16 voxels of dear and cheap tissue, so that few faces blur the sampled costs.
+        """Blocks of 16 voxels of costly and cheap tissue, so that few faces blur the sampled costs.
 
         They begin 3 voxels early: words from the start may lie in the planes x = 0 and y = 0, where a face
-        between dear and cheap would leave their cost open.
+        between costly and cheap would leave their cost open.
         """
         rng = np.random.default_rng(seed)
         environment = maze.environment()
@@ -440,7 +440,7 @@ class TestDuplicates:
         for same in kinds.values():
             for number, earlier in enumerate(same):
                 for later in same[number + 1 :]:
-                    assert (later < earlier - 1e-6).any(), "longer, dearer and more turned, but followed"
+                    assert (later < earlier - 1e-6).any(), "longer, costlier and more turned, but followed"
         ends = [self.lattice().start[None]]
         for _ in range(2):
             turns = [(0.25 * n, 0.1) for n in range(4)] + [(0.0, 0.0)]

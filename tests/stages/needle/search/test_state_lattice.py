@@ -195,8 +195,8 @@ def test_guide_paths_around_another_are_cheaper_and_meet_the_target() -> None:
         assert map_cost(environment, guide.controls) == pytest.approx(guide.cost, rel=1e-9)
     assert (np.diff(costs) <= 1e-9).all()
     assert costs[-1] < 0.97 * costs[0]
-    dearer = lattices.around(guide.controls, 0.125, 0.3, 0.5 * costs[-1])
-    assert dearer.controls is None and dearer.cost == math.inf
+    costlier = lattices.around(guide.controls, 0.125, 0.3, 0.5 * costs[-1])
+    assert costlier.controls is None and costlier.cost == math.inf
 
 
 def test_controls_of_a_path_lead_along_it() -> None:

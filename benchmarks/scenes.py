@@ -12,13 +12,12 @@ import numpy as np
 
 from anatomy.grid import Grid
 from anatomy.typed import Array, Float, Int16, Mask
-from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.patient import PatientImages
+    from lungaccess.coupled import AtlasSearch
     from lungaccess.coupled.atlas import Atlas
-    from lungaccess.coupled.search import AtlasSearch
     from stages.needle.environment import NeedleEnvironment
     from stages.scope.tour.subtree import Subtree
     from stages.tube.mechanics import TubeMechanics
@@ -90,19 +89,15 @@ def images(edge: int) -> PatientImages:
 
 def direct_search(targets: int) -> tuple[Callable[[Float], AtlasSearch], Float]:
     """Return what makes a search for a point of a synthetic lung, and peripheral points."""
-    from lungaccess.coupled.search import AtlasSearch
-    from lungaccess.plans.assemble import Task
+    from lungaccess.coupled import AtlasSearch
     from lungaccess.problem.peripheral import peripheral_targets
     from lungaccess.problem.target import point_target
+    from lungaccess.problem.task import Task
 
     lung, atlas = _small_atlas()
 
     def search_for(point: Float) -> AtlasSearch:
-        task = Task(
-            lung=lung, system=atlas.system, target=point_target(lung, point),
-            objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
-            method="atlas", seed=0,
-        )  # fmt: skip
+        task = Task(lung=lung, system=atlas.system, target=point_target(lung, point))
         return AtlasSearch(task, atlas)
 
     points = peripheral_targets(lung, (targets + 1) // 2, 0)

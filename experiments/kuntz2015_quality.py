@@ -33,11 +33,10 @@ from experiments.support.workspace_rejection import PAPER_PATHS
 from experiments.support.workspace_rejection import PAPER_S as PAPER_PATHS_S
 from lungaccess.coupled.alternatives import Alternative, alternatives
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.plans.assemble import Task
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
+from lungaccess.problem.task import Task
 from lungaccess.report import style
-from stages.needle import Objective
 
 NOT_REPRODUCED = [
     "The goals and the costs of fig. 9: the paper prints no numbers for them, and its lung cannot be had.",
@@ -110,10 +109,12 @@ def add_cost_over_time(result: Result, runs: list[dict[str, object]]) -> None:
 def task_to(atlas: Atlas, point: Float, seed: int) -> Task:
     """Return the task of reference mode to a point."""
     return Task(
-        lung=atlas.lung, system=atlas.system, target=point_target(atlas.lung, point),
-        objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
-        method="reference", seed=seed,
-    )  # fmt: skip
+        lung=atlas.lung,
+        system=atlas.system,
+        target=point_target(atlas.lung, point),
+        method="reference",
+        seed=seed,
+    )
 
 
 def add_rejection(result: Result, atlas: Atlas, points: Float, size: Size) -> None:

@@ -26,16 +26,17 @@ from anatomy.errors import SettingsError
 from anatomy.io.files import atomic_write
 from anatomy.typed import Float
 from lungaccess.cli.inputs import load_device
+from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.coupled.kuntz2015_fcl.search import FOUND, obstacles_for
-from lungaccess.plans.assemble import Candidate, Task, assemble
+from lungaccess.plans.assemble import assemble
+from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.target import point_target
-from stages.needle import Objective
+from lungaccess.problem.task import Task
 
 RRT_TIME_S = 0.05
 MISSED, REFUSED = "missed", "refused"
@@ -73,15 +74,7 @@ class Attack:
             said = str(reason)
         else:
             return {"planner": "plan"}, None
-        task = Task(
-            lung=self.atlas.lung,
-            system=system,
-            target=target,
-            objective=Objective(inverse_clearance=1.0),
-            with_fissures=self.atlas.with_fissures,
-            method="reference",
-            seed=self.seed,
-        )
+        task = Task(lung=self.atlas.lung, system=system, target=target, method="reference", seed=self.seed)
         self.obstacles = self.obstacles or obstacles_for(task)
         self.obstacles.prepare()
         search = ReferenceSearch(task, self.atlas, rrt_time_s=RRT_TIME_S, obstacles=self.obstacles)

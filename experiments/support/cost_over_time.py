@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.typed import Float
+from lungaccess.coupled import AtlasSearch, Step
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.search import AtlasSearch, Step
-from lungaccess.plans.assemble import Task
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
+from lungaccess.problem.task import Task
 from lungaccess.refinement import refine
-from stages.needle import Objective
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,11 +32,7 @@ JOINT = "joint refinement"
 
 def search_for(atlas: Atlas, point: Float, seed: int) -> AtlasSearch:
     """Return a search for a plan to a point."""
-    task = Task(
-        lung=atlas.lung, system=atlas.system, target=point_target(atlas.lung, point),
-        objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
-        method="atlas", seed=seed,
-    )  # fmt: skip
+    task = Task(lung=atlas.lung, system=atlas.system, target=point_target(atlas.lung, point), seed=seed)
     return AtlasSearch(task, atlas)
 
 
@@ -74,7 +69,7 @@ def joint_gain(search: AtlasSearch) -> dict[str, float]:
             continue
         better = refine(search.task, search.atlas.sites, step.candidate)
         costs[name] = step.cost
-        costs[f"{name}, refined"] = step.cost if better is None else search.desk.cost(better.path)
+        costs[f"{name}, refined"] = step.cost if better is None else search.evaluator.cost(better.path)
     return costs
 
 

@@ -16,18 +16,19 @@ from anatomy.lung import Lung
 from anatomy.settings import override
 from anatomy.typed import Float
 from experiments.support.mutants import Rng
+from lungaccess.coupled import DirectArcs
 from lungaccess.coupled.alternatives import alternatives
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.search import AtlasSearch
-from lungaccess.plans.assemble import Task, assemble
+from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, nodule_target, point_target
+from lungaccess.problem.task import Task
 from stages.needle import TERMS, ArcPath
 
 TARGETS = 100
 PLANS_A_BATCH = 60
-MENU = 5
+AT_A_TIME = 5
 TRIED = 60
 """Deployments from which a needle of several arcs is tried."""
 JOINT_ITERATIONS = 402
@@ -119,7 +120,6 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
                 system=system,
                 target=target,
                 objective=objective,
-                with_fissures=atlas.with_fissures,
                 method="bent",
                 seed=seed,
             ),
@@ -129,10 +129,10 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
         return
     try:
         if kind < 0.5:
-            menu = alternatives(
-                lung, system, target, objective=objective, count=MENU, separation_mm=3.0, atlas=atlas
+            found = alternatives(
+                lung, system, target, objective=objective, count=AT_A_TIME, separation_mm=3.0, atlas=atlas
             )
-            yield from (each.plan for each in menu)
+            yield from (each.plan for each in found)
             return
         method = "kuntz2015" if kind > 0.7 else "atlas"
         iterations = 200 if method == "kuntz2015" else int(rng.choice([1, 40, 150, JOINT_ITERATIONS]))
@@ -140,7 +140,7 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
             lung, system, target, objective=objective, method=method, seed=seed, iterations=iterations,
             atlas=atlas,
         )  # fmt: skip
-        yield from list(found)[-MENU:]
+        yield from list(found)[-AT_A_TIME:]
     except (la.NoPlan, TargetError):
         return
 
@@ -148,10 +148,10 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
 def bent_plans(task: Task, atlas: Atlas, rng: Rng) -> Iterator[Plan]:
     """Yield plans of several arcs at random, from deployments near the target, to where they end."""
     device = task.system.needle
-    search = AtlasSearch(task, atlas)
+    arcs_to_target = DirectArcs(task, atlas)
     made = 0
-    for entry in rng.permutation(search.in_workspace)[:TRIED]:
-        candidate = search.finished(int(entry))
+    for entry in rng.permutation(arcs_to_target.in_workspace)[:TRIED]:
+        candidate = arcs_to_target.proved(int(entry))
         if candidate is None:
             continue
         count = int(rng.integers(2, 6))
@@ -168,14 +168,14 @@ def bent_plans(task: Task, atlas: Atlas, rng: Rng) -> Iterator[Plan]:
             path.length_mm > device.max_length_mm
             or path.accumulated_turn_rad > np.deg2rad(device.max_accumulated_turn_deg)
             or path.max_angle_from_start_rad() > np.deg2rad(device.max_angle_from_start_deg)
-            or not search.desk.proved(candidate.deployment, path)
+            or not arcs_to_target.evaluator.proves(candidate.deployment, path)
         ):
             continue
         end = Target(lps_mm=path.frames()[-1][:3, 3], origin="point")
         here = replace(task, target=end)
         yield assemble(here, atlas.sites, replace(candidate, path=path), iteration=0, timing={})
         made += 1
-        if made == MENU:
+        if made == AT_A_TIME:
             return
 
 

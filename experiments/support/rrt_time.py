@@ -6,11 +6,12 @@ import time
 from typing import Any
 
 from anatomy.typed import Float
+from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
-from lungaccess.plans.assemble import Candidate, Task
+from lungaccess.plans.candidate import Candidate
+from lungaccess.problem.task import Task
 from stages.needle.path import ArcPath
 
 LONG_S = 2.0

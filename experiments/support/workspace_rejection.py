@@ -19,11 +19,11 @@ import numpy as np
 
 from anatomy.lung import Lung
 from anatomy.typed import Float
+from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch, ReferenceSearchWithoutRejection
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.coupled.kuntz2015_fcl.search import FOUND, obstacles_for
-from lungaccess.plans.assemble import Task
+from lungaccess.problem.task import Task
 from stages.needle.environment import needle_environment, workspace_lengths
 
 RRT_TIME_S = 0.05
@@ -78,8 +78,10 @@ def compare(
     task: Task, atlas: Atlas, obstacles: Obstacles, paths: int, limit_s: float
 ) -> tuple[Run, Run] | None:
     """Return a run with line 8 and one without; None if the first finds too few paths."""
-    kinds = (ReferenceSearch, ReferenceSearchWithoutRejection)
-    first, second = (kind(task, atlas, rrt_time_s=RRT_TIME_S, obstacles=obstacles) for kind in kinds)
+    first, second = (
+        ReferenceSearch(task, atlas, rejects=rejects, rrt_time_s=RRT_TIME_S, obstacles=obstacles)
+        for rejects in (True, False)
+    )
     with_it = run_until(first, paths, limit_s)
     if with_it.paths < paths:
         return None

@@ -11,12 +11,13 @@ from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.explain import explain
-from lungaccess.coupled.search import AtlasSearch
+from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.diverse import different_candidates
-from lungaccess.plans.assemble import Task, assemble
+from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
-from lungaccess.problem.target import Target, require_free
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
 from stages.needle import Objective
 
 COUNT = 15
@@ -89,30 +90,26 @@ def alternatives(
         raise SettingsError(
             f"{count} plans {separation_mm:g} mm apart are asked for", expected="both above 0"
         )
-    require_free(lung, target.lps_mm)
+    task = Task(lung=lung, system=system, target=target, objective=weighed, method="alternatives")
     if atlas is not None:
         require_same(atlas, lung, system)
     atlas = atlas or build_atlas(lung, system)
-    task = Task(
-        lung=lung, system=system, target=target, objective=weighed, with_fissures=atlas.with_fissures,
-        method="alternatives", seed=0,
-    )  # fmt: skip
     began = time.perf_counter()
-    search = AtlasSearch(task, atlas)
-    chosen = list(different_candidates(search, count, separation_mm))
+    arcs = DirectArcs(task, atlas)
+    chosen = list(different_candidates(arcs, count, separation_mm))
     if not chosen:
-        raise explain(search, 0)
+        raise explain(task, atlas, arcs.evaluator.blocked, 0)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
     plans = [assemble(task, atlas.sites, each, iteration=0, timing=timing) for each in chosen]
-    return judged(plans)
+    return with_front(plans)
 
 
 def criteria(plan: Plan) -> dict[str, float]:
     """Return what plans are compared by; see `Alternative`."""
-    clearances = [values for stage in ("tube", "needle") for values in (plan.clearance_mm[stage],)]
-    judged_structures = [name for name in clearances[0] if name != "fissure" or plan.fissures_are_obstacles]
+    clearances = [plan.clearance_mm[stage] for stage in ("tube", "needle")]
+    obstacles = [name for name in clearances[0] if name != "fissure" or plan.fissures_are_obstacles]
     return {
-        "clearance_mm": min(values[name] for values in clearances for name in judged_structures),
+        "clearance_mm": min(values[name] for values in clearances for name in obstacles),
         "pleura_mm": min(values["outside"] for values in clearances),
         "length_in_tissue_mm": plan.needle.length_mm
         + plan.tube.inner_insertion_mm
@@ -122,7 +119,7 @@ def criteria(plan: Plan) -> dict[str, float]:
     }
 
 
-def judged(plans: list[Plan]) -> tuple[Alternative, ...]:
+def with_front(plans: list[Plan]) -> tuple[Alternative, ...]:
     """Return plans with their criteria, and which of them are on the Pareto front."""
     values = [criteria(plan) for plan in plans]
     signed = np.array(

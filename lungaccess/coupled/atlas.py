@@ -13,6 +13,7 @@ from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.typed import Float
 from lungaccess.problem.system import System
+from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
 from stages.scope import Sites, find_sites
 from stages.tube import (
@@ -95,7 +96,7 @@ def require_same(atlas: Atlas, lung: Lung, system: System) -> None:
     same = (
         atlas.lung.key == lung.key
         and (made.scope, made.tubes, made.margins) == (wanted.scope, wanted.tubes, wanted.margins)
-        and atlas.with_fissures == (lung.has_fissures and not wanted.fissures_allowed)
+        and atlas.with_fissures == fissures_are_obstacles(lung, wanted)
     )
     if not same:
         raise SettingsError(
@@ -128,7 +129,7 @@ def build_atlas(
         Told the share of the work done.
     """
     began = time.perf_counter()
-    with_fissures = lung.has_fissures and not system.fissures_allowed
+    with_fissures = fissures_are_obstacles(lung, system)
     reach = tracking_length_mm(system.tubes)
     places = find_sites(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
     straight = int((~places.turned).sum())

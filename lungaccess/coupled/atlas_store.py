@@ -20,6 +20,7 @@ from anatomy.lung import Lung
 from anatomy.settings import to_mapping
 from lungaccess.coupled.atlas import SITE_SPACING_MM, Atlas, build_atlas
 from lungaccess.problem.system import System
+from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
 from stages.scope import Sites
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
@@ -79,7 +80,7 @@ def _key(lung: Lung, system: System, resolution: dict[str, float]) -> str:
         "scope": to_mapping(system.scope),
         "tubes": to_mapping(system.tubes),
         "margins": to_mapping(system.margins),
-        "with_fissures": lung.has_fissures and not system.fissures_allowed,
+        "with_fissures": fissures_are_obstacles(lung, system),
         **resolution,
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=list).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Which change of one device parameter would make a target reachable, shown by a plan with that change."""
+"""Counterfactuals: the change of one device parameter that makes a target reachable, shown by a plan."""
 
 from __future__ import annotations
 
@@ -11,38 +11,41 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lungaccess.coupled.atlas import Atlas, build_atlas
-from lungaccess.coupled.search import AtlasSearch
+from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.diverse import different_candidates
-from lungaccess.plans.assemble import Candidate, Task, assemble
+from lungaccess.plans.assemble import assemble
+from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
-from stages.needle import direct_arcs
+from lungaccess.problem.task import Task
 from stages.scope import Bronchoscope
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 TIGHTEST_RADIUS_MM = 20.0
 THINNEST_NEEDLE_MM = 0.3
 THINNEST_SCOPE_MM = 2.2
+"""Beyond these sizes no device is proposed."""
 LEAST_WALL_MM = 0.2
 """A scope is thicker than its channel by so much at least."""
 RADIUS_STEP_MM = 1.0
 DIAMETER_STEP_MM = 0.05
 SCOPE_STEP_MM = 0.1
+"""Steps in which the changed parameters are given."""
 ROTATIONS = DEFAULT_ROTATIONS // 2
 STOP_MM = 2.0 * DEFAULT_STOP_MM
-"""A thinner scope has many more places to stand; what it could do there is enumerated more coarsely."""
+"""A thinner scope has many more sites; its deployments are enumerated more coarsely to save time."""
 
 _THIN: WeakKeyDictionary[Atlas, Atlas] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Remedy:
+class Counterfactual:
     """A change of one device parameter with which the target is reached.
 
     Parameters
     ----------
     parameter : str
-        In words.
+        The parameter in words.
     present, needed : float
         Its value, and the nearest one found with which a plan exists; mm.
     plan : Plan
@@ -56,90 +59,92 @@ class Remedy:
 
     @property
     def relative_change(self) -> float:
-        """By which part of itself the parameter has to change."""
+        """The change as a share of the present value."""
         return abs(self.needed - self.present) / self.present
 
     def __str__(self) -> str:
         return f"{self.parameter} of {self.needed:g} mm instead of {self.present:.4g} mm"
 
 
-def remedies(search: AtlasSearch) -> tuple[Remedy, ...]:
-    """Return what would help, the smallest relative change first.
+def counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]:
+    """Return the changes of one parameter with which a single arc reaches the target, the smallest first.
 
-    Tighter curvature and a thinner needle, with the deployments of the atlas, and a thinner scope, with what
-    it could reach beyond them: each changed alone, no more than a single arc of the needle demands.  Whether
-    such a device exists, and what else it would need, is not asked.
+    The parameters are the needle's curvature and diameter, with the deployments of the atlas, and the
+    diameter of the scope, with what a thinner one could reach beyond them.  Each is changed alone, and no
+    more than a single arc of the needle demands.  Whether such a device exists, and what else it would need,
+    is not asked.
     """
-    found = [*_curvature(search), *_needle_diameter(search), *_scope_diameter(search)]
-    return tuple(sorted(found, key=lambda remedy: remedy.relative_change))
+    found = [*_curvature(task, atlas), *_needle_diameter(task, atlas), *_scope_diameter(task, atlas)]
+    return tuple(sorted(found, key=lambda change: change.relative_change))
 
 
-def _curvature(search: AtlasSearch) -> Iterator[Remedy]:
-    needle = search.task.system.needle
+def _curvature(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
+    needle = task.system.needle
     present = needle.min_radius_of_curvature_mm
 
     def made(radius_mm: float) -> System:
         tighter = replace(needle, max_curvature_per_mm=1.0 / radius_mm)
-        return _changed(search.task.system, needle=tighter)
+        return _changed(task.system, needle=tighter)
 
-    yield from _least_change(
-        search, "a needle with a radius of curvature", present, TIGHTEST_RADIUS_MM, RADIUS_STEP_MM, made
-    )
+    name = "a needle with a radius of curvature"
+    yield from _least_change(task, atlas, name, present, TIGHTEST_RADIUS_MM, RADIUS_STEP_MM, made)
 
 
-def _needle_diameter(search: AtlasSearch) -> Iterator[Remedy]:
-    needle = search.task.system.needle
+def _needle_diameter(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
+    needle = task.system.needle
 
     def made(diameter_mm: float) -> System:
-        return _changed(search.task.system, needle=replace(needle, diameter_mm=diameter_mm))
+        return _changed(task.system, needle=replace(needle, diameter_mm=diameter_mm))
 
+    name = "a needle with a diameter"
     yield from _least_change(
-        search, "a needle with a diameter", needle.diameter_mm, THINNEST_NEEDLE_MM, DIAMETER_STEP_MM, made
+        task, atlas, name, needle.diameter_mm, THINNEST_NEEDLE_MM, DIAMETER_STEP_MM, made
     )
 
 
 def _least_change(
-    search: AtlasSearch, name: str, present: float, limit: float, step: float, made: Callable[[float], System]
-) -> Iterator[Remedy]:
-    """Halve the range of a parameter of the needle: what a value reaches, a smaller one reaches too."""
+    task: Task,
+    atlas: Atlas,
+    name: str,
+    present: float,
+    limit: float,
+    step: float,
+    made: Callable[[float], System],
+) -> Iterator[Counterfactual]:
+    """Bisect the range of a parameter of the needle: what a value reaches, a smaller one reaches too."""
     low, high = limit, math.floor(present / step + 1e-9) * step
-    if low >= high or (best := _planned(search, search.atlas, made(low))) is None:
+    if low >= high or (best := _planned(task, atlas, made(low))) is None:
         return
     needed = low
     while high - needed > 1.5 * step:
         middle = round(0.5 * (needed + high) / step) * step
-        plan = _planned(search, search.atlas, made(middle))
+        plan = _planned(task, atlas, made(middle))
         if plan is None:
             high = middle
         else:
             needed, best = middle, plan
-    yield Remedy(parameter=name, present=present, needed=round(needed, 6), plan=best)
+    yield Counterfactual(parameter=name, present=present, needed=round(needed, 6), plan=best)
 
 
-def _scope_diameter(search: AtlasSearch) -> Iterator[Remedy]:
-    """Enumerate what a very thin scope could do; of what reaches the target take what lets it be thickest."""
-    task = search.task
+def _scope_diameter(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
+    """Enumerate what the thinnest scope could do; where it reaches the target, find how thick it may be."""
     scope = task.system.scope
-    atlas = _with_the_thinnest_scope(search.atlas)
-    if atlas is None:
+    thin_atlas = _with_the_thinnest_scope(atlas)
+    if thin_atlas is None:
         return
-    thin = AtlasSearch(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), atlas)
-    entries, near = atlas.deployments, thin.in_workspace
-    blockers, _lengths, _costs = direct_arcs(
-        thin.desk.environment, entries.positions[near], entries.tangents[near], entries.branch[near],
-        task.target.lps_mm,
-    )  # fmt: skip
-    clear = near[blockers == 0]
-    radius_mm = atlas.sites.narrowest_radius_mm[entries.site[clear]] - scope.lumen_margin_mm
+    thin = DirectArcs(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), thin_atlas)
+    near, site = thin.in_workspace, thin_atlas.deployments.site
+    clear = near[thin.blockers(near)[0] == 0]
+    radius_mm = thin_atlas.sites.narrowest_radius_mm[site[clear]] - scope.lumen_margin_mm
     for entry in clear[np.argsort(-radius_mm, kind="stable")]:
-        candidate = thin.finished(int(entry))
+        candidate = thin.proved(int(entry))
         if candidate is None:
             continue
         widest = 2.0 * float(radius_mm[clear == entry][0])
         needed = round(math.floor(widest / SCOPE_STEP_MM + 1e-9) * SCOPE_STEP_MM, 6)
         system = _with_scope(task.system, needed)
-        plan = _assembled(replace(task, system=system), atlas, candidate)
-        yield Remedy(
+        plan = _assembled(replace(task, system=system), thin_atlas, candidate)
+        yield Counterfactual(
             parameter="a bronchoscope with an outer diameter",
             present=scope.outer_diameter_mm,
             needed=needed,
@@ -172,11 +177,12 @@ def _changed(system: System, **parts: Any) -> System:
     return replace(system, **parts, name=f"{system.name} (changed)")
 
 
-def _planned(search: AtlasSearch, atlas: Atlas, system: System) -> Plan | None:
-    task = replace(search.task, system=system)
-    other = AtlasSearch(task, replace(atlas, system=system))
-    for candidate in different_candidates(other, 1, 1.0):
-        return _assembled(task, atlas, candidate)
+def _planned(task: Task, atlas: Atlas, system: System) -> Plan | None:
+    """Return the plan of a direct arc with another system, None if there is none."""
+    changed = replace(task, system=system)
+    arcs = DirectArcs(changed, replace(atlas, system=system))
+    for candidate in different_candidates(arcs, 1, 1.0):
+        return _assembled(changed, atlas, candidate)
     return None
 
 

@@ -3,29 +3,43 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
-from lungaccess.coupled.counterfactuals import Remedy, remedies
-from lungaccess.coupled.search import AtlasSearch
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.counterfactuals import Counterfactual, counterfactuals
+from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.no_plan import NoPlan
-from stages.needle import Needle, direct_arcs, needle_environment
+from lungaccess.problem.task import Task
+from stages.needle import needle_environment
 
 
-def explain(search: AtlasSearch, iterations: int) -> NoPlan:
-    """Return the `NoPlan` of a search that ended without a plan."""
-    workable = search.atlas.deployments.count > 0 and not _reached_with(search, search.task.system.needle)
-    found = remedies(search) if workable else ()
+def explain(task: Task, atlas: Atlas, blocked: Counter[str], iterations: int) -> NoPlan:
+    """Return the `NoPlan` of a search that ended without a plan.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+    blocked : Counter of str
+        How many direct arcs were stopped in the search, by what stopped them.
+    iterations : int
+        How many the search had.
+    """
+    arcs = DirectArcs(task, atlas)
+    direct = _reached(arcs)
+    changes = counterfactuals(task, atlas) if atlas.deployments.count and not direct else ()
     return NoPlan(
-        f"No plan to the target after {iterations} iterations: {_main_reason(search)}",
-        reasons=_reasons(search),
-        advice=_advice(search, found),
-        plans_with_changes={str(remedy): remedy.plan for remedy in found},
+        f"No plan to the target after {iterations} iterations: {_main_reason(arcs, blocked)}",
+        reasons=_reasons(arcs, blocked),
+        advice=_advice(arcs, direct, changes),
+        plans_with_changes={str(change): change.plan for change in changes},
     )
 
 
-def _main_reason(search: AtlasSearch) -> str:
-    atlas = search.atlas
+def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
+    atlas = arcs.atlas
     if atlas.sites.count == 0:
-        scope = f"the scope ({search.task.system.scope.outer_diameter_mm:g} mm) has nowhere to stand"
+        scope = f"the scope ({arcs.task.system.scope.outer_diameter_mm:g} mm) fits nowhere"
         generation, excess = atlas.sites.narrowest
         if generation < 0:
             return f"{scope}; no airway lies in lung tissue"
@@ -33,17 +47,17 @@ def _main_reason(search: AtlasSearch) -> str:
         return f"{scope}; the airway is {narrow}"
     if atlas.deployments.count == 0:
         return "the tubes cannot leave the airway safely from any site"
-    if not len(search.in_workspace):
+    if not len(arcs.in_workspace):
         return "the target lies outside the needle's workspace for every deployment"
-    blocked = search.desk.blocked.copy()
-    del blocked["nothing"], blocked["the needle's limits"]
-    most = f", mostly by {blocked.most_common(1)[0][0]}" if blocked else ""
+    obstacles = blocked.copy()
+    del obstacles["nothing"], obstacles["the needle's limits"]
+    most = f", mostly by {obstacles.most_common(1)[0][0]}" if obstacles else ""
     return f"every path tried from a deployment that could reach the target is blocked{most}"
 
 
-def _reasons(search: AtlasSearch) -> dict[str, int]:
+def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
     """Count, stage by stage, what was ruled out and why."""
-    atlas = search.atlas
+    atlas = arcs.atlas
     reasons = {"scope: sites": atlas.sites.count}
     generation, excess = atlas.sites.narrowest
     closed = int((~atlas.sites.passable).sum())
@@ -54,32 +68,32 @@ def _reasons(search: AtlasSearch) -> dict[str, int]:
         ] = closed
     reasons["tube: deployments looked at"] = atlas.deployments.candidates
     reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
-    outside = atlas.deployments.count - len(search.in_workspace)
+    outside = atlas.deployments.count - len(arcs.in_workspace)
     reasons["needle: deployments whose workspace does not hold the target"] = outside
-    for name, count in sorted(search.desk.blocked.items()):
+    for name, count in sorted(blocked.items()):
         if name != "nothing":
             reasons[f"needle: arcs stopped by {name}"] = count
     return reasons
 
 
-def _advice(search: AtlasSearch, found: tuple[Remedy, ...]) -> str:
+def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...]) -> str:
     """Say what would help, the smallest change first.
 
     Where no site or no deployment is left, say which change brings one back, if that is known.
     """
-    atlas, system = search.atlas, search.task.system
+    atlas = arcs.atlas
     if atlas.sites.count == 0:
         return _thinner_scope(atlas.sites.widest_scope_mm)
     if atlas.deployments.count == 0:
         return ""
-    if _reached_with(search, system.needle):
+    if direct:
         return "The search was too short: a single arc from a deployment of the atlas reaches the target"
     said = []
-    if found:
-        first, *others = (str(remedy) for remedy in found)
+    if changes:
+        first, *others = (str(change) for change in changes)
         also = f"; so would {' or '.join(others)}" if others else ""
         said.append(f"{first[0].upper()}{first[1:]} would reach it{also}")
-    if atlas.with_fissures and _reached_with(search, system.needle, with_fissures=False):
+    if atlas.with_fissures and _reached(arcs, with_fissures=False):
         said.append(
             "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
         )
@@ -91,25 +105,14 @@ def _advice(search: AtlasSearch, found: tuple[Remedy, ...]) -> str:
 def _thinner_scope(widest_mm: float) -> str:
     """Say how thin the scope must be to have a site, rounded down to a tenth."""
     tenths = math.floor(10.0 * widest_mm)
-    return f"A bronchoscope of {tenths / 10:.1f} mm or less has a place to stand" if tenths else ""
+    return f"A bronchoscope of {tenths / 10:.1f} mm or less fits somewhere" if tenths else ""
 
 
-def _reached_with(search: AtlasSearch, needle: Needle, *, with_fissures: bool | None = None) -> bool:
-    """Tell whether a direct arc of another needle reaches the target from the same deployments."""
-    atlas, task = search.atlas, search.task
-    environment = needle_environment(
-        task.lung,
-        needle,
-        task.system.margins,
-        with_fissures=task.with_fissures if with_fissures is None else with_fissures,
-    )
-    entries, target = atlas.deployments, task.target.lps_mm
-    near, _lengths = atlas.index.holding(environment, target)
-    blockers, _lengths, _costs = direct_arcs(
-        environment,
-        entries.positions[near],
-        entries.tangents[near],
-        entries.branch[near],
-        target,
-    )
-    return bool((blockers == 0).any())
+def _reached(arcs: DirectArcs, *, with_fissures: bool = True) -> bool:
+    """Tell whether a direct arc from the atlas reaches the target, if need be through fissures."""
+    task = arcs.task
+    environment = arcs.evaluator.environment
+    if not with_fissures:
+        system = task.system
+        environment = needle_environment(task.lung, system.needle, system.margins, with_fissures=False)
+    return bool((arcs.blockers(arcs.in_workspace, environment)[0] == 0).any())

@@ -1,4 +1,4 @@
-"""Go on with a search in several processes, repeatable from the seed."""
+"""Continue a search in several processes, repeatable from the seed."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from itertools import count
 from multiprocessing.connection import Connection
 
 from anatomy.errors import AnatomyError, SettingsError
-from lungaccess.coupled.search import AtlasSearch, Step
+from lungaccess.coupled.search.base import ParallelSearch, Step
 
 ROUND_ITERATIONS = 100
 """Iterations of one process before the best of all is shared."""
 
 
-def parallel_steps(search: AtlasSearch, processes: int) -> Iterator[Step]:
-    """Search forever in several processes; the caller stops.
+def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
+    """Search in several processes until the caller stops, or until nothing can be found.
 
-    Direct arcs come first.  Then rounds: each process goes on with a search of its own, which begins from
-    every so many of the direct arcs and has random numbers that depend on the seed and its number, and the
-    best of all goes into the next round.  So the same seed, number of processes and iterations give the same
-    plans, whatever the machine's load.
+    Direct arcs come first.  Then rounds: each process continues a search of its own, which begins from every
+    so many of the direct arcs and has random numbers that depend on the seed and its number, and the best of
+    all goes into the next round.  So the same seed, number of processes and iterations give the same plans,
+    whatever the machine's load.
 
     Raises
     ------
@@ -48,23 +48,24 @@ def parallel_steps(search: AtlasSearch, processes: int) -> Iterator[Step]:
             workers.append(worker)
         for turn in count(1):
             for end in ends:
-                end.send(search.best)
+                end.send(search.incumbent.step)
             found = [_received(end) for end in ends]
-            yield _best_of(search, found, turn * processes * ROUND_ITERATIONS)
+            iteration = turn * processes * ROUND_ITERATIONS
+            yield _best_of(search, found, iteration)
+            if search.is_futile(iteration):
+                return
     finally:
         for worker in workers:
             worker.terminate()
             worker.join()
 
 
-def _best_of(search: AtlasSearch, found: list[Step | None], iteration: int) -> Step:
+def _best_of(search: ParallelSearch, found: list[Step | None], iteration: int) -> Step:
     """Return the best of a round, if it is better than all before, and keep it."""
     better = min((step for step in found if step is not None), key=lambda step: step.cost, default=None)
-    if better is None or (search.best is not None and better.cost >= search.best.cost):
-        return Step(iteration=iteration, phase="climb")
-    better = replace(better, iteration=iteration)
-    search.adopt(better)
-    return better
+    if better is None:
+        return Step(iteration=iteration, phase="local search")
+    return search.incumbent.improved(replace(better, iteration=iteration))
 
 
 def _received(end: Connection) -> Step | None:
@@ -76,8 +77,8 @@ def _received(end: Connection) -> Step | None:
     return step
 
 
-def _work(search: AtlasSearch, number: int, processes: int, end: Connection) -> None:
-    """Go on with the search in this process: a round for each message, which is the best of all.
+def _work(search: ParallelSearch, number: int, processes: int, end: Connection) -> None:
+    """Continue the search in this process: a round for each message, which is the best of all.
 
     An interruption from the keyboard reaches every process; only the one that holds the best heeds it.
     """
@@ -90,7 +91,7 @@ def _work(search: AtlasSearch, number: int, processes: int, end: Connection) -> 
         except EOFError:
             return
         if best is not None:
-            search.adopt(best)
+            search.incumbent.adopt(best)
         found = None
         for _ in range(ROUND_ITERATIONS):
             step = next(steps, None)

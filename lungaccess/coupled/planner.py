@@ -6,31 +6,37 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
-from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch, ReferenceSearchWithoutRejection
-from lungaccess.coupled.search import AtlasSearch, KuntzSearch, KuntzSearchWithoutRejection, Step
-from lungaccess.plans.assemble import Task, assemble
+from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
+from lungaccess.coupled.search.atlas_search import AtlasSearch
+from lungaccess.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
+from lungaccess.coupled.search.kuntz2015 import KuntzSearch
+from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
-from lungaccess.problem.target import Target, require_free
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
 from stages.needle import Objective
 
-METHODS = {
+METHODS: dict[str, SearchFactory] = {
     "atlas": AtlasSearch,
     "kuntz2015": KuntzSearch,
-    "kuntz2015-without-rejection": KuntzSearchWithoutRejection,
+    "kuntz2015-without-rejection": partial(KuntzSearch, rejects=False),
     "reference": ReferenceSearch,
-    "reference-without-rejection": ReferenceSearchWithoutRejection,
+    "reference-without-rejection": partial(ReferenceSearch, rejects=False),
 }
+"""The searches by their names.  A search of your own becomes a method of `plan` when you add it here."""
 PROGRESS_EVERY_S = 0.1
+"""Time between two progress reports: a display looks smooth, and the reports cost no time worth mention."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProgressEvent:
-    """Where a search stands.
+    """The progress of a search.
 
     Parameters
     ----------
@@ -40,6 +46,7 @@ class ProgressEvent:
     best_cost : float or None
         None as long as there is no plan.
     phase, message : str
+        What the search does; the message replaces the phase where it is not empty.
     """
 
     iteration: int
@@ -74,11 +81,13 @@ def plan(
         "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1], "length_mm", or a
         weighted sum of them such as "length=1,cost-map=0.5".
     method : str
-        "atlas": direct arcs from every deployment of the atlas, then climbs from the best of them, draws of
-        deployments between, the optimal needle planner from others, and joint refinement.
-        "kuntz2015": Algorithm 1 of that paper; "kuntz2015-without-rejection": the same without its workspace
-        test.  "reference" and "reference-without-rejection": the same as printed, with FCL on meshes, slow;
-        see `lungaccess.coupled.kuntz2015_fcl`.
+        One of METHODS, to which you can add a search of your own; see
+        `lungaccess.coupled.search.base.PlanSearch`.  "atlas": direct arcs from every deployment of the atlas,
+        then local search from the best of them, local sampling of deployments between, the needle's own
+        search from others, and joint refinement.  "kuntz2015": Algorithm 1 of that paper;
+        "kuntz2015-without-rejection": the same without its workspace test.  "reference" and
+        "reference-without-rejection": the same as printed, with FCL on meshes, slow; see
+        `lungaccess.coupled.kuntz2015_fcl`.
     seed : int
         The same seed and `iterations` give the same plans.
     iterations : int, optional
@@ -92,7 +101,7 @@ def plan(
         How many processes vary the best candidate at the same time.  The same seed, number of processes and
         `iterations` give the same plans.
     on_progress : callable, optional
-        Told about ten times a second.
+        Gets a `ProgressEvent` about ten times a second.
 
     Raises
     ------
@@ -108,33 +117,28 @@ def plan(
     if method not in METHODS:
         raise SettingsError(f"There is no method {method!r}", expected=f"one of {', '.join(METHODS)}")
     tell = on_progress or (lambda _event: None)
-    require_free(lung, target.lps_mm)
+    task = Task(lung=lung, system=system, target=target, objective=weighed, method=method, seed=seed)
     if atlas is not None:
         require_same(atlas, lung, system)
     atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(atlas_event(share)))
-    task = Task(
-        lung=lung,
-        system=system,
-        target=target,
-        objective=weighed,
-        with_fissures=atlas.with_fissures,
-        method=method,
-        seed=seed,
-    )
     search = METHODS[method](task, atlas)
-    if processes == 1:
-        return _run(search, search.steps(), iterations, time_s, tell)
-    if method != "atlas":
+    steps = search.steps() if processes == 1 else _parallel(search, method, processes)
+    return _run(task, atlas, search, steps, iterations, time_s, tell)
+
+
+def _parallel(search: PlanSearch, method: str, processes: int) -> Iterator[Step]:
+    """Return the steps of a search in several processes."""
+    from lungaccess.coupled.parallel import parallel_steps
+
+    if not isinstance(search, ParallelSearch):
         raise SettingsError(
             f"{processes} processes are asked for with {method}", expected="one process, or method atlas"
         )
-    from lungaccess.coupled.parallel import parallel_steps
-
-    return _run(search, parallel_steps(search, processes), iterations, time_s, tell)
+    return parallel_steps(search, processes)
 
 
 def atlas_event(share: float) -> ProgressEvent:
-    """Return what is told while the atlas is made."""
+    """Return the progress event of an atlas of which a share is made."""
     return ProgressEvent(
         iteration=0,
         elapsed_s=0.0,
@@ -145,7 +149,9 @@ def atlas_event(share: float) -> ProgressEvent:
 
 
 def _run(
-    search: AtlasSearch,
+    task: Task,
+    atlas: Atlas,
+    search: PlanSearch,
     steps: Iterator[Step],
     iterations: int | None,
     time_s: float | None,
@@ -154,7 +160,7 @@ def _run(
     """Drive a search within its budget."""
     from lungaccess.coupled.explain import explain
 
-    clock, task = Clock(), search.task
+    clock = Clock()
     limit_s = math.inf if time_s is None else time_s
     best: float | None = None
     iteration = 0
@@ -164,10 +170,8 @@ def _run(
         iteration = step.iteration
         if step.candidate is not None:
             best = step.cost
-            timing = {"planning_s": clock.elapsed_s, "atlas_s": search.atlas.build_s}
-            yield assemble(task, search.atlas.sites, step.candidate, iteration=iteration, timing=timing)
-        if best is None and search.is_hopeless(step.iteration):
-            break
+            timing = {"planning_s": clock.elapsed_s, "atlas_s": atlas.build_s}
+            yield assemble(task, atlas.sites, step.candidate, iteration=iteration, timing=timing)
         if (best is not None or iteration > 0) and clock.elapsed_s > limit_s:
             break
         if clock.due():
@@ -177,7 +181,7 @@ def _run(
                 )
             )
     if best is None:
-        raise explain(search, iteration)
+        raise explain(task, atlas, search.blocked, iteration)
 
 
 class Clock:

@@ -207,27 +207,18 @@ def coupled_plan_test(atlas: Atlas, lesion_lps: Float) -> ExitTest:
 
 def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
     """Return the tree points from where a lesion can be reached."""
-    from lungaccess.coupled.search import AtlasSearch
-    from lungaccess.plans.assemble import Task
+    from lungaccess.coupled import DirectArcs
     from lungaccess.problem.target import point_target
-    from stages.needle import SHORTEST, direct_arcs
+    from lungaccess.problem.task import Task
+    from stages.needle import SHORTEST
 
-    task = Task(
-        lung=atlas.lung,
-        system=atlas.system,
-        target=point_target(atlas.lung, lesion),
-        objective=SHORTEST,
-        with_fissures=atlas.with_fissures,
-        method="atlas",
-        seed=0,
-    )
-    search = AtlasSearch(task, atlas)
-    entries, held = atlas.deployments, search.in_workspace
+    target = point_target(atlas.lung, lesion)
+    task = Task(lung=atlas.lung, system=atlas.system, target=target, objective=SHORTEST)
+    arcs = DirectArcs(task, atlas)
+    entries, held = atlas.deployments, arcs.in_workspace
     if not len(held):
         return frozenset()
-    blockers, lengths, _costs = direct_arcs(
-        search.desk.environment, entries.positions[held], entries.tangents[held], entries.branch[held], lesion
-    )
+    blockers, lengths, _costs = arcs.blockers(held)
     clear = np.flatnonzero(blockers == 0)
     clear = held[clear[np.argsort(lengths[clear], kind="stable")]]
     points = atlas.sites.tree_point[entries.site[clear]]
@@ -237,7 +228,7 @@ def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
         if point in good or tried.get(point, 0) >= PROOFS_PER_SITE:
             continue
         tried[point] = tried.get(point, 0) + 1
-        if search.finished(entry) is not None:
+        if arcs.proved(entry) is not None:
             good.add(int(point))
     return frozenset(good)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -15,38 +14,17 @@ from anatomy.lung import Lung
 from anatomy.structures import BITS
 from anatomy.typed import Float
 from lungaccess.plans import costs
+from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import System, system_fingerprint
-from lungaccess.problem.target import Target
-from stages.needle import ArcPath, Objective
+from lungaccess.problem.system import system_fingerprint
+from lungaccess.problem.task import Task
+from stages.needle import ArcPath
 from stages.scope import ScopeTip, Sites, approach, approach_depth_mm, leaving_point
-from stages.tube import Deployment, centreline
+from stages.tube import centreline
 
 CLEARANCE_CAP_MM = 5.0
 SAMPLE_MM = 0.05
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Candidate:
-    """The choices that make a plan; everything else follows from them."""
-
-    tip: ScopeTip
-    deployment: Deployment
-    path: ArcPath
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Task:
-    """What a search is asked: patient, device, target, objective."""
-
-    lung: Lung
-    system: System
-    target: Target
-    objective: Objective
-    with_fissures: bool
-    method: str
-    seed: int
 
 
 def assemble(

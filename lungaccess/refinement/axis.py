@@ -1,4 +1,4 @@
-"""The scope's tip as a smooth function of the way along the airway, and back to the tree."""
+"""The scope's tip as a smooth function of arc length along the airway, and back to the tree."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM
 from stages.scope import ScopeTip, Sites, looks_ahead, tip_at
 
 SAMPLE_MM = 0.125
+"""Step in which poses of the tip are tested and fitted; a voxel is several times as large."""
 ROUNDING_MM = 1e-9
+"""Keeps the end of a range in it whatever is rounded."""
 
 
 class LocalAxis:
-    """The airway's medial axis near a tip, AXIS_SCALE_MM each way, as far as the scope can stand there.
+    """The airway's medial axis near a tip, AXIS_SCALE_MM each way, as far as the scope fits.
 
     Parameters
     ----------
@@ -37,26 +39,30 @@ class LocalAxis:
 
     def __init__(self, tree: AirwayTree, sites: Sites, tip: ScopeTip, branch: int) -> None:
         self._tree = tree
-        way = tree.distance_from_root_mm
-        self._tip_way = float(way[tip.tree_point]) - tip.back_mm
-        self._points = _route_through(tree, tip, branch, self._tip_way)
-        self._ways = way[self._points]
-        behind = np.arange(0.0, min(self._tip_way - self._ways[0], AXIS_SCALE_MM) + ROUNDING_MM, SAMPLE_MM)
-        ahead = np.arange(0.0, min(self._ways[-1] - self._tip_way, AXIS_SCALE_MM) + ROUNDING_MM, SAMPLE_MM)
+        from_root = tree.distance_from_root_mm
+        self._tip_mm = float(from_root[tip.tree_point]) - tip.back_mm
+        self._points = _route_through(tree, tip, branch, self._tip_mm)
+        self._arc_lengths_mm = from_root[self._points]
+        behind = np.arange(
+            0.0, min(self._tip_mm - self._arc_lengths_mm[0], AXIS_SCALE_MM) + ROUNDING_MM, SAMPLE_MM
+        )
+        ahead = np.arange(
+            0.0, min(self._arc_lengths_mm[-1] - self._tip_mm, AXIS_SCALE_MM) + ROUNDING_MM, SAMPLE_MM
+        )
         self.low_mm, self.high_mm = -self._farthest(sites, -behind), self._farthest(sites, ahead)
         self.points, self.tangents = self._fit()
 
     def tip(self, shift_mm: float) -> ScopeTip:
-        """Return the tip moved by `shift_mm` along the airway, as far as the scope can stand."""
+        """Return the tip moved by `shift_mm` along the airway, as far as the scope fits."""
         return self._moved(min(max(shift_mm, self.low_mm), self.high_mm))
 
     def _moved(self, shift_mm: float) -> ScopeTip:
-        at = self._tip_way + shift_mm
-        index = min(int(np.searchsorted(self._ways, at)), len(self._points) - 1)
-        return tip_at(self._tree, int(self._points[index]), float(self._ways[index] - at))
+        at = self._tip_mm + shift_mm
+        index = min(int(np.searchsorted(self._arc_lengths_mm, at)), len(self._points) - 1)
+        return tip_at(self._tree, int(self._points[index]), float(self._arc_lengths_mm[index] - at))
 
     def _farthest(self, sites: Sites, shifts: Float) -> float:
-        """Return how far one may go along `shifts`, away from 0, while the scope can stand everywhere."""
+        """Return how far one may go along `shifts`, away from 0, while the scope fits everywhere."""
         reached = 0.0
         for shift in shifts.tolist():
             tip = self._moved(shift)
@@ -78,8 +84,8 @@ class LocalAxis:
         return fitted[0], fitted[1]
 
 
-class StillAxis:
-    """A tip that is turned aside and stays where it is: it has no smooth way along the airway.
+class FixedTip:
+    """A tip that is turned aside and stays where it is: it has no smooth axis along the airway.
 
     Parameters
     ----------
@@ -94,33 +100,33 @@ class StillAxis:
     def __init__(self, tip: ScopeTip) -> None:
         self._tip = tip
         self.low_mm = self.high_mm = 0.0
-        self.points, self.tangents = standing_still(tip)
+        self.points, self.tangents = one_tip(tip)
 
     def tip(self, _shift_mm: float) -> ScopeTip:
         """Return the tip."""
         return self._tip
 
 
-def axis_of(tree: AirwayTree, sites: Sites, tip: ScopeTip, branch: int) -> LocalAxis | StillAxis:
+def axis_of(tree: AirwayTree, sites: Sites, tip: ScopeTip, branch: int) -> LocalAxis | FixedTip:
     """Return where a tip can be moved; see `LocalAxis`."""
-    return StillAxis(tip) if tip.turned else LocalAxis(tree, sites, tip, branch)
+    return FixedTip(tip) if tip.turned else LocalAxis(tree, sites, tip, branch)
 
 
-def standing_still(tip: ScopeTip) -> tuple[Float, Float]:
+def one_tip(tip: ScopeTip) -> tuple[Float, Float]:
     """Return the coefficients of an axis that is one tip."""
     points, tangents = np.zeros((3, AXIS_DEGREE + 1)), np.zeros((3, AXIS_DEGREE + 1))
     points[:, 0], tangents[:, 0] = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
     return points, tangents
 
 
-def _route_through(tree: AirwayTree, tip: ScopeTip, branch: int, tip_way: float) -> np.ndarray:
+def _route_through(tree: AirwayTree, tip: ScopeTip, branch: int, tip_mm: float) -> np.ndarray:
     """Return tree points from behind the tip to ahead of it, each the parent of the next."""
-    way = tree.distance_from_root_mm
+    from_root = tree.distance_from_root_mm
     points = [tip.tree_point]
-    while way[points[0]] > tip_way - AXIS_SCALE_MM and tree.parent_point[points[0]] >= 0:
+    while from_root[points[0]] > tip_mm - AXIS_SCALE_MM and tree.parent_point[points[0]] >= 0:
         points.insert(0, int(tree.parent_point[points[0]]))
     wanted = set(tree.route(int(tree.branch_start[branch + 1]) - 1).tolist()) if branch >= 0 else set()
-    while way[points[-1]] < tip_way + AXIS_SCALE_MM:
+    while from_root[points[-1]] < tip_mm + AXIS_SCALE_MM:
         children = np.flatnonzero(tree.parent_point == points[-1]).tolist()
         if not children:
             break

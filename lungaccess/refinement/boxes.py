@@ -18,6 +18,7 @@ BOX_VALUES = (100_000, 100_000, 40_000, 20_000, 100_000)
 second (third, ...) value is taken along the axes of the smallest spacing."""
 CLEARANCE, SPARED, WALL, LUMEN_SHARE, MAP = range(5)
 FEWEST = 6
+"""Fewest values along an axis: a cubic B-spline needs four, and the cells at the ends one more each."""
 LUMEN_WIDTH_MM = 0.945
 """A ball of the radius within which that test looks has this spread along each axis."""
 
@@ -101,13 +102,13 @@ def lumen_box(lung: Lung, points: Float, margin_mm: float) -> FieldBox:
 
 
 def map_box(cost: Volume, points: Float, margin_mm: float) -> FieldBox:
-    """Return the cost map around points; infinite costs count as the dearest finite one."""
+    """Return the cost map around points; infinite costs count as the greatest finite one."""
     centres = _centres(cost.grid)
     low, high = _range(centres, cost.grid.shape, points, margin_mm)
     finite = np.isfinite(cost.array[low[0] : high[0], low[1] : high[1], low[2] : high[2]])
     part = cost.array[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
-    dearest = float(part[finite].max()) if finite.any() else 0.0
-    return _cut_box(MAP, np.where(finite, part, dearest), centres, low, 1.0)
+    greatest = float(part[finite].max()) if finite.any() else 0.0
+    return _cut_box(MAP, np.where(finite, part, greatest), centres, low, 1.0)
 
 
 def _centres(grid: Grid) -> Float:

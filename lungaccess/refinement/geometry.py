@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi
 
-from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM, SLOPE_MM, WALL_WAY_MM, Layout
+from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM, SLOPE_MM, WALL_CONTACT_MM, Layout
 
 SERIES_TERMS = 14
 """Up to an angle of 2 pi the series are off by less than 1e-6."""
@@ -128,9 +128,9 @@ class Geometry:
         )
 
     def before_exit(self) -> tuple[list[Any], list[Any]]:
-        """Return the same on the last way to the wall."""
+        """Return the same for the last WALL_CONTACT_MM before the exit."""
         count = self._layout.wall_points
-        places = [casadi.fmax(self.exit - WALL_WAY_MM * m / count, 0.0) for m in range(1, count + 1)]
+        places = [casadi.fmax(self.exit - WALL_CONTACT_MM * m / count, 0.0) for m in range(1, count + 1)]
         return [self.tube_point(s) for s in places], [self._outer_share(s) for s in places]
 
     def at_exit(self) -> list[Any]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from lungaccess.plans.assemble import Candidate, Task
-from lungaccess.refinement.problem import ARC_COUNTS, Court, Problem, program_weights
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
+from lungaccess.refinement.problem import ARC_COUNTS, Problem, program_weights
 from stages.scope import Sites
 
 ITERATIONS = 40
+"""Most steps of IPOPT by default; docs/refinement.md has what they save."""
 NEEDLE_SHARES = (1.0, 0.5)
+"""Where the needle that the program ends at is refused, the one half as far is tried."""
 BETTER = 1e-3
 """Share of the cost that an improvement must save."""
 
@@ -18,8 +22,8 @@ def refine(
     """Improve everything about a candidate together.
 
     A nonlinear program moves the scope's site, the tubes and all arcs of the needle at once.  What it finds
-    is put back into the numbers of a plan and judged by the discrete tests, so nothing is returned that they
-    do not accept.  Called again with what it returned, it may find more.  Not for several threads at a time.
+    is put back into the numbers of a plan and proved by the evaluator, so nothing is returned that it
+    refuses.  Called again with what it returned, it may find more.  Not for several threads at a time.
 
     Parameters
     ----------
@@ -27,7 +31,7 @@ def refine(
     atlas_sites : Sites
         Where the scope passes.
     candidate : Candidate
-        Accepted by the same tests.
+        Proved by the evaluator.
     iterations : int
         Most steps of the program's solver, each time it runs (two or three times a call).  For each number a
         program is built at the first call, which takes a second or two.
@@ -41,26 +45,31 @@ def refine(
     weights = program_weights(task)
     if len(candidate.path.arcs) > ARC_COUNTS[-1] or weights is None:
         return None
-    return _refined(Court(task), atlas_sites, candidate, weights, iterations)
+    return _refined(CandidateEvaluator(task), atlas_sites, candidate, weights, iterations)
 
 
 def _refined(
-    court: Court, sites: Sites, candidate: Candidate, weights: tuple[float, float, float], iterations: int
+    evaluator: CandidateEvaluator,
+    sites: Sites,
+    candidate: Candidate,
+    weights: tuple[float, float, float],
+    iterations: int,
 ) -> Candidate | None:
-    """Solve for everything, then for the needle alone from tubes that the discrete test accepts."""
+    """Solve for everything, then for the needle alone from tubes that are proved."""
     from lungaccess.refinement.program import program
 
-    problem, limit = Problem(court, sites, candidate, weights), court.cost(candidate) * (1.0 - BETTER)
+    problem = Problem(evaluator, sites, candidate, weights)
+    limit = evaluator.cost(candidate.path) * (1.0 - BETTER)
     solver = program(problem.layout, iterations)
     _objective, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
     found = solver.solve(problem.start, problem.eased(values), problem.boxes)
-    for stand in problem.stands(found):
-        aimed = solver.solve(stand.x, problem.for_needle(stand), problem.boxes)
+    for placement in problem.placements(found):
+        aimed = solver.solve(placement.x, problem.for_needle(placement), problem.boxes)
         for share in NEEDLE_SHARES:
-            new = problem.finished(stand, stand.x + share * (aimed - stand.x))
+            new = problem.candidate(placement, placement.x + share * (aimed - placement.x))
             if new is None:
                 continue
-            if court.cost(new) < limit:
+            if evaluator.cost(new.path) < limit:
                 return new
             break
     return None

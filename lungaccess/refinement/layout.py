@@ -1,4 +1,4 @@
-"""Which number stands where in the refinement's program."""
+"""The layout of the refinement's program: the place of each variable, parameter and constraint."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from typing import Any
 from anatomy.typed import Float
 
 AXIS_DEGREE = 5
-"""The airway's axis near the site is a polynomial of this degree ..."""
+"""The airway's axis near the site is a polynomial of this degree in the arc length along it."""
 AXIS_SCALE_MM = 2.5
-"""... in the way along it, as a share of the greatest, so many mm to either side."""
+"""The scope moves at most so far either way; the polynomial's variable is the arc length in this unit."""
 ZONE_POINTS = 8
 NEEDLE_POINTS = 60
 TUBE_POINTS = 24
 WALL_POINTS = 8
-WALL_WAY_MM = 6.0
-"""Way of the tubes before the exit where they may touch the wall."""
+"""Samples of the exempt length, the needle, the tubes behind the exit and before it, about one a mm.  Slack
+in the constraints covers what lies between."""
+WALL_CONTACT_MM = 6.0
+"""Length of the tubes before the exit where they may touch the wall."""
 SLOPE_MM = 0.5
 """Step over which the share of lumen is compared at the exit."""
 
@@ -142,7 +144,7 @@ def _end(places: dict[str, slice]) -> int:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Numbers:
-    """What one call of a program is about.
+    """The numbers of one call of a program.
 
     Parameters
     ----------

@@ -12,32 +12,40 @@ from scipy import ndimage
 from anatomy import poses
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
-from lungaccess.plans.assemble import Candidate, Task
-from lungaccess.plans.costs import path_cost
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
 from lungaccess.refinement import boxes as fields
-from lungaccess.refinement.axis import axis_of, standing_still
+from lungaccess.refinement.axis import axis_of, one_tip
 from lungaccess.refinement.curve import aimed, path_of, rows_of, split
-from lungaccess.refinement.layout import SLOPE_MM, WALL_WAY_MM, Layout, Numbers
-from stages.needle import CURVATURE, Query, map_integral, needle_environment, violation
+from lungaccess.refinement.layout import SLOPE_MM, WALL_CONTACT_MM, Layout, Numbers
 from stages.scope import ScopeTip, Sites
-from stages.tube import Deployment, TubeJudge, centreline, tracking_length_mm, tube_constants
+from stages.tube import Deployment, centreline, tracking_length_mm, tube_constants
 from stages.tube.kernels import deployment as index
 
 ARC_COUNTS = (3, 5, 8)
 """A program is built for each; shorter paths are split."""
 NEEDLE_MARGIN_MM = 10.0
 TUBE_MARGIN_MM = 8.0
+"""The boxes of field values reach so far beyond needle and tubes of the candidate: so far these may move."""
 MAX_TURN_RAD = 1.2
+"""The tubes turn by no more than this, so that they stay within the boxes."""
 SHORTEST_ARC_MM = 1.0
+"""Shorter arcs are not made: the direction of their curvature would hardly matter."""
 NEEDLE_SLACK_MM = 0.02
 TUBE_SLACK_MM = 0.1
-"""More than is required, for what lies between samples and for the field between its lattice points."""
+"""The program demands so much more clearance, for what lies between samples and between lattice points."""
 CURVATURE_SLACK = 1e-3
 ANGLE_SLACK_RAD = math.radians(2.0)
+"""The program keeps so far from the limits of curvature and wall angle, for the same reason."""
 EASED = ("zone", "needle", "tube", "wall", "slope")
+"""Constraints on field values, which the candidate may break in the program though it is proved."""
 EASE = 1e-4
+"""The candidate lies so far inside the eased constraints, so that it is a strictly feasible start."""
 SHARES = (1.0, 0.85, 0.7, 0.5, 0.35, 0.2, 0.1)
-MOVED_STANDS = 2
+"""Shares of the step from the candidate to what the program found that are tried until one is proved."""
+MOVED_PLACEMENTS = 2
+"""So many proved placements besides the candidate's own get a program for the needle alone, to save time."""
 
 
 def program_weights(task: Task) -> tuple[float, float, float] | None:
@@ -60,13 +68,13 @@ def program_weights(task: Task) -> tuple[float, float, float] | None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Stand:
-    """Accepted tubes, and the program's variables there.
+class Placement:
+    """Proved scope and tubes, and the program's variables there.
 
     Parameters
     ----------
     share : float
-        How far on the way from the candidate (0) to what the program found (1).
+        Share of the step from the candidate (0) to what the program found (1).
     x : (n,) float64
         The site counts from `tip`.
     tip : ScopeTip
@@ -79,42 +87,12 @@ class Stand:
     deployment: Deployment
 
 
-class Court:
-    """Judges candidates of one task by the discrete tests."""
-
-    def __init__(self, task: Task) -> None:
-        self.task = task
-        system, fissures = task.system, task.with_fissures
-        self._environment = needle_environment(
-            task.lung, system.needle, system.margins, with_fissures=fissures
-        )
-        self.tubes = TubeJudge(task.lung, system.tubes, system.margins, with_fissures=fissures)
-
-    def cost(self, candidate: Candidate) -> float:
-        """Return the cost under the task's objective."""
-        task = self.task
-        return path_cost(task.lung, candidate.path, task.objective, with_fissures=task.with_fissures)
-
-    def accepts(self, candidate: Candidate) -> bool:
-        """Tell whether the needle keeps all limits, is proved clear and enters no voxel of infinite cost."""
-        deployment = candidate.deployment
-        query = Query(
-            lps_from_start=deployment.lps_from_tip, target=self.task.target.lps_mm, branch=deployment.branch
-        )
-        tightest = candidate.path.arcs[:, CURVATURE].max()
-        if tightest > self.task.system.needle.max_curvature_per_mm:
-            return False
-        if violation(self._environment, query, candidate.path):
-            return False
-        return math.isfinite(map_integral(self.task.lung.cost, candidate.path))
-
-
 class Problem:
     """The program's numbers for one candidate.
 
     Parameters
     ----------
-    court : Court
+    evaluator : CandidateEvaluator
     sites : Sites
     candidate : Candidate
         With at most as many arcs as the last of ARC_COUNTS.
@@ -128,14 +106,18 @@ class Problem:
         The candidate as variables.
     numbers : Numbers
     boxes : tuple of FieldBox
-    axis : LocalAxis or StillAxis
+    axis : LocalAxis or FixedTip
     """
 
     def __init__(
-        self, court: Court, sites: Sites, candidate: Candidate, weights: tuple[float, float, float]
+        self,
+        evaluator: CandidateEvaluator,
+        sites: Sites,
+        candidate: Candidate,
+        weights: tuple[float, float, float],
     ) -> None:
-        self.task = court.task
-        self._court, self._candidate, self._weights = court, candidate, weights
+        self.task = evaluator.task
+        self._evaluator, self._candidate, self._weights = evaluator, candidate, weights
         needle, deployment = self.task.system.needle, candidate.deployment
         rows = rows_of(candidate.path)
         arcs = next(count for count in ARC_COUNTS if count >= len(rows))
@@ -168,62 +150,62 @@ class Problem:
             least[place] = np.minimum(least[place], values[place] - EASE)
         return replace(self.numbers, least=least)
 
-    def stands(self, found: Float) -> Iterator[Stand]:
-        """Yield accepted tubes: the nearest to `found`, some at most half as far, those of the candidate."""
-        farthest, left = 1.0, MOVED_STANDS
+    def placements(self, found: Float) -> Iterator[Placement]:
+        """Yield proved tubes: the nearest to `found`, some at most half as far, those of the candidate."""
+        farthest, left = 1.0, MOVED_PLACEMENTS
         for share in SHARES:
-            moved = self.stand(found, share) if left and share <= farthest else None
+            moved = self.placement(found, share) if left and share <= farthest else None
             if moved is not None:
                 farthest, left = 0.5 * share, left - 1
                 yield moved
-        own = self.stand(found, 0.0)
+        own = self.placement(found, 0.0)
         if own is not None:
             yield own
 
-    def stand(self, found: Float, share: float) -> Stand | None:
-        """Return the tubes at a share of the way from the candidate to `found`, if they are accepted."""
+    def placement(self, found: Float, share: float) -> Placement | None:
+        """Return the tubes at a share of the step from the candidate to `found`, None if they are refused."""
         at = self.layout.variables
         x = self.start + share * (found - self.start)
         tip = self.axis.tip(float(x[at["site"]]))
-        deployment = self._judged(tip, x)
+        deployment = self._deployment(tip, x)
         if isinstance(deployment, str):
             return None
         x[at["site"]] = 0.0
         x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm
         x[at["exit"]] = deployment.exit_mm
-        return Stand(share=share, x=x, tip=tip, deployment=deployment)
+        return Placement(share=share, x=x, tip=tip, deployment=deployment)
 
-    def for_needle(self, stand: Stand) -> Numbers:
+    def for_needle(self, placement: Placement) -> Numbers:
         """Return the numbers for the needle alone, from tubes that stay as they are."""
         rows, numbers = self.layout.constraints, self.numbers
         lower, upper = numbers.lower.copy(), numbers.upper.copy()
         least, most = numbers.least.copy(), numbers.most.copy()
         tubes = slice(0, self.layout.variables["lengths"].start)
-        lower[tubes] = upper[tubes] = stand.x[tubes]
+        lower[tubes] = upper[tubes] = placement.x[tubes]
         for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall"):
             least[rows[name]], most[rows[name]] = -np.inf, np.inf
-        parameters = self._parameters(*standing_still(stand.tip))
+        parameters = self._parameters(*one_tip(placement.tip))
         return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
 
-    def finished(self, stand: Stand, x: Float) -> Candidate | None:
-        """Return the candidate with the needle of `x`, aimed anew, if the discrete tests accept it."""
+    def candidate(self, placement: Placement, x: Float) -> Candidate | None:
+        """Return the candidate with the needle of `x`, aimed anew, None if its proof fails."""
         at, kappa = self.layout.variables, self.task.system.needle.max_curvature_per_mm
-        start = stand.deployment.lps_from_tip
+        start = placement.deployment.lps_from_tip
         rows = np.stack([x[at["lengths"]], kappa * x[at["bend_x"]], kappa * x[at["bend_y"]]], axis=1)
         aim = aimed(start, rows, self.task.target.lps_mm, kappa)
         if aim is None:
             return None
-        found = Candidate(tip=stand.tip, deployment=stand.deployment, path=path_of(start, aim))
-        return found if self._court.accepts(found) else None
+        found = Candidate(tip=placement.tip, deployment=placement.deployment, path=path_of(start, aim))
+        return found if self._evaluator.proves(found.deployment, found.path) else None
 
-    def _judged(self, tip: ScopeTip, x: Float) -> Deployment | str:
-        """Judge the tubes of `x`; the angle of rotation counts from the tip's own +x."""
+    def _deployment(self, tip: ScopeTip, x: Float) -> Deployment | str:
+        """Return the tubes of `x`, or why they are refused; the rotation counts from the tip's own +x."""
         at, frame = self.layout.variables, tip.lps_from_scope_tip
         smooth = poses.pose(frame[:3, 3], frame[:3, 2], self._sideways)
         bend = poses.bending_directions(smooth, x[at["rotation"]])[0]
         inner = min(max(float(x[at["inner"]]), 0.0), self._longest_mm)
         outer = min(max(float(x[at["outer"]]), 0.0), inner)
-        return self._court.tubes.judge(frame, poses.roll_towards(frame, bend), outer, inner)
+        return self._evaluator.tubes.judge(frame, poses.roll_towards(frame, bend), outer, inner)
 
     @property
     def _sideways(self) -> Float:
@@ -245,7 +227,7 @@ class Problem:
         bits = obstacle_bits(fissures)
         leaves = deployment.exit_mm
         outside = self._tube_points(np.linspace(leaves, deployment.inner_mm, 12))
-        inside = self._tube_points(np.linspace(max(leaves - WALL_WAY_MM, 0.0), leaves, 6))
+        inside = self._tube_points(np.linspace(max(leaves - WALL_CONTACT_MM, 0.0), leaves, 6))
         needle, lengths = self._candidate.path.sample(1.0)
         near = np.concatenate([outside, needle[lengths <= self._exempt_mm]])
         boxes = [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from lungaccess.coupled.search import evaluator as desk
+from lungaccess.plans import evaluator
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.kernels.limits import REQUIRED
 from tests.scenarios import runs
@@ -59,7 +59,7 @@ def test_a_planner_without_the_clearance_test_is_refused(
         limits[REQUIRED] = 0.0
         return replace(environment, limits=limits, required_clearance_mm=0.0)
 
-    monkeypatch.setattr(desk, "needle_environment", careless_environment)
+    monkeypatch.setattr(evaluator, "needle_environment", careless_environment)
     answers = [answer_for(synthetic, CASE, target) for target in expected["targets"][CASE.anatomy.name]]
     assert any("the check refuses" in fault for answer in answers for fault in answer.faults)
 

@@ -15,11 +15,13 @@ from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.coupled.kuntz2015_fcl.tubes import TubeTrial
-from lungaccess.coupled.search import AtlasSearch, Step
-from lungaccess.plans.assemble import Candidate, Task
+from lungaccess.coupled.search.base import Step
+from lungaccess.coupled.search.random_placement import Placement, random_placements
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
 from stages.needle import ArcPath
-from stages.scope import MedialAxis, looks_ahead
-from stages.tube import Deployment, TubeJudge, tracking_length_mm
+from stages.tube import Deployment
 
 PHASE = "reference"
 FOUND = "found"
@@ -38,18 +40,20 @@ class Refusal:
     candidate: Candidate
 
 
-class ReferenceSearch(AtlasSearch):
+class ReferenceSearch:
     """Random placements, FCL, a needle RRT each, keep the best: the yardstick of the planner.
 
-    As printed, but for what the paper leaves open or safety asks for: the scope stands where it fits and an
-    airway in lung tissue lies ahead, as in `KuntzSearch`; after line 8 the tubes are judged too.  A path
-    that is found is yielded only if the planner's proof accepts it.
+    The algorithm is as printed, but for what the paper leaves open or safety asks for.  The scope takes poses
+    where it fits and an airway in lung tissue lies ahead, as in `KuntzSearch`; after line 8 the tubes are
+    validated too.  A path that is found is yielded only if the planner's proof accepts it.
 
     Parameters
     ----------
     task : Task
     atlas : Atlas
         Only its sites are used, to know where the scope fits.
+    rejects : bool
+        Whether line 8 is carried out; [Kuntz2015, sec. V] compares with a run without it.
     rrt_iterations : int
         Samples of each RRT: the same seed then gives the same plans.
     rrt_time_s : float, optional
@@ -72,70 +76,62 @@ class ReferenceSearch(AtlasSearch):
         If an RRT has no budget.
     """
 
-    rejects = True
-    """Whether line 8 is carried out."""
-    from_atlas = False
-
     def __init__(
         self,
         task: Task,
         atlas: Atlas,
         *,
+        rejects: bool = True,
         rrt_iterations: int = RRT_ITERATIONS,
         rrt_time_s: float | None = None,
         obstacles: Obstacles | None = None,
     ) -> None:
-        super().__init__(task, atlas)
         if not (rrt_iterations if rrt_time_s is None else rrt_time_s) > 0:
             raise SettingsError("The RRT has no budget", expected="rrt_iterations or rrt_time_s above 0")
         system = task.system
+        self.task, self._atlas, self._rejects = task, atlas, rejects
+        self._evaluator = CandidateEvaluator(task)
+        self.blocked = self._evaluator.blocked
         self.obstacles = obstacles or obstacles_for(task)
         self._budget = (rrt_iterations, None) if rrt_time_s is None else (None, rrt_time_s)
         self._trial = TubeTrial(system, self.obstacles)
         required_mm = system.needle.radius_mm + system.margins.total_mm
         self._needle_rrt = NeedleRRT(system.needle, required_mm, self.obstacles)
-        self._proof = TubeJudge(task.lung, system.tubes, system.margins, with_fissures=task.with_fissures)
-        self._random = np.random.Generator(np.random.PCG64(task.seed))
         self.counts: Counter[str] = Counter()
         self.spent_s: defaultdict[str, float] = defaultdict(float)
         self.refused_by_proof: list[Refusal] = []
 
     def steps(self) -> Iterator[Step]:
-        """Search forever; the caller stops."""
-        best = math.inf
-        axis = MedialAxis(self.task.lung.tree, self.atlas.sites.passable & self.atlas.sites.exits_ahead)
-        iteration = 0
-        while axis.length_mm > 0.0:
-            iteration += 1
-            found = self._attempt(axis)
+        """Search until the caller stops, or not at all if the scope fits nowhere."""
+        best, began = math.inf, time.thread_time()
+        for iteration, placement in enumerate(random_placements(self.task, self._atlas), start=1):
+            found = self._attempt(placement, began)
             proved = None if found is None else self._proved(found)
-            cost = math.inf if proved is None else self.desk.cost(proved.path)
+            cost = math.inf if proved is None else self._evaluator.cost(proved.path)
             if cost < best:
                 best = cost
                 yield Step(iteration=iteration, phase=PHASE, candidate=proved, cost=cost)
             else:
                 yield Step(iteration=iteration, phase=PHASE)
+            began = time.thread_time()
 
-    def _attempt(self, axis: MedialAxis) -> Candidate | None:
-        """Carry out lines 3 to 9 once."""
-        random, began = self._random, time.thread_time()
-        tip = axis.sample(random)
-        rotation = float(random.uniform(0.0, 2.0 * math.pi))
-        outer, inner = np.sort(random.uniform(0.0, tracking_length_mm(self.task.system.tubes), 2))
-        seed = int(random.integers(2**63))
-        shape = self._trial.shape(tip.lps_from_scope_tip, rotation, float(outer), float(inner))
-        looks = looks_ahead(self.task.lung.tree, tip)
-        reached = looks and (not self.rejects or self.desk.reaches(shape.frames()[-1]))
+    def _attempt(self, placement: Placement, began: float) -> Candidate | None:
+        """Carry out lines 8 and 9 for a placement that has been drawn since `began`."""
+        tip = placement.tip
+        shape = self._trial.shape(
+            tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
+        )
+        reached = placement.looks_ahead and (not self._rejects or self._evaluator.reaches(shape.frames()[-1]))
         began = self._spend("placement", began)
         if not reached:
-            self.counts[OUT_OF_WORKSPACE if looks else LOOKS_BACK] += 1
+            self.counts[OUT_OF_WORKSPACE if placement.looks_ahead else LOOKS_BACK] += 1
             return None
         deployment = self._trial.judge(shape)
         began = self._spend("tubes", began)
         if isinstance(deployment, str):
             self.counts[deployment] += 1
             return None
-        path = self._path(deployment, seed)
+        path = self._path(deployment, placement.needle_seed)
         self._spend("needle", began)
         self.counts[NO_PATH if path is None else FOUND] += 1
         return None if path is None else Candidate(tip=tip, deployment=deployment, path=path)
@@ -155,13 +151,15 @@ class ReferenceSearch(AtlasSearch):
     def _proved(self, found: Candidate) -> Candidate | None:
         """Return what was found with the tubes and the needle as the planner proves them."""
         began, own = time.thread_time(), found.deployment
-        judged = self._proof.judge(found.tip.lps_from_scope_tip, own.rotation_rad, own.outer_mm, own.inner_mm)
-        stage = "tubes" if isinstance(judged, str) else ""
-        if not isinstance(judged, str):
-            path = replace(found.path, lps_from_start=judged.lps_from_tip)
-            if self.desk.proved(judged, path):
+        deployment = self._evaluator.tubes.judge(
+            found.tip.lps_from_scope_tip, own.rotation_rad, own.outer_mm, own.inner_mm
+        )
+        stage = "tubes" if isinstance(deployment, str) else ""
+        if not isinstance(deployment, str):
+            path = replace(found.path, lps_from_start=deployment.lps_from_tip)
+            if self._evaluator.proves(deployment, path):
                 self._spend("proof", began)
-                return Candidate(tip=found.tip, deployment=judged, path=path)
+                return Candidate(tip=found.tip, deployment=deployment, path=path)
             stage = "needle"
         self._spend("proof", began)
         self.refused_by_proof.append(Refusal(stage=stage, candidate=found))
@@ -171,12 +169,6 @@ class ReferenceSearch(AtlasSearch):
         now = time.thread_time()
         self.spent_s[part] += now - began
         return now
-
-
-class ReferenceSearchWithoutRejection(ReferenceSearch):
-    """The same without line 8: what [Kuntz2015, sec. V] compares with."""
-
-    rejects = False
 
 
 def obstacles_for(task: Task) -> Obstacles:

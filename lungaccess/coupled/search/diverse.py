@@ -1,4 +1,4 @@
-"""Direct arcs from the atlas that differ from each other: the menu of alternatives."""
+"""Direct arcs from the atlas that are separated from each other: the candidates of a diverse plan set."""
 
 from __future__ import annotations
 
@@ -8,49 +8,33 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy.typed import Float, Int
-from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
 from lungaccess.coupled.kernels.separation import choose_separated
-from lungaccess.coupled.search.atlas_search import AtlasSearch
-from lungaccess.coupled.search.local_search import needle_of
-from lungaccess.plans.assemble import Candidate
+from lungaccess.coupled.search.direct_arcs import DirectArcs
+from lungaccess.plans.candidate import Candidate
 
 SAMPLES = 17
 """Points of each path that are compared; between two of them a path strays less than 1 mm from a line."""
 NEAREST, SAMPLED, LEAST_OF_BRANCH = 1000, 2000, 100
-"""Deployments that are looked at: the nearest ones, and about so many of all, evenly spaced; at least so many
-of every branch."""
+"""The deployments that are evaluated: the nearest ones, and about so many of all, evenly spaced; at least so
+many of every branch."""
 
 
-def different_candidates(search: AtlasSearch, count: int, separation_mm: float) -> Iterator[Candidate]:
-    """Yield proved direct arcs that differ, the cheapest of each branch first, then the others.
+def different_candidates(arcs: DirectArcs, count: int, separation_mm: float) -> Iterator[Candidate]:
+    """Yield proved direct arcs that are separated, the cheapest of each branch first, then the others.
 
-    The nearest deployments are looked at, and an even sample of the others; of these all, sample by sample,
-    only as long as there are not enough plans.
+    The nearest deployments are evaluated with an even sample of the others, then further samples, but only
+    as long as there are not enough plans.
     """
-    near, needle = search.in_workspace, needle_of(search.desk.environment, search.task)
-    x, y, z = search.task.target.lps_mm.tolist()
-    entries = search.atlas.deployments
-    pool, costs = np.zeros(0, dtype=np.int64), np.zeros(0)
+    near, evaluator = arcs.in_workspace, arcs.evaluator
+    pool, pool_costs = np.zeros(0, dtype=np.int64), np.zeros(0)
     proved: dict[int, Candidate | None] = {}
     chosen: list[int] = []
-    for sample in _samples(entries.branch[near]):
-        looked = near[sample]
-        blockers, estimates = np.zeros(len(looked), dtype=np.int64), np.zeros(len(looked))
-        evaluate_arcs(
-            needle,
-            entries.positions[looked],
-            entries.tangents[looked],
-            entries.branch[looked],
-            (x, y, z),
-            math.inf,
-            math.inf,
-            blockers,
-            estimates,
-        )
-        search.desk.count_blockers(blockers)
+    for sample in _samples(arcs.atlas.deployments.branch[near]):
+        blockers, costs, _best = arcs.evaluate(near[sample], math.inf)
+        evaluator.count_blockers(blockers)
         clear = np.flatnonzero(blockers == 0)
-        pool, costs = np.append(pool, looked[clear]), np.append(costs, estimates[clear])
-        chosen = _chosen(search, pool[np.argsort(costs, kind="stable")], count, separation_mm, proved)
+        pool, pool_costs = np.append(pool, near[sample][clear]), np.append(pool_costs, costs[clear])
+        chosen = _chosen(arcs, pool[np.argsort(pool_costs, kind="stable")], count, separation_mm, proved)
         if len(chosen) == count:
             break
     for entry in chosen:
@@ -78,11 +62,11 @@ def _samples(branch: Int) -> Iterator[Int]:
 
 
 def _chosen(
-    search: AtlasSearch, ordered: Int, count: int, separation_mm: float, proved: dict[int, Candidate | None]
+    arcs: DirectArcs, ordered: Int, count: int, separation_mm: float, proved: dict[int, Candidate | None]
 ) -> list[int]:
-    """Return the deployments of a menu, chosen from clear ones by rising cost; `proved` keeps the proofs."""
-    lines = _lines(search, ordered)
-    order = _branches_first(search.atlas.deployments.branch[ordered])
+    """Choose separated deployments from clear ones by rising cost; `proved` keeps the proofs."""
+    lines = _lines(arcs, ordered)
+    order = _branches_first(arcs.atlas.deployments.branch[ordered])
     while True:
         refused = [n for n, entry in enumerate(ordered.tolist()) if proved.get(entry, True) is None]
         places = np.zeros(count, dtype=np.int64)
@@ -90,7 +74,7 @@ def _chosen(
         chosen: list[int] = ordered[places[:found]].tolist()
         unproved = [entry for entry in chosen if entry not in proved]
         for entry in unproved:
-            proved[entry] = search.finished(entry)
+            proved[entry] = arcs.proved(entry)
         if all(proved[entry] is not None for entry in chosen):
             return chosen
 
@@ -103,13 +87,13 @@ def _branches_first(branch: Int) -> Int:
     return np.concatenate([first, rest])
 
 
-def _lines(search: AtlasSearch, chosen: Int) -> Float:
+def _lines(arcs: DirectArcs, chosen: Int) -> Float:
     """Return points (E, SAMPLES, 3) of the direct arcs."""
-    entries, target = search.atlas.deployments, search.task.target.lps_mm
+    entries, target = arcs.atlas.deployments, arcs.task.target.lps_mm
     start, tangent = entries.positions[chosen], entries.tangents[chosen]
-    way = target - start
-    ahead = (way * tangent).sum(axis=1, keepdims=True)
-    aside = way - ahead * tangent
+    offset = target - start
+    ahead = (offset * tangent).sum(axis=1, keepdims=True)
+    aside = offset - ahead * tangent
     off = np.linalg.norm(aside, axis=1, keepdims=True)
     normal = np.divide(aside, off, out=np.zeros_like(aside), where=off > 1e-9)
     turn = 2.0 * np.arctan2(off, ahead)

@@ -1,17 +1,16 @@
-"""The deployments of an atlas in the order in which a search looks at them."""
+"""Which deployments of an atlas are similar."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Float, Int
-from lungaccess.coupled.kernels import direct_arcs
-from lungaccess.coupled.search.local_search import Needle
+from anatomy.typed import Int
 from stages.tube import Deployments
 
 CELL_MM = 5.0
+"""Size of the cells within which tips of the tubes count as similar: about the reach of a local search."""
 DIRECTIONS = 2.0
-"""Tangents differ if a component, times this, rounds to another whole number."""
+"""Tangents are similar if each component, times this, rounds to the same whole number."""
 
 
 def different(entries: Deployments, ordered: Int) -> Int:
@@ -31,23 +30,3 @@ def different(entries: Deployments, ordered: Int) -> Int:
     keys = np.column_stack([entries.branch[ordered], places, towards]).astype(np.int64)
     _groups, first = np.unique(keys, axis=0, return_index=True)
     return ordered[np.sort(first)]
-
-
-def cost_bounds(needle: Needle, entries: Deployments, chosen: Int, lengths: Float, target: Float) -> Float:
-    """Return lower bounds `(N,)` of the cost of any path from deployments to the target.
-
-    Parameters
-    ----------
-    needle : tuple
-        See `lungaccess.coupled.kernels.candidate`.
-    entries : Deployments
-    chosen : (N,) int64
-    lengths : (N,) float64
-        Of the shortest path in free space, mm.
-    target : (3,) float64, LPS mm
-    """
-    x, y, z = target.tolist()
-    bounds = np.zeros(len(chosen))
-    positions = np.ascontiguousarray(entries.positions[chosen])
-    direct_arcs.cost_bounds(needle, positions, np.array(lengths), (x, y, z), bounds)
-    return bounds

@@ -1,64 +1,68 @@
-"""Algorithm 1 of [Kuntz2015], for comparison."""
+"""Algorithm 1 of [Kuntz2015] on clearance fields, for comparison."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
-import numpy as np
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.coupled.search.random_placement import Placement, random_placements
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
 
-from lungaccess.coupled.search.atlas_search import AtlasSearch
-from lungaccess.coupled.search.evaluator import Step
-from lungaccess.plans.assemble import Candidate
-from stages.scope import MedialAxis, looks_ahead
-from stages.tube import tracking_length_mm
+if TYPE_CHECKING:
+    from stages.needle.ompl import NeedleProblem
 
 RRT_ITERATIONS = 300
+"""Iterations of each RRT; the paper gives it 0.05 s, but a run by time cannot be repeated exactly."""
 
 
-class KuntzSearch(AtlasSearch):
+class KuntzSearch:
     """Algorithm 1 of [Kuntz2015]: random placement, workspace rejection, RRT, keep the best.
 
-    Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not
-    hold the target; line 9 runs the RRT, here for a fixed number of iterations so that runs repeat.
+    Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not hold
+    the target; line 9 runs the RRT, here for a fixed number of iterations so that runs repeat.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+        Only its sites are used, to know where the scope fits.
+    rejects : bool
+        Whether line 8 is carried out; the paper compares with a run without it.
     """
 
-    rejects = True
-    """Whether line 8 is carried out."""
-    from_atlas = False
+    phase = "Algorithm 1"
+
+    def __init__(self, task: Task, atlas: Atlas, *, rejects: bool = True) -> None:
+        self._task, self._atlas, self._rejects = task, atlas, rejects
+        self._evaluator = CandidateEvaluator(task)
+        self.blocked = self._evaluator.blocked
 
     def steps(self) -> Iterator[Step]:
-        """Search forever; the caller stops."""
-        best = math.inf
-        axis = MedialAxis(self.task.lung.tree, self.atlas.sites.passable & self.atlas.sites.exits_ahead)
-        iteration = 0
-        while axis.length_mm > 0.0:
-            iteration += 1
-            step = self._algorithm_1(iteration, axis)
-            if step.candidate is not None and step.cost < best:
-                best = step.cost
-            else:
-                step = replace(step, candidate=None)
-            yield step
+        """Search until the caller stops, or not at all if the scope fits nowhere."""
+        incumbent = Incumbent()
+        for iteration, placement in enumerate(random_placements(self._task, self._atlas), start=1):
+            candidate = self._attempt(placement) if placement.looks_ahead else None
+            yield incumbent.improved(evaluated_step(self._evaluator, self.phase, candidate, iteration))
 
-    def _algorithm_1(self, iteration: int, axis: MedialAxis) -> Step:
-        rng, tubes = self.rng, self.task.system.tubes
-        tip = axis.sample(rng)
-        rotation = float(rng.uniform(0.0, 2 * math.pi))
-        outer, inner = np.sort(rng.uniform(0.0, tracking_length_mm(tubes), 2))
-        seed = int(rng.integers(2**63))
-        if not looks_ahead(self.task.lung.tree, tip):
-            return Step(iteration=iteration, phase="Algorithm 1")
-        deployment = self.judge.judge(tip.lps_from_scope_tip, rotation, float(outer), float(inner))
-        if isinstance(deployment, str) or (self.rejects and not self.desk.reaches(deployment.lps_from_tip)):
-            return Step(iteration=iteration, phase="Algorithm 1")
-        path = self.desk.search(deployment, seed, RRT_ITERATIONS)
-        candidate = None if path is None else Candidate(tip=tip, deployment=deployment, path=path)
-        return self.desk.finished(iteration, "Algorithm 1", candidate)
+    def _attempt(self, placement: Placement) -> Candidate | None:
+        """Carry out lines 8 and 9 for a placement."""
+        evaluator, tip = self._evaluator, placement.tip
+        deployment = evaluator.tubes.judge(
+            tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
+        )
+        if isinstance(deployment, str) or (self._rejects and not evaluator.reaches(deployment.lps_from_tip)):
+            return None
+        query, seed = evaluator.query(deployment), placement.needle_seed
+        path = self._needle_problem.plan(query, seed=seed, iterations=RRT_ITERATIONS)
+        return None if path is None else Candidate(tip=tip, deployment=deployment, path=path)
 
+    @cached_property
+    def _needle_problem(self) -> NeedleProblem:
+        from stages.needle.ompl import NeedleProblem
 
-class KuntzSearchWithoutRejection(KuntzSearch):
-    """The same without line 8: the paper's measure of what rejection saves."""
-
-    rejects = False
+        return NeedleProblem(self._evaluator.environment)

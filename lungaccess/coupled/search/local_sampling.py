@@ -1,4 +1,4 @@
-"""Random deployments near those of the atlas, each with a single arc: what lies between its entries."""
+"""Local sampling: random deployments near those of the atlas, each with a direct arc."""
 
 from __future__ import annotations
 
@@ -10,68 +10,89 @@ from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.candidate import N_CHOICE, SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import sample_deployments
-from lungaccess.coupled.search.local_search import Climber
-from lungaccess.plans.assemble import Candidate
-from stages.needle import Needle, direct_path
-from stages.tube import TubeJudge
+from lungaccess.coupled.search.direct_arcs import DirectArcs
+from lungaccess.coupled.search.entries import different
+from lungaccess.coupled.search.local_search import LocalSearch
+from lungaccess.plans.candidate import Candidate
+from stages.needle import Needle
 
 MOST = 1000
-"""Deployments that are varied."""
+"""Deployments of the atlas around which samples are drawn: about as many as one iteration has samples for."""
 TRIES = 2000
-"""Of an iteration, a few milliseconds at most: nearly all of them end at the limits of the needle."""
+"""Samples of an iteration, a few milliseconds at most: nearly all end at the limits of the needle."""
 SPREADS = np.array([math.radians(15.0), 2.0])
 """How far rotation and insertions (mm) are varied: to the next entry of the atlas and beyond."""
 SWING_RAD = 0.15
-"""So far such a change turns the tip of the tubes, roughly."""
+"""By about this angle such a variation turns the tip of the tubes."""
 
 
-class Scatter:
-    """Draws deployments near entries of an atlas.
+class LocalSampling:
+    """Samples deployments near entries of an atlas.
 
     Parameters
     ----------
-    climber : Climber
-    judge : TubeJudge
-    atlas : Atlas
+    local_search : LocalSearch
+        Has the arguments of the kernels.
+    arcs : DirectArcs
     chosen : (N,) int64
-        Entries, at least one.
+        Entries of the atlas, at least one.
     rng : numpy.random.Generator
     """
 
     def __init__(
-        self, climber: Climber, judge: TubeJudge, atlas: Atlas, chosen: Int, rng: np.random.Generator
+        self, local_search: LocalSearch, arcs: DirectArcs, chosen: Int, rng: np.random.Generator
     ) -> None:
-        self._climber, self._judge, self._rng = climber, judge, rng
-        entries, tree = atlas.deployments, atlas.lung.tree
-        sites, self._row_of = np.unique(entries.site[chosen], return_inverse=True)
-        self._tips = [atlas.sites.tip(tree, int(site)) for site in sites]
+        self._kernel_arguments = local_search
+        self._evaluator, self._rng = arcs.evaluator, rng
+        entries, sites, tree = arcs.atlas.deployments, arcs.atlas.sites, arcs.task.lung.tree
+        numbers, self._pose_of = np.unique(entries.site[chosen], return_inverse=True)
+        self._tips = [sites.tip(tree, int(site)) for site in numbers]
         frames = np.array([tip.lps_from_scope_tip for tip in self._tips])
-        self._rows = np.ascontiguousarray(frames[:, :3, [3, 2, 0]].transpose(0, 2, 1).reshape(-1, 9))
+        self._poses = np.ascontiguousarray(frames[:, :3, [3, 2, 0]].transpose(0, 2, 1).reshape(-1, 9))
         self._deployed = (entries.rotation_rad[chosen], entries.outer_mm[chosen], entries.inner_mm[chosen])
 
-    def draw(self, dearest: float) -> Candidate | None:
-        """Return the cheapest of TRIES deployments with an arc estimated to cost less than `dearest`."""
+    def sample(self, cost_limit: float) -> Candidate | None:
+        """Return the cheapest of TRIES samples if its estimated cost is below a limit."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
         best = np.zeros(N_CHOICE)
         cost = sample_deployments(
-            self._climber.tube, self._climber.needle, self._rows, self._row_of, *self._deployed, SPREADS,
-            self._climber.target, TRIES, dearest, state, best,
-        )  # fmt: skip
-        if not cost < dearest:
+            self._kernel_arguments.tube,
+            self._kernel_arguments.needle,
+            self._poses,
+            self._pose_of,
+            *self._deployed,
+            SPREADS,
+            self._kernel_arguments.target,
+            TRIES,
+            cost_limit,
+            state,
+            best,
+        )
+        if not cost < cost_limit:
             return None
-        tip, (rotation, outer, inner) = self._tips[int(best[SCOPE_POSE])], best[1:].tolist()
-        deployment = self._judge.judge(tip.lps_from_scope_tip, rotation % (2.0 * math.pi), outer, inner)
-        if isinstance(deployment, str):
-            return None
-        path = direct_path(deployment.lps_from_tip, np.array(self._climber.target))
-        return Candidate(tip=tip, deployment=deployment, path=path)
+        rotation, outer, inner = best[1:].tolist()
+        tip = self._tips[int(best[SCOPE_POSE])]
+        return self._evaluator.direct(tip, rotation % (2.0 * math.pi), outer, inner)
+
+
+def sampling_near_target(
+    local_search: LocalSearch, arcs: DirectArcs, rng: np.random.Generator
+) -> LocalSampling:
+    """Return local sampling around the deployments from which the needle reaches the target, or nearly does.
+
+    Up to half of MOST are different ones that may reach it at the least cost; the others miss it by least.
+    """
+    inside = different(arcs.atlas.deployments, arcs.by_bound[0])[: MOST // 2]
+    target, most = arcs.task.target.lps_mm, MOST - len(inside)
+    outside = nearly_reaching(arcs.atlas, arcs.task.system.needle, target, most)
+    return LocalSampling(local_search, arcs, np.concatenate([inside, outside]), rng)
 
 
 def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> Int:
     """Return `most` entries whose single arc to the target exceeds the needle's limits, nearest misses first.
 
-    A miss is how far the target lies from the needle's workspace, or less, against how far a small change of
-    the deployment moves that workspace: a few mm, and the farther from the tubes the more.
+    A miss is how far the target lies from the needle's workspace, or less.  It counts in relation to how far
+    a variation of the deployment moves that workspace: a few mm, and more with the distance from the tubes.
 
     Parameters
     ----------

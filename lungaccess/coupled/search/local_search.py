@@ -1,141 +1,131 @@
-"""Random improvement of site, tubes and needle together, in compiled batches."""
+"""Stochastic local search over scope pose, tubes and needle together, in compiled batches."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.typed import Float, Float32, UInt64
+from anatomy.typed import Float, UInt64
 from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
-from lungaccess.coupled.search.evaluator import NeedleDesk
-from lungaccess.coupled.search.scope_poses import Stands
-from lungaccess.plans.assemble import Candidate, Task
-from stages.needle import (
-    NO_MAP,
-    ArcPath,
-    NeedleEnvironment,
-    Objective,
-    ObjectiveArrays,
-    Obstacles,
-    direct_path,
-)
+from lungaccess.coupled.search.scope_poses import ScopePoses
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from stages.needle import ArcPath, direct_path
 from stages.scope import Sites
-from stages.tube import Deployment, TubeJudge, scene_of, tube_constants
+from stages.tube import Deployment, scene_of, tube_constants
 
-Needle = tuple[Obstacles, Float, ObjectiveArrays, bool, Float32]
-
-KICK = np.array([4.0, math.radians(15.0), 2.0, 2.0])
-"""Spread of stand (rows), rotation, and insertions in mm."""
-VIA_KICK_MM = 3.0
-
-
-def objective_of(task: Task) -> Objective:
-    """Return a task's objective for the kernels, which weigh a cost map only where there is one."""
-    return task.objective.without_map if task.lung.cost is None else task.objective
+PERTURBATION = np.array([4.0, math.radians(15.0), 2.0, 2.0])
+"""Standard deviations of a perturbation: scope pose (rows), rotation, and insertions in mm.  They are a few
+steps of the atlas, so that the search leaves the neighbourhood of where it was."""
+VIA_PERTURBATION_MM = 3.0
+"""The same for each coordinate of a via point: the largest spread of a variation in the local search."""
 
 
 @dataclass(kw_only=True, eq=False)
-class Climb:
-    """A candidate on its way to the nearest optimum.
+class LocalSearchRun:
+    """A local search on its way from one candidate.
 
     Parameters
     ----------
-    stands : Stands
+    poses : ScopePoses
     x : (4,) float64
     vias : (MAX_VIAS, 3) float64
-        See `lungaccess.coupled.kernels.candidate`.
+        The best choice so far; see `lungaccess.coupled.kernels.candidate`.
     count : int
         Number of vias in use.
     cost : float
-        Estimated; infinite before the first climb.
-    priced : float
-        The estimated cost when it was last finished.
-    tries : int
-        How many have been spent.
+        Estimated cost of that choice; infinite before the search has begun.
+    evaluated_cost : float
+        The estimated cost at which the choice was last evaluated in full.
     """
 
-    stands: Stands
+    poses: ScopePoses
     x: Float
     vias: Float
     count: int
     cost: float = math.inf
-    priced: float = math.inf
-    tries: int = field(default=0)
+    evaluated_cost: float = math.inf
 
 
-def needle_of(environment: NeedleEnvironment, task: Task) -> Needle:
-    """Return a needle among obstacles, and what its path is to keep small, for the kernels."""
-    objective, costs = objective_of(task), task.lung.cost
-    blind = costs is not None and not objective.weighs_map and not np.isfinite(costs.array).all()
-    walls = costs.array if blind and costs is not None else NO_MAP
-    return environment.obstacles, environment.limits, environment.objective_arrays(objective), blind, walls
-
-
-class Climber:
+class LocalSearch:
     """Improves candidates of one task.
 
     Parameters
     ----------
-    desk : NeedleDesk
-    judge : TubeJudge
-    places : Sites
+    evaluator : CandidateEvaluator
+    sites : Sites
+        Where the scope passes.
     rng : numpy.random.Generator
+
+    Attributes
+    ----------
+    tube, needle : tuple
+        Arguments of the kernels; see `lungaccess.coupled.kernels.candidate`.
+    target : tuple of 3 floats
     """
 
-    def __init__(self, desk: NeedleDesk, judge: TubeJudge, places: Sites, rng: np.random.Generator) -> None:
-        task, environment = desk.task, desk.environment
-        tubes, margins = task.system.tubes, task.system.margins
-        self._desk, self._judge, self._places, self._rng = desk, judge, places, rng
+    def __init__(self, evaluator: CandidateEvaluator, sites: Sites, rng: np.random.Generator) -> None:
+        task = evaluator.task
+        self._evaluator, self._sites, self._rng = evaluator, sites, rng
         scene = scene_of(task.lung, with_fissures=task.with_fissures)
-        self.tube = (scene, tube_constants(tubes, margins))
-        self.needle = needle_of(environment, task)
+        self.tube = (scene, tube_constants(task.system.tubes, task.system.margins))
+        self.needle = evaluator.needle_arrays
         x, y, z = task.target.lps_mm.tolist()
         self.target = (x, y, z)
 
-    def begin(self, candidate: Candidate) -> Climb | None:
-        """Return where a candidate stands; None if its needle has too many arcs."""
-        task, deployment = self._desk.task, candidate.deployment
+    def begin(self, candidate: Candidate | None) -> LocalSearchRun | None:
+        """Return a run from a candidate; None without one, or if its needle has too many arcs."""
+        if candidate is None:
+            return None
+        task, deployment = self._evaluator.task, candidate.deployment
         points = candidate.path.frames()[1:-1, :3, 3]
         if len(points) > MAX_VIAS:
             return None
-        stands = Stands(task.lung, task.system.scope, self._places, candidate.tip, self._rng)
+        poses = ScopePoses(task.lung, task.system.scope, self._sites, candidate.tip, self._rng)
         vias = np.zeros((MAX_VIAS, 3))
         vias[: len(points)] = points
-        x = np.array([stands.home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
-        return Climb(stands=stands, x=x, vias=vias, count=len(points))
+        x = np.array([poses.home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
+        return LocalSearchRun(poses=poses, x=x, vias=vias, count=len(points))
 
-    def advance(self, climb: Climb, tries: int) -> None:
-        """Spend tries on a climb."""
+    def advance(self, run: LocalSearchRun, tries: int) -> None:
+        """Evaluate so many variations of a run's choice, and keep the best."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
-        climb.count, climb.cost = improve(
-            self.tube, self.needle, climb.stands.rows, climb.stands.allowed, climb.x, climb.vias, climb.count,
-            self.target, tries, state,
-        )  # fmt: skip
-        climb.tries += tries
+        run.count, run.cost = improve(
+            self.tube,
+            self.needle,
+            run.poses.rows,
+            run.poses.allowed,
+            run.x,
+            run.vias,
+            run.count,
+            self.target,
+            tries,
+            state,
+        )
 
-    def kick(self, climb: Climb) -> None:
-        """Move a climb some way off at random, and let its needle go straight for the target or nearly so."""
-        x, drawn = climb.x, self._rng.standard_normal(N_CHOICE)
-        x[:] = x + drawn * KICK
-        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(climb.stands.tips) - 1)
+    def perturb(self, run: LocalSearchRun) -> None:
+        """Move a run some distance away at random, and leave out some of its via points."""
+        x, drawn = run.x, self._rng.standard_normal(N_CHOICE)
+        x[:] = x + drawn * PERTURBATION
+        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(run.poses.tips) - 1)
         x[OUTER] = max(x[OUTER], 0.0)
         x[INNER] = max(x[INNER], x[OUTER])
-        climb.count = min(climb.count, int(self._rng.integers(MAX_VIAS)))
-        climb.vias[: climb.count] += VIA_KICK_MM * self._rng.standard_normal((climb.count, 3))
-        climb.cost = climb.priced = math.inf
+        run.count = min(run.count, int(self._rng.integers(MAX_VIAS)))
+        run.vias[: run.count] += VIA_PERTURBATION_MM * self._rng.standard_normal((run.count, 3))
+        run.cost = run.evaluated_cost = math.inf
 
-    def candidate(self, climb: Climb) -> Candidate | None:
-        """Return the candidate at which a climb stands, in the numbers of a plan."""
-        stand = int(climb.x[SCOPE_POSE])
-        tip, (rotation, outer, inner) = climb.stands.tips[stand], climb.x[1:].tolist()
-        rotation = climb.stands.rotation_rad(stand, rotation)
-        deployment = self._judge.judge(tip.lps_from_scope_tip, rotation, outer, inner)
+    def candidate(self, run: LocalSearchRun) -> Candidate | None:
+        """Return a run's best choice as a candidate, in the numbers of a plan."""
+        index = int(run.x[SCOPE_POSE])
+        tip, (rotation, outer, inner) = run.poses.tips[index], run.x[1:].tolist()
+        rotation = run.poses.rotation_rad(index, rotation)
+        deployment = self._evaluator.tubes.judge(tip.lps_from_scope_tip, rotation, outer, inner)
         if isinstance(deployment, str):
             return None
-        path = path_through(deployment, climb.vias[: climb.count], self._desk.task.target.lps_mm)
+        path = path_through(deployment, run.vias[: run.count], self._evaluator.task.target.lps_mm)
         return Candidate(tip=tip, deployment=deployment, path=path)
 
 

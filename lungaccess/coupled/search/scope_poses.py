@@ -1,4 +1,4 @@
-"""Scope tips in a row along the airway, as the kernels of the coupled search take them."""
+"""Scope poses in a row along the airway, as the kernels of the coupled search take them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from anatomy.typed import Bool, Float
 from stages.scope import Bronchoscope, ScopeTip, Sites, tip_is_feasible, walk
 
 STEP_MM = 0.25
+"""Spacing of the poses: a fraction of the 1 mm between the sites of an atlas."""
 REACH_MM = 4.0
+"""Length of the row each way: several times as far as the next site of the atlas."""
 TURNED_STEP_MM = 0.5
-"""Whether a turned tip has room takes longer to find out."""
+"""Spacing of turned poses, which take longer to validate."""
 
 
-class Stands:
-    """The scope tips up to REACH_MM behind and ahead of one; at forks a random way is taken.
+class ScopePoses:
+    """The scope tips up to REACH_MM behind and ahead of one; at each fork a random branch is taken.
 
     Parameters
     ----------
@@ -31,11 +33,12 @@ class Stands:
     ----------
     tips : list of ScopeTip
     home : int
-        Which of them is the one given.
+        The index of the tip given.
     rows : (K, 9) float64
-        Point, tangent, and the vector across from which rotations count: that of the tip given, carried over.
+        Point, tangent, and the vector from which rotations count: the +x of the tip given, carried over to
+        each tip.
     allowed : (K,) bool
-        Where the scope can stand.
+        Which of these poses the scope can take.
     """
 
     def __init__(
@@ -59,8 +62,8 @@ class Stands:
             self.rows[n, 6:] = across / size if size > 0.1 else frame[:3, 0]
             self.allowed[n] = tip_is_feasible(lung, scope, places, each)
 
-    def rotation_rad(self, stand: int, rotation_rad: float) -> float:
+    def rotation_rad(self, index: int, rotation_rad: float) -> float:
         """Return the rotation counted from the tip's own +x, from one counted from the row's vector."""
-        point, forward, sideways = np.split(self.rows[stand], 3)
+        point, forward, sideways = np.split(self.rows[index], 3)
         bend = poses.bending_directions(poses.pose(point, forward, sideways), rotation_rad)[0]
-        return poses.roll_towards(self.tips[stand].lps_from_scope_tip, bend)
+        return poses.roll_towards(self.tips[index].lps_from_scope_tip, bend)

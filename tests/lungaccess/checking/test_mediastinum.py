@@ -11,10 +11,11 @@ import lungaccess as la
 from anatomy.errors import LungaccessError
 from anatomy.lung import Lung
 from lungaccess.checking import Checker
-from lungaccess.coupled.search import AtlasSearch
-from lungaccess.plans.assemble import Task, assemble
+from lungaccess.coupled import DirectArcs
+from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target
+from lungaccess.problem.task import Task
 from stages.needle import SHORTEST
 
 AHEAD_MM = 15.0
@@ -29,11 +30,8 @@ def plans_through(lung: Lung, branches: np.ndarray) -> list[Plan]:
     for entry in np.random.default_rng(0).permutation(leaving)[:300].tolist():
         with contextlib.suppress(LungaccessError):
             point = entries.positions[entry] + AHEAD_MM * entries.tangents[entry]
-            task = Task(
-                lung=lung, system=atlas.system, target=point_target(lung, point), objective=SHORTEST,
-                with_fissures=atlas.with_fissures, method="atlas", seed=0,
-            )  # fmt: skip
-            found = AtlasSearch(task, atlas).finished(entry)
+            task = Task(lung=lung, system=atlas.system, target=point_target(lung, point), objective=SHORTEST)
+            found = DirectArcs(task, atlas).proved(entry)
             if found is not None:
                 plans.append(assemble(task, atlas.sites, found, iteration=0, timing={}))
         if len(plans) == WANTED:

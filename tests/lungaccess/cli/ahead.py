@@ -9,11 +9,10 @@ import numpy as np
 import lungaccess as la
 from anatomy.errors import TargetError
 from anatomy.lung import Lung
-from lungaccess.coupled.search import AtlasSearch
-from lungaccess.plans.assemble import Candidate, Task
-from lungaccess.problem.target import point_target, require_free
-from stages.needle import Objective
-from stages.needle.environment import direct_arcs
+from lungaccess.coupled import AtlasSearch
+from lungaccess.plans.candidate import Candidate
+from lungaccess.problem.target import point_target
+from lungaccess.problem.task import Task
 
 AHEAD_MM = 25.0
 ASIDE_MM = 3.0
@@ -28,17 +27,11 @@ def turned_candidates(lung: Lung, atlas: la.Atlas) -> Iterator[tuple[AtlasSearch
         point = point + rng.uniform(-ASIDE_MM, ASIDE_MM, 3)
         try:
             target = point_target(lung, point)
-            require_free(lung, point)
         except TargetError:
             continue
-        task = Task(
-            lung=lung, system=atlas.system, target=target, objective=Objective(inverse_clearance=1.0),
-            with_fissures=atlas.with_fissures, method="atlas", seed=0,
-        )  # fmt: skip
-        search, one = AtlasSearch(task, atlas), slice(int(entry), int(entry) + 1)
-        blockers, _lengths, _costs = direct_arcs(
-            search.desk.environment, entries.positions[one], entries.tangents[one], entries.branch[one], point
-        )
-        candidate = search.finished(int(entry)) if blockers[0] == 0 else None
+        task = Task(lung=lung, system=atlas.system, target=target)
+        search = AtlasSearch(task, atlas)
+        clear = search.arcs.blockers(np.array([entry]))[0] == 0
+        candidate = search.arcs.proved(int(entry)) if clear else None
         if candidate is not None:
             yield search, candidate

@@ -1,4 +1,4 @@
-"""Menus of plans to one target: different, proved, and honestly compared."""
+"""Diverse plan sets: different, proved, and honestly compared."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
-from lungaccess.coupled.alternatives import Alternative, alternatives, judged
+from lungaccess.coupled import Alternative, alternatives, with_front
 from lungaccess.coupled.kernels.separation import choose_separated
 from lungaccess.coupled.search.diverse import _branches_first, _lines, _samples
 from stages.needle.path import direct_path
@@ -31,23 +31,23 @@ def atlas(small_lung: Lung) -> la.Atlas:
 
 
 @pytest.fixture(scope="module")
-def menu(small_lung: Lung, atlas: la.Atlas) -> tuple[Alternative, ...]:
+def found(small_lung: Lung, atlas: la.Atlas) -> tuple[Alternative, ...]:
     target = la.resolve_target(small_lung)
     return alternatives(small_lung, SYSTEM, target, atlas=atlas, count=8, separation_mm=3.0)
 
 
-def test_plans_differ_and_pass_the_check(menu: tuple[Alternative, ...], small_lung: Lung) -> None:
-    assert len(menu) >= 3
-    for one, other in itertools.combinations(menu, 2):
+def test_plans_differ_and_pass_the_check(found: tuple[Alternative, ...], small_lung: Lung) -> None:
+    assert len(found) >= 3
+    for one, other in itertools.combinations(found, 2):
         a, b = needle_walk(one.plan).points[::20], needle_walk(other.plan).points[::20]
         gaps = np.linalg.norm(a[:, None] - b[None], axis=-1)
         assert max(gaps.min(axis=1).max(), gaps.min(axis=0).max()) >= 3.0 - 0.3
-    for each in menu:
+    for each in found:
         assert la.check(each.plan, small_lung).accepted
 
 
-def test_each_branch_comes_first_once(menu: tuple[Alternative, ...]) -> None:
-    branches = [each.plan.tube.exit.branch for each in menu]
+def test_each_branch_comes_first_once(found: tuple[Alternative, ...]) -> None:
+    branches = [each.plan.tube.exit.branch for each in found]
     first = list(dict.fromkeys(branches))
     assert branches[: len(first)] == first
     assert _branches_first(np.array([4, 4, 2, 4, 7, 2])).tolist() == [0, 2, 4, 1, 3, 5]
@@ -101,8 +101,8 @@ def test_lines_are_apart_if_a_point_strays() -> None:
     assert choose_separated(lines, np.arange(5), 5.0, chosen[:2]) == 2
 
 
-def test_criteria_are_those_of_the_plan(menu: tuple[Alternative, ...]) -> None:
-    for each in menu:
+def test_criteria_are_those_of_the_plan(found: tuple[Alternative, ...]) -> None:
+    for each in found:
         plan, values = each.plan, each.criteria
         assert values["inverse_clearance"] == plan.costs["inverse_clearance"]
         beyond = plan.tube.inner_insertion_mm - plan.tube.exit.arc_length_mm
@@ -110,12 +110,12 @@ def test_criteria_are_those_of_the_plan(menu: tuple[Alternative, ...]) -> None:
         assert values["clearance_mm"] <= min(plan.clearance_mm["needle"]["vessel"], values["pleura_mm"])
 
 
-def test_front(menu: tuple[Alternative, ...]) -> None:
-    assert any(each.on_front for each in menu)
-    alone = judged([menu[0].plan])
+def test_front(found: tuple[Alternative, ...]) -> None:
+    assert any(each.on_front for each in found)
+    alone = with_front([found[0].plan])
     assert alone[0].on_front
-    worse = replace(menu[0].plan, costs={name: cost + 1.0 for name, cost in menu[0].plan.costs.items()})
-    assert [each.on_front for each in judged([worse, menu[0].plan])] == [False, True]
+    worse = replace(found[0].plan, costs={name: cost + 1.0 for name, cost in found[0].plan.costs.items()})
+    assert [each.on_front for each in with_front([worse, found[0].plan])] == [False, True]
 
 
 def test_lines_are_the_arcs() -> None:
@@ -125,13 +125,11 @@ def test_lines_are_the_arcs() -> None:
     entries = SimpleNamespace(positions=rng.standard_normal((20, 3)), tangents=tangents)
     target = np.array([3.0, 40.0, -10.0])
     entries.tangents[0] = (target - entries.positions[0]) / np.linalg.norm(target - entries.positions[0])
-    search: Any = SimpleNamespace(
+    arcs: Any = SimpleNamespace(
         atlas=SimpleNamespace(deployments=entries),
         task=SimpleNamespace(target=SimpleNamespace(lps_mm=target)),
     )
-    for line, position, tangent in zip(
-        _lines(search, np.arange(20)), entries.positions, tangents, strict=True
-    ):
+    for line, position, tangent in zip(_lines(arcs, np.arange(20)), entries.positions, tangents, strict=True):
         frame = np.eye(4)
         frame[:3, 2] = tangent
         frame[:3, 0] = np.linalg.svd(tangent[None])[2][1]
@@ -161,7 +159,7 @@ def test_an_atlas_serves_another_needle(small_lung: Lung, atlas: la.Atlas) -> No
 def test_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lungaccess.cli.commands.alternatives.load_lung", lambda *_: small_lung)
     words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]
-    assert cli.main([*words, "--out", str(tmp_path / "menu"), "--cache", str(tmp_path)]) == 0
-    saved = sorted(path.name for path in (tmp_path / "menu").iterdir())
+    assert cli.main([*words, "--out", str(tmp_path / "plans"), "--cache", str(tmp_path)]) == 0
+    saved = sorted(path.name for path in (tmp_path / "plans").iterdir())
     assert saved == ["plan-01.json", "plan-02.json"]
-    assert la.check(la.Plan.load(tmp_path / "menu" / "plan-01.json"), small_lung).accepted
+    assert la.check(la.Plan.load(tmp_path / "plans" / "plan-01.json"), small_lung).accepted

@@ -64,9 +64,9 @@ class TestScope:
 
     THICK_SCOPE = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=15.0))
 
-    def test_nowhere_to_stand(self, small_lung: Lung) -> None:
+    def test_it_fits_nowhere(self, small_lung: Lung) -> None:
         error = explained(small_lung, self.THICK_SCOPE, la.resolve_target(small_lung))
-        assert "the scope (15 mm) has nowhere to stand" in str(error)
+        assert "the scope (15 mm) fits nowhere" in str(error)
         assert error.reasons["scope: sites"] == 0
         generation = int(re.search(r"too narrow at generation (\d+)", str(error))[1])
         closed = next(count for reason, count in error.reasons.items() if "too narrow" in reason)
@@ -75,12 +75,12 @@ class TestScope:
     def test_the_advised_diameter_has_a_place_and_a_larger_one_has_none(self, small_lung: Lung) -> None:
         advice = explained(small_lung, self.THICK_SCOPE, la.resolve_target(small_lung)).advice
         widest = float(re.search(r"of ([\d.]+) mm or less", advice)[1])
-        for diameter, stands in ((widest, True), (widest + 0.11, False)):
+        for diameter, fits in ((widest, True), (widest + 0.11, False)):
             scope = replace(SYSTEM.scope, outer_diameter_mm=diameter)
             atlas = la.build_atlas(
                 small_lung, replace(SYSTEM, scope=scope), rotations=1, stop_spacing_mm=20.0
             )
-            assert (atlas.sites.count > 0) == stands
+            assert (atlas.sites.count > 0) == fits
 
     def test_no_airway_in_lung_tissue(self, small_lung: Lung) -> None:
         """The lung is far from every airway: a thinner scope is no help, and none is advised."""
@@ -91,7 +91,7 @@ class TestScope:
         labels[where] = 0
         lung = lung_of(labels, small_lung.grid, small_lung.tree)
         error = explained(lung, replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=1.8)), target)
-        assert "nowhere to stand" in str(error)
+        assert "fits nowhere" in str(error)
         assert error.reasons["scope: sites"] == 0 and error.advice == ""
 
 

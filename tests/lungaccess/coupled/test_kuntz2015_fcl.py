@@ -20,15 +20,15 @@ from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 from experiments import noplan_attack
-from lungaccess.coupled.kuntz2015_fcl import ReferenceSearch, ReferenceSearchWithoutRejection
+from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT, sample_ahead
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, Solid, chord_mm
 from lungaccess.coupled.kuntz2015_fcl.search import FOUND, OUT_OF_WORKSPACE, obstacles_for
 from lungaccess.coupled.kuntz2015_fcl.tubes import TubeTrial, frame_at, line_between
-from lungaccess.plans.assemble import Task
+from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
-from stages.needle import Objective
+from lungaccess.problem.task import Task
 from stages.needle.device import Needle
 from stages.scope.tips import MedialAxis
 from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
@@ -52,15 +52,7 @@ def target(small_lung: Lung) -> Target:
 
 
 def task_for(atlas: la.Atlas, target: Target, seed: int = 1) -> Task:
-    return Task(
-        lung=atlas.lung,
-        system=atlas.system,
-        target=target,
-        objective=Objective(inverse_clearance=1.0),
-        with_fissures=atlas.with_fissures,
-        method="reference",
-        seed=seed,
-    )
+    return Task(lung=atlas.lung, system=atlas.system, target=target, method="reference", seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +117,10 @@ class TestSearch:
 
     def test_counts_add_up(self, atlas: la.Atlas, target: Target, obstacles: Obstacles) -> None:
         counts: list[Counter[str]] = []
-        for kind in (ReferenceSearch, ReferenceSearchWithoutRejection):
-            search = kind(task_for(atlas, target), atlas, obstacles=obstacles, rrt_iterations=15)
+        for rejects in (True, False):
+            search = ReferenceSearch(
+                task_for(atlas, target), atlas, rejects=rejects, obstacles=obstacles, rrt_iterations=15
+            )
             searched(search)
             assert sum(search.counts.values()) == ITERATIONS
             assert set(search.spent_s) == {"placement", "tubes", "needle", "proof"}
@@ -142,7 +136,7 @@ class TestSearch:
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         search = ReferenceSearch(task_for(atlas, target), atlas, obstacles=obstacles)
-        monkeypatch.setattr(search.desk, "proved", lambda *_: False)
+        monkeypatch.setattr(CandidateEvaluator, "proves", lambda *_: False)
         assert searched(search) == []
         assert len(search.refused_by_proof) == search.counts[FOUND] >= 2
         assert {refusal.stage for refusal in search.refused_by_proof} == {"needle"}

@@ -1,4 +1,4 @@
-"""Deployments drawn between those of the atlas: proved, near them, and sometimes the only ones that reach."""
+"""Deployments sampled between those of the atlas: proved, near them, sometimes the only ones that reach."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from anatomy.settings import override
-from lungaccess.coupled.search import AtlasSearch
-from lungaccess.coupled.search.local_sampling import SPREADS, Scatter, nearly_reaching
-from lungaccess.coupled.search.local_search import Climber
-from lungaccess.plans.assemble import Task
+from lungaccess.coupled import AtlasSearch
+from lungaccess.coupled.search.local_sampling import SPREADS, LocalSampling, nearly_reaching
+from lungaccess.coupled.search.local_search import LocalSearch
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
-from stages.needle import Objective
+from lungaccess.problem.task import Task
 
 SYSTEM = override(la.load_system("ultrathin"), {"name": "own", "fissures_allowed": True})
 MOST = 200
@@ -29,50 +28,44 @@ def searches() -> list[AtlasSearch]:
     lung = build_lung(make_phantom(seed=1, size="small").images)
     atlas = la.build_atlas(lung, SYSTEM, rotations=3, stop_spacing_mm=12.0, site_spacing_mm=8.0)
     return [
-        AtlasSearch(
-            Task(
-                lung=lung, system=SYSTEM, target=point_target(lung, point),
-                objective=Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures,
-                method="atlas", seed=seed,
-            ),
-            atlas,
-        )
+        AtlasSearch(Task(lung=lung, system=SYSTEM, target=point_target(lung, point), seed=seed), atlas)
         for seed, point in enumerate(peripheral_targets(lung, 16, 3))
-    ]  # fmt: skip
+    ]
 
 
-def scatter_of(search: AtlasSearch) -> tuple[Scatter, np.ndarray]:
+def sampling_of(search: AtlasSearch) -> tuple[LocalSampling, np.ndarray]:
     target, needle = search.task.target.lps_mm, SYSTEM.needle
     outside = nearly_reaching(search.atlas, needle, target, MOST)
-    chosen = np.concatenate([search.in_workspace[:MOST], outside])
-    climber = Climber(search.desk, search.judge, search.atlas.sites, search.rng)
-    return Scatter(climber, search.judge, search.atlas, chosen, search.rng), chosen
+    chosen = np.concatenate([search.arcs.in_workspace[:MOST], outside])
+    rng = np.random.default_rng(search.task.seed)
+    local_search = LocalSearch(search.evaluator, search.atlas.sites, rng)
+    return LocalSampling(local_search, search.arcs, chosen, rng), chosen
 
 
-def test_what_is_drawn_is_proved_and_near_the_atlas(searches: list[AtlasSearch]) -> None:
+def test_what_is_sampled_is_proved_and_near_the_atlas(searches: list[AtlasSearch]) -> None:
     seen = 0
     for search in searches:
-        scatter, chosen = scatter_of(search)
-        entries, dearest = search.atlas.deployments, math.inf
+        sampling, chosen = sampling_of(search)
+        entries, limit = search.atlas.deployments, math.inf
         for _ in range(30):
-            found = scatter.draw(dearest)
+            found = sampling.sample(limit)
             if found is None:
                 continue
             seen += 1
-            step = search.desk.finished(1, "draw", found)
-            assert step.candidate is not None and step.cost < 1.03 * dearest
+            cost = search.evaluator.evaluate(found)
+            assert cost < 1.03 * limit
             own = found.deployment
             turn = np.abs(np.angle(np.exp(1j * (entries.rotation_rad[chosen] - own.rotation_rad))))
             inserted = np.abs(entries.inner_mm[chosen] - own.inner_mm)
             assert ((turn <= SPREADS[0] + 1e-9) & (inserted <= 2.0 * SPREADS[1] + 1e-9)).any()
-            dearest = step.cost
+            limit = cost
     assert seen >= 4
 
 
 def test_a_target_between_all_workspaces_is_reached(searches: list[AtlasSearch]) -> None:
     """Not one entry has these targets in its workspace; a deployment between the entries has."""
-    between = [search for search in searches if not len(search.in_workspace)]
-    reached = [s for s in between if any(scatter_of(s)[0].draw(math.inf) is not None for _ in range(30))]
+    between = [search for search in searches if not len(search.arcs.in_workspace)]
+    reached = [s for s in between if any(sampling_of(s)[0].sample(math.inf) is not None for _ in range(30))]
     assert reached
     search = reached[0]
     steps = (step for step in search.steps() if step.candidate is not None or step.iteration >= 500)
@@ -83,8 +76,8 @@ def test_those_that_miss_by_least_come_first(searches: list[AtlasSearch]) -> Non
     search = searches[0]
     target, entries = search.task.target.lps_mm, search.atlas.deployments
     order = nearly_reaching(search.atlas, SYSTEM.needle, target, entries.count)
-    outside = order[: entries.count - len(search.in_workspace)]
-    assert not set(outside.tolist()) & set(search.in_workspace.tolist())
+    outside = order[: entries.count - len(search.arcs.in_workspace)]
+    assert not set(outside.tolist()) & set(search.arcs.in_workspace.tolist())
     away = target - entries.positions[outside]
     leans = np.arccos((away * entries.tangents[outside]).sum(axis=1) / np.linalg.norm(away, axis=1))
     assert leans[:20].mean() < leans[-20:].mean()

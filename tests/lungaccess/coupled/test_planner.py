@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,18 +16,24 @@ import lungaccess as la
 from anatomy.errors import SettingsError, TargetError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
-from anatomy.typed import Float, Int
-from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, evaluate_arcs
-from lungaccess.coupled.planner import ProgressEvent
-from lungaccess.coupled.search import AtlasSearch
-from lungaccess.coupled.search.entries import cost_bounds, different
-from lungaccess.coupled.search.local_search import Climber, needle_of, path_through
-from lungaccess.coupled.search.scope_poses import Stands
-from lungaccess.plans.assemble import Task
+from lungaccess.coupled import (
+    METHODS,
+    AtlasSearch,
+    DirectArcs,
+    ProgressEvent,
+    SearchSettings,
+    Step,
+    evaluated_step,
+)
+from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND
+from lungaccess.coupled.search.entries import different
+from lungaccess.coupled.search.local_search import LocalSearch, path_through
+from lungaccess.coupled.search.scope_poses import ScopePoses
+from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
 from stages.needle import TERMS, Objective
-from stages.needle.environment import direct_arcs, workspace_lengths
 from tests.lungaccess.cli.ahead import turned_candidates
 from tests.lungaccess.resample import needle_walk, problems
 
@@ -229,7 +237,7 @@ class TestBudget:
         plans.close()  # type: ignore[attr-defined]
         assert costs[0] > costs[1] > costs[2]
 
-    def test_a_hopeless_search_without_budget_ends(self, small_lung: Lung, atlas: la.Atlas) -> None:
+    def test_a_futile_search_without_budget_ends(self, small_lung: Lung, atlas: la.Atlas) -> None:
         far = la.resolve_target(small_lung, nodule=3)
         with pytest.raises(la.NoPlan, match="outside the needle's workspace"):
             list(la.plan(small_lung, SYSTEM, far, atlas=atlas))
@@ -288,6 +296,55 @@ class TestInfiniteCost:
                 plan.to_json()
 
 
+class NearestArcs:
+    """A search of a user: the direct arcs of the nearest deployments, one a step."""
+
+    def __init__(self, task: Task, atlas: la.Atlas) -> None:
+        self._arcs = DirectArcs(task, atlas)
+        self.blocked = self._arcs.evaluator.blocked
+
+    def steps(self) -> Iterator[Step]:
+        best = math.inf
+        for iteration, entry in enumerate(self._arcs.in_workspace.tolist(), start=1):
+            candidate = self._arcs.candidate(entry)
+            step = evaluated_step(self._arcs.evaluator, "nearest arcs", candidate, iteration)
+            yield step if step.cost < best else Step(iteration=iteration, phase=step.phase)
+            best = min(best, step.cost)
+
+
+class TestOwnSearch:
+    """A search that is added to `METHODS`."""
+
+    def test_it_becomes_a_method_of_the_planner(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setitem(METHODS, "nearest", NearestArcs)
+        plans = plans_of(small_lung, target, atlas, method="nearest", iterations=200)
+        assert plans and {plan.method for plan in plans} == {"nearest"}
+        assert all(la.check(plan, small_lung).accepted for plan in plans[-2:])
+        with pytest.raises(SettingsError, match="processes"):
+            plans_of(small_lung, target, atlas, method="nearest", processes=2)
+        far = la.resolve_target(small_lung, nodule=3)
+        with pytest.raises(la.NoPlan, match="outside the needle's workspace"):
+            plans_of(small_lung, far, atlas, method="nearest")
+
+
+class TestSearchSettings:
+    """Settings of the search over the atlas."""
+
+    def test_other_settings_give_other_plans(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        few = SearchSettings(starts=1, rungs=2, samplings=0, needle_searches=0)
+        monkeypatch.setitem(METHODS, "few", partial(AtlasSearch, settings=few))
+        plans = plans_of(small_lung, target, atlas, method="few")
+        assert plans[-1].digest != plans_of(small_lung, target, atlas)[-1].digest
+
+    def test_absurd_ones_are_refused(self) -> None:
+        with pytest.raises(SettingsError, match="rungs"):
+            SearchSettings(rungs=0)
+
+
 class TestBadInput:
     """Typed errors, before any work."""
 
@@ -333,57 +390,43 @@ class TestProcesses:
 
 @pytest.fixture(scope="module")
 def search(small_lung: Lung, target: Target, atlas: la.Atlas) -> AtlasSearch:
-    task = Task(
-        lung=small_lung, system=SYSTEM, target=target, objective=Objective(inverse_clearance=1.0),
-        with_fissures=atlas.with_fissures, method="atlas", seed=0,
-    )  # fmt: skip
+    task = Task(lung=small_lung, system=SYSTEM, target=target)
     return AtlasSearch(task, atlas)
 
 
-def prices(search: AtlasSearch, slack: float) -> tuple[Int, Float]:
-    """Return blockers and estimated costs of the direct arcs from all deployments in the workspace."""
-    entries, near = search.atlas.deployments, search.in_workspace
-    blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
-    x, y, z = search.task.target.lps_mm.tolist()
-    evaluate_arcs(
-        needle_of(search.desk.environment, search.task), entries.positions[near], entries.tangents[near],
-        entries.branch[near], (x, y, z), slack, math.inf, blockers, costs,
-    )  # fmt: skip
-    return blockers, costs
+def first_clear(search: AtlasSearch, place: int = 0) -> Candidate:
+    """Return the direct arc at a place among those that are clear, the nearest first."""
+    arcs = search.arcs
+    found = arcs.proved(int(arcs.in_workspace[arcs.blockers(arcs.in_workspace)[0] == 0][place]))
+    assert found is not None
+    return found
 
 
-class TestPrices:
+class TestDirectArcs:
     """Direct arcs with a running best, and lower bounds."""
 
-    def test_what_is_not_passed_over_is_judged_as_by_the_needle_stage(self, search: AtlasSearch) -> None:
-        entries, near = search.atlas.deployments, search.in_workspace
-        labels, _lengths, inverse = direct_arcs(
-            search.desk.environment, entries.positions[near], entries.tangents[near], entries.branch[near],
-            search.task.target.lps_mm,
-        )  # fmt: skip
-        blockers, costs = prices(search, math.inf)
+    def test_what_is_not_pruned_is_evaluated_as_by_the_needle_stage(self, search: AtlasSearch) -> None:
+        near = search.arcs.in_workspace
+        labels, _lengths, inverse = search.arcs.blockers(near)
+        blockers, costs, _best = search.arcs.evaluate(near, math.inf)
         assert (blockers == labels).all() and (costs[labels == 0] == inverse[labels == 0]).all()
-        blockers, costs = prices(search, 1.0)
-        dear = blockers == PRUNED_BY_BOUND
-        assert 0 < dear.sum() < len(near) and (blockers[~dear] == labels[~dear]).all()
-        best = inverse[labels == 0].min()
-        assert costs[blockers == 0].min() == best
-        assert (inverse[dear & (labels == 0)] >= best).all()
+        blockers, costs, best = search.arcs.evaluate(near, 1.0)
+        pruned = blockers == PRUNED_BY_BOUND
+        assert 0 < pruned.sum() < len(near) and (blockers[~pruned] == labels[~pruned]).all()
+        assert best == costs[blockers == 0].min() == inverse[labels == 0].min()
+        assert (inverse[pruned & (labels == 0)] >= best).all()
 
     def test_lower_bounds_are_below_exact_costs(self, search: AtlasSearch) -> None:
-        entries, near = search.atlas.deployments, search.in_workspace
-        needle, target = needle_of(search.desk.environment, search.task), search.task.target.lps_mm
-        lengths = workspace_lengths(
-            search.desk.environment, entries.positions[near], entries.tangents[near], target
-        )
-        bounds = cost_bounds(needle, entries, near, lengths, target)
-        clear = np.flatnonzero(prices(search, math.inf)[0] == 0)
-        for n in clear[:: max(len(clear) // 60, 1)].tolist():
-            candidate = search.finished(int(near[n]))
-            assert candidate is not None and 0.0 < bounds[n] <= search.desk.cost(candidate.path)
+        ordered, bounds = search.arcs.by_bound
+        assert set(ordered.tolist()) == set(search.arcs.in_workspace.tolist())
+        assert (np.diff(bounds[ordered]) >= 0.0).all()
+        clear = ordered[search.arcs.blockers(ordered)[0] == 0]
+        for entry in clear[:: max(len(clear) // 60, 1)].tolist():
+            candidate = search.arcs.proved(entry)
+            assert candidate is not None and 0.0 < bounds[entry] <= search.evaluator.cost(candidate.path)
 
     def test_different_deployments_are_the_first_of_their_kind(self, search: AtlasSearch) -> None:
-        entries, near = search.atlas.deployments, search.in_workspace
+        entries, near = search.atlas.deployments, search.arcs.in_workspace
         kept = different(entries, near)
         assert kept[0] == near[0] and 0 < len(kept) < len(near)
         assert (np.diff([near.tolist().index(n) for n in kept.tolist()]) > 0).all()
@@ -391,61 +434,60 @@ class TestPrices:
         assert (different(entries, kept) == kept).all()
 
 
-class TestClimbs:
+def local_search_of(search: AtlasSearch) -> LocalSearch:
+    return LocalSearch(search.evaluator, search.atlas.sites, np.random.default_rng(0))
+
+
+class TestLocalSearch:
     """Random improvement in compiled batches."""
 
     @pytest.mark.parametrize("turned", [False, True])
-    def test_they_only_fall_and_end_at_what_is_proved(
+    def test_costs_only_fall_and_every_result_is_proved(
         self, search: AtlasSearch, small_lung: Lung, atlas: la.Atlas, turned: bool
     ) -> None:
         if turned:
             search, begun = next(turned_candidates(small_lung, atlas))
         else:
-            last = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][-1]))
-            assert last is not None
-            begun = last
-        climber = Climber(search.desk, search.judge, search.atlas.sites, np.random.default_rng(0))
-        climb = climber.begin(begun)
-        assert climb is not None
-        again = climber.candidate(climb)
+            begun = first_clear(search, -1)
+        local_search = local_search_of(search)
+        run = local_search.begin(begun)
+        assert run is not None
+        again = local_search.candidate(run)
         assert again is not None and np.allclose(again.path.arcs, begun.path.arcs, atol=1e-9)
         costs = []
         for _ in range(12):
-            climber.advance(climb, 50)
-            costs.append(climb.cost)
-            found = search.desk.finished(0, "climb", climber.candidate(climb))
-            assert found.candidate is not None
-            assert found.cost == pytest.approx(climb.cost, rel=0.05)
-            assert found.candidate.tip.turned == turned
-        assert costs == sorted(costs, reverse=True) and costs[-1] < 0.99 * search.desk.cost(begun.path)
+            local_search.advance(run, 50)
+            costs.append(run.cost)
+            found = local_search.candidate(run)
+            assert found is not None and found.tip.turned == turned
+            assert search.evaluator.evaluate(found) == pytest.approx(run.cost, rel=0.05)
+        assert costs == sorted(costs, reverse=True)
+        assert costs[-1] < 0.99 * search.evaluator.cost(begun.path)
 
-    def test_kicked_ones_find_back_to_what_is_proved(self, search: AtlasSearch) -> None:
-        climber = Climber(search.desk, search.judge, search.atlas.sites, np.random.default_rng(0))
-        begun = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][0]))
-        assert begun is not None
-        finite = 0
+    def test_perturbed_runs_find_back_to_what_is_proved(self, search: AtlasSearch) -> None:
+        local_search, begun, finite = local_search_of(search), first_clear(search), 0
         for _ in range(8):
-            climb = climber.begin(begun)
-            assert climb is not None
-            climber.kick(climb)
-            climber.advance(climb, 300)
-            if math.isfinite(climb.cost):
+            run = local_search.begin(begun)
+            assert run is not None
+            local_search.perturb(run)
+            local_search.advance(run, 300)
+            if math.isfinite(run.cost):
                 finite += 1
-                assert search.desk.finished(0, "climb", climber.candidate(climb)).candidate is not None
+                found = local_search.candidate(run)
+                assert found is not None and math.isfinite(search.evaluator.evaluate(found))
         assert finite >= 1
 
     def test_rows_hold_the_tips(self, search: AtlasSearch, small_lung: Lung) -> None:
         tip = search.atlas.sites.tip(small_lung.tree, 0)
-        stands = Stands(small_lung, SYSTEM.scope, search.atlas.sites, tip, np.random.default_rng(0))
-        assert stands.allowed[stands.home] and stands.rotation_rad(stands.home, 0.7) == pytest.approx(0.7)
-        for row, each in zip(stands.rows, stands.tips, strict=True):
+        poses = ScopePoses(small_lung, SYSTEM.scope, search.atlas.sites, tip, np.random.default_rng(0))
+        assert poses.allowed[poses.home] and poses.rotation_rad(poses.home, 0.7) == pytest.approx(0.7)
+        for row, each in zip(poses.rows, poses.tips, strict=True):
             frame = each.lps_from_scope_tip
             assert np.allclose(row[:6], [*frame[:3, 3], *frame[:3, 2]])
             assert abs(row[3:6] @ row[6:]) < 1e-9 and np.linalg.norm(row[6:]) == pytest.approx(1.0)
 
     def test_paths_lead_through_their_points(self, search: AtlasSearch) -> None:
-        begun = search.finished(int(search.in_workspace[prices(search, math.inf)[0] == 0][0]))
-        assert begun is not None
+        begun = first_clear(search)
         target = search.task.target.lps_mm
         vias = begun.path.sample(2.0)[0][[3, 6]] + 0.3
         path = path_through(begun.deployment, vias, target)

@@ -10,12 +10,12 @@ import pytest
 import lungaccess as la
 from anatomy.errors import TargetError
 from anatomy.lung import Lung
-from lungaccess.coupled.search import AtlasSearch
-from lungaccess.plans.assemble import Task, assemble
+from lungaccess.coupled import DirectArcs
+from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.target import point_target, require_free
+from lungaccess.problem.target import point_target
+from lungaccess.problem.task import Task
 from stages.needle import SHORTEST
-from stages.needle.environment import direct_arcs
 
 SYSTEM = la.load_system("ultrathin")
 COUNT = 12
@@ -32,19 +32,12 @@ def plans(small_lung: Lung) -> list[Plan]:
         point = entries.positions[entry] + AHEAD_MM * entries.tangents[entry]
         try:
             target = point_target(small_lung, point)
-            require_free(small_lung, point)
         except TargetError:
             continue
-        task = Task(
-            lung=small_lung, system=SYSTEM, target=target, objective=SHORTEST,
-            with_fissures=atlas.with_fissures, method="atlas", seed=0,
-        )  # fmt: skip
-        search = AtlasSearch(task, atlas)
-        one = slice(int(entry), int(entry) + 1)
-        blockers, _lengths, _costs = direct_arcs(
-            search.desk.environment, entries.positions[one], entries.tangents[one], entries.branch[one], point
-        )
-        candidate = search.finished(int(entry)) if blockers[0] == 0 else None
+        task = Task(lung=small_lung, system=SYSTEM, target=target, objective=SHORTEST)
+        arcs = DirectArcs(task, atlas)
+        clear = arcs.blockers(np.array([entry]))[0] == 0
+        candidate = arcs.proved(int(entry)) if clear else None
         if candidate is not None:
             found.append(assemble(task, atlas.sites, candidate, iteration=0, timing={}))
         if len(found) == COUNT:

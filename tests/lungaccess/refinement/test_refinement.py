@@ -15,12 +15,15 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES
 from anatomy.typed import Float
-from lungaccess.plans.assemble import Candidate, Task, assemble
+from lungaccess.plans.assemble import assemble
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
 from lungaccess.refinement import boxes, refine
 from lungaccess.refinement.axis import LocalAxis
 from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.geometry import Geometry
-from lungaccess.refinement.problem import Court, Problem
+from lungaccess.refinement.problem import Problem
 from lungaccess.refinement.program import Program, program
 from stages.needle import SHORTEST, Objective
 from stages.needle.environment import direct_arcs, needle_environment
@@ -49,15 +52,7 @@ def case(small_lung: Lung) -> Case:
     """Direct arcs to the first nodule."""
     system, lung = SYSTEM, small_lung
     target = la.resolve_target(lung)
-    task = Task(
-        lung=lung,
-        system=system,
-        target=target,
-        objective=Objective(inverse_clearance=1.0),
-        with_fissures=lung.has_fissures,
-        method="atlas",
-        seed=0,
-    )
+    task = Task(lung=lung, system=system, target=target)
     places = find_sites(lung, system.scope, reach_mm=tracking_length_mm(system.tubes))
     fissures = {"with_fissures": task.with_fissures}
     found = enumerate_deployments(lung, system.tubes, system.margins, places.poses, **fissures)
@@ -91,9 +86,9 @@ class TestRefine:
     def test_every_result_is_cheaper_and_most_candidates_have_one(
         self, case: Case, refined: list[Candidate | None]
     ) -> None:
-        court = Court(case.task)
+        evaluator = CandidateEvaluator(case.task)
         found = [
-            (court.cost(old), court.cost(new))
+            (evaluator.cost(old.path), evaluator.cost(new.path))
             for old, new in zip(case.candidates, refined, strict=True)
             if new
         ]
@@ -140,7 +135,8 @@ class TestRefine:
         task, old = replace(case.task, lung=lung, objective=Objective(cost_map=1.0)), case.candidates[0]
         new = refine(task, case.sites, old, iterations=ITERATIONS)
         assert new is not None
-        assert Court(task).cost(new) < 0.99 * Court(task).cost(old)
+        cost = CandidateEvaluator(task).cost
+        assert cost(new.path) < 0.99 * cost(old.path)
 
     def test_without_a_map_nothing_is_cheaper_than_free(self, case: Case) -> None:
         task = replace(case.task, objective=Objective(cost_map=1.0))
@@ -153,17 +149,17 @@ class TestRefine:
 
 
 def set_up(case: Case) -> tuple[Problem, Program]:
-    problem = Problem(Court(case.task), case.sites, case.candidates[1], (1.0, 0.0, 0.0))
+    problem = Problem(CandidateEvaluator(case.task), case.sites, case.candidates[1], (1.0, 0.0, 0.0))
     return problem, program(problem.layout, ITERATIONS)
 
 
 class TestProgram:
     """The program is what it says, and so are its derivatives."""
 
-    def test_at_the_start_it_prices_the_candidate(self, case: Case) -> None:
+    def test_at_the_start_it_costs_as_much_as_the_candidate(self, case: Case) -> None:
         problem, solver = set_up(case)
         cost, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
-        assert cost == pytest.approx(Court(case.task).cost(case.candidates[1]), rel=0.1)
+        assert cost == pytest.approx(CandidateEvaluator(case.task).cost(case.candidates[1].path), rel=0.1)
         assert np.abs(values[problem.layout.constraints["end"]]).max() < 1e-6
         assert values[problem.layout.constraints["length"]][0] == pytest.approx(
             case.candidates[1].path.length_mm
@@ -351,7 +347,7 @@ def places_of(box: boxes.FieldBox) -> Float:
 
 
 def test_turned_tips_stay_where_they_are(small_lung: Lung) -> None:
-    """Tubes and needle move; the tip, which has no smooth way along the airway, does not."""
+    """Tubes and needle move; the tip, which has no smooth axis along the airway, does not."""
     atlas = la.build_atlas(small_lung, SYSTEM)
     better = 0
     for search, candidate in islice(turned_candidates(small_lung, atlas), 4):
@@ -360,9 +356,8 @@ def test_turned_tips_stay_where_they_are(small_lung: Lung) -> None:
         if refined is None:
             continue
         better += 1
-        court = Court(search.task)
-        assert refined.tip is candidate.tip and court.accepts(refined)
-        assert court.cost(refined) < court.cost(candidate)
+        assert refined.tip is candidate.tip
+        assert search.evaluator.evaluate(refined) < search.evaluator.cost(candidate.path)
         plan = assemble(search.task, atlas.sites, refined, iteration=0, timing={})
         assert la.check(plan, small_lung).accepted
     assert better >= 2

@@ -1,0 +1,183 @@
+"""Direct arcs from the deployments of an atlas to a target: the first phase of a search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+
+from anatomy.typed import Float, Int
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, cost_bounds, evaluate_arcs
+from lungaccess.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
+from stages.needle import NeedleEnvironment, direct_arcs
+
+CHUNK = 1000
+"""Arcs that are evaluated in one call of a kernel: between two calls the caller can end the search."""
+FINALISTS = 3
+"""Proved arcs of a chunk: the estimated costs by which they are chosen may be in the wrong order."""
+
+
+class DirectArcs:
+    """The single arcs of a needle from the deployments of an atlas to a target.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+
+    Attributes
+    ----------
+    evaluator : CandidateEvaluator
+    in_workspace : (N,) int64
+        The deployments whose workspace of the needle holds the target, the nearest first.
+    """
+
+    def __init__(self, task: Task, atlas: Atlas) -> None:
+        self.task = task
+        self.atlas = atlas
+        self.evaluator = CandidateEvaluator(task)
+        self.in_workspace, self._lengths = atlas.index.holding(self.evaluator.environment, task.target.lps_mm)
+
+    def blockers(self, chosen: Int, environment: NeedleEnvironment | None = None) -> tuple[Int, Float, Float]:
+        """Return what blocks the arcs from deployments, their lengths and their integrals of 1 / clearance.
+
+        Parameters
+        ----------
+        chosen : (N,) int64
+        environment : NeedleEnvironment, optional
+            Another one than the task's.
+
+        Returns
+        -------
+        blockers : (N,) int64
+            0 for arcs that are proved clear, -1 where no arc keeps the needle's limits, else a voxel label.
+        lengths, inverse_clearance : (N,) float64
+        """
+        entries = self.atlas.deployments
+        return direct_arcs(
+            environment or self.evaluator.environment,
+            entries.positions[chosen],
+            entries.tangents[chosen],
+            entries.branch[chosen],
+            self.task.target.lps_mm,
+        )
+
+    def candidate(self, entry: int) -> Candidate | None:
+        """Return a deployment of the atlas in full with its arc, None if the tubes are refused."""
+        entries = self.atlas.deployments
+        return self.evaluator.direct(
+            self.atlas.sites.tip(self.task.lung.tree, int(entries.site[entry])),
+            float(entries.rotation_rad[entry]),
+            float(entries.outer_mm[entry]),
+            float(entries.inner_mm[entry]),
+        )
+
+    def proved(self, entry: int) -> Candidate | None:
+        """Return a deployment of the atlas with its arc, None if the proof fails."""
+        candidate = self.candidate(entry)
+        proved = candidate is not None and self.evaluator.proves(candidate.deployment, candidate.path)
+        return candidate if proved else None
+
+    @cached_property
+    def by_bound(self) -> tuple[Int, Float]:
+        """The deployments with the target in their workspace, the least lower bound of the cost first.
+
+        The second array `(E,)` has the bounds by deployment; they are 0 for all others.
+        """
+        entries = self.atlas.deployments
+        bounds = np.zeros(len(self.in_workspace))
+        positions = np.ascontiguousarray(entries.positions[self.in_workspace])
+        cost_bounds(self.evaluator.needle_arrays, positions, np.array(self._lengths), self._target, bounds)
+        by_entry = np.zeros(entries.count)
+        by_entry[self.in_workspace] = bounds
+        return self.in_workspace[np.argsort(bounds, kind="stable")], by_entry
+
+    @property
+    def _target(self) -> tuple[float, float, float]:
+        x, y, z = self.task.target.lps_mm.tolist()
+        return x, y, z
+
+    def evaluate(self, chosen: Int, slack: float, best: float = math.inf) -> tuple[Int, Float, float]:
+        """Evaluate the arcs from deployments, less and less of them as cheap ones are found.
+
+        Parameters
+        ----------
+        chosen : (N,) int64
+        slack, best : float
+            Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not tested.
+
+        Returns
+        -------
+        blockers : (N,) int64
+            As those of the method `blockers`, or PRUNED_BY_BOUND.
+        costs : (N,) float64
+            Estimated costs, infinite where a lower bound was enough.
+        best : float
+            Cost of the cheapest clear arc, or `best`.
+        """
+        entries = self.atlas.deployments
+        blockers, costs = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen))
+        best = evaluate_arcs(
+            self.evaluator.needle_arrays,
+            entries.positions[chosen],
+            entries.tangents[chosen],
+            entries.branch[chosen],
+            self._target,
+            slack,
+            best,
+            blockers,
+            costs,
+        )
+        return blockers, costs, best
+
+
+class DirectArcSearch:
+    """Evaluates the direct arcs of an atlas chunk by chunk, the nearest deployments first.
+
+    Parameters
+    ----------
+    arcs : DirectArcs
+    incumbent : Incumbent
+    settings : SearchSettings
+
+    Attributes
+    ----------
+    clear : (C,) int64
+        After the search the deployments with a clear arc, the cheapest first.
+    """
+
+    phase = "direct arcs"
+
+    def __init__(self, arcs: DirectArcs, incumbent: Incumbent, settings: SearchSettings) -> None:
+        self._arcs, self._incumbent, self._settings = arcs, incumbent, settings
+        self.clear: Int = np.zeros(0, dtype=np.int64)
+
+    def steps(self) -> Iterator[Step]:
+        """Yield a step for each chunk, and one for each arc of it that is proved in full."""
+        found, estimates, cheapest = [], [], math.inf
+        near, evaluator = self._arcs.in_workspace, self._arcs.evaluator
+        for begin in range(0, len(near), CHUNK):
+            chunk = near[begin : begin + CHUNK]
+            blockers, costs, cheapest = self._arcs.evaluate(chunk, self._settings.kept_slack, cheapest)
+            evaluator.count_blockers(blockers[blockers != PRUNED_BY_BOUND])
+            clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
+            found.append(chunk[clear])
+            estimates.append(costs[clear])
+            yield Step(iteration=0, phase=self.phase)
+            left = FINALISTS
+            for n in clear[np.argsort(costs[clear], kind="stable")].tolist():
+                if not left or costs[n] > ESTIMATE_SLACK * self._incumbent.cost:
+                    break
+                step = evaluated_step(evaluator, self.phase, self._arcs.candidate(int(chunk[n])))
+                left -= step.candidate is not None
+                yield self._incumbent.improved(step)
+        if found:
+            clear, costs = np.concatenate(found), np.concatenate(estimates)
+            self.clear = clear[np.argsort(costs, kind="stable")]

@@ -1,0 +1,143 @@
+"""The evaluator of candidates: it proves them by the tests of all stages, and computes their cost."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from functools import cached_property
+
+import numpy as np
+
+from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+from anatomy.typed import Float, Float32, Int
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.costs import path_cost
+from lungaccess.problem.task import Task
+from stages.needle import (
+    CURVATURE,
+    NO_MAP,
+    ArcPath,
+    NeedleEnvironment,
+    Objective,
+    ObjectiveArrays,
+    Obstacles,
+    Query,
+    direct_path,
+    map_integral,
+    needle_environment,
+    violation,
+    workspace_lengths,
+)
+from stages.scope import ScopeTip
+from stages.tube import Deployment, TubeJudge
+
+NeedleArrays = tuple[Obstacles, Float, ObjectiveArrays, bool, Float32]
+"""A needle among obstacles for the compiled kernels; see `lungaccess.coupled.kernels.candidate`."""
+
+BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"), (AIRWAY, "an airway"))
+
+
+class CandidateEvaluator:
+    """Proves and costs the candidates of one task, from the numbers that a plan will state.
+
+    Parameters
+    ----------
+    task : Task
+
+    Attributes
+    ----------
+    environment : NeedleEnvironment
+        What the needle collides with, and its limits.
+    tubes : TubeJudge
+        Validates deployments of the tubes.
+    blocked : Counter of str
+        How many direct arcs were stopped, by what stopped them.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        system, fissures = task.system, task.with_fissures
+        self.environment: NeedleEnvironment = needle_environment(
+            task.lung, system.needle, system.margins, with_fissures=fissures
+        )
+        self.tubes = TubeJudge(task.lung, system.tubes, system.margins, with_fissures=fissures)
+        self.blocked: Counter[str] = Counter()
+
+    def cost(self, path: ArcPath) -> float:
+        """Return the cost of a path under the task's objective."""
+        task = self.task
+        return path_cost(task.lung, path, task.objective, with_fissures=task.with_fissures)
+
+    def evaluate(self, candidate: Candidate) -> float:
+        """Return the cost of a candidate, infinite if its proof fails."""
+        proved = self.proves(candidate.deployment, candidate.path)
+        return self.cost(candidate.path) if proved else math.inf
+
+    def proves(self, deployment: Deployment, path: ArcPath) -> bool:
+        """Tell whether a needle path keeps all limits, is clear, and enters no voxel of infinite cost.
+
+        Such a voxel may not be entered, whatever the objective is.
+        """
+        if path.arcs[:, CURVATURE].max() > self.task.system.needle.max_curvature_per_mm:
+            return False
+        if violation(self.environment, self.query(deployment), path):
+            return False
+        return math.isfinite(map_integral(self.task.lung.cost, path))
+
+    def direct(
+        self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float
+    ) -> Candidate | None:
+        """Return a deployment with a direct arc to the target, None if the deployment is refused."""
+        deployment = self.tubes.judge(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
+        if isinstance(deployment, str):
+            return None
+        path = direct_path(deployment.lps_from_tip, self.task.target.lps_mm)
+        return Candidate(tip=tip, deployment=deployment, path=path)
+
+    def reaches(self, lps_from_tip: Float) -> bool:
+        """Tell whether the target lies in the needle's workspace at a start pose."""
+        length = workspace_lengths(
+            self.environment, lps_from_tip[None, :3, 3], lps_from_tip[None, :3, 2], self.task.target.lps_mm
+        )
+        return bool(np.isfinite(length[0]))
+
+    def query(self, deployment: Deployment) -> Query:
+        """Return what is asked of the needle's searches from the tip of the tubes."""
+        return Query(
+            lps_from_start=deployment.lps_from_tip, target=self.task.target.lps_mm, branch=deployment.branch
+        )
+
+    def count_blockers(self, blockers: Int) -> None:
+        """Add to `blocked` what stopped direct arcs, by their labels `(N,)`."""
+        labels, counts = np.unique(blockers, return_counts=True)
+        for label, count in zip(labels, counts, strict=True):
+            self.blocked[blocker_name(int(label))] += int(count)
+
+    @property
+    def objective(self) -> Objective:
+        """The task's objective for the kernels, which weigh a cost map only where there is one."""
+        objective = self.task.objective
+        return objective.without_map if self.task.lung.cost is None else objective
+
+    @cached_property
+    def needle_arrays(self) -> NeedleArrays:
+        """The needle, its environment and the objective for the kernels."""
+        costs, objective = self.task.lung.cost, self.objective
+        unseen = costs is not None and not objective.weighs_map and not np.isfinite(costs.array).all()
+        forbidden = costs.array if unseen and costs is not None else NO_MAP
+        return (
+            self.environment.obstacles,
+            self.environment.limits,
+            self.environment.objective_arrays(objective),
+            unseen,
+            forbidden,
+        )
+
+
+def blocker_name(label: int) -> str:
+    """Name what blocks an arc: 0 nothing, -1 the limits of the needle, else a voxel label."""
+    if label == 0:
+        return "nothing"
+    if label < 0:
+        return "the needle's limits"
+    return next(name for bit, name in BLOCKERS if label & bit)

@@ -1,0 +1,53 @@
+"""The task of a search: patient, devices, target and objective, tested together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from anatomy.lung import Lung
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target, require_free
+from stages.needle import Objective
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Task:
+    """What a search for plans is asked.
+
+    Parameters
+    ----------
+    lung : Lung
+    system : System
+    target : Target
+    objective : Objective
+        What a plan is to keep small.
+    method : str
+        The name of the search, which plans state.
+    seed : int
+        Of the search's random numbers.
+
+    Raises
+    ------
+    TargetError
+        If the target lies outside the lung or inside an obstacle.
+    """
+
+    lung: Lung
+    system: System
+    target: Target
+    objective: Objective = Objective(inverse_clearance=1.0)
+    method: str = "atlas"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_free(self.lung, self.target.lps_mm)
+
+    @property
+    def with_fissures(self) -> bool:
+        """Whether fissures are obstacles."""
+        return fissures_are_obstacles(self.lung, self.system)
+
+
+def fissures_are_obstacles(lung: Lung, system: System) -> bool:
+    """Tell whether fissures are obstacles: the lung has a mask of them, and the system may not cross them."""
+    return lung.has_fissures and not system.fissures_allowed

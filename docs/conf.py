@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
+import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+from sphinx.application import Sphinx
+
+from anatomy.facade import public_names
 
 project = "lungaccess"
 author = "The lungaccess contributors"
 copyright = f"2026, {author}"
 release = importlib.metadata.version("lungaccess")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build", "pictures"]
-templates_path = ["_templates"]
 html_theme = "furo"
 html_title = "lungaccess"
 
@@ -26,13 +32,56 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
-autosummary_generate = True
-autosummary_imported_members = False
 nitpicky = False
 # Docstrings name their sources as [Kuntz2015]; the bibliography is one page for all of them.
-suppress_warnings = ["ref.citation", "ref.python"]
+suppress_warnings = ["ref.citation", "ref.python", "ref.ref"]
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+OPTIONS = {"class": ["   :members:"], "function": [], "data": ["   :no-value:"]}
+
+
+def write_reference() -> None:
+    """Write a page of the reference for each package that states public names; a name is described once."""
+    described: set[str] = set()
+    files = [
+        file for top in ("lungaccess", "stages", "anatomy") for file in (ROOT / top).rglob("__init__.py")
+    ]
+    for file in sorted(files, key=lambda path: len(path.parts), reverse=True):
+        names = public_names(str(file))
+        if "kernels" in file.parts or not names:
+            continue
+        package = ".".join(file.parent.relative_to(ROOT).parts)
+        summary = (importlib.import_module(package).__doc__ or "").splitlines()[0]
+        page = [package, "=" * len(package), "", summary, ""]
+        for name, module in sorted(names.items()):
+            value = getattr(importlib.import_module(module), name)
+            kind = "class" if inspect.isclass(value) else "function" if inspect.isfunction(value) else "data"
+            full = f"{module if kind == 'data' else value.__module__}.{name}"
+            if full in described:
+                page += [f"``{name}``: see :py:obj:`{full}`", ""]
+                continue
+            described.add(full)
+            page += [f".. auto{kind}:: {full}", *OPTIONS[kind], ""]
+        (HERE / "reference" / f"{package}.rst").write_text("\n".join(page), encoding="utf-8")
+
+
+(HERE / "reference").mkdir(exist_ok=True)
+for old in (HERE / "reference").iterdir():
+    old.unlink()
+write_reference()
 
 # The pictures of the gallery are those that its scripts make.
-HERE = Path(__file__).resolve().parent
-EXAMPLES = HERE.parent / "examples" / "run_all.py"
-subprocess.run([sys.executable, str(EXAMPLES), str(HERE / "pictures")], check=True)
+subprocess.run([sys.executable, str(ROOT / "examples" / "run_all.py"), str(HERE / "pictures")], check=True)
+
+
+def tidy(_app: object, what: str, _name: str, value: object, _options: object, lines: list[str]) -> None:
+    """Name sources in plain text: the bibliography is one page for all; leave out the docstring of a type."""
+    if what == "data" and lines and lines[0] in (type(value).__doc__ or ""):
+        lines.clear()
+    lines[:] = [re.sub(r"^(\s*)\.\. \[(\w+)\]", r"\1\2", line) for line in lines]
+
+
+def setup(app: Sphinx) -> None:
+    """Connect to Sphinx."""
+    app.connect("autodoc-process-docstring", tidy, priority=400)

@@ -41,7 +41,7 @@ from lungaccess.problem.system import System
 PHANTOM_SEED = 1
 
 
-class Judge:
+class PlanCheck:
     """Checks plans and mutants of one lung."""
 
     def __init__(self, lung: Lung) -> None:
@@ -50,11 +50,11 @@ class Judge:
         self._edited = EditedLung(lung)
 
     def of_plan(self, plan: Plan, system: System, asked_lps: Float) -> CheckReport:
-        """Judge a plan as its user would."""
+        """Check a plan as its user would."""
         return self._checker.check(plan, system, target_lps=asked_lps)
 
     def of_mutant(self, mutant: Mutant, system: System, asked_lps: Float) -> CheckReport:
-        """Judge a mutant, with its voxel if it has one."""
+        """Check a mutant, with its voxel if it has one."""
         if mutant.voxel is None:
             asked = {"system": system, "target_lps": asked_lps} if mutant.asked else {}
             return self._checker.check(mutant.plan, **asked)
@@ -77,14 +77,14 @@ class EditedLung:
         return getattr(self._lung, name)
 
 
-def attack(judge: Judge, patient: str, number: int, keep: Path) -> list[dict[str, Any]]:
+def attack(check: PlanCheck, patient: str, number: int, keep: Path) -> list[dict[str, Any]]:
     """Make, check, mutate and check the plans of one batch; return a record of each."""
     rng = np.random.default_rng([number, *patient.encode()])
     records: list[dict[str, Any]] = []
     other: Plan | None = None
-    for system, asked_lps, plan in plans_of_batch(judge.lung, rng):
+    for system, asked_lps, plan in plans_of_batch(check.lung, rng):
         began = time.process_time()
-        report = judge.of_plan(plan, system, asked_lps)
+        report = check.of_plan(plan, system, asked_lps)
         record: dict[str, Any] = {
             "patient": patient,
             "batch": number,
@@ -100,8 +100,8 @@ def attack(judge: Judge, patient: str, number: int, keep: Path) -> list[dict[str
         if not report.accepted:
             plan.save(keep / f"refused-{name}")
         else:
-            kind, mutant = mutate(Case(lung=judge.lung, plan=plan, report=report, other=other or plan), rng)
-            verdict = judge.of_mutant(mutant, system, asked_lps)
+            kind, mutant = mutate(Case(lung=check.lung, plan=plan, report=report, other=other or plan), rng)
+            verdict = check.of_mutant(mutant, system, asked_lps)
             record |= {
                 "mutation": kind,
                 "mutant_accepted": verdict.accepted,
@@ -128,14 +128,14 @@ def run(patient: str, lung: Lung, plans: int, seed: int, out: Path, keep: Path) 
     """Attack batch after batch until FILE has so many plans of the patient."""
     mine = [each for each in read(out) if each["patient"] == patient]
     done, total = {each["batch"] for each in mine}, sum("accepted" in each for each in mine)
-    judge = Judge(lung)
+    check = PlanCheck(lung)
     for number in count(seed):
         if total >= plans:
             return
         if number in done:
             continue
         began = time.process_time()
-        records = attack(judge, patient, number, keep)
+        records = attack(check, patient, number, keep)
         total += len(records)
         seconds = round(time.process_time() - began, 1)
         records.append({"patient": patient, "batch": number, "batch_s": seconds})

@@ -11,9 +11,9 @@ from anatomy import structures
 from anatomy.typed import Bool, Float, Labels
 from lungaccess.checking import shapes
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
+from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import POSITION_TOLERANCE_MM, check_rigid, check_same_pose
-from lungaccess.checking.scene import Scene
 from lungaccess.checking.shapes import Curve
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at, region_around
 from lungaccess.plans.plan import Plan
@@ -53,9 +53,9 @@ class Exit:
     branch: int
 
 
-def check_deployment(plan: Plan, scene: Scene, found: Findings) -> Curve | None:
+def check_deployment(plan: Plan, environment: Environment, found: Findings) -> Curve | None:
     """Record everything about the tubes; return their re-integrated centreline if it can be followed."""
-    tube, tubes, lung = plan.tube, plan.system.tubes, scene.lung
+    tube, tubes, lung = plan.tube, plan.system.tubes, environment.lung
     if not (check_rigid("tube.tip", tube.lps_from_tip, found) and _is_pose(plan.scope.lps_from_scope_tip)):
         return None
     bend = shapes.bend_of(tubes, tube.outer_insertion_mm, tube.inner_insertion_mm)
@@ -70,8 +70,8 @@ def check_deployment(plan: Plan, scene: Scene, found: Findings) -> Curve | None:
         way_out = replace(way_out, frame=int(np.abs(curve.arc_mm - way_out.arc_mm).argmin()))
         labels = labels_at(lung, curve.points)
         _check_containment(plan, curve, labels, way_out, found)
-        _check_out_of_lumen(scene, curve, way_out, found)
-        _check_clearance(plan, scene, curve, way_out, sweep_mm, found)
+        _check_out_of_lumen(environment, curve, way_out, found)
+        _check_clearance(plan, environment, curve, way_out, sweep_mm, found)
     return curve
 
 
@@ -103,8 +103,8 @@ def _check_sweep(plan: Plan, found: Findings) -> float:
     sweep = leader = 0.0
     bends = shapes.deployment_bends(tubes, outer, inner, SWEEP_STEP_MM)
     for bend in bends:
-        apart = shapes.distance_to_polyline(shapes.planar_shape(bend, SWEEP_POINT_MM), final)
-        sweep, leader = max(sweep, float(apart.max())), max(leader, float(apart[-1]))
+        distances = shapes.distance_to_polyline(shapes.planar_shape(bend, SWEEP_POINT_MM), final)
+        sweep, leader = max(sweep, float(distances.max())), max(leader, float(distances[-1]))
     limit = tubes.max_lateral_sweep_mm
     detail = f"sideways motion while the tubes are deployed, {len(bends)} steps replayed"
     found.at_most("tube.sweep.limit", sweep, limit, "mm", detail, SWEEP_TOLERANCE_MM)
@@ -217,7 +217,7 @@ def _check_containment(plan: Plan, curve: Curve, labels: Labels, way_out: Exit, 
     found.true("tube.containment", not hit.any(), f"{int(hit.sum())} samples behind the exit in an obstacle")
 
 
-def _check_out_of_lumen(scene: Scene, curve: Curve, way_out: Exit, found: Findings) -> None:
+def _check_out_of_lumen(environment: Environment, curve: Curve, way_out: Exit, found: Findings) -> None:
     """Beyond the zone of the wall no segment of the axis comes near lumen, however thin the corner."""
     begin_mm = way_out.arc_mm + WALL_ZONE_MM
     if curve.arc_mm[-1] <= begin_mm:
@@ -225,7 +225,7 @@ def _check_out_of_lumen(scene: Scene, curve: Curve, way_out: Exit, found: Findin
     begin = [np.interp(begin_mm, curve.arc_mm, curve.points[:, axis]) for axis in range(3)]
     points = np.concatenate([[begin], curve.points[curve.arc_mm > begin_mm]])
     needed = np.full(len(points) - 1, OUT_OF_LUMEN_MM)
-    boxes = scene.boxes(has(structures.LUMEN), REACH_MM)
+    boxes = environment.boxes(has(structures.LUMEN), REACH_MM)
     check_clear("tube.beyond_wall.lumen", boxes, points, needed, found, limited=True)
 
 
@@ -245,10 +245,10 @@ def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:
 
 
 def _check_clearance(
-    plan: Plan, scene: Scene, curve: Curve, way_out: Exit, sweep_mm: float, found: Findings
+    plan: Plan, environment: Environment, curve: Curve, way_out: Exit, sweep_mm: float, found: Findings
 ) -> None:
     """From its first contact with the wall on, each tube keeps radius, margins and sweep from obstacles."""
-    contact = _first_contact(scene.lung, curve, way_out, plan)
+    contact = _first_contact(environment.lung, curve, way_out, plan)
     margin = plan.system.margins.total_mm + sweep_mm
     tubes = plan.system.tubes
     radius = np.where(
@@ -258,14 +258,14 @@ def _check_clearance(
     )
     needed = radius + margin + curve.sagitta_mm
     for name, select, first in obstacles_of(way_out.branch, contact, way_out.frame):
-        boxes = scene.boxes(select, REACH_MM)
+        boxes = environment.boxes(select, REACH_MM)
         points = curve.points[first:]
         least = check_clear(
             f"tube.clearance.{name}", boxes, points, needed[first:], found,
             limited=name != "fissure" or plan.fissures_are_obstacles,
         )  # fmt: skip
         most = boxes.least_mm(curve.points[way_out.frame :])
-        diagonal = float(np.linalg.norm(scene.lung.grid.spacing_mm))
+        diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
         check_stated_clearance(plan, "tube", name, (least, most), diagonal, found)
 
 

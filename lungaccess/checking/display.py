@@ -4,43 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
 from anatomy.display import title
-
-if TYPE_CHECKING:
-    from lungaccess.checking.findings import CheckReport, Finding
 
 _HEADINGS = ("", "what", "found", "limit", "margin", "")
 
 
-def report_html(report: CheckReport) -> str:
-    """Return a report as HTML; the verdict is a word, not a colour alone."""
-    refused = report.refusals
-    verdict = "accepts the plan" if report.accepted else f"REFUSES the plan ({len(refused)} findings)"
-    colour = "#1a7f37" if report.accepted else "#c00000"
-    everything = (
-        f"<details><summary>{len(report.findings)} findings</summary>{_table(report.findings)}</details>"
-    )
+Row = tuple[str, ...]
+"""The cells of one finding, in the order of the headings; see `Finding.cells`."""
+
+
+def report_html(findings: Sequence[Row], refused: Sequence[Row], *, accepted: bool) -> str:
+    """Return the verdict and the findings as HTML; the verdict is a word, not a colour alone."""
+    verdict = "accepts the plan" if accepted else f"REFUSES the plan ({len(refused)} findings)"
+    colour = "#1a7f37" if accepted else "#c00000"
+    everything = f"<details><summary>{len(findings)} findings</summary>{_table(findings)}</details>"
     return (
         f'<div style="color:{colour}">{title(f"The independent check {verdict}")}</div>'
         f"{_table(refused) if refused else ''}{everything}"
     )
 
 
-def _table(findings: Sequence[Finding]) -> str:
+def _table(rows: Sequence[Row]) -> str:
     head = "".join(f"<th>{heading}</th>" for heading in _HEADINGS)
-    return f"<table><tr>{head}</tr>{''.join(_row(each) for each in findings)}</table>"
+    return f"<table><tr>{head}</tr>{''.join(_row(row) for row in rows)}</table>"
 
 
-def _row(finding: Finding) -> str:
-    unit = f" {finding.unit}" if finding.unit else ""
-    cells = (
-        "ok" if finding.ok else "REFUSED",
-        finding.name,
-        "" if finding.value is None else f"{finding.value:.4g}{unit}",
-        "" if finding.side is None else f"{finding.side} {finding.limit:.4g}",
-        "" if finding.margin is None else f"{finding.margin:.3g}",
-        finding.detail,
-    )
-    return "<tr>" + "".join(f'<td style="text-align:left">{escape(cell)}</td>' for cell in cells) + "</tr>"
+def _row(row: Row) -> str:
+    return "<tr>" + "".join(f'<td style="text-align:left">{escape(cell)}</td>' for cell in row) + "</tr>"

@@ -62,6 +62,18 @@ class Finding:
         detail = f": {self.detail}" if self.detail else ""
         return f"{mark} {self.name}{number}{bound}{detail}"
 
+    def cells(self) -> tuple[str, ...]:
+        """Return what a row of a table says: verdict, name, value, limit, margin and detail."""
+        unit = f" {self.unit}" if self.unit else ""
+        return (
+            "ok" if self.ok else "REFUSED",
+            self.name,
+            "" if self.value is None else f"{self.value:.4g}{unit}",
+            "" if self.side is None else f"{self.side} {self.limit:.4g}",
+            "" if self.margin is None else f"{self.margin:.3g}",
+            self.detail,
+        )
+
     def to_mapping(self) -> dict[str, object]:
         """Return plain JSON values; a number that is not finite becomes None."""
         numbers = {"value": self.value, "limit": self.limit, "margin": self.margin}
@@ -87,7 +99,8 @@ class CheckReport:
         """Return what a notebook shows."""
         from lungaccess.checking.display import report_html
 
-        return report_html(self)
+        rows, refused = ([each.cells() for each in some] for some in (self.findings, self.refusals))
+        return report_html(rows, refused, accepted=self.accepted)
 
     @property
     def refusals(self) -> tuple[Finding, ...]:

@@ -1,4 +1,4 @@
-"""Second part of the check: the bronchoscope fits where it runs, and its tip stands on the airway axis."""
+"""Second part of the check: the bronchoscope fits where it runs, and its tip is on the airway axis."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.typed import Float
+from lungaccess.checking.environment import AirwayAxis, Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_MM, angle_between, check_rigid
-from lungaccess.checking.scene import AirwayAxis, Scene
 from lungaccess.checking.space import labels_at, not_lumen
 from lungaccess.plans.parts import ScopeRoute
 from lungaccess.plans.plan import Plan
@@ -40,17 +40,17 @@ BENDING_RADIUS_MM = 10.0
 """Smallest radius with which a scope bends there."""
 
 
-def check_route(plan: Plan, scene: Scene, found: Findings) -> None:
+def check_route(plan: Plan, environment: Environment, found: Findings) -> None:
     """Record everything about the bronchoscope."""
-    route, lung = plan.scope, scene.lung
-    astray_mm = _check_on_tree(route, scene.axis, found)
+    route, lung = plan.scope, environment.lung
+    astray_mm = _check_on_tree(route, environment.axis, found)
     samples = _resample(route.points_lps, SAMPLE_MM)
     in_lumen = (labels_at(lung, samples) & structures.LUMEN) != 0
     detail = f"{int((~in_lumen).sum())} of {len(samples)} samples outside"
     found.true("scope.in_lumen", in_lumen.all(), detail)
     if astray_mm <= REACH_MM:
-        _check_fit(plan, scene, samples, found)
-    _check_tip(route, scene.axis, found)
+        _check_fit(plan, environment, samples, found)
+    _check_tip(route, environment.axis, found)
     _check_statements(route, lung.tree, found)
 
 
@@ -97,7 +97,7 @@ def _is_turned(route: ScopeRoute, axis: AirwayAxis) -> bool:
     return float(tilt) > ANGLE_TOLERANCE_RAD
 
 
-def _apart(points: Float) -> Float:
+def _distinct(points: Float) -> Float:
     """Return a polyline without the points that are where the one before them is: they have no direction."""
     kept = [points[0]]
     for point in points[1:]:
@@ -108,7 +108,7 @@ def _apart(points: Float) -> Float:
 
 def _check_bend(points: Float, gaps: Float, before_tip: Float, found: Findings) -> None:
     """Where the route leaves the axis it bends no tighter than a scope can."""
-    steps = np.diff(_apart(points), axis=0)
+    steps = np.diff(_distinct(points), axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     off = before_tip[gaps > AXIS_TOLERANCE_MM].max(initial=0.0)
     within = np.flatnonzero(np.cumsum(lengths[::-1])[::-1] < off)
@@ -121,10 +121,10 @@ def _check_bend(points: Float, gaps: Float, before_tip: Float, found: Findings) 
     )
 
 
-def _check_fit(plan: Plan, scene: Scene, samples: Float, found: Findings) -> None:
+def _check_fit(plan: Plan, environment: Environment, samples: Float, found: Findings) -> None:
     """The lumen is wide enough all along, and the stated radii and margin are not more than there is."""
     route, scope = plan.scope, plan.system.scope
-    boxes = scene.boxes(not_lumen, REACH_MM)
+    boxes = environment.boxes(not_lumen, REACH_MM)
     radius = 0.5 * scope.outer_diameter_mm
     narrowest = boxes.least_mm(samples)
     found.at_least(
@@ -137,14 +137,14 @@ def _check_fit(plan: Plan, scene: Scene, samples: Float, found: Findings) -> Non
     )
     stated = np.minimum(route.lumen_radius_mm, REACH_MM) - boxes.distance_mm(route.points_lps)
     found.at_most("scope.lumen_radius", float(stated.max()), RADIUS_TOLERANCE_MM, "mm", "stated beyond found")
-    slack = float(np.linalg.norm(scene.lung.grid.spacing_mm))
+    slack = float(np.linalg.norm(environment.lung.grid.spacing_mm))
     found.at_least("scope.lumen_radius.least", float(stated.min()), -slack, "mm", "stated below found")
     over = route.min_lumen_margin_mm - (narrowest - radius)
     found.at_most("scope.margin", over, RADIUS_TOLERANCE_MM, "mm", "stated beyond recomputed margin")
 
 
 def _check_tip(route: ScopeRoute, axis: AirwayAxis, found: Findings) -> None:
-    """The tip stands at the end of the route and looks along the airway."""
+    """The tip is at the end of the route and looks along the airway."""
     pose, tree = route.lps_from_scope_tip, axis.tree
     if not check_rigid("scope.tip", pose, found):
         return

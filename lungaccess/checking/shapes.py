@@ -114,7 +114,7 @@ def integrate(lps_from_start: Float, pieces: Sequence[Piece]) -> Curve:
 
 
 def cut_at(pieces: Sequence[Piece], at_mm: float) -> list[Piece]:
-    """Cut the piece that passes the arc length `at_mm` in two, so that a frame stands exactly there."""
+    """Cut the piece that passes the arc length `at_mm` in two, so that there is a frame exactly there."""
     cut: list[Piece] = []
     begin = 0.0
     for piece in pieces:
@@ -188,7 +188,7 @@ def planar_shape(bend: Bend, step_mm: float) -> Float:
 
 
 def deployment_bends(tubes: ConcentricTubes, outer_mm: float, inner_mm: float, step_mm: float) -> list[Bend]:
-    """Return the shapes on the way [Kuntz2015]: both tubes flush to `outer_mm`, then the inner one alone."""
+    """Return the shapes of a deployment [Kuntz2015]: both flush to `outer_mm`, then the inner one."""
     flush = np.linspace(0.0, outer_mm, max(int(np.ceil(outer_mm / step_mm)), 1) + 1)[1:]
     alone = np.linspace(outer_mm, inner_mm, max(int(np.ceil((inner_mm - outer_mm) / step_mm)), 1) + 1)
     together = [bend_of(tubes, float(e), float(e)) for e in flush if e > 0.0]

@@ -10,6 +10,7 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
+from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import (
     ANGLE_TOLERANCE_RAD,
@@ -18,7 +19,6 @@ from lungaccess.checking.poses import (
     check_rigid,
     check_same_pose,
 )
-from lungaccess.checking.scene import Scene
 from lungaccess.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
 from lungaccess.plans.plan import Plan
@@ -41,9 +41,9 @@ ROUNDING = 1e-12
 """Sums of four numbers agree to this share of them, whatever the order."""
 
 
-def check_needle(plan: Plan, scene: Scene, tube_end: Float | None, found: Findings) -> None:
+def check_needle(plan: Plan, environment: Environment, tube_end: Float | None, found: Findings) -> None:
     """Record everything about the needle, the target and the costs."""
-    needle, lung = plan.needle, scene.lung
+    needle, lung = plan.needle, environment.lung
     if not check_rigid("needle.start", needle.lps_from_start, found):
         return
     check_same_pose("needle.start", needle.lps_from_start, plan.tube.lps_from_tip, found)
@@ -59,8 +59,8 @@ def check_needle(plan: Plan, scene: Scene, tube_end: Float | None, found: Findin
     _check_target(plan, lung, curve, found)
     _check_exemption(plan, found)
     _check_containment(plan, lung, curve, found)
-    _check_clearance(plan, scene, curve, found)
-    _check_costs(plan, scene, curve, found)
+    _check_clearance(plan, environment, curve, found)
+    _check_costs(plan, environment, curve, found)
 
 
 def _check_motion(plan: Plan, curve: Curve, found: Findings) -> bool:
@@ -121,7 +121,7 @@ def forbidden_bits(plan: Plan) -> int:
 
 
 def _check_exemption(plan: Plan, found: Findings) -> None:
-    """The exemption is not longer than the device's; its branch and point are judged with the tube's exit."""
+    """The exemption is not longer than the device's; the exit of the tubes settles its branch and point."""
     exempt = plan.exemption.needle_length_mm
     limit, detail = plan.system.needle.exit_exemption_mm, "needle that may be near the pierced wall"
     found.at_most("exemption.length", exempt, limit, "mm", detail, LENGTH_TOLERANCE_MM)
@@ -142,7 +142,7 @@ def _check_containment(plan: Plan, lung: Lung, curve: Curve, found: Findings) ->
     found.true("needle.containment", not hit.any(), f"{int(hit.sum())} samples in an obstacle")
 
 
-def _check_clearance(plan: Plan, scene: Scene, curve: Curve, found: Findings) -> None:
+def _check_clearance(plan: Plan, environment: Environment, curve: Curve, found: Findings) -> None:
     """The needle, as capsules padded by the sagitta, keeps radius and margins from every structure."""
     radius = 0.5 * plan.system.needle.diameter_mm
     required = radius + plan.system.margins.total_mm
@@ -163,7 +163,7 @@ def _check_clearance(plan: Plan, scene: Scene, curve: Curve, found: Findings) ->
             continue
         nearest[name] = check_clear(
             f"needle.clearance.{name}",
-            scene.boxes(select, REACH_MM),
+            environment.boxes(select, REACH_MM),
             curve.points[first : last + 1],
             needed + curve.sagitta_mm[first:last],
             found,
@@ -172,7 +172,7 @@ def _check_clearance(plan: Plan, scene: Scene, curve: Curve, found: Findings) ->
     # Towards the airway counts all of it behind the exempt length, and other branches before.
     airway = min(nearest.pop("airway", REACH_MM), nearest.pop("other_airway", REACH_MM))
     nearest.pop("lumen", None)
-    diagonal = float(np.linalg.norm(scene.lung.grid.spacing_mm))
+    diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
     for name, exact in {**nearest, "airway": airway}.items():
         check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
 
@@ -185,7 +185,7 @@ def _stretch(where: np.ndarray) -> tuple[int, int]:
     return int(frames[0]), min(int(frames[-1]) + 1, len(where) - 1)
 
 
-def _check_costs(plan: Plan, scene: Scene, curve: Curve, found: Findings) -> None:
+def _check_costs(plan: Plan, environment: Environment, curve: Curve, found: Findings) -> None:
     """The stated costs are those of the re-integrated needle."""
     stated: Mapping[str, float] = plan.costs
     required = set(COSTS) - {"voxel_sum"}
@@ -199,10 +199,10 @@ def _check_costs(plan: Plan, scene: Scene, curve: Curve, found: Findings) -> Non
         tolerance = ROUNDING * abs(total)
         found.agrees("costs.objective.sum", stated[plan.objective], total, tolerance, "")
     found.agrees("costs.length_mm", stated["length_mm"], curve.arc_mm[-1], LENGTH_TOLERANCE_MM, "mm")
-    recomputed = inverse_clearance(plan, scene, curve)
+    recomputed = inverse_clearance(plan, environment, curve)
     tolerance = COST_TOLERANCE * recomputed
     found.agrees("costs.inverse_clearance", stated["inverse_clearance"], recomputed, tolerance, "")
-    mapped, summed = cost_map_integral_and_sum(scene.lung, curve)
+    mapped, summed = cost_map_integral_and_sum(environment.lung, curve)
     found.agrees("costs.cost_map", stated["cost_map"], mapped, COST_TOLERANCE * mapped + 1e-6, "mm")
     if "voxel_sum" in stated:
         tolerance = COST_TOLERANCE * summed + GREATEST_VOXEL_COST
@@ -225,7 +225,7 @@ def objective_weights(objective: str) -> dict[str, float] | None:
     return weights if in_range and set(weights) <= set(COSTS) else None
 
 
-def inverse_clearance(plan: Plan, scene: Scene, curve: Curve) -> float:
+def inverse_clearance(plan: Plan, environment: Environment, curve: Curve) -> float:
     """Return the integral of 1 / clearance over the needle's length [Kuntz2015], by the trapezoid rule.
 
     The clearance to the nearest obstacle, voxels as solid boxes, is not taken below 0.1 mm nor above
@@ -235,10 +235,10 @@ def inverse_clearance(plan: Plan, scene: Scene, curve: Curve) -> float:
     arc = np.linspace(0.0, length, max(int(np.ceil(length / COST_STEP_MM)), 1) + 1)
     points = np.stack([np.interp(arc, curve.arc_mm, curve.points[:, axis]) for axis in range(3)], axis=1)
     obstacles = has(forbidden_bits(plan))
-    clearance = scene.boxes(obstacles, REACH_MM).distance_mm(points)
+    clearance = environment.boxes(obstacles, REACH_MM).distance_mm(points)
     far = clearance >= REACH_MM
     if far.any():
-        clearance[far] = scene.boxes(obstacles, COST_REACH_MM).distance_mm(points[far])
+        clearance[far] = environment.boxes(obstacles, COST_REACH_MM).distance_mm(points[far])
     return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
 
 

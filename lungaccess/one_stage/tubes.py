@@ -69,7 +69,7 @@ class TubePair:
 
 @dataclass(frozen=True, kw_only=True)
 class TubeAnswer:
-    """A deployment as in [Kuntz2015], judged.
+    """A deployment as in [Kuntz2015], and what it does.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class TubeAnswer:
     outer_mm, inner_mm, rotation_rad, relative_rad : float
         What was asked for.
     final : Equilibrium
-        The deployed tubes; if they snap on the way, an equilibrium that cannot be had in this way.
+        The deployed tubes; if they snap before, an equilibrium that this sequence does not reach.
     deployed : DeployedSequence or None
         All steps; None if the tubes snap.
     snap : SnapError or None
@@ -98,7 +98,7 @@ class TubeAnswer:
 
     @property
     def acceptable(self) -> bool:
-        """Whether the tubes are stable all the way."""
+        """Whether the tubes are stable at every step."""
         return self.snap is None and self.final.stable
 
 

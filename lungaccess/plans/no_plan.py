@@ -18,7 +18,7 @@ class NoPlan(LungaccessError):  # noqa: N818
     Parameters
     ----------
     found : str
-        One sentence: what stands in the way.
+        One sentence: what prevents a plan.
     reasons : mapping of str to int
         How many sites, deployments or needle paths each reason ruled out.
     advice : str

@@ -12,7 +12,7 @@ from lungaccess.plans.record import Record, shaped
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScopeRoute(Record):
-    """Where the bronchoscope runs and where its tip stands.
+    """Where the bronchoscope runs and the pose of its tip.
 
     Parameters
     ----------

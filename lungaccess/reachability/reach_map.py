@@ -82,7 +82,7 @@ class ReachMap:
     with_fissures : bool
         Whether fissures are obstacles.
     kinds : Volume of uint8
-        `NOT_COUNTED` or one of `KINDS` at each voxel, judged at its centre.
+        `NOT_COUNTED` or one of `KINDS` at each voxel, classified by its centre.
     cost, clearance_mm : Volume of float32
         Estimated integral of 1 / clearance of the best path found, and the clearance that it keeps
         beyond the exempt length of the needle; 0 where there is none.

@@ -28,14 +28,14 @@ class Regions:
     volume : Volume of uint8
         A key of `names`, or 0.
     names : mapping of int to str
-    told_apart : bool
+    lungs_are_separate : bool
         Whether the two lungs are parts of the mask without a bridge; else the plane through the carina
         divides them.
     """
 
     volume: Volume
     names: Mapping[int, str]
-    told_apart: bool
+    lungs_are_separate: bool
 
 
 def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
@@ -43,7 +43,7 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
 
     The lungs are the two largest parts of the free tissue between which no face is shared; smaller parts
     belong to the side of the carina on which they lie.  The anatomy keeps no lobes: fissures are open
-    here and there, so that lobes do not fall apart.
+    here and there, so that lobes are not separate parts.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     grid : Grid
         Any grid in the same place.
     where : (ni, nj, nk) bool
-        Voxels of `grid` to be told; the others are 0.
+        Voxels of `grid` that get a side; the others are 0.
     """
     from scipy import ndimage
 
@@ -59,12 +59,12 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     two = np.argsort(sizes)[::-1][:2]
-    told_apart = len(two) == 2 and bool(sizes[two[1]] >= max(1.0, SMALLER_LUNG_SHARE * sizes[two[0]]))
+    lungs_are_separate = len(two) == 2 and bool(sizes[two[1]] >= max(1.0, SMALLER_LUNG_SHARE * sizes[two[0]]))
     ijk = np.argwhere(where)
     points = grid.lps(ijk)
     # LPS: the patient's left is +x.
     codes = np.where(points[:, 0] > lung.tree.carina_lps[0], LEFT, RIGHT).astype(np.uint8)
-    if told_apart:
+    if lungs_are_separate:
         voxels = np.clip(np.floor(lung.grid.ijk(points) + 0.5).astype(int), 0, np.array(parts.shape) - 1)
         here = parts[tuple(voxels.T)]
         first, second = here == two[0], here == two[1]
@@ -73,7 +73,7 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
         codes[second] = RIGHT if first_is_left else LEFT
     array = np.zeros(grid.shape, dtype=np.uint8, order="F")
     array[tuple(ijk.T)] = codes
-    return Regions(volume=Volume(grid=grid, array=array), names=NAMES, told_apart=told_apart)
+    return Regions(volume=Volume(grid=grid, array=array), names=NAMES, lungs_are_separate=lungs_are_separate)
 
 
 def _mean_x(points: Float) -> float:

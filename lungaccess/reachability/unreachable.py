@@ -261,24 +261,24 @@ def _finished(knots: list[Float], cones: list[Float], nearest: object, reach_mm:
 
 
 def _cone(tree: AirwayTree, point: int, shares: Float) -> Float:
-    """Return the middle of the directions of tips on a part of the way to a tree point, and the angle around.
+    """Return the mean direction of tips on a part of the edge to a tree point, and the angle around it.
 
     A tip looks along the medial axis, or is turned from the chord between where the scope leaves the axis
     and its place; see `stages.scope.tips`.
     """
     parent = int(tree.parent_point[point])
     begin, end = tree.points_lps[parent], tree.points_lps[point]
-    way = tree.distance_from_root_mm
-    ways = way[parent] + shares * (way[point] - way[parent])
+    inserted_mm = tree.distance_from_root_mm
+    tips_mm = inserted_mm[parent] + shares * (inserted_mm[point] - inserted_mm[parent])
     places = [begin + share * (end - begin) for share in shares]
     tangents = [(1.0 - share) * tree.tangents[parent] + share * tree.tangents[point] for share in shares]
     chords: list[Float] = []
     left = point
-    while way[left] > ways[1] - LEAVING_MM and tree.parent_point[left] >= 0:
+    while inserted_mm[left] > tips_mm[1] - LEAVING_MM and tree.parent_point[left] >= 0:
         left = int(tree.parent_point[left])
     while True:
         chords += [place - tree.points_lps[left] for place in places]
-        if way[left] <= ways[0] - LEAVING_MM or tree.parent_point[left] < 0:
+        if inserted_mm[left] <= tips_mm[0] - LEAVING_MM or tree.parent_point[left] < 0:
             break
         left = int(tree.parent_point[left])
     seen = np.array([_unit(chord if np.any(chord) else tree.tangents[point]) for chord in chords])

@@ -43,7 +43,7 @@ def dress(axes: Axes, view: View, *, ticks: bool) -> None:
 
 
 def _lps_ticks(axes: Axes, view: View) -> None:
-    """Label the ticks with LPS coordinates, whatever way the axis points in the picture."""
+    """Label the ticks with LPS coordinates, whichever direction the axis has in the picture."""
     axes.tick_params(labelsize=7, colors=style.FAINT_INK, length=2, pad=2)
     for axis, direction in ((axes.xaxis, view.right), (axes.yaxis, view.up)):
         component = int(np.argmax(np.abs(direction)))
@@ -153,7 +153,7 @@ def ribbon(axes: Axes, uv: Float, radius_mm: float, colour: str, *, fill: float,
 
 
 def dashed_band(axes: Axes, uv: Float, half_width_mm: float, order: int) -> None:
-    """Draw the border of the room that must stay free around a device."""
+    """Draw the border of the clearance that is required around a device."""
     if len(uv) < 2:
         return
     for side in (half_width_mm, -half_width_mm):

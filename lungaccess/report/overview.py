@@ -119,7 +119,7 @@ def _legend_entries(layers: Layers) -> list[Line2D | Patch]:
         Line2D([], [], color=style.SCOPE, lw=4, label="bronchoscope"),
         Line2D([], [], color=style.TUBE, lw=4, label="tubes"),
         Line2D([], [], color=style.NEEDLE, lw=3, label="needle"),
-        Line2D([], [], color=style.INK, lw=0.9, ls=(0, (3, 2)), label="room to keep free"),
+        Line2D([], [], color=style.INK, lw=0.9, ls=(0, (3, 2)), label="required clearance"),
         Line2D([], [], ls="none", marker="D", mfc="white", mec=style.INK, label="exit"),
         Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2, label="target"),
     ]

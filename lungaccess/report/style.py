@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from anatomy.io.files import atomic_write
 
-# Okabe and Ito's palette: told apart with every common colour vision, and in grey by lightness.
+# Okabe and Ito's palette: distinct with every common colour vision, and in grey by lightness.
 SCOPE = "#0072B2"
 TUBE = "#E69F00"
 NEEDLE = "#111111"

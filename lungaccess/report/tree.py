@@ -57,7 +57,7 @@ def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
 
 
 def _generation_colours(deepest: int) -> tuple[Colormap, BoundaryNorm]:
-    """Return one colour a generation, told apart by lightness too."""
+    """Return one colour a generation, distinct in lightness too."""
     shades = matplotlib.colormaps["plasma"](np.linspace(0.0, 0.88, deepest + 1))
     return ListedColormap(shades), BoundaryNorm(np.arange(deepest + 2) - 0.5, deepest + 1)
 

@@ -254,8 +254,8 @@ def _limits(values: Float, least: float, *, with_zero: bool) -> tuple[float, flo
     low, high = float(finite.min()), float(finite.max())
     if with_zero:
         low, high = min(low, 0.0), max(high, 0.0)
-    room = max(0.12 * (high - low), 0.5 * (least - high + low))
-    return low - room, high + room
+    border = max(0.12 * (high - low), 0.5 * (least - high + low))
+    return low - border, high + border
 
 
 def _curves(axes: Axes, s: Float, curves: Float, *, single: bool) -> None:

@@ -44,7 +44,7 @@ def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
 
 
 def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
-    """Draw the needle's way, in the plane that fits it best."""
+    """Draw the path of the needle, in the plane that fits it best."""
     needle = plan.curves().needle.points_lps
     target = np.asarray(plan.target_lps)
     view = plane_view(needle, "")

@@ -35,7 +35,7 @@ STRUCTURES: dict[str, int] = {
     "airway": AIRWAY,
     "stays in the airway": kernel.STAYS_INSIDE,
 }
-"""What can go wrong on the way, and the flag that the kernel sets for it."""
+"""What can go wrong before the end, and the flag that the kernel sets for it."""
 
 DEFAULT_RADIUS_MM = 5.0
 """Radius of the goal where the target is no nodule of the nodule mask: one of 10 mm."""

@@ -21,7 +21,7 @@ import psutil
 
 from anatomy.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
-from lungaccess.checking.judge import Checker
+from lungaccess.checking import Checker
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.atlas_store import open_atlas
 from lungaccess.coupled.planner import plan

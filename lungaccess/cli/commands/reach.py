@@ -119,7 +119,7 @@ def record(reach: ReachMap) -> dict[str, object]:
         "fissures_are_obstacles": reach.with_fissures,
         "spacing_mm": float(reach.kinds.grid.spacing_mm[0]),
         "deployments": reach.entries,
-        "sides_told_apart": reach.regions.told_apart,
+        "lungs_are_separate": reach.regions.lungs_are_separate,
         "regions": [_plain(row) for row in reach.by_region()],
         "resumed_layers": reach.resumed_layers,
         "timing": {"scan_s": reach.scan_s, "atlas_s": reach.atlas_s},

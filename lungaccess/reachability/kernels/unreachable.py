@@ -1,11 +1,11 @@
 """A proof by boxes that no deployment has a target in its needle's workspace; see docs/unreachable.md.
 
-What all deployments of a box have in common is told from the one in its middle and from bounds of how far the
+What all deployments of a box have in common follows from the one in its middle and from bounds of how far the
 others differ.  A box that cannot be ruled out is halved.
 
 `cones` (N, 4) is, for a tip between two knots, the middle of what it may look to and the angle (rad) from it.
 `scene` is the tuple (corner fields of the distance to lumen, to lumen that may be left, to what tubes keep
-clear of; depth in the lumen; distance to what the needle may pass on its way to the target; labels; their
+clear of; depth in the lumen; distance to what the needle may pass before the target; labels; their
 geometry; that of the depth; bits of what tubes keep clear of; by how much a bound of these fields may fall
 short of the distance, mm).
 """
@@ -59,13 +59,13 @@ RULED_OUT, UNDECIDED, TOO_MANY = 1, 2, 3
 UNNOTICED_MM = 0.05
 """A tube that is farther than this from all lumen has left it noticeably; see `deployment.march`."""
 FIRST_LOOK_MM, FARTHEST_LOOK_MM = 5.0, 40.0
-"""The needle's way is looked at from so far ahead of the tip on, as long as it is known so well."""
+"""The path of the needle is looked at from so far ahead of the tip on, as long as it is known so well."""
 INSERTION_STEP_MM = 0.5
 """Of the outer tube, in the table of greatest insertions."""
 LEAST_TIP_MM, LEAST_VIEW_MM = 0.25, 0.5
 """A box in which tips, and the target as they see it, differ by less is not halved."""
 FOLLOWED_MM = 8.0
-"""The way of the tubes is looked at where their tips differ by less."""
+"""The path of the tubes is looked at where their tips differ by less."""
 LOOSE_SWEEP_MM = 0.3
 """The sweep of a box is looked at where it is known so well."""
 EXACT_BELOW_MM = 1.0
@@ -121,7 +121,7 @@ def _outside_workspace(limits, seen, sums):
 
 @inner_kernel
 def _tips_blocked(scene, tubes, limits, seen, family, box):
-    """Tell whether all tips are in the lumen or have no way ahead, and how far tips are from the middle."""
+    """Tell whether all tips are in the lumen or blocked ahead, and how far tips are from the middle."""
     _lumen, _allowed, _hazards, depth, freed, _labels, geometry, depth_geometry, _bits, _loss = scene
     pose, rho, ahead, _size, _moved, _second = seen
     _middle, _forward, _normal, bounds, _outer, _inner = family

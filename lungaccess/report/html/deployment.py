@@ -1,4 +1,4 @@
-"""A plan as motion: what a page needs to play scope, tubes and needle, and what they cost on the way."""
+"""A plan as motion: what a page needs to play scope, tubes and needle, and their costs up to each point."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _tubes(plan: Plan) -> Packed:
 
 
 def _insertions(outer_mm: float, inner_mm: float) -> Float:
-    """Return the insertions of the inner tube on the way [Kuntz2015]: with the outer tube, then alone."""
+    """Return insertions of the inner tube [Kuntz2015]: it goes out with the outer tube, then alone."""
     parts = [np.zeros(1)]
     for begin, end in ((0.0, outer_mm), (outer_mm, inner_mm)):
         count = max(int(np.ceil((end - begin) / TUBE_STEP_MM)), 1)

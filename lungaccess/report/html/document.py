@@ -64,7 +64,7 @@ def write_page(
     ----------
     path : path of the HTML file
     template : str
-        Name of the page's own HTML, which stands in the body.
+        Name of the page's own HTML, which goes into the body.
     modules : sequence of str
         Scripts of this page, after `SHARED_MODULES`.
     data : mapping

@@ -41,7 +41,7 @@ def bronchoscopy_webp(
     frames: int = FRAMES,
     pixels: int = PIXELS,
 ) -> Path:
-    """Write what the scope's camera sees on its way to the plan's site as an animated WebP.
+    """Write what the scope's camera sees on its route to the plan's site as an animated WebP.
 
     The patient's front is up in the trachea, and the camera does not roll.  The wall is where the blurred
     lumen is half full, so that voxels do not show; no device is drawn.
@@ -108,9 +108,9 @@ class SmoothLumen:
 
         grid = lung.grid
         places = grid.ijk(points_lps)
-        room = AROUND_MM / grid.spacing_mm
-        start = np.maximum(np.floor(places.min(axis=0) - room), 0).astype(int)
-        stop = np.minimum(np.ceil(places.max(axis=0) + room) + 1, grid.shape).astype(int)
+        around = AROUND_MM / grid.spacing_mm
+        start = np.maximum(np.floor(places.min(axis=0) - around), 0).astype(int)
+        stop = np.minimum(np.ceil(places.max(axis=0) + around) + 1, grid.shape).astype(int)
         part = lung.labels[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
         filled = ((part & LUMEN) != 0).astype(np.float32)
         self._share = gaussian_filter(filled, BLUR_VOXELS * grid.spacing_mm.max() / grid.spacing_mm)

@@ -60,7 +60,7 @@ def unpack(packed: Packed) -> Array:
 
 
 def script_text(content: Any) -> str:
-    """Return JSON that may stand inside a script element: it holds no `<`.
+    """Return JSON that may be put into a script element: it holds no `<`.
 
     Raises
     ------

@@ -46,7 +46,7 @@ class PageOptions:
     risk_samples, risk_seed : int
         See `lungaccess.risk.assessment.assess`; 0 samples for none.
     instructions : bool
-        Whether the scope's way is searched and told turn by turn.
+        Whether the scope's route is searched, with instructions turn by turn.
     """
 
     alternatives: Sequence[Plan] = ()
@@ -83,7 +83,7 @@ def plan_page(
     AnatomyError
         If the CT does not hold the plan.
     """
-    from lungaccess.checking.judge import Checker
+    from lungaccess.checking import Checker
     from lungaccess.risk.assessment import assess
 
     chosen = options or PageOptions()

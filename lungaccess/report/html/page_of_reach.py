@@ -47,7 +47,7 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
     parts = {
         "title": words.text(f"What can be reached of {lung.name}"),
         "summary": words.text(
-            f"Voxels of {first.kinds.grid.spacing_mm[0]:g} mm, each judged at its centre; "
+            f"Voxels of {first.kinds.grid.spacing_mm[0]:g} mm, each classified at its centre; "
             "not counted: outside the lung, in an obstacle"
         ),
         "scene": scene_figure(),
@@ -127,7 +127,7 @@ def volumes_section(maps: Sequence[ReachMap]) -> str:
             for row in each.by_region()
         ]
         tables.append(words.table(each.system.name, headings, rows))
-    note = "The anatomy has no lobes: fissure masks have gaps, so that lobes do not come apart."
+    note = "The anatomy has no lobes: fissure masks have gaps, so that lobes are not separate."
     return "".join(tables) + f"<p class='note'>{note}</p>"
 
 

@@ -143,9 +143,9 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     path = advice.path
     steps = words.steps(one.text() for one in advice.instructions)
     end = (
-        "This way reaches the place of the plan's tip."
+        "This route reaches the place of the plan's tip."
         if path.reached
-        else f"This way ends {path.distance_mm:.1f} mm before that place: {advice.why_stopped}"
+        else f"This route ends {path.distance_mm:.1f} mm before that place: {advice.why_stopped}"
     )
     note = (
         f"Insertion {path.length_mm:.0f} mm, {path.retreats} retreats. Found by the search for the scope "

@@ -12,7 +12,7 @@ export class Bronchoscopy {
     this.caption = caption;
   }
 
-  // Draw the view at a state of a motion.  The camera stands beside the channel, within the scope.
+  // Draw the view at a state of a motion.  The camera is beside the channel, within the scope.
   draw(state, motion) {
     const radius = motion.plan.radius_mm;
     const aside = Math.min(Math.max(0.7 * radius.scope, radius.outer + ROOM_MM), 0.9 * radius.scope);

@@ -1,4 +1,4 @@
-// A plan in motion: what is where when the slider stands somewhere.
+// A plan in motion: what is where at a position of the slider.
 import { unpack } from "./decode.js";
 import { minus, mix, point, rgb, unit } from "./vectors.js";
 
@@ -93,7 +93,7 @@ export class Motion {
   }
 }
 
-// Return where each stage begins on the slider, and 1; a stage of no length has no room.
+// Return where each stage begins on the slider, and 1; a stage without length has no part of it.
 function stageStarts(ends) {
   const lengths = [ends.scope, ends.outer, ends.inner - ends.outer, ends.needle];
   const weights = WEIGHTS.map((weight, n) => (lengths[n] > 1e-6 ? weight : 0));
@@ -106,7 +106,7 @@ function stageStarts(ends) {
 
 const clamp = (value) => Math.min(Math.max(value, 0), 1);
 
-// Return the index before a length and the share of the way to the next one.
+// Return the index before a length and the share of the step to the next one.
 function place(along, mm) {
   let n = 0;
   while (n + 2 < along.length && along[n + 1] <= mm) n += 1;

@@ -67,9 +67,9 @@ export class Orbit {
     const [x, y] = [now[0] - before[0], now[1] - before[1]];
     if (this.fingers.size > 1) {
       const other = [...this.fingers].find(([id]) => id !== event.pointerId)[1];
-      const apart = (a) => Math.hypot(a[0] - other[0], a[1] - other[1]) || 1;
+      const distance = (a) => Math.hypot(a[0] - other[0], a[1] - other[1]) || 1;
       this.fingers.set(event.pointerId, now);
-      this.zoom(apart(before) / apart(now));
+      this.zoom(distance(before) / distance(now));
       this.pan(x / 2, y / 2);
       return;
     }

@@ -1,6 +1,6 @@
 // The switches: one labelled box for each thing that can be shown.
 
-// Add a switch to a list; changed is told whether it is on.
+// Add a switch to a list; changed receives whether it is on.
 export function addSwitch(list, { key, name, colour, shown }, changed) {
   const item = document.createElement("li");
   const label = document.createElement("label");

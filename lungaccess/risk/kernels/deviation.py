@@ -1,4 +1,4 @@
-"""Compiled kernel of the risk: where plans with deviations end, and what they touch on the way.
+"""Compiled kernel of the risk: where plans with deviations end, and what they touch before.
 
 The tubes beyond the scope tip and the needle are one chain of arcs.  `pieces` is `(N, P, 4)`: for each of N
 deviated plans the length in mm, the roll in rad before it, the curvature in 1/mm and the radius in mm of

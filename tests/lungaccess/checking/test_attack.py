@@ -40,8 +40,8 @@ def systems() -> list[la.System]:
 
 
 @pytest.fixture(scope="module")
-def judge(small_lung: Lung) -> Any:
-    return check_attack.Judge(small_lung)
+def checks(small_lung: Lung) -> Any:
+    return check_attack.PlanCheck(small_lung)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def made(small_lung: Lung) -> list[tuple[Any, Any, Plan]]:
 
 
 @pytest.fixture(scope="module")
-def cases(made: list[tuple[Any, Any, Plan]], judge: Any, small_lung: Lung) -> list[tuple[Any, Any, Case]]:
+def cases(made: list[tuple[Any, Any, Plan]], checks: Any, small_lung: Lung) -> list[tuple[Any, Any, Case]]:
     return [
         (
             system,
@@ -70,7 +70,7 @@ def cases(made: list[tuple[Any, Any, Plan]], judge: Any, small_lung: Lung) -> li
             Case(
                 lung=small_lung,
                 plan=plan,
-                report=judge.of_plan(plan, system, target),
+                report=checks.of_plan(plan, system, target),
                 other=made[n - 1][2],
             ),
         )
@@ -85,14 +85,14 @@ def test_every_plan_is_accepted(cases: list[tuple[Any, Any, Case]]) -> None:
 
 
 @pytest.mark.parametrize("kind", MUTATIONS)
-def test_every_kind_of_mutant_is_refused(kind: str, cases: list[tuple[Any, Any, Case]], judge: Any) -> None:
+def test_every_kind_of_mutant_is_refused(kind: str, cases: list[tuple[Any, Any, Case]], checks: Any) -> None:
     rng = np.random.default_rng(0)
     refused = 0
     for n in range(200):
         system, target, case = cases[n % len(cases)]
         mutant = MUTATIONS[kind](case, rng)
         if mutant is not None:
-            assert not judge.of_mutant(mutant, system, target).accepted, f"mutant {n} of {kind}"
+            assert not checks.of_mutant(mutant, system, target).accepted, f"mutant {n} of {kind}"
             refused += 1
         if refused == MUTANTS_OF_A_KIND:
             return
@@ -102,11 +102,11 @@ def test_every_kind_of_mutant_is_refused(kind: str, cases: list[tuple[Any, Any, 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 2**32), number=st.integers(0, 2 * PLANS_A_SYSTEM - 1))
 def test_random_mutants_are_refused(
-    seed: int, number: int, cases: list[tuple[Any, Any, Case]], judge: Any
+    seed: int, number: int, cases: list[tuple[Any, Any, Case]], checks: Any
 ) -> None:
     system, target, case = cases[number]
     kind, mutant = check_attack.mutate(case, np.random.default_rng(seed))
-    assert not judge.of_mutant(mutant, system, target).accepted, kind
+    assert not checks.of_mutant(mutant, system, target).accepted, kind
 
 
 def test_a_checker_that_has_seen_other_plans_says_the_same(

@@ -14,8 +14,8 @@ from scipy.linalg import expm
 from anatomy import structures
 from lungaccess.checking import shapes
 from lungaccess.checking.boxes import Boxes
+from lungaccess.checking.environment import AirwayAxis
 from lungaccess.checking.poses import angle_between
-from lungaccess.checking.scene import AirwayAxis
 from lungaccess.checking.space import Select, airway_except, has, labels_at, not_lumen
 from lungaccess.checking.tiles import Tiles
 

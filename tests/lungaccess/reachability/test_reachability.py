@@ -201,7 +201,7 @@ def test_shares_add_up(reach: ReachMap) -> None:
 
 
 def test_left_is_left(reach: ReachMap, small_lung: Lung) -> None:
-    assert reach.regions.told_apart
+    assert reach.regions.lungs_are_separate
     codes = reach.regions.volume
     points = codes.grid.lps(np.argwhere(codes.array == LEFT))
     others = codes.grid.lps(np.argwhere(codes.array == RIGHT))
@@ -214,7 +214,7 @@ def test_one_lung_is_divided_at_the_carina() -> None:
     canvas = Canvas.empty([-20, -10, -10], [20, 10, 10], 1.0)
     lung = canvas.lung()
     regions = lung_regions(lung, lung.grid, (lung.labels & (OUTSIDE | AIRWAY)) == 0)
-    assert not regions.told_apart
+    assert not regions.lungs_are_separate
     left = lung.grid.lps(np.argwhere(regions.volume.array == LEFT))
     right = lung.grid.lps(np.argwhere(regions.volume.array == RIGHT))
     assert left[:, 0].min() > lung.tree.carina_lps[0] >= right[:, 0].max()

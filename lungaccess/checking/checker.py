@@ -1,4 +1,4 @@
-"""The judge: looks at a finished plan with arithmetic of its own and accepts or refuses it."""
+"""The independent check: it computes everything in a finished plan anew and accepts or refuses the plan."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lungaccess.checking.deployment import check_deployment
+from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import CheckReport, Findings
 from lungaccess.checking.record import check_record
 from lungaccess.checking.route import check_route
-from lungaccess.checking.scene import Scene
 from lungaccess.checking.steering import check_needle
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Checker:
-    """Judges many plans of one lung: what follows from the lung alone is worked out once.
+    """Checks many plans of one lung: what follows from the lung alone is computed once.
 
     Parameters
     ----------
@@ -30,25 +30,25 @@ class Checker:
     """
 
     def __init__(self, lung: Lung) -> None:
-        self._scene = Scene(lung)
+        self._environment = Environment(lung)
 
     def check(
         self, plan: Plan, system: System | None = None, *, target_lps: ArrayLike | None = None
     ) -> CheckReport:
-        """Judge one plan; as `lungaccess.checking.check`."""
+        """Check one plan; see `lungaccess.checking.check`."""
         found = Findings()
         target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
-        if check_record(plan, self._scene.lung, found, system, target):
-            check_route(plan, self._scene, found)
-            curve = check_deployment(plan, self._scene, found)
-            check_needle(plan, self._scene, None if curve is None else curve.end, found)
+        if check_record(plan, self._environment.lung, found, system, target):
+            check_route(plan, self._environment, found)
+            curve = check_deployment(plan, self._environment, found)
+            check_needle(plan, self._environment, None if curve is None else curve.end, found)
         return found.report()
 
 
 def check(
     plan: Plan, lung: Lung, system: System | None = None, *, target_lps: ArrayLike | None = None
 ) -> CheckReport:
-    """Judge a plan against the masks of a patient, independently of how it was made.
+    """Check a plan against the masks of a patient, independently of how it was made.
 
     The kinematics are re-integrated, clearances are measured with FCL to the exact surface of the voxel
     boxes, containment is looked up in the label volume, and every stated value is recomputed.  Nothing

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
 
 
-class Scene:
+class Environment:
     """A lung, its structures as solid boxes, and its airway tree as lines.
 
     Parameters

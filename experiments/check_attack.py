@@ -6,7 +6,7 @@
 Plans come in batches: a random system (a preset or one of its own), a coarse atlas, targets all over the
 lung, several plans a target from the menu of alternatives, the search, its refinement, Algorithm 1 of
 [Kuntz2015] and random needles of several arcs (`random_plans`).  Each is checked, and so is one random mutant
-of each (`plan_mutations.MUTATIONS`).  A line of FILE is a plan; a batch follows from patient and number
+of each (`mutants.all.MUTATIONS`).  A line of FILE is a plan; a batch follows from patient and number
 alone, and one that FILE holds is not made again, so that an interrupted run goes on where it was.  A plan
 that is refused and a mutant that is accepted are kept in FOLDER.
 """
@@ -30,9 +30,9 @@ from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
 from anatomy.typed import Float
-from experiments.support.mutants import Case, Mutant
-from experiments.support.plan_mutations import mutate
-from experiments.support.random_plans import plans_of_batch
+from experiments.support.mutants.all import mutate
+from experiments.support.mutants.mutant import Case, Mutant
+from experiments.support.mutants.random_plans import plans_of_batch
 from lungaccess.checking import Checker, CheckReport
 from lungaccess.coupled import explain
 from lungaccess.plans.plan import Plan

@@ -20,19 +20,12 @@ import lungaccess as la
 from anatomy.errors import TargetError
 from anatomy.lung import Lung
 from anatomy.typed import Float
+from experiments.support.anatomies import PHANTOM, anatomy, default_anatomies
 from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
+from experiments.support.insertion.figure import draw_insertions
 from experiments.support.insertion.repeated import Study, Summary, study, summary
 from experiments.support.insertion.truth import Errors, tilt
-from experiments.support.insertion_figure import draw_insertions
-from experiments.support.results import (
-    PHANTOM,
-    Result,
-    anatomy,
-    default_anatomies,
-    setting_of,
-    study_parser,
-    write_result,
-)
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from stages.needle.environment import NeedleEnvironment, needle_environment

@@ -32,17 +32,10 @@ from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, vesselness
 from anatomy.segmentation.vessels import Vessels, segment_vessels
 from anatomy.tree import tree_from_mask
 from anatomy.typed import Float32
-from experiments.support import segmentation_scores as scores
-from experiments.support.results import (
-    PHANTOM,
-    Result,
-    default_anatomies,
-    require_data,
-    setting_of,
-    study_parser,
-    write_result,
-)
-from experiments.support.synthetic_ct import CtLook, SyntheticCt, render_ct
+from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
+from experiments.support.results import Result, setting_of, study_parser, write_result
+from experiments.support.segmentation import scores
+from experiments.support.segmentation.synthetic_ct import CtLook, SyntheticCt, render_ct
 from lungaccess.report import style
 
 PAPER_F1 = 0.9709

@@ -17,10 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from anatomy.typed import Float
-from experiments.support.cost_map_case import NEEDLE, SAFETY_MM, Case, case_of
-from experiments.support.cost_map_figure import draw
-from experiments.support.cost_map_problems import Scenario, choose_scenarios
-from experiments.support.cost_map_runs import (
+from experiments.support.anatomies import PHANTOM, data_folder
+from experiments.support.cost_map.case import NEEDLE, SAFETY_MM, Case, case_of
+from experiments.support.cost_map.figure import draw
+from experiments.support.cost_map.inflation import largest_step_mm
+from experiments.support.cost_map.problems import Scenario, choose_scenarios
+from experiments.support.cost_map.runs import (
     COST_MAP,
     INTENSITY,
     PAPER_MODE_ITERATIONS,
@@ -32,8 +34,7 @@ from experiments.support.cost_map_runs import (
     run_all,
     success_and_means,
 )
-from experiments.support.inflation import largest_step_mm
-from experiments.support.results import PHANTOM, Result, data_folder, setting_of, study_parser, write_result
+from experiments.support.results import Result, setting_of, study_parser, write_result
 
 SHARES_OF_TIME = (0.01, 0.1, 1.0)
 PAPER_CHANGE = -50.0

@@ -19,18 +19,12 @@ from matplotlib.axes import Axes
 
 import lungaccess as la
 from anatomy.typed import Float
-from experiments.support import cost_over_time, workspace_rejection
-from experiments.support.results import (
-    Result,
-    anatomy,
-    default_anatomies,
-    setting_of,
-    study_parser,
-    write_result,
-)
-from experiments.support.rrt_time import LONG_S, PAPER_S, PAPER_SHARE, TimedRRT, success_times
-from experiments.support.workspace_rejection import PAPER_PATHS
-from experiments.support.workspace_rejection import PAPER_S as PAPER_PATHS_S
+from experiments.support.anatomies import anatomy, default_anatomies
+from experiments.support.kuntz2015 import cost_over_time, workspace_rejection
+from experiments.support.kuntz2015.rrt_time import LONG_S, PAPER_S, PAPER_SHARE, TimedRRT, success_times
+from experiments.support.kuntz2015.workspace_rejection import PAPER_PATHS
+from experiments.support.kuntz2015.workspace_rejection import PAPER_S as PAPER_PATHS_S
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.coupled.alternatives import Alternative, alternatives
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.problem.peripheral import peripheral_targets

@@ -18,15 +18,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from anatomy.typed import Float
-from experiments.support.results import (
-    PHANTOM,
-    Result,
-    default_anatomies,
-    require_data,
-    setting_of,
-    study_parser,
-    write_result,
-)  # fmt: skip
+from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.report import style
 from lungaccess.study.driver import run_study
 from lungaccess.study.results import ResultsFile

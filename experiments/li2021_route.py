@@ -2,7 +2,7 @@
 
     python -m experiments.li2021_route [--quick] [--seed 1] [--results FOLDER] [--groups G1 G2 G3 G4]
 
-The groups: see `experiments.support.route_groups`.  Ends have Gaussian noise.  A trial succeeds if the final
+The groups: see `experiments.support.route.groups`.  Ends have Gaussian noise.  A trial succeeds if the final
 curve is proved on its whole length: curvature, and inside the lumen; beside it is what the method's own test
 at path points says, which for RRT and RRT* is that there is a path.  These go on sampling until a curve is
 proved or 4048 samples are taken; "first" is their first path, whatever its curve.
@@ -19,10 +19,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import kruskal
 
-from experiments.support.results import Result, default_anatomies, setting_of, study_parser, write_result
-from experiments.support.route_baselines import sampled_route
-from experiments.support.route_groups import LIMITS_PER_MM, NOISE_MM, TRIALS, Trial, load_group, trials
-from experiments.support.route_speed import replanning, side_by_side
+from experiments.support.anatomies import default_anatomies
+from experiments.support.results import Result, setting_of, study_parser, write_result
+from experiments.support.route.baselines import sampled_route
+from experiments.support.route.groups import LIMITS_PER_MM, NOISE_MM, TRIALS, Trial, load_group, trials
+from experiments.support.route.speed import replanning, side_by_side
 from lungaccess.report import style
 from stages.scope.route.curve import Curve
 from stages.scope.route.metrics import measure

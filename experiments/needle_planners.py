@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
-from experiments.support.needle_queries import (
+from experiments.support.anatomies import data_folder, require_data
+from experiments.support.needle.queries import (
     Judge,
     Obstacles,
     Query,
@@ -30,7 +31,7 @@ from experiments.support.needle_queries import (
     load_obstacles,
     obstacles_of,
 )
-from experiments.support.needle_runs import (
+from experiments.support.needle.runs import (
     MARKS_S,
     SLICE,
     Problem,
@@ -41,14 +42,7 @@ from experiments.support.needle_runs import (
     run,
     solved_by_other,
 )
-from experiments.support.results import (
-    Result,
-    data_folder,
-    require_data,
-    setting_of,
-    study_parser,
-    write_result,
-)
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.report import style
 from stages.needle.search.planners import PLANNERS
 

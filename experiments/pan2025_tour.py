@@ -18,14 +18,8 @@ from matplotlib.figure import Figure
 from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
 from anatomy.typed import Float
-from experiments.support.results import (
-    Result,
-    anatomy,
-    default_anatomies,
-    setting_of,
-    study_parser,
-    write_result,
-)
+from experiments.support.anatomies import anatomy, default_anatomies
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.tour_models import random_airway, random_lesions
 from lungaccess.report import style
 from stages.scope.tour.circuit import SAME_RESISTANCE, circuits

@@ -18,14 +18,8 @@ from matplotlib.figure import Figure
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.typed import Float
-from experiments.support.results import (
-    Result,
-    anatomy,
-    default_anatomies,
-    setting_of,
-    study_parser,
-    write_result,
-)
+from experiments.support.anatomies import anatomy, default_anatomies
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.system import System
 from lungaccess.reachability.reach_map import reachability
 from lungaccess.report import style

@@ -15,17 +15,11 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from anatomy.lung import Lung
-from experiments.support.results import (
-    Result,
-    anatomy,
-    default_anatomies,
-    setting_of,
-    study_parser,
-    write_result,
-)
-from experiments.support.scope_ends import NEAR_MM, success, touching
-from experiments.support.scope_goals import PAPER_SPACING_MM, ends, goal_with_room
-from experiments.support.scope_speed import ARRIVED_MM, ROOM_VOXELS, measure_speed
+from experiments.support.anatomies import anatomy, default_anatomies
+from experiments.support.results import Result, setting_of, study_parser, write_result
+from experiments.support.scope.ends import NEAR_MM, success, touching
+from experiments.support.scope.goals import PAPER_SPACING_MM, ends, goal_with_room
+from experiments.support.scope.speed import ARRIVED_MM, ROOM_VOXELS, measure_speed
 from lungaccess.report import style
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import Weights

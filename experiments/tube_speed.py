@@ -17,15 +17,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.scenes import configurations, mechanics
+from experiments.support.anatomies import data_folder, require_data
 from experiments.support.machine import median_cpu_s
-from experiments.support.results import (
-    Result,
-    data_folder,
-    require_data,
-    setting_of,
-    study_parser,
-    write_result,
-)
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.report import style
 from stages.tube.casadi_model import CasadiTubes
 from stages.tube.device import Tube

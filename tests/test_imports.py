@@ -68,6 +68,11 @@ def test_kernels_use_only_numpy_numba_array_types_and_kernels_below_them(graph: 
     assert not wrong
 
 
+@pytest.mark.parametrize("outside", ["benchmarks", "experiments", "tests"])
+def test_what_is_installed_uses_nothing_that_is_not(graph: grimp.ImportGraph, outside: str) -> None:
+    assert outside not in graph.modules
+
+
 def test_check_uses_only_data_types_and_anatomy(graph: grimp.ImportGraph) -> None:
     rooms = {"lungaccess.checking"} | graph.find_descendants("lungaccess.checking")
     used = set().union(*(graph.find_modules_directly_imported_by(module) for module in rooms))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import time
 from dataclasses import asdict, dataclass, field
 from io import BytesIO
@@ -23,10 +22,6 @@ from experiments.support.machine import cpu_seconds, machine
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from anatomy.lung import Lung
-
-PHANTOM = "phantom"
-PATIENTS = ("Patient1", "Patient2")
 PNG_BYTES = 150_000
 PNG_DPI = (130, 110, 90, 70, 55)
 
@@ -139,71 +134,6 @@ def study_parser(doc: str) -> argparse.ArgumentParser:
 def setting_of(options: argparse.Namespace) -> str:
     """Return "quick" or "full"."""
     return "quick" if options.quick else "full"
-
-
-def data_folder() -> Path | None:
-    """Return the folder of real anatomy that LUNGACCESS_DATA names, or None where it is not set.
-
-    Raises
-    ------
-    FileError
-        If it names something else than a folder.
-    """
-    stated = os.environ.get("LUNGACCESS_DATA")
-    if not stated:
-        return None
-    if not Path(stated).is_dir():
-        raise FileError(
-            f"LUNGACCESS_DATA names {stated}, which is not a folder",
-            expected="the folder that holds med-rad/Patient1",
-            remedy="Set it to the folder of the data, or unset it to use synthetic anatomy",
-        )
-    return Path(stated)
-
-
-def require_data(part: str) -> Path:
-    """Return a folder or file below LUNGACCESS_DATA.
-
-    Raises
-    ------
-    FileError
-        If LUNGACCESS_DATA is not set or has no such part.
-    """
-    folder = data_folder()
-    if folder is None or not (folder / part).exists():
-        raise FileError(
-            f"{part} was not found: LUNGACCESS_DATA {'is not set' if folder is None else 'lacks it'}",
-            expected=f"a folder that holds {part}",
-            remedy="Set LUNGACCESS_DATA; this study cannot run on synthetic anatomy",
-        )
-    return folder / part
-
-
-def default_anatomies() -> tuple[str, ...]:
-    """Return the names of the patients where LUNGACCESS_DATA is set, and of the phantom otherwise."""
-    return (PHANTOM,) if data_folder() is None else PATIENTS
-
-
-def anatomy(name: str) -> Lung:
-    """Return the lung of that name.
-
-    Parameters
-    ----------
-    name : str
-        "phantom" (a child's size, seed 3), the name of a folder below med-rad of LUNGACCESS_DATA, or a path.
-
-    Raises
-    ------
-    FileError
-        If there is no such patient.
-    """
-    from anatomy.build import build_lung
-    from anatomy.phantom import make_phantom
-    from lungaccess.problem.patients import load_patient
-
-    if name == PHANTOM:
-        return build_lung(make_phantom(seed=3, size="small").images)
-    return load_patient(name if Path(name).exists() else require_data(f"med-rad/{name}"))
 
 
 def write_result(result: Result, folder: str | Path) -> Path:

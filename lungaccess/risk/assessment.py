@@ -14,7 +14,6 @@ from anatomy.errors import PlanFileError, SettingsError
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
-from experiments.support.insertion.repeated import wilson_interval
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.errors import (
     CURVATURE,
@@ -42,6 +41,8 @@ DEFAULT_RADIUS_MM = 5.0
 DEFAULT_SAMPLES = 10_000
 THREADS = 2
 MISS_QUANTILES = (0.5, 0.9, 0.95)
+Z_95 = 1.959963984540054
+"""Two-sided 95 % quantile of the normal distribution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +65,11 @@ class Share:
     @property
     def interval(self) -> tuple[float, float]:
         """The 95 % confidence interval of [Wilson1927]."""
-        return wilson_interval(self.count, self.samples)
+        share, z2 = self.count / self.samples, Z_95 * Z_95
+        middle = (share + 0.5 * z2 / self.samples) / (1.0 + z2 / self.samples)
+        half = Z_95 * math.sqrt(share * (1.0 - share) / self.samples + 0.25 * z2 / self.samples**2)
+        half /= 1.0 + z2 / self.samples
+        return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

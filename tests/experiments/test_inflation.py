@@ -13,7 +13,7 @@ import lungaccess
 from anatomy.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
-from experiments.support.inflation import (
+from experiments.support.cost_map.inflation import (
     inflated_environment,
     inflation_voxels,
     largest_step_mm,

@@ -17,7 +17,7 @@ from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL
 from experiments.support.insertion.closed_loop import Insertion, Outcome, simulate
-from experiments.support.insertion.repeated import Study, study, summary, wilson_interval
+from experiments.support.insertion.repeated import Study, study, summary
 from experiments.support.insertion.truth import Errors, Truth
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
@@ -324,13 +324,6 @@ class TestStudy:
         assert made.reached_low < made.reached_share < made.reached_high
         assert made.median_error_mm == pytest.approx(float(np.median(errors)))
         assert made.clearance_mm == min(insertion.clearance_mm for insertion in made.insertions)
-
-    def test_wilson(self) -> None:
-        """[Wilson1927]: 8 of 10 give 0.490 to 0.943."""
-        assert wilson_interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-        low, high = wilson_interval(0, 20)
-        assert low == 0.0 and high == pytest.approx(0.1611, abs=1e-4)
-        assert wilson_interval(20, 20) == pytest.approx((1.0 - high, 1.0))
 
     def test_nothing_is_no_study(self) -> None:
         with pytest.raises(SettingsError):

@@ -17,7 +17,7 @@ from PIL import Image
 from anatomy.errors import FileError
 from anatomy.lung import Lung
 from experiments import pan2025_tour, run_all, write_results
-from experiments.support import results
+from experiments.support import anatomies, results
 from experiments.support.results import PNG_BYTES, Result, Row, cells, number, write_result
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -197,17 +197,17 @@ def test_a_damaged_result_is_refused(tmp_path: Path, text: str) -> None:
 
 def test_data_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("LUNGACCESS_DATA", raising=False)
-    assert results.data_folder() is None
-    assert results.default_anatomies() == ("phantom",)
+    assert anatomies.data_folder() is None
+    assert anatomies.default_anatomies() == ("phantom",)
     with pytest.raises(FileError, match="is not set"):
-        results.anatomy("Patient1")
+        anatomies.anatomy("Patient1")
     monkeypatch.setenv("LUNGACCESS_DATA", str(tmp_path))
-    assert results.default_anatomies() == ("Patient1", "Patient2")
+    assert anatomies.default_anatomies() == ("Patient1", "Patient2")
     with pytest.raises(FileError, match="lacks it"):
-        results.require_data("needle")
+        anatomies.require_data("needle")
     monkeypatch.setenv("LUNGACCESS_DATA", str(tmp_path / "nothing"))
     with pytest.raises(FileError, match="not a folder"):
-        results.data_folder()
+        anatomies.data_folder()
 
 
 def test_a_study_that_fails_loses_its_old_result_and_no_other(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from anatomy.grid import Grid, Volume
-from experiments.support import segmentation_scores as scores
-from experiments.support.synthetic_ct import SyntheticCt
+from experiments.support.segmentation import scores
+from experiments.support.segmentation.synthetic_ct import SyntheticCt
 
 SPACING_MM = 0.5
 SHAPE = (60, 40, 60)

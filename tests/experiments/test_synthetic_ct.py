@@ -10,7 +10,7 @@ import pytest
 from anatomy.errors import AnatomyError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
-from experiments.support.synthetic_ct import CtLook, render_ct
+from experiments.support.segmentation.synthetic_ct import CtLook, render_ct
 
 SILENT = CtLook(noise_hu=0.0, texture_hu=0.0, spacing_mm=1.0)
 

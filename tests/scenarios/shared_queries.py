@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.support.needle_queries import Judge, Obstacles, hard_queries, load_obstacles
+from experiments.support.needle.queries import Judge, Obstacles, hard_queries, load_obstacles
 from stages.needle.search import base as searches
 from stages.needle.search.planners import PLANNERS
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES

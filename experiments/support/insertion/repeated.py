@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -18,14 +17,12 @@ from experiments.support.insertion.closed_loop import (
     simulate,
 )
 from experiments.support.insertion.truth import Errors
+from lungaccess.risk.assessment import Share
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.replanning.replanner import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
 from stages.needle.search.base import Query
-
-Z_95 = 1.959963984540054
-"""Two-sided 95 % quantile of the normal distribution."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,7 +109,7 @@ def summary(insertions: Iterable[Insertion]) -> Summary:
         raise SettingsError("A study has no insertions", expected="at least one seed")
     outcomes = {outcome: sum(run.outcome is outcome for run in runs) for outcome in Outcome}
     errors = np.array([run.tip_error_mm for run in runs])
-    low, high = wilson_interval(outcomes[Outcome.REACHED], len(runs))
+    low, high = Share(count=outcomes[Outcome.REACHED], samples=len(runs)).interval
     return Summary(
         insertions=runs,
         outcomes=outcomes,
@@ -123,17 +120,3 @@ def summary(insertions: Iterable[Insertion]) -> Summary:
         error_95_mm=float(np.quantile(errors, 0.95)),
         clearance_mm=min(run.clearance_mm for run in runs),
     )
-
-
-def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share [Wilson1927].
-
-    Parameters
-    ----------
-    successes, runs : int
-        At least one run.
-    """
-    share, z2 = successes / runs, Z_95 * Z_95
-    middle = (share + 0.5 * z2 / runs) / (1.0 + z2 / runs)
-    half = Z_95 * math.sqrt(share * (1.0 - share) / runs + 0.25 * z2 / runs**2) / (1.0 + z2 / runs)
-    return max(middle - half, 0.0), min(middle + half, 1.0)

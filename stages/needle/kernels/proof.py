@@ -62,7 +62,7 @@ def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
     The first `limits[EXEMPT_LENGTH]` mm of the needle (this arc starts at `s0`) may be near the
     wall of the pierced `branch` (-1: none), but never nearer than the needle's radius to any lumen.
 
-    With `limits[LOOKUP_STEP]` nothing is proved: see `experiments.support.inflation`.
+    With `limits[LOOKUP_STEP]` nothing is proved: see `experiments.support.cost_map.inflation`.
     """
     if limits[LOOKUP_STEP] > 0.0:
         return _blocker_by_lookup(obstacles, limits[LOOKUP_STEP], pose, bend, length)

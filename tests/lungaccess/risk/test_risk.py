@@ -241,11 +241,12 @@ def test_larger_errors_are_riskier(assessor: RiskAssessor) -> None:
     assert shares[3] < 0.2
 
 
-def test_wilson_interval() -> None:
+def test_interval_of_wilson_1927() -> None:
     for count, samples in ((0, 10), (10, 10), (3, 10), (500, 1000), (1, 10_000)):
         truth = binomtest(count, samples).proportion_ci(method="wilson")
         low, high = Share(count=count, samples=samples).interval
         assert (low, high) == pytest.approx((truth.low, truth.high), abs=1e-12)
+    assert Share(count=8, samples=10).interval == pytest.approx((0.4902, 0.9433), abs=1e-4)
 
 
 @pytest.fixture(scope="module")

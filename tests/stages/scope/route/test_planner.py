@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anatomy.errors import SettingsError, TargetError
-from experiments.support.route_baselines import SamplingSettings, sampled_route
+from experiments.support.route.baselines import SamplingSettings, sampled_route
 from stages.scope.route.centreline import Centreline, from_image
 from stages.scope.route.exact import segments
 from stages.scope.route.genetic import repair_genetic

@@ -8,8 +8,18 @@ from typing import Any
 import numpy as np
 
 from anatomy.typed import Float
-from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, far, rotation, signed, way
-from experiments.support.mutants_of_motion import end_of
+from experiments.support.mutants.motion import end_of
+from experiments.support.mutants.mutant import (
+    Case,
+    Mutant,
+    Mutation,
+    Rng,
+    changed,
+    far,
+    rotation,
+    signed,
+    way,
+)
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from typing import Any
 
-from experiments.support.needle_queries import Judge, Query
+from experiments.support.needle.queries import Judge, Query
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.search import base as searches
 from stages.needle.search.base import RestartingRRT

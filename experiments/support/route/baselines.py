@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float, Int
-from experiments.support.route_sampling import grow
+from experiments.support.route.sampling import grow
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve, interpolate
 from stages.scope.route.proof import prove

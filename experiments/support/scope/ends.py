@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from anatomy.lung import Lung
-from experiments.support.scope_goals import end_goals, ends, goal_with_room
+from experiments.support.scope.goals import end_goals, ends, goal_with_room
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, joints

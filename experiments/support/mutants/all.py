@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from experiments.support import mutants_of_motion, mutants_of_place, mutants_of_record, mutants_of_tissue
-from experiments.support.mutants import Case, Mutant, Mutation, Rng
+from experiments.support.mutants import motion, place, record, tissue
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng
 
 MUTATIONS: dict[str, Mutation] = {
-    mutation.__name__: mutation
-    for family in (mutants_of_record, mutants_of_motion, mutants_of_place, mutants_of_tissue)
-    for mutation in family.MUTATIONS
+    mutation.__name__: mutation for family in (record, motion, place, tissue) for mutation in family.MUTATIONS
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.lung import Lung
 from experiments.support.machine import median_cpu_s
 from experiments.support.results import Result
-from experiments.support.scope_goals import PAPER_VOXELS, end_goals, ends, goal_with_room, paper_sized
+from experiments.support.scope.goals import PAPER_VOXELS, end_goals, ends, goal_with_room, paper_sized
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import best_motion
 from stages.scope.advisor.kinematics import ScopeModel

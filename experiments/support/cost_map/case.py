@@ -16,7 +16,7 @@ from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
 from anatomy.tree import tree_from_mask
 from anatomy.typed import Float
-from experiments.support.results import PHANTOM, require_data
+from experiments.support.anatomies import PHANTOM, require_data
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 

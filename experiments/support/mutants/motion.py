@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.typed import Float
-from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng, changed, far, signed, way
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath
 

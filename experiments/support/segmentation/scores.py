@@ -12,7 +12,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid
 from anatomy.segmentation.airway import Airways
 from anatomy.typed import Float32, Int, Mask
-from experiments.support.synthetic_ct import SyntheticCt
+from experiments.support.segmentation.synthetic_ct import SyntheticCt
 
 POINTS, VESSEL_POINTS, NEAR_MM = 882, 281, 3.0
 """As many as in VESSEL12's three scans [Rudyanto2014]; half of the others lie so near to what confuses."""

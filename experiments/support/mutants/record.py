@@ -8,7 +8,17 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.settings import override, to_mapping
-from experiments.support.mutants import Case, Mutant, Mutation, Rng, changed, far, signed, way, with_system
+from experiments.support.mutants.mutant import (
+    Case,
+    Mutant,
+    Mutation,
+    Rng,
+    changed,
+    far,
+    signed,
+    way,
+    with_system,
+)
 
 SEEN_MM = 0.05
 """A stated clearance may be so much too large."""

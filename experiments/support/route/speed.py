@@ -10,7 +10,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from anatomy.errors import LungaccessError
-from experiments.support.route_groups import Tubes, trials
+from experiments.support.route.groups import Tubes, trials
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.genetic import GeneticSettings, cut_segments, repair_genetic, search_segment

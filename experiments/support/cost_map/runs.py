@@ -11,9 +11,9 @@ import numpy as np
 
 from anatomy.grid import Volume
 from anatomy.typed import Float
-from experiments.support.cost_map_case import Case
-from experiments.support.cost_map_problems import LEAST_COST, TRIES, TRY_ITERATIONS, Scenario, candidates
-from experiments.support.inflation import inflated_environment, refuting_labels
+from experiments.support.cost_map.case import Case
+from experiments.support.cost_map.inflation import inflated_environment, refuting_labels
+from experiments.support.cost_map.problems import LEAST_COST, TRIES, TRY_ITERATIONS, Scenario, candidates
 from stages.needle.costs import map_integral, obstacle_clearance_mm, voxel_sum
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective

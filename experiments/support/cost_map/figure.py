@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from anatomy.typed import Float
-from experiments.support.cost_map_case import Case
-from experiments.support.cost_map_problems import Scenario, unit
-from experiments.support.cost_map_runs import COST_MAP, INTENSITY, SHORTEST_PATH, Run, success_and_means
+from experiments.support.cost_map.case import Case
+from experiments.support.cost_map.problems import Scenario, unit
+from experiments.support.cost_map.runs import COST_MAP, INTENSITY, SHORTEST_PATH, Run, success_and_means
 from lungaccess.report import style
 from stages.needle.path import ArcPath
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from anatomy.structures import OUTSIDE
 from anatomy.typed import Float
-from experiments.support.cost_map_case import Case
-from experiments.support.inflation import refuting_labels
+from experiments.support.cost_map.case import Case
+from experiments.support.cost_map.inflation import refuting_labels
 from stages.needle.costs import voxel_sum
 from stages.needle.environment import NeedleEnvironment, direct_arcs, workspace_lengths
 from stages.needle.objective import SHORTEST

@@ -1,0 +1,1 @@
+"""Needles on the cost map of a CT [Fu2018]."""

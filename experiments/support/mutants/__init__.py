@@ -1,0 +1,1 @@
+"""Plans made false on purpose, which the check must refuse."""

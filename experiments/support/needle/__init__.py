@@ -1,0 +1,1 @@
+"""Recorded needle queries, and the runs of planners on them."""

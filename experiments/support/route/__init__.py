@@ -1,0 +1,1 @@
+"""Tubes, baselines and timings for routes of limited curvature."""

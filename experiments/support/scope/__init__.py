@@ -1,0 +1,1 @@
+"""Goals, ends and timings for the bronchoscope advisor."""

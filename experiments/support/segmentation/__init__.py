@@ -1,0 +1,1 @@
+"""CTs rendered with known truth, and scores of their segmentation."""

@@ -14,8 +14,9 @@ import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.settings import override
 from experiments import check_attack
+from experiments.support.mutants import random_plans
 from experiments.support.mutants.all import MUTATIONS
-from experiments.support.mutants.mutant import Case, random_plans
+from experiments.support.mutants.mutant import Case
 from lungaccess.checking import Checker, check
 from lungaccess.plans.plan import Plan
 

@@ -20,6 +20,7 @@ NAMES = (
     "coupled_plan",
     "objective",
     "diverse_plans",
+    "planner",
     "risk",
     "device",
     "study",

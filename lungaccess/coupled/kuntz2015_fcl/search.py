@@ -14,7 +14,7 @@ from anatomy.errors import SettingsError
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
-from lungaccess.coupled.kuntz2015_fcl.tubes import TubeTrial
+from lungaccess.coupled.kuntz2015_fcl.tubes import TubeValidator
 from lungaccess.coupled.search.base import Step
 from lungaccess.coupled.search.random_placement import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
@@ -94,7 +94,7 @@ class ReferenceSearch:
         self.blocked = self._evaluator.blocked
         self.obstacles = obstacles or obstacles_for(task)
         self._budget = (rrt_iterations, None) if rrt_time_s is None else (None, rrt_time_s)
-        self._trial = TubeTrial(system, self.obstacles)
+        self._tubes = TubeValidator(system, self.obstacles)
         required_mm = system.needle.radius_mm + system.margins.total_mm
         self._needle_rrt = NeedleRRT(system.needle, required_mm, self.obstacles)
         self.counts: Counter[str] = Counter()
@@ -118,7 +118,7 @@ class ReferenceSearch:
     def _attempt(self, placement: Placement, began: float) -> Candidate | None:
         """Carry out lines 8 and 9 for a placement that has been drawn since `began`."""
         tip = placement.tip
-        shape = self._trial.shape(
+        shape = self._tubes.shape(
             tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
         )
         reached = placement.looks_ahead and (not self._rejects or self._evaluator.reaches(shape.frames()[-1]))
@@ -126,7 +126,7 @@ class ReferenceSearch:
         if not reached:
             self.counts[OUT_OF_WORKSPACE if placement.looks_ahead else LOOKS_BACK] += 1
             return None
-        deployment = self._trial.judge(shape)
+        deployment = self._tubes.validate(shape)
         began = self._spend("tubes", began)
         if isinstance(deployment, str):
             self.counts[deployment] += 1

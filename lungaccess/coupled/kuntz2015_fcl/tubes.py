@@ -1,4 +1,4 @@
-"""Deployments of the tubes judged with FCL: leave the airway once, and touch nothing beyond it."""
+"""Deployments of the tubes validated with FCL: they leave the airway once and touch nothing beyond it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SAMPLES_PER_CONTACT = 5
 EXIT_SAMPLES = 51
 
 
-class TubeTrial:
-    """Judges deployments without sideways sweep, with the rules of `stages.tube` but none of its fields.
+class TubeValidator:
+    """Validates deployments without sideways sweep, by the rules of `stages.tube` but none of its fields.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class TubeTrial:
         arcs = np.array([[outer_mm, rotation_rad, overlap], [inner_mm - outer_mm, 0.0, free]])
         return ArcPath(lps_from_start=lps_from_scope_tip, arcs=arcs)
 
-    def judge(self, shape: ArcPath) -> Deployment | str:
+    def validate(self, shape: ArcPath) -> Deployment | str:
         """Return the deployment of a centreline, or the reason why it is refused."""
         (outer_mm, rotation, _), (protrusion, _, _) = shape.arcs
         if protrusion > self._system.tubes.max_inner_protrusion_mm:

@@ -24,7 +24,7 @@ from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT, sample_ahead
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, Solid, chord_mm
 from lungaccess.coupled.kuntz2015_fcl.search import FOUND, OUT_OF_WORKSPACE, obstacles_for
-from lungaccess.coupled.kuntz2015_fcl.tubes import TubeTrial, frame_at, line_between
+from lungaccess.coupled.kuntz2015_fcl.tubes import TubeValidator, frame_at, line_between
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
@@ -154,18 +154,18 @@ class TestSearch:
 
 
 class TestTubes:
-    """The judge with meshes and the planner's proof with fields are different code for one rule."""
+    """The validator with meshes and the planner's proof with fields are different code for one rule."""
 
     def test_they_agree(self, atlas: la.Atlas, small_lung: Lung, obstacles: Obstacles) -> None:
-        trial = TubeTrial(SYSTEM, obstacles)
+        validator = TubeValidator(SYSTEM, obstacles)
         proof = TubeJudge(small_lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=atlas.with_fissures)
         axis = MedialAxis(small_lung.tree, atlas.sites.passable & atlas.sites.exits_ahead)
         rng = np.random.default_rng(0)
-        both, only_trial, only_proof = 0, 0, 0
+        both, only_meshes, only_proof = 0, 0, 0
         for _ in range(1500):
             frame, rotation = axis.sample(rng).lps_from_scope_tip, float(rng.uniform(0.0, 2.0 * math.pi))
             outer, inner = np.sort(rng.uniform(0.0, tracking_length_mm(SYSTEM.tubes), 2))
-            ours = trial.judge(trial.shape(frame, rotation, float(outer), float(inner)))
+            ours = validator.validate(validator.shape(frame, rotation, float(outer), float(inner)))
             theirs = proof.judge(frame, rotation, float(outer), float(inner))
             if isinstance(ours, Deployment) and isinstance(theirs, Deployment):
                 both += 1
@@ -173,14 +173,14 @@ class TestTubes:
                 assert ours.branch == theirs.branch and ours.lateral_sweep_mm == theirs.lateral_sweep_mm
                 assert ours.exit_mm == pytest.approx(theirs.exit_mm, abs=0.002)
                 assert ours.wall_angle_rad == pytest.approx(theirs.wall_angle_rad, abs=0.05)
-            only_trial += isinstance(ours, Deployment) and isinstance(theirs, str)
+            only_meshes += isinstance(ours, Deployment) and isinstance(theirs, str)
             only_proof += isinstance(ours, str) and isinstance(theirs, Deployment)
         # The proof knows no corners of voxels that the samples step over; chords are padded by 0.01 mm.
-        assert both >= 20 and only_proof <= 1 and only_trial <= 0.25 * both
+        assert both >= 20 and only_proof <= 1 and only_meshes <= 0.25 * both
 
     def test_lines_follow_their_curves(self, obstacles: Obstacles) -> None:
         frame = poses.pose([1.0, 2.0, 3.0], [0.2, 0.4, 1.0])
-        shape = TubeTrial(SYSTEM, obstacles).shape(frame, 0.7, 6.0, 25.0)
+        shape = TubeValidator(SYSTEM, obstacles).shape(frame, 0.7, 6.0, 25.0)
         dense, at_mm = shape.sample(0.01)
         line = line_between(shape, 2.5, 21.0)
         np.testing.assert_allclose(line[0], frame_at(shape, 2.5)[:3, 3])

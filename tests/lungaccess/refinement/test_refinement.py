@@ -183,7 +183,7 @@ class TestProgram:
                 slopes.append(g + weights @ j)
             np.testing.assert_allclose((slopes[0] - slopes[1]) / 2e-5, hessian[n], rtol=1e-3, atol=1e-2)
 
-    def test_the_symbolic_tip_moves_as_that_of_the_discrete_judge(self, case: Case) -> None:
+    def test_the_symbolic_tip_moves_as_that_of_the_planner(self, case: Case) -> None:
         problem, _solver = set_up(case)
         x, p = (
             casadi.SX.sym(n, size)
@@ -197,7 +197,7 @@ class TestProgram:
         np.testing.assert_allclose(value.ravel(), pose_numbers(deployment), atol=1e-9)
         for name, tolerance in (("rotation", 1e-4), ("outer", 1e-4), ("inner", 1e-4)):
             n = problem.layout.variables[name]
-            slope = judged_slope(case, name, 1e-4)
+            slope = planner_slope(case, name, 1e-4)
             np.testing.assert_allclose(jacobian[:, n], slope, atol=tolerance)
 
     def test_the_symbolic_tip_follows_the_site(self, case: Case) -> None:
@@ -224,8 +224,8 @@ def pose_numbers(deployment: Deployment) -> Float:
     return np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
 
 
-def judged_slope(case: Case, name: str, step: float) -> Float:
-    """Differentiate what the judge says of the second candidate, by central differences."""
+def planner_slope(case: Case, name: str, step: float) -> Float:
+    """Differentiate what the planner says of the second candidate, by central differences."""
     old = case.candidates[1]
     judge = TubeJudge(case.task.lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=case.task.with_fissures)
     ends = []

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.coupled.alternatives import Alternative as Alternative
-    from lungaccess.coupled.alternatives import alternatives as alternatives
-    from lungaccess.coupled.alternatives import criteria as criteria
-    from lungaccess.coupled.alternatives import with_front as with_front
     from lungaccess.coupled.atlas import Atlas as Atlas
     from lungaccess.coupled.atlas import build_atlas as build_atlas
     from lungaccess.coupled.atlas_store import open_atlas as open_atlas
     from lungaccess.coupled.counterfactuals import Counterfactual as Counterfactual
-    from lungaccess.coupled.counterfactuals import counterfactuals as counterfactuals
-    from lungaccess.coupled.explain import explain as explain
+    from lungaccess.coupled.counterfactuals import find_counterfactuals as find_counterfactuals
+    from lungaccess.coupled.diverse_plans import Alternative as Alternative
+    from lungaccess.coupled.diverse_plans import alternatives as alternatives
+    from lungaccess.coupled.diverse_plans import criteria as criteria
+    from lungaccess.coupled.diverse_plans import with_front as with_front
+    from lungaccess.coupled.explanation import explain as explain
     from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch as ReferenceSearch
     from lungaccess.coupled.planner import METHODS as METHODS
     from lungaccess.coupled.planner import ProgressEvent as ProgressEvent

@@ -12,7 +12,7 @@ import numpy as np
 
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.coupled.search.direct_arcs import DirectArcs
-from lungaccess.coupled.search.diverse import different_candidates
+from lungaccess.coupled.search.separated_arcs import separated_candidates
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
@@ -66,7 +66,7 @@ class Counterfactual:
         return f"{self.parameter} of {self.needed:g} mm instead of {self.present:.4g} mm"
 
 
-def counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]:
+def find_counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]:
     """Return the changes of one parameter with which a single arc reaches the target, the smallest first.
 
     The parameters are the needle's curvature and diameter, with the deployments of the atlas, and the
@@ -181,7 +181,7 @@ def _planned(task: Task, atlas: Atlas, system: System) -> Plan | None:
     """Return the plan of a direct arc with another system, None if there is none."""
     changed = replace(task, system=system)
     arcs = DirectArcs(changed, replace(atlas, system=system))
-    for candidate in different_candidates(arcs, 1, 1.0):
+    for candidate in separated_candidates(arcs, 1, 1.0):
         return _assembled(changed, atlas, candidate)
     return None
 

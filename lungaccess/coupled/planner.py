@@ -158,7 +158,7 @@ def _run(
     tell: Callable[[ProgressEvent], None],
 ) -> Iterator[Plan]:
     """Drive a search within its budget."""
-    from lungaccess.coupled.explain import explain
+    from lungaccess.coupled.explanation import explain
 
     clock = Clock()
     limit_s = math.inf if time_s is None else time_s

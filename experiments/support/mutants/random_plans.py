@@ -17,7 +17,7 @@ from anatomy.settings import override
 from anatomy.typed import Float
 from experiments.support.mutants.mutant import Rng
 from lungaccess.coupled import DirectArcs
-from lungaccess.coupled.alternatives import alternatives
+from lungaccess.coupled import alternatives
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan

@@ -13,7 +13,7 @@ from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
 if TYPE_CHECKING:
-    from lungaccess.coupled.alternatives import Alternative
+    from lungaccess.coupled import Alternative
 
 ACCEPTED, REFUSED = 0, 1
 COLUMNS = (
@@ -63,7 +63,7 @@ def alternatives(
         Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.checking import check
-    from lungaccess.coupled.alternatives import alternatives as find_alternatives
+    from lungaccess.coupled import alternatives as find_alternatives
     from lungaccess.coupled.atlas_store import open_atlas
     from lungaccess.problem.target import resolve_target
 

@@ -100,7 +100,7 @@ def report(
 
 def _others(plan: Plan, lung: Lung, count: int, cache: Path | None) -> tuple[Plan, ...]:
     """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it."""
-    from lungaccess.coupled.alternatives import alternatives as find
+    from lungaccess.coupled import alternatives as find
     from lungaccess.coupled.atlas_store import open_atlas
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import Target

@@ -97,7 +97,7 @@ def _value(finding: Finding) -> str:
 
 def plans_section(plans: Sequence[Plan], verdicts: Sequence[CheckReport]) -> str:
     """Return a table that compares plans."""
-    from lungaccess.coupled.alternatives import criteria
+    from lungaccess.coupled import criteria
 
     rows = []
     for number, (plan, verdict) in enumerate(zip(plans, verdicts, strict=True)):

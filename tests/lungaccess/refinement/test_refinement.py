@@ -212,11 +212,11 @@ class TestProgram:
         for shift in (0.3 * far, 0.6 * far):
             place = problem.start.copy()
             place[problem.layout.variables["site"]] = shift
-            stand = problem.stand(place, 1.0)
-            assert stand is not None
+            placement = problem.placement(place, 1.0)
+            assert placement is not None
             point = np.asarray(function(place, problem.numbers.parameters)).ravel()
             moved = np.linalg.norm(point - pose_numbers(case.candidates[1].deployment)[:3])
-            assert np.linalg.norm(point - stand.deployment.lps_from_tip[:3, 3]) < 0.2 * moved
+            assert np.linalg.norm(point - placement.deployment.lps_from_tip[:3, 3]) < 0.2 * moved
 
 
 def pose_numbers(deployment: Deployment) -> Float:

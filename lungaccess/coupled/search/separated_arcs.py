@@ -19,7 +19,7 @@ NEAREST, SAMPLED, LEAST_OF_BRANCH = 1000, 2000, 100
 many of every branch."""
 
 
-def different_candidates(arcs: DirectArcs, count: int, separation_mm: float) -> Iterator[Candidate]:
+def separated_candidates(arcs: DirectArcs, count: int, separation_mm: float) -> Iterator[Candidate]:
     """Yield proved direct arcs that are separated, the cheapest of each branch first, then the others.
 
     The nearest deployments are evaluated with an even sample of the others, then further samples, but only

@@ -18,7 +18,7 @@ from anatomy.lung import Lung
 from lungaccess.cli import app as cli
 from lungaccess.coupled import Alternative, alternatives, with_front
 from lungaccess.coupled.kernels.separation import choose_separated
-from lungaccess.coupled.search.diverse import _branches_first, _lines, _samples
+from lungaccess.coupled.search.separated_arcs import _branches_first, _lines, _samples
 from stages.needle.path import direct_path
 from tests.lungaccess.resample import needle_walk
 

@@ -10,9 +10,9 @@ import numpy as np
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
-from lungaccess.coupled.explain import explain
+from lungaccess.coupled.explanation import explain
 from lungaccess.coupled.search.direct_arcs import DirectArcs
-from lungaccess.coupled.search.diverse import different_candidates
+from lungaccess.coupled.search.separated_arcs import separated_candidates
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
@@ -96,7 +96,7 @@ def alternatives(
     atlas = atlas or build_atlas(lung, system)
     began = time.perf_counter()
     arcs = DirectArcs(task, atlas)
-    chosen = list(different_candidates(arcs, count, separation_mm))
+    chosen = list(separated_candidates(arcs, count, separation_mm))
     if not chosen:
         raise explain(task, atlas, arcs.evaluator.blocked, 0)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.counterfactuals import Counterfactual, counterfactuals
+from lungaccess.coupled.counterfactuals import Counterfactual, find_counterfactuals
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.task import Task
@@ -27,7 +27,7 @@ def explain(task: Task, atlas: Atlas, blocked: Counter[str], iterations: int) ->
     """
     arcs = DirectArcs(task, atlas)
     direct = _reached(arcs)
-    changes = counterfactuals(task, atlas) if atlas.deployments.count and not direct else ()
+    changes = find_counterfactuals(task, atlas) if atlas.deployments.count and not direct else ()
     return NoPlan(
         f"No plan to the target after {iterations} iterations: {_main_reason(arcs, blocked)}",
         reasons=_reasons(arcs, blocked),

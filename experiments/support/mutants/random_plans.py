@@ -16,8 +16,7 @@ from anatomy.lung import Lung
 from anatomy.settings import override
 from anatomy.typed import Float
 from experiments.support.mutants.mutant import Rng
-from lungaccess.coupled import DirectArcs
-from lungaccess.coupled import alternatives
+from lungaccess.coupled import DirectArcs, alternatives
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan

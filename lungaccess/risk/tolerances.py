@@ -13,17 +13,10 @@ from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
-from lungaccess.risk.assessment import RiskAssessor, Share
-from lungaccess.risk.errors import (
-    CURVATURE,
-    FIELD_OF,
-    UNITS,
-    Deviations,
-    Draws,
-    ErrorModel,
-    in_radians,
-    no_deviations,
-)
+from lungaccess.risk.assessor import RiskAssessor
+from lungaccess.risk.deviations import FIELD_OF, Deviations, Draws, in_radians, no_deviations
+from lungaccess.risk.errors import CURVATURE, UNITS, ErrorModel
+from lungaccess.risk.statistics import Share
 
 DEFAULT_PROBABILITY = 0.95
 DEFAULT_SAMPLES = 2000

@@ -13,7 +13,8 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.risk.assessment import RiskReport, Share
+    from lungaccess.risk.assessment import RiskReport
+    from lungaccess.risk.statistics import Share
     from lungaccess.risk.tolerances import Tolerance
 
 

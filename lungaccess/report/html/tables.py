@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from lungaccess.checking import CheckReport
     from lungaccess.checking.findings import Finding
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk.assessment import RiskReport, Share
+    from lungaccess.risk.assessment import RiskReport
+    from lungaccess.risk.statistics import Share
 
 GOAL_RADIUS_MM = 2.0
 AXES_AGREE = "largest angle between the axes"

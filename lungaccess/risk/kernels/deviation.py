@@ -42,13 +42,13 @@ _LUMEN = np.int64(LUMEN)
 
 
 @inner_kernel
-def _touch(scene, touched, x, y, z, radius, spared, lumen_mm):
+def _touch(environment, touched, x, y, z, radius, spared, lumen_mm):
     """Add what a ball touches, and return how far no structure that is not yet touched can be met.
 
     The airway of the branch `spared` counts for nothing (-1: none is spared), but the lumen of any airway
     nearer than `lumen_mm` does (negative: it does not).
     """
-    _field, labels, geometry, bits = scene
+    _field, labels, geometry, bits = environment
     reach = radius + EXACT_REACH_MM
     gap = EXACT_REACH_MM
     left = bits & ~touched
@@ -73,9 +73,9 @@ def _touch(scene, touched, x, y, z, radius, spared, lumen_mm):
 
 
 @inner_kernel
-def _in_lumen(scene, depth, x, y, z):
+def _in_lumen(environment, depth, x, y, z):
     """Return the step to the next point in a lumen, and the branch; NOT_IN_LUMEN outside of all."""
-    _field, labels, geometry, _bits = scene
+    _field, labels, geometry, _bits = environment
     label = label_at(labels, geometry, x, y, z)
     if not label & LUMEN:
         return 0.0, NOT_IN_LUMEN
@@ -84,9 +84,9 @@ def _in_lumen(scene, depth, x, y, z):
 
 
 @inner_kernel
-def _follow(scene, depth, mediastinal, start, pieces, n_tube, exempt_mm):
+def _follow(environment, depth, mediastinal, start, pieces, n_tube, exempt_mm):
     """Follow one chain; return what it touches and the point where it ends."""
-    field, _labels, geometry, bits = scene
+    field, _labels, geometry, bits = environment
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
     nx, ny, nz = start[6], start[7], start[8]
     touched = 0
@@ -108,7 +108,7 @@ def _follow(scene, depth, mediastinal, start, pieces, n_tube, exempt_mm):
         while not touched & STAYS_INSIDE and touched & bits != bits:
             x, y, z = point_on_arc(pose, bend, at)
             if pierced == IN_LUMEN:
-                step, here = _in_lumen(scene, depth, x, y, z)
+                step, here = _in_lumen(environment, depth, x, y, z)
                 if here == NOT_IN_LUMEN:
                     if branch == IN_LUMEN:
                         touched |= STAYS_INSIDE
@@ -127,7 +127,7 @@ def _follow(scene, depth, mediastinal, start, pieces, n_tube, exempt_mm):
                         lumen_mm = radius
                     elif done + at > left_at + WALL_ZONE_MM:
                         lumen_mm = 0.0
-                    touched, step = _touch(scene, touched, x, y, z, radius, spared, lumen_mm)
+                    touched, step = _touch(environment, touched, x, y, z, radius, spared, lumen_mm)
             if at >= length:
                 break
             at = min(at + step, length)
@@ -138,7 +138,7 @@ def _follow(scene, depth, mediastinal, start, pieces, n_tube, exempt_mm):
 
 
 @numba.njit(cache=True, nogil=True)
-def follow(scene, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched, ends):
+def follow(environment, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched, ends):
     """Follow N deviated plans, and note what each touches and where it ends.
 
     A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
@@ -149,7 +149,7 @@ def follow(scene, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched
 
     Parameters
     ----------
-    scene : tuple
+    environment : tuple
         Clearance field of all structures in `bits`, labels, geometry, bits.
     depth : tuple
         Lumen depth and its geometry.
@@ -165,7 +165,7 @@ def follow(scene, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched
         Receives the last points.
     """
     for n in range(starts.shape[0]):
-        found, x, y, z = _follow(scene, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm)
+        found, x, y, z = _follow(environment, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm)
         touched[n] = found
         ends[n, 0] = x
         ends[n, 1] = y

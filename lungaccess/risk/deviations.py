@@ -1,0 +1,166 @@
+"""Random deviations from a plan, and the deviated devices as arcs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy.typed import Float
+from lungaccess.plans.plan import Plan
+from lungaccess.risk.errors import UNITS
+from lungaccess.risk.kernels import deviation as kernel
+
+TUBE_PIECES = 4
+"""Arcs of the tubes, see `stages.tube.device.TubeArcs`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Deviations:
+    """N sets of errors of a plan whose needle has A arcs.
+
+    Parameters
+    ----------
+    scope_mm : (N, 3) float64, LPS mm
+        Shift of the scope tip.
+    tilt_rad : (N, 2) float64
+        Rotation vector of the scope tip's tilt, along +x and +y of its frame.
+    rotation_rad : (N,) float64
+        Added to the rotation of the tubes; it leaves the roll of the needle where it is.
+    insertion_mm : (N, 2) float64
+        Added to the insertions of outer and inner tube.
+    factor : (N,) float64
+        Multiplies the curvature of all arcs.
+    roll_rad, stop_mm : (N, A) float64
+        Added to the needle's angle in each arc, and to its insertion where the arc ends.
+    target_mm : (N, 3) float64, LPS mm
+        Shift of the target.
+    """
+
+    scope_mm: Float
+    tilt_rad: Float
+    rotation_rad: Float
+    insertion_mm: Float
+    factor: Float
+    roll_rad: Float
+    stop_mm: Float
+    target_mm: Float
+
+    @property
+    def count(self) -> int:
+        """Number of sets, N."""
+        return len(self.factor)
+
+
+def no_deviations(count: int, n_arcs: int) -> dict[str, Float]:
+    """Return the fields of `Deviations` for `count` sets without any error."""
+    return {
+        "scope_mm": np.zeros((count, 3)),
+        "tilt_rad": np.zeros((count, 2)),
+        "rotation_rad": np.zeros(count),
+        "insertion_mm": np.zeros((count, 2)),
+        "factor": np.ones(count),
+        "roll_rad": np.zeros((count, n_arcs)),
+        "stop_mm": np.zeros((count, n_arcs)),
+        "target_mm": np.zeros((count, 3)),
+    }
+
+
+FIELD_OF: dict[str, str] = {
+    "scope_position": "scope_mm",
+    "scope_direction": "tilt_rad",
+    "tube_rotation": "rotation_rad",
+    "tube_insertion": "insertion_mm",
+    "needle_roll": "roll_rad",
+    "needle_insertion": "stop_mm",
+    "target_position": "target_mm",
+}
+"""The field of `Deviations` that holds each kind of error."""
+
+
+class Draws:
+    """Standard normal and uniform numbers, drawn once and scaled to any sizes of error.
+
+    Parameters
+    ----------
+    count, n_arcs : int
+        N and A of `Deviations`.
+    seed : int
+        The same seed gives the same numbers.
+    """
+
+    def __init__(self, count: int, n_arcs: int, seed: int) -> None:
+        rng = np.random.Generator(np.random.PCG64(seed))
+        shapes = no_deviations(count, n_arcs)
+        self._uniform = rng.uniform(size=count)
+        self._normal = {name: rng.standard_normal(shapes[field].shape) for name, field in FIELD_OF.items()}
+        self._shapes = shapes
+
+    def scaled(self, sizes: Mapping[str, float], factors: tuple[float, float]) -> Deviations:
+        """Return deviations of given sizes.
+
+        Parameters
+        ----------
+        sizes : mapping of str to float
+            Standard deviation by kind, in the unit of `UNITS`; kinds left out have no error.
+        factors : (float, float)
+            Least and greatest factor of the needle's curvature.
+        """
+        values = dict(self._shapes)
+        for name, size in sizes.items():
+            values[FIELD_OF[name]] = self._normal[name] * in_radians(name, size)
+        values["factor"] = factors[0] + (factors[1] - factors[0]) * self._uniform
+        return Deviations(**values)
+
+
+def in_radians(name: str, size: float) -> float:
+    """Return the size of a kind of error in mm or rad, from mm or degrees."""
+    return math.radians(size) if UNITS[name] == "deg" else size
+
+
+def deviated_starts(plan: Plan, deviations: Deviations) -> Float:
+    """Return point, tangent and +x axis `(N, 9)` of the deviated scope tips, LPS mm."""
+    frame = np.asarray(plan.scope.lps_from_scope_tip)
+    vectors = deviations.tilt_rad @ frame[:3, :2].T
+    starts = np.zeros((deviations.count, 9))
+    starts[:, :3] = frame[:3, 3] + deviations.scope_mm
+    starts[:, 3:6] = _rotated(frame[:3, 2], vectors)
+    starts[:, 6:] = _rotated(frame[:3, 0], vectors)
+    return starts
+
+
+def _rotated(direction: Float, vectors: Float) -> Float:
+    """Turn one direction by many rotation vectors `(N, 3)`."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None]
+    axis = vectors / np.where(angle > 0.0, angle, 1.0)
+    along = (axis @ direction)[:, None]
+    turned = np.cos(angle) * direction + np.sin(angle) * np.cross(axis, direction)
+    return np.asarray(turned + (1.0 - np.cos(angle)) * along * axis)
+
+
+def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
+    """Return the arcs `(N, 4 + A, 4)` of tubes and needle, see `lungaccess.risk.kernels.deviation`.
+
+    The radius of the tubes includes the sideways sweep of the plan.  Neither tube goes back behind the
+    scope tip, nor the inner behind the outer, nor the needle behind the end of an arc.
+    """
+    arcs = plan.needle.arcs
+    pieces = np.zeros((deviations.count, TUBE_PIECES + len(arcs), kernel.N_PIECE))
+    outer = np.maximum(plan.tube.outer_insertion_mm + deviations.insertion_mm[:, 0], 0.0)
+    inner = np.maximum(plan.tube.inner_insertion_mm + deviations.insertion_mm[:, 1], outer)
+    tubes = plan.system.tubes.arcs(outer, inner)
+    pieces[:, :TUBE_PIECES, kernel.LENGTH] = tubes.length_mm
+    pieces[:, 0, kernel.ROLL] = plan.tube.rotation_rad + deviations.rotation_rad
+    pieces[:, :TUBE_PIECES, kernel.CURVATURE] = tubes.curvature_per_mm
+    pieces[:, :TUBE_PIECES, kernel.RADIUS] = tubes.radius_mm + plan.tube.lateral_sweep_mm
+    pieces[:, TUBE_PIECES:, kernel.RADIUS] = plan.system.needle.radius_mm
+    ends = np.cumsum([arc.length_mm for arc in arcs]) + deviations.stop_mm
+    ends = np.maximum.accumulate(np.maximum(ends, 0.0), axis=1)
+    pieces[:, TUBE_PIECES:, kernel.LENGTH] = np.diff(ends, axis=1, prepend=0.0)
+    angles = np.cumsum([arc.roll_rad for arc in arcs]) + deviations.roll_rad
+    pieces[:, TUBE_PIECES:, kernel.ROLL] = np.diff(angles, axis=1, prepend=deviations.rotation_rad[:, None])
+    bends = np.array([arc.curvature_per_mm for arc in arcs])
+    pieces[:, TUBE_PIECES:, kernel.CURVATURE] = deviations.factor[:, None] * bends
+    return pieces

@@ -82,6 +82,32 @@ def test_check_uses_only_data_types_and_anatomy(graph: grimp.ImportGraph) -> Non
     assert not {module for module in ours if is_kernel(module)}
 
 
+def test_the_product_uses_the_stages_through_their_facades(graph: grimp.ImportGraph) -> None:
+    """What the check reaches takes devices alone, so that it does not meet the planners at a facade."""
+    packages = {m for m in graph.modules if m.startswith("stages") and graph.find_children(m)}
+    reached = graph.find_upstream_modules("lungaccess.checking", as_package=True)
+    reached |= {"lungaccess.checking"} | graph.find_descendants("lungaccess.checking")
+    wrong = [
+        (module, used)
+        for module in graph.find_descendants("lungaccess")
+        for used in graph.find_modules_directly_imported_by(module)
+        if used.startswith("stages.") and used not in packages
+        if module not in reached or not fnmatch(used, "stages.*.device")
+    ]
+    assert not wrong
+
+
+def test_no_modules_of_the_product_import_each_other_in_a_circle(graph: grimp.ImportGraph) -> None:
+    modules = {module for module in graph.modules if module.split(".")[0] in OURS}
+    while True:
+        inner = {m for m in modules if graph.find_modules_directly_imported_by(m) & modules}
+        inner = {m for m in inner if graph.find_modules_that_directly_import(m) & modules}
+        if inner == modules:
+            break
+        modules = inner
+    assert modules <= {"lungaccess.cli.app", "lungaccess.cli.commands.doctor"}
+
+
 def test_nothing_that_check_uses_leads_to_a_planner(graph: grimp.ImportGraph) -> None:
     reached = graph.find_upstream_modules("lungaccess.checking", as_package=True)
     stages = {module for module in reached if module.startswith("stages.")}

@@ -5,7 +5,8 @@ from __future__ import annotations
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
-from stages.needle import ArcPath, Objective, Obstacles, costs
+from stages import needle
+from stages.needle import ArcPath, Objective, Obstacles
 
 
 def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fissures: bool) -> float:
@@ -23,17 +24,17 @@ def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fis
     """
     weighed = Objective.of(objective)
     terms = [term for term, _weight in weighed.weighed]
-    return weighed.total(costs.path_costs(_obstacles(lung, with_fissures), lung.cost, path, terms))
+    return weighed.total(needle.path_costs(_obstacles(lung, with_fissures), lung.cost, path, terms))
 
 
 def path_costs(lung: Lung, path: ArcPath, *, with_fissures: bool) -> dict[str, float]:
     """Return every cost of a needle path by its key; see `path_cost`."""
-    return costs.path_costs(_obstacles(lung, with_fissures), lung.cost, path)
+    return needle.path_costs(_obstacles(lung, with_fissures), lung.cost, path)
 
 
 def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> Float:
     """Return the distance `(N,)` in mm from points to the nearest obstacle, voxels as solid boxes."""
-    return costs.obstacle_clearance_mm(_obstacles(lung, with_fissures), points)
+    return needle.obstacle_clearance_mm(_obstacles(lung, with_fissures), points)
 
 
 def _obstacles(lung: Lung, with_fissures: bool) -> Obstacles:

@@ -21,7 +21,7 @@ from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_CONTACT_MM, Layout, Numbers
 from stages.scope import ScopeTip, Sites
 from stages.tube import Deployment, centreline, tracking_length_mm, tube_constants
-from stages.tube.kernels import deployment as index
+from stages.tube import kernels as index
 
 ARC_COUNTS = (3, 5, 8)
 """A program is built for each; shorter paths are split."""

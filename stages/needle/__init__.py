@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.needle.costs import map_integral as map_integral
+    from stages.needle.costs import obstacle_clearance_mm as obstacle_clearance_mm
     from stages.needle.costs import path_costs as path_costs
     from stages.needle.device import Needle as Needle
     from stages.needle.environment import RRT_STEP_MM as RRT_STEP_MM

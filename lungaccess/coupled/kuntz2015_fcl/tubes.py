@@ -11,8 +11,7 @@ from anatomy.typed import Float, Labels
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, branch_of, chord_mm, labels_at
 from lungaccess.problem.system import System
 from stages.needle import ArcPath, arc_transform
-from stages.tube import REASONS, Deployment, tube_constants
-from stages.tube.kernels import deployment as kernels
+from stages.tube import REASONS, Deployment, kernels, tube_constants
 
 NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
 LABEL_STEP_MM = 0.05

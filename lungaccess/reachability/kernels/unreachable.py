@@ -39,7 +39,7 @@ from lungaccess.reachability.kernels.deployment_boxes import (
     tubes_of,
     turned_vector,
 )
-from stages.needle.infeasibility.kernels.reachability_pruning import escape_depth
+from stages.needle.infeasibility.kernels import escape_depth
 from stages.needle.kernels import EXEMPT_LENGTH, GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MAX_LENGTH
 from stages.tube.kernels import (
     CURVED_LENGTH,

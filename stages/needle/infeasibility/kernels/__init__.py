@@ -1,1 +1,12 @@
-"""Compiled kernels of the infeasibility proofs."""
+"""Compiled kernels of the infeasibility proofs, and those that other proofs call."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from stages.needle.infeasibility.kernels.reachability_pruning import escape_depth as escape_depth
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -126,7 +126,7 @@ def build_atlas(
     stop_spacing_mm, site_spacing_mm : float
         Spacing of insertions and of sites along the airway.
     progress : callable, optional
-        Told the share of the work done.
+        Called with the share of the work done.
     """
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)

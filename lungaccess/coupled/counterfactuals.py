@@ -173,7 +173,7 @@ def _with_scope(system: System, outer_diameter_mm: float) -> System:
 
 
 def _changed(system: System, **parts: Any) -> System:
-    """Return a system with another part, and a name that says so: it is no longer the preset."""
+    """Return a system with another part, and a name that says that it is not the preset."""
     return replace(system, **parts, name=f"{system.name} (changed)")
 
 

@@ -189,7 +189,7 @@ class Clock:
 
     def __init__(self) -> None:
         self._began = time.perf_counter()
-        self._told = self._began
+        self._reported = self._began
 
     @property
     def elapsed_s(self) -> float:
@@ -199,7 +199,7 @@ class Clock:
     def due(self) -> bool:
         """Tell whether the next progress report is due, and start counting anew if so."""
         now = time.perf_counter()
-        if now - self._told < PROGRESS_EVERY_S:
+        if now - self._reported < PROGRESS_EVERY_S:
             return False
-        self._told = now
+        self._reported = now
         return True

@@ -1,6 +1,6 @@
 """The curve of tubes and needle as symbols, in closed form.
 
-Every piece is an arc of constant curvature.  Sine and cosine stand as power series of the squared angle, so
+Every piece is an arc of constant curvature.  Sine and cosine are power series of the squared angle, so
 that a straight arc is nothing special and all derivatives exist there.
 """
 

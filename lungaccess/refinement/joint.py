@@ -6,6 +6,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from lungaccess.refinement.problem import ARC_COUNTS, Problem, program_weights
+from lungaccess.refinement.reconstruction import Reconstruction
 from stages.scope import Sites
 
 ITERATIONS = 40
@@ -58,15 +59,16 @@ def _refined(
     """Solve for everything, then for the needle alone from tubes that are proved."""
     from lungaccess.refinement.program import program
 
-    problem = Problem(evaluator, sites, candidate, weights)
+    problem = Problem(evaluator.task, sites, candidate, weights)
+    reconstruction = Reconstruction(evaluator, problem)
     limit = evaluator.cost(candidate.path) * (1.0 - BETTER)
     solver = program(problem.layout, iterations)
     _objective, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
     found = solver.solve(problem.start, problem.eased(values), problem.boxes)
-    for placement in problem.placements(found):
-        aimed = solver.solve(placement.x, problem.for_needle(placement), problem.boxes)
+    for placement in reconstruction.placements(found):
+        aimed = solver.solve(placement.x, problem.for_needle(placement.x, placement.tip), problem.boxes)
         for share in NEEDLE_SHARES:
-            new = problem.candidate(placement, placement.x + share * (aimed - placement.x))
+            new = reconstruction.candidate(placement, placement.x + share * (aimed - placement.x))
             if new is None:
                 continue
             if evaluator.cost(new.path) < limit:

@@ -1,26 +1,23 @@
-"""The numbers of the refinement's program for one candidate, and candidates from its variables."""
+"""The numbers of the refinement's program for one candidate."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
 
-from anatomy import poses
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
 from lungaccess.plans.candidate import Candidate
-from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from lungaccess.refinement import boxes as fields
 from lungaccess.refinement.axis import axis_of, one_tip
-from lungaccess.refinement.curve import aimed, path_of, rows_of, split
+from lungaccess.refinement.curve import rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_CONTACT_MM, Layout, Numbers
 from stages.scope import ScopeTip, Sites
-from stages.tube import Deployment, centreline, tracking_length_mm, tube_constants
+from stages.tube import centreline, tracking_length_mm, tube_constants
 from stages.tube import kernels as index
 
 ARC_COUNTS = (3, 5, 8)
@@ -42,10 +39,6 @@ EASED = ("zone", "needle", "tube", "wall", "slope")
 """Constraints on field values, which the candidate may break in the program though it is proved."""
 EASE = 1e-4
 """The candidate lies so far inside the eased constraints, so that it is a strictly feasible start."""
-SHARES = (1.0, 0.85, 0.7, 0.5, 0.35, 0.2, 0.1)
-"""Shares of the step from the candidate to what the program found that are tried until one is proved."""
-MOVED_PLACEMENTS = 2
-"""So many proved placements besides the candidate's own get a program for the needle alone, to save time."""
 
 
 def program_weights(task: Task) -> tuple[float, float, float] | None:
@@ -67,32 +60,12 @@ def program_weights(task: Task) -> tuple[float, float, float] | None:
     return weights if any(weights) else None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Placement:
-    """Proved scope and tubes, and the program's variables there.
-
-    Parameters
-    ----------
-    share : float
-        Share of the step from the candidate (0) to what the program found (1).
-    x : (n,) float64
-        The site counts from `tip`.
-    tip : ScopeTip
-    deployment : Deployment
-    """
-
-    share: float
-    x: Float
-    tip: ScopeTip
-    deployment: Deployment
-
-
 class Problem:
     """The program's numbers for one candidate.
 
     Parameters
     ----------
-    evaluator : CandidateEvaluator
+    task : Task
     sites : Sites
     candidate : Candidate
         With at most as many arcs as the last of ARC_COUNTS.
@@ -111,13 +84,13 @@ class Problem:
 
     def __init__(
         self,
-        evaluator: CandidateEvaluator,
+        task: Task,
         sites: Sites,
         candidate: Candidate,
         weights: tuple[float, float, float],
     ) -> None:
-        self.task = evaluator.task
-        self._evaluator, self._candidate, self._weights = evaluator, candidate, weights
+        self.task = task
+        self._candidate, self._weights = candidate, weights
         needle, deployment = self.task.system.needle, candidate.deployment
         rows = rows_of(candidate.path)
         arcs = next(count for count in ARC_COUNTS if count >= len(rows))
@@ -150,65 +123,21 @@ class Problem:
             least[place] = np.minimum(least[place], values[place] - EASE)
         return replace(self.numbers, least=least)
 
-    def placements(self, found: Float) -> Iterator[Placement]:
-        """Yield proved tubes: the nearest to `found`, some at most half as far, those of the candidate."""
-        farthest, left = 1.0, MOVED_PLACEMENTS
-        for share in SHARES:
-            moved = self.placement(found, share) if left and share <= farthest else None
-            if moved is not None:
-                farthest, left = 0.5 * share, left - 1
-                yield moved
-        own = self.placement(found, 0.0)
-        if own is not None:
-            yield own
-
-    def placement(self, found: Float, share: float) -> Placement | None:
-        """Return the tubes at a share of the step from the candidate to `found`, None if they are refused."""
-        at = self.layout.variables
-        x = self.start + share * (found - self.start)
-        tip = self.axis.tip(float(x[at["site"]]))
-        deployment = self._deployment(tip, x)
-        if isinstance(deployment, str):
-            return None
-        x[at["site"]] = 0.0
-        x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm
-        x[at["exit"]] = deployment.exit_mm
-        return Placement(share=share, x=x, tip=tip, deployment=deployment)
-
-    def for_needle(self, placement: Placement) -> Numbers:
-        """Return the numbers for the needle alone, from tubes that stay as they are."""
+    def for_needle(self, x: Float, tip: ScopeTip) -> Numbers:
+        """Return the numbers for the needle alone, from the tubes of `x` and a tip that stay as they are."""
         rows, numbers = self.layout.constraints, self.numbers
         lower, upper = numbers.lower.copy(), numbers.upper.copy()
         least, most = numbers.least.copy(), numbers.most.copy()
         tubes = slice(0, self.layout.variables["lengths"].start)
-        lower[tubes] = upper[tubes] = placement.x[tubes]
+        lower[tubes] = upper[tubes] = x[tubes]
         for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall"):
             least[rows[name]], most[rows[name]] = -np.inf, np.inf
-        parameters = self._parameters(*one_tip(placement.tip))
+        parameters = self._parameters(*one_tip(tip))
         return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
 
-    def candidate(self, placement: Placement, x: Float) -> Candidate | None:
-        """Return the candidate with the needle of `x`, aimed anew, None if its proof fails."""
-        at, kappa = self.layout.variables, self.task.system.needle.max_curvature_per_mm
-        start = placement.deployment.lps_from_tip
-        rows = np.stack([x[at["lengths"]], kappa * x[at["bend_x"]], kappa * x[at["bend_y"]]], axis=1)
-        aim = aimed(start, rows, self.task.target.lps_mm, kappa)
-        if aim is None:
-            return None
-        found = Candidate(tip=placement.tip, deployment=placement.deployment, path=path_of(start, aim))
-        return found if self._evaluator.proves(found.deployment, found.path) else None
-
-    def _deployment(self, tip: ScopeTip, x: Float) -> Deployment | str:
-        """Return the tubes of `x`, or why they are refused; the rotation counts from the tip's own +x."""
-        at, frame = self.layout.variables, tip.lps_from_scope_tip
-        smooth = poses.pose(frame[:3, 3], frame[:3, 2], self._sideways)
-        bend = poses.bending_directions(smooth, x[at["rotation"]])[0]
-        inner = min(max(float(x[at["inner"]]), 0.0), self._longest_mm)
-        outer = min(max(float(x[at["outer"]]), 0.0), inner)
-        return self._evaluator.tubes.judge(frame, poses.roll_towards(frame, bend), outer, inner)
-
     @property
-    def _sideways(self) -> Float:
+    def sideways(self) -> Float:
+        """The +x of the candidate's tip, from which rotations count."""
         return np.asarray(self._candidate.tip.lps_from_scope_tip[:3, 0])
 
     @property
@@ -217,7 +146,7 @@ class Problem:
         return 0.0 < self.task.system.tubes.inner.curved_length_mm < self._candidate.deployment.inner_mm
 
     @property
-    def _longest_mm(self) -> float:
+    def longest_mm(self) -> float:
         """The greatest insertion: where the tubes follow their own track, or that of the candidate."""
         return max(tracking_length_mm(self.task.system.tubes), self._candidate.deployment.inner_mm)
 
@@ -269,7 +198,7 @@ class Problem:
         values: dict[str, object] = {
             "axis_points": points,
             "axis_tangents": tangents,
-            "sideways": self._sideways,
+            "sideways": self.sideways,
             "target": self.task.target.lps_mm,
             "max_curvature_per_mm": self.task.system.needle.max_curvature_per_mm,
             "shared_curvature_per_mm": constants[index.OVERLAP_CURVATURE],
@@ -297,9 +226,9 @@ class Problem:
         bounds = {
             "site": (self.axis.low_mm, self.axis.high_mm),
             "rotation": (rotation - MAX_TURN_RAD, rotation + MAX_TURN_RAD),
-            "outer": (0.0, self._longest_mm),
-            "inner": (system.tubes.inner.curved_length_mm if self._straight_out else 0.0, self._longest_mm),
-            "exit": (0.0, self._longest_mm),
+            "outer": (0.0, self.longest_mm),
+            "inner": (system.tubes.inner.curved_length_mm if self._straight_out else 0.0, self.longest_mm),
+            "exit": (0.0, self.longest_mm),
             "lengths": (SHORTEST_ARC_MM, system.needle.max_length_mm),
         }
         for name, (low, high) in bounds.items():

@@ -1,7 +1,7 @@
 """The nonlinear program of the joint refinement, in CasADi for IPOPT.
 
-All variables move together: where the scope stands, how the tubes are turned and inserted, and every arc of
-the needle.  The program is built once for a number of arcs; patient, target and candidate are parameters.
+All variables move together: the scope's site, rotation and insertions of the tubes, and every arc of the
+needle.  The program is built once for a number of arcs; patient, target and candidate are parameters.
 
 Fields are uniform cubic B-splines on boxes of lattice values.  Their value, gradient and second derivatives
 at a point are looked up by number (`_look_up`); the program itself sees the quadratic that they define about

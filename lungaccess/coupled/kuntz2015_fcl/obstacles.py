@@ -91,7 +91,7 @@ class Obstacles:
         self._other_airways: dict[int, Solid] = {}
 
     def prepare(self) -> None:
-        """Make the meshes of the whole lung now; those of single branches follow when they are pierced."""
+        """Make the meshes of the whole lung; those of single branches are made when they are pierced."""
         for solid in (self.tissue, self.airways, self.lumen):
             solid.is_near(self.lung.tree.points_lps[:1], 0.0)
 

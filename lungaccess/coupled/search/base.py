@@ -39,7 +39,7 @@ class Step:
 class PlanSearch(Protocol):
     """A search for whole plans: the planner drives it and makes plans of its candidates.
 
-    A search is made from a `Task` and an `Atlas`.  The name under which it stands in
+    A search is made from a `Task` and an `Atlas`.  Its name in
     `lungaccess.coupled.planner.METHODS` is the `method` of the planner and of the command line.
 
     Attributes

@@ -26,7 +26,7 @@ VIA_PERTURBATION_MM = 3.0
 
 @dataclass(kw_only=True, eq=False)
 class LocalSearchRun:
-    """A local search on its way from one candidate.
+    """The state of a local search that began at one candidate.
 
     Parameters
     ----------

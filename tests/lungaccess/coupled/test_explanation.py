@@ -21,7 +21,7 @@ from tests.stages.scenes import lung_of
 
 # The check compares a system that has the name of a preset with the preset.
 SYSTEM = replace(la.load_system("ultrathin"), name="changed")
-# Already bends most tightly, needs much room: what is left to advise is a thinner needle, or a fissure.
+# Already bends most tightly, needs much clearance: what is left to advise is a thinner needle, or a fissure.
 THICK = replace(
     SYSTEM,
     needle=replace(SYSTEM.needle, max_curvature_per_mm=1 / 30, diameter_mm=1.0),
@@ -49,7 +49,7 @@ def explained(lung: Lung, system: System, target: Target, **options: Any) -> NoP
     return caught.value
 
 
-def scattered_targets(lung: Lung, count: int, seed: int) -> list[Target]:
+def random_targets(lung: Lung, count: int, seed: int) -> list[Target]:
     rng, found = np.random.default_rng(seed), []
     while len(found) < count:
         point: Float = lung.grid.lps(rng.uniform(0, np.array(lung.grid.shape) - 1))
@@ -159,7 +159,7 @@ class TestAdvice:
     def test_the_least_tightening_and_no_less(self, small_lung: Lung, atlas_of: Any) -> None:
         """Three targets: a plan with the named radius, none with a radius 3 mm larger."""
         seen = 0
-        for target in scattered_targets(small_lung, 25, 0):
+        for target in random_targets(small_lung, 25, 0):
             try:
                 list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
             except la.NoPlan as error:
@@ -184,7 +184,7 @@ class TestAdvice:
 
     def test_thinner_needles_and_scopes_and_crossing_a_fissure(self, small_lung: Lung, atlas_of: Any) -> None:
         seen = set()
-        for target in scattered_targets(small_lung, 60, 0):
+        for target in random_targets(small_lung, 60, 0):
             if seen >= {"needle", "fissure"}:
                 break
             try:
@@ -204,7 +204,7 @@ class TestAdvice:
         """The named diameter gives a plan, and the sites of one a tenth thicker do not."""
         thick = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=4.5))
         atlas = la.build_atlas(small_lung, thick)
-        for target in scattered_targets(small_lung, 40, 1):
+        for target in random_targets(small_lung, 40, 1):
             try:
                 list(la.plan(small_lung, thick, target, atlas=atlas, iterations=0))
             except la.NoPlan as error:
@@ -222,7 +222,7 @@ class TestAdvice:
         raise AssertionError("no target needed a thinner scope")
 
     def test_changes_are_named_smallest_first(self, small_lung: Lung, atlas_of: Any) -> None:
-        for target in scattered_targets(small_lung, 25, 0):
+        for target in random_targets(small_lung, 25, 0):
             try:
                 list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
             except la.NoPlan as error:

@@ -25,6 +25,7 @@ from lungaccess.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.refinement.geometry import Geometry
 from lungaccess.refinement.problem import Problem
 from lungaccess.refinement.program import Program, program
+from lungaccess.refinement.reconstruction import Reconstruction
 from stages.needle import SHORTEST, Objective
 from stages.needle.environment import direct_arcs, needle_environment
 from stages.needle.path import ArcPath, direct_path
@@ -149,7 +150,7 @@ class TestRefine:
 
 
 def set_up(case: Case) -> tuple[Problem, Program]:
-    problem = Problem(CandidateEvaluator(case.task), case.sites, case.candidates[1], (1.0, 0.0, 0.0))
+    problem = Problem(case.task, case.sites, case.candidates[1], (1.0, 0.0, 0.0))
     return problem, program(problem.layout, ITERATIONS)
 
 
@@ -209,10 +210,11 @@ class TestProgram:
         function = casadi.Function("tip", [x, p], [Geometry(problem.layout, x, p).tip.point])
         far = max(problem.axis.low_mm, problem.axis.high_mm, key=abs)
         assert abs(far) > 0.4
+        reconstruction = Reconstruction(CandidateEvaluator(case.task), problem)
         for shift in (0.3 * far, 0.6 * far):
             place = problem.start.copy()
             place[problem.layout.variables["site"]] = shift
-            placement = problem.placement(place, 1.0)
+            placement = reconstruction.placement(place, 1.0)
             assert placement is not None
             point = np.asarray(function(place, problem.numbers.parameters)).ravel()
             moved = np.linalg.norm(point - pose_numbers(case.candidates[1].deployment)[:3])
@@ -260,8 +262,10 @@ class TestAxis:
     def test_a_shift_is_a_way_along_the_airway(self, case: Case) -> None:
         tree, tip = case.task.lung.tree, case.candidates[0].tip
         axis = LocalAxis(tree, case.sites, tip, case.candidates[0].deployment.branch)
-        way = [tree.distance_from_root_mm[t.tree_point] - t.back_mm for t in (tip, axis.tip(axis.low_mm))]
-        assert way[1] - way[0] == pytest.approx(axis.low_mm, abs=1e-9)
+        from_root_mm = [
+            tree.distance_from_root_mm[t.tree_point] - t.back_mm for t in (tip, axis.tip(axis.low_mm))
+        ]
+        assert from_root_mm[1] - from_root_mm[0] == pytest.approx(axis.low_mm, abs=1e-9)
 
 
 def winding_path(seed: int) -> ArcPath:

@@ -9,6 +9,8 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas as Atlas
     from lungaccess.coupled.atlas import build_atlas as build_atlas
+    from lungaccess.coupled.atlas_measures import tip_clearances_mm as tip_clearances_mm
+    from lungaccess.coupled.atlas_measures import tube_stability as tube_stability
     from lungaccess.coupled.atlas_store import open_atlas as open_atlas
     from lungaccess.coupled.counterfactuals import Counterfactual as Counterfactual
     from lungaccess.coupled.counterfactuals import find_counterfactuals as find_counterfactuals

@@ -5,9 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-
-import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
@@ -20,14 +17,15 @@ from stages.tube import (
     DEFAULT_ROTATIONS,
     DEFAULT_STOP_MM,
     Deployments,
-    TubeMechanics,
     enumerate_deployments,
     joined,
     tracking_length_mm,
 )
 
 SITE_SPACING_MM = 1.0
+"""A free choice: local search and local sampling cover what lies between two sites."""
 TURNED_COARSER = 2
+"""By this factor deployments from turned tips have fewer rotations and stops: their directions are many."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,38 +54,6 @@ class Atlas:
     deployments: Deployments
     index: StartIndex
     build_s: float
-
-    def site_pose(self, site: int) -> Float:
-        """Return point and tangent `(6,)` of a site."""
-        return np.asarray(self.sites.poses[site])
-
-    @cached_property
-    def exit_clearance_mm(self) -> Float:
-        """For each deployment `(E,)`, by how much its tip is clearer of vessels and pleura than it must be.
-
-        A lower bound, mm, of the distance from the tip of the inner tube to vessels, pleura and, where they
-        are obstacles, fissures, less the tube's radius and the margins.  Airways do not count: the tube has
-        just pierced one.
-        """
-        names = ("vessel", "pleura", "fissure") if self.with_fissures else ("vessel", "pleura")
-        tips = self.deployments.positions
-        nearest = np.min([self.lung.fields[name].lower_bound_mm(tips) for name in names], axis=0)
-        required = self.system.tubes.inner.radius_mm + self.system.margins.total_mm
-        return np.asarray(nearest - required)
-
-    @cached_property
-    def stability(self) -> Float:
-        """For each deployment `(E,)`, the least determinant of its tubes in torsion: stable above 0.
-
-        1 is that of tubes which do not wind each other up; see `stages.tube.mechanics.Equilibrium`.
-        """
-        entries, tubes = self.deployments, self.system.tubes
-        insertions, which = np.unique(
-            np.stack([entries.inner_mm, entries.outer_mm], axis=1), axis=0, return_inverse=True
-        )
-        rear_ends = insertions - np.array([tubes.inner.length_mm, tubes.outer.length_mm])
-        solved = TubeMechanics((tubes.inner, tubes.outer)).batch(np.zeros_like(rear_ends), rear_ends)
-        return np.asarray(np.where(solved.converged, solved.least_determinant, -np.inf)[which.ravel()])
 
 
 def require_same(atlas: Atlas, lung: Lung, system: System) -> None:

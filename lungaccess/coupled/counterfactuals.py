@@ -36,6 +36,7 @@ STOP_MM = 2.0 * DEFAULT_STOP_MM
 """A thinner scope has many more sites; its deployments are enumerated more coarsely to save time."""
 
 _THIN: WeakKeyDictionary[Atlas, Atlas] = WeakKeyDictionary()
+"""Atlases of the thinnest scopes by the atlases they belong to: they take seconds to make."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,9 +22,11 @@ from stages.needle import Objective
 
 COUNT = 15
 SEPARATION_MM = 5.0
+"""Fig. 6 of [Kuntz2015] shows as many plans; the separation is a free choice."""
 
 SMALL_IS_GOOD = ("inverse_clearance", "cost_map", "length_in_tissue_mm")
 LARGE_IS_GOOD = ("clearance_mm", "pleura_mm")
+"""The criteria of the Pareto front."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

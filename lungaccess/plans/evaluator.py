@@ -35,6 +35,7 @@ NeedleArrays = tuple[Obstacles, Float, ObjectiveArrays, bool, Float32]
 """A needle among obstacles for the compiled kernels; see `lungaccess.coupled.kernels.candidate`."""
 
 BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"), (AIRWAY, "an airway"))
+"""Names of obstacles; the first one of a voxel counts."""
 
 
 class CandidateEvaluator:

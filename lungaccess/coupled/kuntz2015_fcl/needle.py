@@ -17,6 +17,7 @@ from stages.needle.kernels import least_cosine
 SPREAD = 1.2
 """Samples lie up to so many times the distance of the goal ahead of the start."""
 SHORTEST_ARC_MM = 1e-6
+"""A shorter arc leads to the state itself."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

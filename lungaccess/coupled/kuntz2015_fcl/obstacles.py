@@ -15,6 +15,7 @@ from anatomy.typed import Bool, Float, Int, Int32, Labels
 
 SAGITTA_MM = 0.01
 LONGEST_CHORD_MM = 2.0
+"""Curves are tested as chords of at most this length, padded by at most this sagitta, well below a voxel."""
 
 
 def chord_mm(curvature_per_mm: float) -> float:

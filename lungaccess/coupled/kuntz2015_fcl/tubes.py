@@ -18,6 +18,7 @@ LABEL_STEP_MM = 0.05
 SAMPLES_PER_CONTACT = 5
 """Every so many samples it is asked whether the tube touches the wall from inside."""
 EXIT_SAMPLES = 51
+"""Points between two label samples among which the exit is found, about 0.001 mm from each other."""
 
 
 class TubeValidator:

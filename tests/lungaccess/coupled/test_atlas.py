@@ -10,6 +10,7 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from lungaccess.coupled import tip_clearances_mm, tube_stability
 from stages.tube.deployments import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, insertion_stops
 from stages.tube.kernels import deployment as kernels
 from stages.tube.shape import centreline
@@ -40,7 +41,7 @@ def test_sites_index_the_tree(atlas: la.Atlas, small_lung: Lung) -> None:
     assert found_sites(atlas) <= set(range(atlas.sites.count))
     for site in (0, atlas.sites.count - 1):
         assert np.array_equal(
-            atlas.site_pose(site)[:3], small_lung.tree.points_lps[atlas.sites.tree_point[site]]
+            atlas.sites.poses[site, :3], small_lung.tree.points_lps[atlas.sites.tree_point[site]]
         )
     assert (np.diff(atlas.deployments.site) >= 0).all()
 
@@ -55,7 +56,7 @@ def test_tubes_are_clear_behind_the_exit(atlas: la.Atlas, small_lung: Lung) -> N
 
     found, tubes, margin = atlas.deployments, SYSTEM.tubes, SYSTEM.margins.total_mm
     for n in np.random.default_rng(0).choice(found.count, 60, replace=False):
-        site = atlas.site_pose(int(found.site[n]))
+        site = atlas.sites.poses[found.site[n]]
         outer, inner = float(found.outer_mm[n]), float(found.inner_mm[n])
         s = np.linspace(0.0, inner, round(inner / 0.05) + 1)
         points = centreline(tubes, pose(site[:3], site[3:]), float(found.rotation_rad[n]), outer, inner, s)
@@ -156,7 +157,7 @@ def test_further_rotations_lie_between_unlike_ones_and_only_there(atlas: la.Atla
 
 
 def test_exits_are_as_clear_as_every_voxel_says(atlas: la.Atlas, small_lung: Lung) -> None:
-    clear = atlas.exit_clearance_mm
+    clear = tip_clearances_mm(atlas)
     assert clear.shape == (atlas.deployments.count,)
     bits = FISSURE | VESSEL | OUTSIDE if atlas.with_fissures else VESSEL | OUTSIDE
     some = np.random.default_rng(0).choice(len(clear), 60, replace=False)
@@ -171,5 +172,6 @@ def test_exits_are_as_clear_as_every_voxel_says(atlas: la.Atlas, small_lung: Lun
 
 
 def test_tubes_of_which_one_is_straight_are_stable(atlas: la.Atlas) -> None:
-    assert atlas.stability.shape == (atlas.deployments.count,)
-    assert atlas.stability == pytest.approx(1.0)
+    stability = tube_stability(atlas)
+    assert stability.shape == (atlas.deployments.count,)
+    assert stability == pytest.approx(1.0)

@@ -4,16 +4,18 @@
 The picture shows tubes and needles of the set from the front, over the airway tree.
 """
 
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 
 import lungaccess as la
 from lungaccess.coupled import alternatives
 
 lung = la.load_patient("phantom-3")
-system = la.load_system("ultrathin")
-target = la.resolve_target(lung, nodule=1)
+system = la.load_system(Path(__file__).with_name("my_device.toml"))
+target = la.resolve_target(lung, nodule=2)
 found = alternatives(lung, system, target, count=8, separation_mm=5.0)
-figure, ax = plt.subplots(figsize=(6, 5))
+figure, ax = plt.subplots(figsize=(9, 5))
 x, _y, z = lung.tree.points_lps.T
 ax.plot(x, z, ".", color="0.8", markersize=2)
 for number, each in enumerate(found, start=1):
@@ -24,5 +26,6 @@ for number, each in enumerate(found, start=1):
     ax.plot(needle.points_lps[:, 0], needle.points_lps[:, 2], color=line.get_color(), label=label)
 ax.plot(target.lps_mm[0], target.lps_mm[2], "k+", markersize=12)
 ax.set(xlabel="LPS x, mm", ylabel="LPS z, mm", aspect="equal", title="A diverse plan set")
-ax.legend()
+ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+figure.tight_layout()
 figure.savefig("diverse_plans.png")

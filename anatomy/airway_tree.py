@@ -44,7 +44,7 @@ class AirwayTree:
     generation : (B,) int64
         0 for the trachea, one more at each branching.
     distance_from_root_mm : (N,) float64
-        Length of the way along the tree.
+        Length along the tree.
     tangents : (N, 3) float64
         Unit vectors in LPS that point away from the root.
     report : TreeReport

@@ -1,4 +1,4 @@
-"""The needle stage on a made-up scene, and what compiling it costs."""
+"""The needle stage in a made-up environment, and what compiling it costs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ RADIUS_MM = 60.0
 SIDE = 96
 BALLS = 160
 COLD_RUN = """
-from benchmarks.bench_needle import query, scene
+from benchmarks.bench_needle import made_environment, query
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
 from stages.needle.search.base import RestartingRRT
-environment = scene(0)
+environment = made_environment(0)
 for kind in (RestartingRRT, OptimalSearch, ResolutionSearch):
     kind(environment, query()).advance(500)
 proof = NoPathProof(environment, query())
@@ -32,7 +32,7 @@ for _ in range(4):
 """
 
 
-def scene(seed: int, balls: int = BALLS) -> NeedleEnvironment:
+def made_environment(seed: int, balls: int = BALLS) -> NeedleEnvironment:
     """Return a cube of tissue with balls of vessel, none at start and target."""
     rng = np.random.default_rng(seed)
     labels = np.zeros((SIDE, SIDE, SIDE), dtype=np.uint16, order="F")
@@ -57,8 +57,8 @@ class Searches:
     """From one pose to one target."""
 
     def setup(self) -> None:
-        """Make scenes, and compile."""
-        self.scenes = [scene(seed) for seed in range(8)]
+        """Make environments, and compile."""
+        self.environments = [made_environment(seed) for seed in range(8)]
         self.query = query()
         self.time_first_paths()
         self.time_refine()
@@ -66,30 +66,30 @@ class Searches:
         self.time_proof()
 
     def time_first_paths(self) -> None:
-        """The RRT's first path in eight scenes, at most 20,000 iterations each."""
-        for environment in self.scenes:
+        """The RRT's first path in eight environments, at most 20,000 iterations each."""
+        for environment in self.environments:
             RestartingRRT(environment, self.query).advance(20_000)
 
     def time_refine(self) -> None:
         """20,000 iterations of the optimal search."""
-        search = OptimalSearch(self.scenes[0], self.query)
+        search = OptimalSearch(self.environments[0], self.query)
         while search.iterations < 20_000:
             search.advance(1000)
 
     def track_length_after_20000_iterations(self) -> float:
         """Length in mm that the optimal search has reached."""
-        search = OptimalSearch(self.scenes[0], self.query)
+        search = OptimalSearch(self.environments[0], self.query)
         while search.iterations < 20_000:
             search.advance(1000)
         return float("nan") if search.path is None else search.path.length_mm
 
     def time_resolution(self) -> None:
         """20,000 iterations of the resolution search."""
-        ResolutionSearch(self.scenes[0], self.query).advance(20_000)
+        ResolutionSearch(self.environments[0], self.query).advance(20_000)
 
     def time_proof(self) -> None:
         """Eight planes of the proof that no path exists."""
-        proof = NoPathProof(self.scenes[0], self.query)
+        proof = NoPathProof(self.environments[0], self.query)
         for _ in range(8):
             proof.advance()
 

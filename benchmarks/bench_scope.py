@@ -36,9 +36,9 @@ def airway() -> tuple[Lumen, AirwayTree]:
     points = grid.lps(np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1))
     mask = np.zeros(grid.shape, dtype=bool)
     for a, b, radius in LINES:
-        begin, way = np.array(a, dtype=float), np.subtract(b, a).astype(float)
-        t = np.clip((points - begin) @ way / (way @ way), 0.0, 1.0)
-        mask |= np.linalg.norm(points - begin - t[..., None] * way, axis=-1) <= radius
+        begin, along = np.array(a, dtype=float), np.subtract(b, a).astype(float)
+        t = np.clip((points - begin) @ along / (along @ along), 0.0, 1.0)
+        mask |= np.linalg.norm(points - begin - t[..., None] * along, axis=-1) <= radius
     z = np.arange(80.0, -0.25, -0.5)
     line = np.column_stack([np.zeros_like(z), np.zeros_like(z), z])
     tree = AirwayTree(

@@ -72,8 +72,8 @@ def _distance_field(edge: int) -> Work:
 def _vesselness(edge: int) -> Work:
     from anatomy.segmentation.vesselness import vesselness
 
-    scene = scenes.chest(edge)
-    return lambda: vesselness(scene.hu, scene.lung, scene.grid.spacing_mm)
+    chest = scenes.chest(edge)
+    return lambda: vesselness(chest.hu, chest.lung, chest.grid.spacing_mm)
 
 
 def _cost_map(edge: int) -> Work:
@@ -81,13 +81,13 @@ def _cost_map(edge: int) -> Work:
     from anatomy.segmentation.cost_map import cost_map
     from anatomy.segmentation.vessels import Vessels
 
-    scene = scenes.chest(edge)
+    chest = scenes.chest(edge)
     vessels = Vessels(
-        vesselness=np.where(scene.vessels, np.float32(1.0), np.float32(0.1)), large=scene.vessels,
-        mask=scene.vessels, threshold=0.5,
+        vesselness=np.where(chest.vessels, np.float32(1.0), np.float32(0.1)), large=chest.vessels,
+        mask=chest.vessels, threshold=0.5,
     )  # fmt: skip
-    airways = Airways(lumen=scene.lumen, wall=scene.wall)
-    return lambda: cost_map(vessels, airways, scene.lung, scene.grid)
+    airways = Airways(lumen=chest.lumen, wall=chest.wall)
+    return lambda: cost_map(vessels, airways, chest.lung, chest.grid)
 
 
 def _build_lung(edge: int) -> Work:

@@ -4,7 +4,7 @@
     python -m experiments.check_attack --table FILE
 
 Plans come in batches: a random system (a preset or one of its own), a coarse atlas, targets all over the
-lung, several plans a target from the menu of alternatives, the search, its refinement, Algorithm 1 of
+lung, several plans a target from the diverse set of alternatives, the search, its refinement, Algorithm 1 of
 [Kuntz2015] and random needles of several arcs (`random_plans`).  Each is checked, and so is one random mutant
 of each (`mutants.all.MUTATIONS`).  A line of FILE is a plan; a batch follows from patient and number
 alone, and one that FILE holds is not made again, so that an interrupted run goes on where it was.  A plan

@@ -54,8 +54,8 @@ FULL = Size(goals=6, seeds=3, time_s=300.0, easy_goals=3, repeats=2, limit_s=60.
 QUICK = Size(goals=2, seeds=1, time_s=3.0, easy_goals=1, repeats=1, limit_s=15.0, rrts=10)
 
 
-def menus(atlas: Atlas, points: Float, count: int) -> list[tuple[float, tuple[Alternative, ...]]]:
-    """Return for so many goals the processor time of the second of two equal calls, and the menu."""
+def diverse_sets(atlas: Atlas, points: Float, count: int) -> list[tuple[float, tuple[Alternative, ...]]]:
+    """Return for so many goals the processor time of the second of two equal calls, and the plan set."""
     found = []
     for point in points:
         target = point_target(atlas.lung, point)
@@ -64,22 +64,22 @@ def menus(atlas: Atlas, points: Float, count: int) -> list[tuple[float, tuple[Al
         except la.NoPlan:
             continue
         began = time.process_time()
-        menu = alternatives(atlas.lung, atlas.system, target, atlas=atlas)
-        found.append((time.process_time() - began, menu))
+        plans = alternatives(atlas.lung, atlas.system, target, atlas=atlas)
+        found.append((time.process_time() - began, plans))
         if len(found) == count:
             break
     return found
 
 
-def add_menus(result: Result, found: list[tuple[float, tuple[Alternative, ...]]]) -> None:
+def add_diverse_sets(result: Result, found: list[tuple[float, tuple[Alternative, ...]]]) -> None:
     """Add the rows of fig. 6."""
-    full = [(spent, menu) for spent, menu in found if len(menu) >= PAPER_PATHS]
-    note = f"median of {len(full)} goals of {len(found)} that have so many; every two somewhere 5 mm apart"
-    spent = float(np.median([spent for spent, _menu in full])) if full else None
+    full = [(spent, plans) for spent, plans in found if len(plans) >= PAPER_PATHS]
+    note = f"median of {len(full)} goals of {len(found)} that have so many; every two separated by 5 mm"
+    spent = float(np.median([spent for spent, _plans in full])) if full else None
     result.add(
         f"fig. 6: {PAPER_PATHS} plans to one goal", spent, PAPER_PATHS_S[0], "s", f"{note}; processor time"
     )
-    branches = [len({each.plan.tube.exit.branch for each in menu}) for _spent, menu in full]
+    branches = [len({each.plan.tube.exit.branch for each in plans}) for _spent, plans in full]
     result.add(
         "fig. 6: airway branches among them", float(np.median(branches)) if full else None, note="median"
     )
@@ -168,16 +168,16 @@ def add_rrt_time(result: Result, atlas: Atlas, points: Float, size: Size) -> lis
     return times
 
 
-def draw_menu(axes: Axes, menu: tuple[Alternative, ...], atlas: Atlas) -> None:
+def draw_diverse_set(axes: Axes, plans: tuple[Alternative, ...], atlas: Atlas) -> None:
     """Draw the needles to one goal, seen from the front, over the medial axis."""
     tree = atlas.lung.tree
     for begin, end in pairwise(tree.branch_start):
         points = tree.points_lps[begin:end]
         axes.plot(points[:, 0], points[:, 2], color=style.AIRWAY, linewidth=0.8)
-    for each in menu:
+    for each in plans:
         needle = each.plan.curves().needle.points_lps
         axes.plot(needle[:, 0], needle[:, 2], color=style.TUBE, linewidth=1.0)
-    goal = menu[0].plan.target_lps
+    goal = plans[0].plan.target_lps
     axes.plot(goal[0], goal[2], "o", color=style.NODULE, markersize=5)
     axes.set(xlabel="x, towards the left (mm)", ylabel="z, up (mm)", aspect="equal", title="fig. 6")
 
@@ -211,15 +211,15 @@ def main() -> None:
         "goals": f"of 100 random peripheral targets {size.goals} for fig. 9, the easiest for the ablations",
     }  # fmt: skip
     points = workspace_rejection.goals_by_ease(lung, atlas, peripheral_targets(lung, 50, 0))
-    found = menus(atlas, points, 20 if options.quick else 100)
-    add_menus(result, found)
+    found = diverse_sets(atlas, points, 20 if options.quick else 100)
+    add_diverse_sets(result, found)
     runs = cost_over_time.all_runs(atlas, size.goals, seeds, size.time_s, options.runs)
     add_cost_over_time(result, runs)
     add_rejection(result, atlas, points, size)
     times = add_rrt_time(result, atlas, points, size)
     result.figure = style.new_figure(10.5, 3.6)
     left, middle, right = result.figure.subplots(1, 3)
-    draw_menu(left, max((menu for _spent, menu in found), key=len), atlas)
+    draw_diverse_set(left, max((plans for _spent, plans in found), key=len), atlas)
     cost_over_time.draw(middle, runs)
     draw_rrt(right, times)
     result.figure.tight_layout()

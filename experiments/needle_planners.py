@@ -22,9 +22,9 @@ from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from experiments.support.anatomies import data_folder, require_data
 from experiments.support.needle.queries import (
-    Judge,
     Obstacles,
     Query,
+    Validator,
     easy_queries,
     generated_queries,
     hard_queries,
@@ -77,15 +77,15 @@ def problems(query_set: str, every: int, seed: int) -> Iterator[Problem]:
 
 def _problem(obstacles: Obstacles, query: Query) -> Problem:
     environment = obstacles.environment(query)
-    return query, environment, Judge(environment, query)
+    return query, environment, Validator(environment, query)
 
 
 def run_all_planners(found: Problem, numbers: dict[str, Any], seed: int) -> dict[str, Any]:
     """Run all planners on one query, and decide it."""
-    query, environment, judge = found
+    query, environment, validator = found
     runs = {
         name: [
-            run(PLANNERS[name], environment, query, each, numbers["time_s"], judge)
+            run(PLANNERS[name], environment, query, each, numbers["time_s"], validator)
             for each in range(seed, seed + (1 if name == "resolution" else numbers["seeds"]))
         ]
         for name in NAMES
@@ -94,7 +94,7 @@ def run_all_planners(found: Problem, numbers: dict[str, Any], seed: int) -> dict
         "query": query,
         "solved": any(each["first_s"] is not None for of_name in runs.values() for each in of_name),
         "runs": runs,
-        "decision": decide(environment, query, seed, numbers["decide_s"], judge),
+        "decision": decide(environment, query, seed, numbers["decide_s"], validator),
     }
 
 

@@ -18,8 +18,8 @@ from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.scope.ends import NEAR_MM, success, touching
-from experiments.support.scope.goals import PAPER_SPACING_MM, ends, goal_with_room
-from experiments.support.scope.speed import ARRIVED_MM, ROOM_VOXELS, measure_speed
+from experiments.support.scope.goals import PAPER_SPACING_MM, ends, goal_with_clearance
+from experiments.support.scope.speed import ARRIVED_MM, SPARE_VOXELS, measure_speed
 from lungaccess.report import style
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import Weights
@@ -60,16 +60,16 @@ def measures(path: ScopePath, environment: ScopeEnvironment, length_mm: float) -
 
 
 def compare_weights(lung: Lung, seeds: list[int]) -> tuple[Values, Curves]:
-    """Run the three weights of fig. 6 to all ends, each measured on the way that all three went.
+    """Run the three weights of fig. 6 to all ends, each measured over the length that all three went.
 
-    Returns for each end the median over the seeds, and the curves of the longest common way.
+    Returns for each end the median over the seeds, and the curves of the longest common length.
     """
     lumen, model = lumen_of_lung(lung), ScopeModel()
     state = start_state(lumen, lung.tree, model)
     values: Values = {name: [] for name in WEIGHTS}
     longest, curves = -1.0, ({}, None)
     for point in ends(lung):
-        goal = goal_with_room(lumen, lung, point, model, ROOM_VOXELS)
+        goal = goal_with_clearance(lumen, lung, point, model, SPARE_VOXELS)
         advisor = Advisor(lumen, model, goal, reproduction=True)
         runs: Values = {name: [] for name in WEIGHTS}
         for seed in seeds:
@@ -135,9 +135,9 @@ def draw_fig6(curves: Curves) -> Figure:
     figure = style.new_figure(8.0, 5.6)
     above, below = figure.subplots(2, 1, sharex=True)
     for (name, path), colour in zip(paths.items(), COLOURS, strict=True):
-        way = np.cumsum(path.steps_mm)
-        above.plot(way, environment.distances(path.states), color=colour, label=name)
-        below.plot(way, np.degrees(path.states[:, 12]), color=colour)
+        arc_length_mm = np.cumsum(path.steps_mm)
+        above.plot(arc_length_mm, environment.distances(path.states), color=colour, label=name)
+        below.plot(arc_length_mm, np.degrees(path.states[:, 12]), color=colour)
     above.set_ylabel("distance (sum of clearances, voxels)")
     above.legend(title="weights NF1, clearance, twist", frameon=False, fontsize=9)
     below.set(ylabel="twist (deg)", xlabel="advance (mm)")
@@ -161,7 +161,7 @@ def main() -> None:
         conditions={
             "speed": f"first anatomy resampled to {' x '.join(map(str, PAPER_SPACING_MM))} mm, trachea cut "
             "to the paper's number of voxels; CPU seconds of one core, kernels compiled before, median",
-            "fig. 6": "printed rules, all airway ends, median of the seeds, over the way that all three "
+            "fig. 6": "printed rules, all airway ends, median of the seeds, over the length that all three "
             "weights went; look-ahead 5 mm, sub-step 1 mm",
             "ends": "chain of 10 mm, bends of 120 degrees and twists of 90 degrees to either side",
         },

@@ -17,7 +17,7 @@ from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.territory import Territory
 from anatomy.typed import Float
 
-Room = Callable[[Float], Float]
+Clearance = Callable[[Float], Float]
 
 FEWEST_POINTS = 4
 SMALLEST_SHARE = 0.2
@@ -93,11 +93,11 @@ def grow(
     rule: GrowthRule,
     territory: Territory,
     rng: np.random.Generator,
-    room: Room | None = None,
+    clearance: Clearance | None = None,
 ) -> None:
     """Let `branch` divide until its descendants supply the points `cloud` `(N, 3)` of its lobe.
 
-    With `room`, which tells the free distance (mm) at points `(N, 3)`, branches turn aside from obstacles.
+    With `clearance`, the free distance in mm at points `(N, 3)`, branches turn aside from obstacles.
     """
     queue = deque([(branch, cloud)])
     while queue:
@@ -112,7 +112,7 @@ def grow(
             if diameter < rule.smallest_diameter_mm:
                 continue
             chord = _chord(sprouts, parent, part, diameter, rule, rng)
-            line = _free_line(sprouts, parent, chord, diameter, territory, room)
+            line = _free_line(sprouts, parent, chord, diameter, territory, clearance)
             if line is not None:
                 queue.append((sprouts.add(parent, line, diameter, sprouts.lobe[parent]), part))
 
@@ -131,13 +131,18 @@ def _chord(
 
 
 def _free_line(
-    sprouts: Sprouts, parent: int, chord: Float, diameter_mm: float, territory: Territory, room: Room | None
+    sprouts: Sprouts,
+    parent: int,
+    chord: Float,
+    diameter_mm: float,
+    territory: Territory,
+    clearance: Clearance | None,
 ) -> Float | None:
     """Return the curve of a new branch along about `chord` `(3,)`, or None if it leaves the lobe."""
     start, heading = sprouts.points[parent][-1], sprouts.direction(parent)
     margin = 0.5 * diameter_mm + PLEURA_MARGIN_MM
     best, least = None, np.inf
-    for turned, penalty in _variants(chord) if room is not None else [(chord, 0.0)]:
+    for turned, penalty in _variants(chord) if clearance is not None else [(chord, 0.0)]:
         for shrink in (1.0, 0.75, 0.5):
             end = start + shrink * turned
             if territory.holds(end, sprouts.lobe[parent], margin):
@@ -145,7 +150,7 @@ def _free_line(
         else:
             continue
         line = bent_line(start, heading, end, STEP_MM)
-        cost = penalty + (0.0 if room is None else overlap_mm(line[1:], 0.5 * diameter_mm, room))
+        cost = penalty + (0.0 if clearance is None else overlap_mm(line[1:], 0.5 * diameter_mm, clearance))
         if cost < least:
             best, least = line, cost
         if cost <= penalty:
@@ -165,6 +170,6 @@ def _variants(chord: Float) -> Iterator[tuple[Float, float]]:
             yield np.cos(angle) * chord + np.sin(angle) * length * side, 0.3 * angle
 
 
-def overlap_mm(line: Float, radius_mm: float, room: Room) -> float:
-    """Return the most, in mm, by which a tube around `line` `(K, 3)` lacks room."""
-    return float(np.maximum(radius_mm - room(line), 0).max())
+def overlap_mm(line: Float, radius_mm: float, clearance: Clearance) -> float:
+    """Return the most, in mm, by which a tube around `line` `(K, 3)` lacks clearance."""
+    return float(np.maximum(radius_mm - clearance(line), 0).max())

@@ -31,7 +31,7 @@ def paint_tree(
     allowed,
     keep,
 ):
-    """Draw the branches of a tree, each only if it has room; mark those drawn in `keep`.
+    """Draw the branches of a tree, each only if it fits; mark those drawn in `keep`.
 
     `labels` uint8, `owner` int16 (0 free, `base + branch + 1` of this tree, others taken) and the covers
     (uint8 share of a voxel, 0 to 255) are `(ni, nj, nk)`.  `points` `(N, 3)` LPS mm with the radii `inner`

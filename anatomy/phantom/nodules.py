@@ -55,14 +55,14 @@ def place_nodules(
     Raises
     ------
     AnatomyError
-        If there is no room for three.
+        If three do not fit.
     """
     from scipy.spatial import cKDTree
 
     wanted = int(rng.integers(3, 7))
     points = territory.points_lps
     distance, nearest = cKDTree(tube_points).query(points, k=TUBES_LOOKED_AT)
-    room = (distance - tube_radius_mm[nearest]).min(axis=1)
+    clearance_mm = (distance - tube_radius_mm[nearest]).min(axis=1)
     found: list[Nodule] = []
     map_error = territory.spacing_mm
     for index in rng.permutation(len(points)):
@@ -73,7 +73,7 @@ def place_nodules(
         fits = (
             radius + scale * LEAST_PLEURA_MM + map_error < pleura < scale * GREATEST_PLEURA_MM - map_error
             and territory.holds(centre, lobe, radius + 2 * map_error)
-            and room[index] > radius + scale * TUBE_GAP_MM
+            and clearance_mm[index] > radius + scale * TUBE_GAP_MM
             and all(np.linalg.norm(n.centre_lps - centre) > scale * NODULE_GAP_MM for n in found)
         )
         if fits:
@@ -83,7 +83,7 @@ def place_nodules(
     if len(found) >= 3:
         return tuple(found)
     raise AnatomyError(
-        "The synthetic lungs have no room for three nodules",
+        "The synthetic lungs are too narrow for three nodules",
         expected="free tissue near the pleura",
         remedy="Use another seed",
     )

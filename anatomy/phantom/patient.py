@@ -100,7 +100,7 @@ def make_phantom(
     SettingsError
         If an argument is out of its range.
     AnatomyError
-        If the lungs of this seed have no room for what belongs in them.
+        If the lungs of this seed are too narrow for what belongs in them.
 
     References
     ----------

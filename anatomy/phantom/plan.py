@@ -57,7 +57,7 @@ def plan_patient(
     Raises
     ------
     AnatomyError
-        If there is no room for three nodules.
+        If three nodules do not fit.
     """
     sprouts, rule = grow_airways(territory, scale, rng)
     airways = _plan_airways(sprouts, spacing_mm)

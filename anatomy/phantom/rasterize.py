@@ -148,7 +148,7 @@ def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
     Returns
     -------
     (B,) bool
-        Which branches found room and were drawn.
+        Which branches fitted and were drawn.
     """
     sprouts = tree.sprouts
     allowed = np.zeros(len(LABELS), dtype=np.bool_)

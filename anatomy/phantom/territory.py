@@ -1,4 +1,4 @@
-"""The room that trees grow into: a coarse map of the lobes, its depths, and points spread evenly in it."""
+"""Where trees grow: a coarse map of the lobes, its depths, and points spread evenly in it."""
 
 from __future__ import annotations
 

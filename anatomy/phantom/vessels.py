@@ -1,4 +1,4 @@
-"""Pulmonary vessels: an artery beside every airway, veins grown into the room between them."""
+"""Pulmonary vessels: an artery beside every airway, veins grown into the gaps between them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.phantom.branching import Sprouts, smooth_line, unit
 from anatomy.phantom.chest import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.phantom.growth import STEP_MM, GrowthRule, Room, grow, overlap_mm
+from anatomy.phantom.growth import STEP_MM, Clearance, GrowthRule, grow, overlap_mm
 from anatomy.phantom.territory import Territory
 from anatomy.typed import Bool, Float, Int
 
@@ -45,7 +45,7 @@ class Obstacles:
     centres: Float
     radii: Float
 
-    def room(self) -> Room:
+    def clearance(self) -> Clearance:
         """Return the function that tells how far (mm) points `(N, 3)` are from the nearest ball."""
         from scipy.spatial import cKDTree
 
@@ -93,9 +93,9 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
     pulmonary artery.  A named artery changes to the other side of its airway where it would run into
     another airway.
     """
-    room = Obstacles(
+    clearance = Obstacles(
         centres=np.vstack(airways.points), radii=np.repeat(outer_radius_mm, airways.counts)
-    ).room()
+    ).clearance()
     distance = outer_radius_mm + radius_mm + SHEATH_MM
     central = {0: TRUNK_KNOTS, RIGHT_MAIN: RIGHT_ARTERY_KNOTS, LEFT_MAIN: LEFT_ARTERY_KNOTS}
     children = airways.children()
@@ -113,11 +113,11 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
         else:
             start = side[parent] * distance[parent]
             signs = (1, -1) if airways.name[branch] else (1,)
-            ways = [_beside(line, start, sign * side[branch] * distance[branch]) for sign in signs]
-            lacks = [overlap_mm(way[1:], radius_mm[branch], room) for way in ways]
+            lines = [_beside(line, start, sign * side[branch] * distance[branch]) for sign in signs]
+            lacks = [overlap_mm(line_beside[1:], radius_mm[branch], clearance) for line_beside in lines]
             other = lacks[0] > lacks[-1] + OTHER_SIDE_SHARE * radius_mm[branch]
             side[branch] *= signs[-1] if other else 1
-            line = ways[-1] if other else ways[0]
+            line = lines[-1] if other else lines[0]
             line[0] = arteries.points[parent][-1]
         name = CENTRAL_ARTERIES[branch] if branch in central else _artery_name(airways.name[branch])
         arteries.add(parent, line, 2 * radius_mm[branch], airways.lobe[branch], name)
@@ -143,14 +143,14 @@ def grow_veins(
     atrium = scale * np.array([ATRIUM_LPS, np.array(ATRIUM_LPS) + (0.0, 2.0, 0.0)])
     veins.add(-1, atrium, 1.6 * rule.root_diameter_mm, 0, "left atrium")
     away, _ = cKDTree(obstacles.centres).query(territory.points_lps)
-    room = obstacles.room()
+    clearance = obstacles.clearance()
     for lobe, knots in LOBAR_VEINS.items():
         inside = territory.lobe_of_point == lobe
         cloud = territory.points_lps[inside & (away > np.quantile(away[inside], 1 - FAR_SHARE))]
         line = smooth_line(np.vstack([atrium[-1], scale * np.array(knots)]), STEP_MM)
         local = replace(rule, total_points=max(1, round(FAR_SHARE * rule.total_points)))
         root = veins.add(0, line, local.diameter_mm(len(cloud)), lobe, "")
-        grow(veins, root, cloud, local, territory, rng, room)
+        grow(veins, root, cloud, local, territory, rng, clearance)
     return veins
 
 
@@ -190,10 +190,10 @@ def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: floa
         watched = np.flatnonzero(_spread(trouble, WATCHED_NEIGHBOURS))
         watched = watched[watched >= fixed]
     distance, nearest = finder.query(position, k=NEIGHBOURS)
-    room = (distance - obstacles.radii[nearest]).min(axis=1) - 0.5 * gap_mm
+    clearance = (distance - obstacles.radii[nearest]).min(axis=1) - 0.5 * gap_mm
     for branch in range(len(counts)):
         tree.points[branch] = position[start[branch] : start[branch + 1]].copy()
-    return np.asarray(np.clip(room, SQUEEZE * radius, radius))
+    return np.asarray(np.clip(clearance, SQUEEZE * radius, radius))
 
 
 def _spread(flags: Bool, steps: int) -> Bool:

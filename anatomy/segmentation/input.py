@@ -1,4 +1,4 @@
-"""Is this a CT of the chest that can be segmented?  What cannot be is refused, what is doubtful told."""
+"""Whether an image is a CT of the chest that can be segmented: what cannot be is refused, doubts are warned of."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ TRACHEA_MM = 20.0
 def without_larynx(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]:
     """Cut the upper end of the airway off, as far as it is narrower than the trachea.
 
-    Vocal cords that are closed while the breath is held taper the airway to a point, in which no scope
-    would find room although it passes them in fact.
+    Vocal cords that are closed while the breath is held taper the airway to a point, which
+    would be too narrow for any scope, although a scope passes them in fact.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ def _best_gap(near: Int, far: Int, spacing_mm: Float, max_gap_mm: float) -> _Gap
 
 
 def _in_direction(near: Int, far: Int, begin: Int, end: Int, spacing_mm: Float) -> bool:
-    """Tell whether the two sides and the gap between them point about the same way.
+    """Tell whether the two sides and the gap between them point in about the same direction.
 
     A piece must meet the gap with its end, not with its side; one that has no axis (a blob) is joined
     only if it is large.
@@ -156,7 +156,7 @@ def face_connected_line(begin: Int, end: Int) -> Int:
 
 
 def face_paths(step: Int) -> list[list[Int]]:
-    """Return the ways to walk a step to one of the 26 neighbours by faces, as voxels in between."""
+    """Return the paths of a step to one of the 26 neighbours by faces, as voxels in between."""
     axes = [a for a in range(3) if step[a]]
     paths = []
     for order in itertools.permutations(axes):

@@ -11,13 +11,13 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Volume
 from anatomy.tree.branches import Strand, assemble, divide
 from anatomy.tree.cavities import around_cavities
-from anatomy.tree.course import ROUNDS, Course, centred_course, rooted_course
 from anatomy.tree.coverage import complete
 from anatomy.tree.lumen import PreparedLumen, prepare_lumen
 from anatomy.tree.parallel import unite_parallel
 from anatomy.tree.resample import strands_along
 from anatomy.tree.skeleton import prune, spanning_tree, thin
 from anatomy.tree.trachea import find_trachea
+from anatomy.tree.voxel_tree import ROUNDS, VoxelTree, centred, rooted_voxel_tree
 from anatomy.tree.warn import warnings_of
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.typed import Int
@@ -57,13 +57,13 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
     skeleton, rings = spanning_tree(ijk, prepared.lumen, depth, grid.spacing_mm)
     spurs = prune(skeleton, grid.spacing_mm)
     trunk = find_trachea(skeleton, grid.lps_from_ijk[:3, :3] / grid.spacing_mm)
-    course = rooted_course(skeleton, trunk.nodes[0], trunk.nodes[-1], prepared)
-    course = unite_parallel(around_cavities(course, prepared), prepared.lumen)
+    voxel_tree = rooted_voxel_tree(skeleton, trunk.nodes[0], trunk.nodes[-1], prepared)
+    voxel_tree = unite_parallel(around_cavities(voxel_tree, prepared), prepared.lumen)
     # Lines that centring has drawn together are one line too.
-    course = unite_parallel(centred_course(course, prepared, ROUNDS), prepared.lumen)
-    course = centred_course(course, prepared, ROUNDS // 3)
+    voxel_tree = unite_parallel(centred(voxel_tree, prepared, ROUNDS), prepared.lumen)
+    voxel_tree = centred(voxel_tree, prepared, ROUNDS // 3)
     report = TreeReport(
-        gaps_bridged=prepared.gaps + _contacts(course, prepared),
+        gaps_bridged=prepared.gaps + _contacts(voxel_tree, prepared),
         spurs_pruned=tuple(
             SpurPruned(position_lps=grid.lps(ijk[end]), length_mm=length) for end, length in spurs
         ),
@@ -75,7 +75,7 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
         voxels_dropped=prepared.voxels_dropped,
         cavity_voxels=prepared.cavity_voxels,
     )
-    tree = assemble(strands_along(course, prepared, spacing_mm), report)
+    tree = assemble(strands_along(voxel_tree, prepared, spacing_mm), report)
     return replace(tree, report=replace(report, warnings=warnings_of(tree)))
 
 
@@ -131,10 +131,10 @@ def _rooted(neighbours: list[list[int]], root: int) -> tuple[list[int], Int]:
     return order, np.array(parent)
 
 
-def _contacts(course: Course, prepared: PreparedLumen) -> tuple[GapBridged, ...]:
+def _contacts(voxel_tree: VoxelTree, prepared: PreparedLumen) -> tuple[GapBridged, ...]:
     """List the steps between voxels of the lumen that touch by an edge or corner alone."""
-    step = np.flatnonzero(course.across_gap)
-    begin, end = course.ijk[course.parent[step]], course.ijk[step]
+    step = np.flatnonzero(voxel_tree.across_gap)
+    begin, end = voxel_tree.ijk[voxel_tree.parent[step]], voxel_tree.ijk[step]
     at = np.rint(np.stack((begin, end))).astype(np.int64)
     in_lumen = prepared.lumen[at[..., 0], at[..., 1], at[..., 2]].all(axis=0)
     return tuple(

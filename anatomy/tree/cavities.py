@@ -1,27 +1,27 @@
-"""Lead a course around the holes of a lumen mask, through which thinning had laid it."""
+"""Lead a voxel tree around the holes of a lumen mask, through which thinning had laid it."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from anatomy.tree.course import Course, course_of
 from anatomy.tree.depth import inside
 from anatomy.tree.lumen import PreparedLumen
+from anatomy.tree.voxel_tree import VoxelTree, voxel_tree_of
 
-Way = list[tuple[int, ...]]
+VoxelPath = list[tuple[int, ...]]
 
 MARGIN_VOXELS = 6
 
 
-def around_cavities(course: Course, prepared: PreparedLumen) -> Course:
-    """Replace the positions that lie in cavities by ways through the lumen beside them.
+def around_cavities(voxel_tree: VoxelTree, prepared: PreparedLumen) -> VoxelTree:
+    """Replace the positions that lie in cavities by paths through the lumen beside them.
 
     Positions in bridges stay.  A twig that ends in a cavity ends before it.
     """
-    voxel = np.rint(course.ijk).astype(np.int64)
-    in_cavity = ~inside(prepared.lumen, course.ijk) & ~prepared.bridges[tuple(voxel.T)]
+    voxel = np.rint(voxel_tree.ijk).astype(np.int64)
+    in_cavity = ~inside(prepared.lumen, voxel_tree.ijk) & ~prepared.bridges[tuple(voxel.T)]
     if not in_cavity.any():
-        return course
+        return voxel_tree
     ijk: list[tuple[int, ...]] = []
     parent: list[int] = []
     new_index = np.full(len(voxel), -1)
@@ -29,16 +29,16 @@ def around_cavities(course: Course, prepared: PreparedLumen) -> Course:
     for node in range(len(voxel)):
         if in_cavity[node]:
             continue
-        before = int(course.parent[node])
+        before = int(voxel_tree.parent[node])
         while before >= 0 and in_cavity[before]:
-            before = int(course.parent[before])
+            before = int(voxel_tree.parent[before])
         last = int(new_index[before]) if before >= 0 else -1
-        if before >= 0 and before != course.parent[node]:
+        if before >= 0 and before != voxel_tree.parent[node]:
             known = detours.setdefault(last, [last])
-            way = _way(prepared, [ijk[n] for n in known], tuple(voxel[node].tolist()))
-            if way:
-                last = known[[ijk[n] for n in known].index(way[0])]
-            for step in way[1:-1]:
+            path = _path(prepared, [ijk[n] for n in known], tuple(voxel[node].tolist()))
+            if path:
+                last = known[[ijk[n] for n in known].index(path[0])]
+            for step in path[1:-1]:
                 ijk.append(step)
                 parent.append(last)
                 last = len(ijk) - 1
@@ -46,16 +46,16 @@ def around_cavities(course: Course, prepared: PreparedLumen) -> Course:
         ijk.append(tuple(voxel[node].tolist()))
         parent.append(last)
         new_index[node] = len(ijk) - 1
-    trunk_end = course.trunk_end
+    trunk_end = voxel_tree.trunk_end
     while in_cavity[trunk_end]:
-        trunk_end = int(course.parent[trunk_end])
-    return course_of(
+        trunk_end = int(voxel_tree.parent[trunk_end])
+    return voxel_tree_of(
         np.array(ijk, dtype=np.float64), np.array(parent), int(new_index[trunk_end]), prepared.lumen
     )
 
 
-def _way(prepared: PreparedLumen, begins: Way, end: tuple[int, ...]) -> Way:
-    """Find the way by faces through the middle of the lumen from any of `begins` to `end`."""
+def _path(prepared: PreparedLumen, begins: VoxelPath, end: tuple[int, ...]) -> VoxelPath:
+    """Find the path by faces through the middle of the lumen from any of `begins` to `end`."""
     from skimage.graph import MCP_Geometric
 
     corners = np.array([*begins, end])

@@ -1,7 +1,7 @@
 """Add to a skeleton what thinning has lost.
 
 Thinning keeps a line only where it is one voxel wide when its end is met; a tube of even width can be
-eaten from its end, and with it a whole branch.  So every voxel must be near the skeleton, or a way from
+eaten from its end, and with it a whole branch.  So every voxel must be near the skeleton, or a path from
 it to the skeleton is added.
 """
 
@@ -23,7 +23,7 @@ MOST_WAYS = 500
 
 
 def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
-    """Return the skeleton voxels `(M, 3)` with ways to all parts of the mask that they do not reach."""
+    """Return the skeleton voxels `(M, 3)` with paths to all parts of the mask that they do not reach."""
     from scipy import ndimage
 
     if len(skeleton) == 0:
@@ -69,7 +69,7 @@ def _reached(voxels: Int, skeleton: Int, prepared: PreparedLumen) -> Bool:
 
 
 def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -> Int:
-    """Return the new voxels of the way along the middle from the skeleton to the farthest open voxel."""
+    """Return the new voxels of the path along the middle from the skeleton to the farthest open voxel."""
     from scipy.spatial import KDTree
     from skimage.graph import MCP_Geometric
 
@@ -89,8 +89,8 @@ def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -
         end = tuple((target - low).tolist())
         total, _ = search.find_costs([tuple(s) for s in starts.tolist()], [end])
         if np.isfinite(total[end]) or (np.array(cost.shape) == prepared.solid.shape).all():
-            way: Int = np.array(search.traceback(end)[1:]) + low
-            return way
+            path: Int = np.array(search.traceback(end)[1:]) + low
+            return path
         margin = margin * 2
 
 

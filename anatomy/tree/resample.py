@@ -5,26 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.tree.branches import NodeBranch, Strand, divide
-from anatomy.tree.course import Course
 from anatomy.tree.depth import exact_depth_mm, segments_inside
 from anatomy.tree.lumen import PreparedLumen
+from anatomy.tree.voxel_tree import VoxelTree
 from anatomy.typed import Float
 
 CAP_FRACTION = 0.8
 """The trachea begins where the inscribed sphere reaches this fraction of the trachea's radius."""
 
 
-def strands_along(course: Course, prepared: PreparedLumen, spacing_mm: float) -> list[Strand]:
-    """Resample the branches of a course and measure their radius."""
+def strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: float) -> list[Strand]:
+    """Resample the branches of a voxel tree and measure their radius."""
     voxel_mm = prepared.grid.spacing_mm
-    mm = course.ijk * voxel_mm
-    depth = exact_depth_mm(prepared.lumen, voxel_mm, course.ijk)
-    branches = divide(mm, course.parent, depth, course.trunk_end)
+    mm = voxel_tree.ijk * voxel_mm
+    depth = exact_depth_mm(prepared.lumen, voxel_mm, voxel_tree.ijk)
+    branches = divide(mm, voxel_tree.parent, depth, voxel_tree.trunk_end)
     _drop_cap(branches, mm, depth)
-    marks = {b.attach for b in branches} | set(np.flatnonzero(course.across_gap).tolist())
-    marks |= set(course.parent[course.across_gap].tolist())
+    marks = {b.attach for b in branches} | set(np.flatnonzero(voxel_tree.across_gap).tolist())
+    marks |= set(voxel_tree.parent[voxel_tree.across_gap].tolist())
     index = {id(branch): b for b, branch in enumerate(branches)}
-    lines = [_resample(branch, course, prepared, marks, spacing_mm) for branch in branches]
+    lines = [_resample(branch, voxel_tree, prepared, marks, spacing_mm) for branch in branches]
     ends = np.cumsum([len(points) for points, _ in lines])
     radius = np.split(
         exact_depth_mm(prepared.lumen, voxel_mm, np.concatenate([points for points, _ in lines])), ends[:-1]
@@ -56,7 +56,7 @@ def _drop_cap(branches: list[NodeBranch], mm: Float, depth_mm: Float) -> None:
 
 
 def _resample(
-    branch: NodeBranch, course: Course, prepared: PreparedLumen, marks: set[int], spacing_mm: float
+    branch: NodeBranch, voxel_tree: VoxelTree, prepared: PreparedLumen, marks: set[int], spacing_mm: float
 ) -> tuple[Float, dict[int, int]]:
     """Space the points of a branch evenly between the nodes in `marks`, which are kept.
 
@@ -69,10 +69,10 @@ def _resample(
     """
     line = branch.nodes if branch.attach < 0 else [branch.attach, *branch.nodes]
     keep = [n for n in range(len(line)) if n in (0, len(line) - 1) or line[n] in marks]
-    pieces, index, count = [course.ijk[line[:1]]], {line[0]: 0}, 1
+    pieces, index, count = [voxel_tree.ijk[line[:1]]], {line[0]: 0}, 1
     for a, b in zip(keep[:-1], keep[1:], strict=True):
-        fine = course.ijk[line[a : b + 1]]
-        across = b == a + 1 and course.across_gap[line[b]]
+        fine = voxel_tree.ijk[line[a : b + 1]]
+        across = b == a + 1 and voxel_tree.across_gap[line[b]]
         points = fine[1:] if across else _even(fine, prepared, spacing_mm)[1:]
         pieces.append(points)
         count += len(points)

@@ -96,7 +96,7 @@ def _walkable(begin: Int, end: Int, lumen: Bool) -> Bool:
 def span(
     mm: Float, depth_mm: Float, pairs: Int, factor: ArrayLike = 1.0
 ) -> tuple[SkeletonTree, list[tuple[int, int, float]]]:
-    """Span a graph by the tree that keeps to the widest way.
+    """Span a graph by the tree that keeps to the widest path.
 
     An edge costs its length over the squared depth, so that a ring is cut where it is thinnest.
 

@@ -72,10 +72,10 @@ def draw_queries(scenes: Scenes, anatomy: Anatomy) -> list[dict[str, Any]]:
     free: list[dict[str, Any]] = []
     blocked: list[dict[str, Any]] = []
     while len(free) < FREE_QUERIES or len(blocked) < BLOCKED_QUERIES:
-        target, way = targets[rng.integers(len(targets))], rng.standard_normal(3)
-        way /= np.linalg.norm(way)
-        start = (target - rng.uniform(*QUERY_MM) * way).round(3)
-        direction = way + AIM_SPREAD * rng.standard_normal(3)
+        target, ahead = targets[rng.integers(len(targets))], rng.standard_normal(3)
+        ahead /= np.linalg.norm(ahead)
+        start = (target - rng.uniform(*QUERY_MM) * ahead).round(3)
+        direction = ahead + AIM_SPREAD * rng.standard_normal(3)
         direction = (direction / np.linalg.norm(direction)).round(6)
         one = direction[None] / np.linalg.norm(direction)
         if not lung.grid.contains(start[None]).all() or not _clear(lung, start):
@@ -83,9 +83,9 @@ def draw_queries(scenes: Scenes, anatomy: Anatomy) -> list[dict[str, Any]]:
         if not np.isfinite(workspace_lengths(environment, start[None], one, target)).all():
             continue
         blockers, _lengths, _costs = direct_arcs(environment, start[None], one, np.array([-1]), target)
-        kind, room = (free, FREE_QUERIES) if blockers[0] == 0 else (blocked, BLOCKED_QUERIES)
+        kind, most = (free, FREE_QUERIES) if blockers[0] == 0 else (blocked, BLOCKED_QUERIES)
         query = {"start": start.tolist(), "direction": direction.tolist(), "target": target.tolist()}
-        if len(kind) < room and needle_answers(scenes, anatomy, [query], "decide")[0].cost is not None:
+        if len(kind) < most and needle_answers(scenes, anatomy, [query], "decide")[0].cost is not None:
             kind.append(query)
     return free + blocked
 

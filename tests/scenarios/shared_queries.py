@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.support.needle.queries import Judge, Obstacles, hard_queries, load_obstacles
+from experiments.support.needle.queries import Obstacles, Validator, hard_queries, load_obstacles
 from stages.needle.search import base as searches
 from stages.needle.search.planners import PLANNERS
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES
@@ -34,6 +34,6 @@ class SharedQueries:
             if path is None:
                 out.append(Answer(cost=None, digest=""))
                 continue
-            faults = tuple(Judge(environment, query).faults(path))
+            faults = tuple(Validator(environment, query).faults(path))
             out.append(Answer(cost=search.cost, digest=path.arcs.tobytes().hex(), faults=faults))
         return out

@@ -106,7 +106,7 @@ def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
 def join_corners(hu, state, shape, lumen, count):
     """Add the darkest voxels between voxels of the lumen that touch by an edge or corner alone.
 
-    Two voxels that differ by one along two or three axes get a way of faces between them, which lies in the
+    Two voxels that differ by one along two or three axes get a path of faces between them, which lies in the
     box of the two and so not in the border.  `lumen` is `(V,)` int64.  Returns the new count.
     """
     steps = np.zeros(3, dtype=np.int64)
@@ -123,13 +123,13 @@ def join_corners(hu, state, shape, lumen, count):
                     steps[2] = di
                     if here > here + steps.sum() or state[here + steps.sum()] != LUMEN:
                         continue
-                    count = _corner_way(hu, state, here, steps, lumen, count)
+                    count = _corner_path(hu, state, here, steps, lumen, count)
     return count
 
 
 @numba.njit(cache=True)
-def _corner_way(hu, state, here, steps, lumen, count):
-    """Join a voxel to `here + sum of steps` by the face-connected way whose brightest voxel is darkest."""
+def _corner_path(hu, state, here, steps, lumen, count):
+    """Join a voxel to `here + sum of steps` by the face-connected path whose brightest voxel is darkest."""
     best = np.int32(1 << 20)
     first = 0
     second = 0

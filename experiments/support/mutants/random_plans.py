@@ -1,4 +1,4 @@
-"""Random plans: random systems, coarse atlases, targets all over the lung, and all the ways to plan."""
+"""Random plans: random systems, coarse atlases, targets all over the lung, and all planners."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def free_point(lung: Lung, rng: Rng, *, beside_obstacle: bool) -> Float:
 
 
 def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng) -> Iterator[Plan]:
-    """Yield plans by one of the ways to make them; none if there is none."""
+    """Yield plans by a planner drawn at random; none if there is none."""
     objective, seed, kind = (
         str(rng.choice([term.key for term in TERMS])),
         int(rng.integers(2**31)),

@@ -37,7 +37,7 @@ BORDER_MM = 30.0
 GENERATED_RADII_MM = (50.0, 121.0)
 GENERATED_MM = (20.0, 50.0)
 GENERATED_CONE_RAD = 0.5
-ROOM_VOXELS = 3
+AROUND_VOXELS = 3
 EXEMPT_MM = 4.0
 
 
@@ -192,8 +192,8 @@ def generated_queries(obstacles: Obstacles, tree: AirwayTree, count: int, seed: 
 
 
 def _has_clearance(obstacles: Obstacles, target: Float) -> bool:
-    low = np.floor(obstacles.grid.ijk(target)).astype(int) - ROOM_VOXELS
-    high = low + 2 * ROOM_VOXELS + 2
+    low = np.floor(obstacles.grid.ijk(target)).astype(int) - AROUND_VOXELS
+    high = low + 2 * AROUND_VOXELS + 2
     if (low < 0).any() or (high > obstacles.grid.shape).any():
         return False
     return not obstacles.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].any()
@@ -205,7 +205,7 @@ def _poses(folder: Path) -> tuple[tuple[Float, ...], Float]:
     return images.starts, images.targets_lps[0]
 
 
-class Judge:
+class Validator:
     """Walks a path again in small steps and measures to every obstacle voxel's centre.
 
     It shares nothing with the planners but the path's own numbers.

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from typing import Any
 
-from experiments.support.needle.queries import Judge, Query
+from experiments.support.needle.queries import Query, Validator
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.search import base as searches
 from stages.needle.search.base import RestartingRRT
@@ -19,7 +19,7 @@ MARKS_S = (0.01, 0.1, 1.0)
 SLICE = 200
 UNIT = Resolution(fine_mm=1.0, fine_rolls=16)
 
-Problem = tuple[Query, NeedleEnvironment, Judge]
+Problem = tuple[Query, NeedleEnvironment, Validator]
 
 
 def asked(query: Query) -> searches.Query:
@@ -28,7 +28,12 @@ def asked(query: Query) -> searches.Query:
 
 
 def run(
-    make: MakeSearch, environment: NeedleEnvironment, query: Query, seed: int, time_s: float, judge: Judge
+    make: MakeSearch,
+    environment: NeedleEnvironment,
+    query: Query,
+    seed: int,
+    time_s: float,
+    validator: Validator,
 ) -> dict[str, Any]:
     """Run one planner for some CPU time; return when it had which length, and its paths' faults."""
     began = time.process_time()
@@ -41,9 +46,9 @@ def run(
         if search.advance(SLICE) and search.path is not None:
             spent = time.process_time() - began
             first = spent if first is None else first
-            history.append((spent, search.path.length_mm + judge.miss_mm(search.path)))
+            history.append((spent, search.path.length_mm + validator.miss_mm(search.path)))
             aside = time.process_time()
-            faults += judge.faults(search.path)
+            faults += validator.faults(search.path)
             paths += 1
             began += time.process_time() - aside
     return {
@@ -55,7 +60,7 @@ def run(
 
 
 def decide(
-    environment: NeedleEnvironment, query: Query, seed: int, time_s: float, judge: Judge
+    environment: NeedleEnvironment, query: Query, seed: int, time_s: float, validator: Validator
 ) -> dict[str, Any]:
     """Decide a query: a path, a proof that there is none, exhausted at a resolution, or undecided."""
     began = time.process_time()
@@ -64,7 +69,7 @@ def decide(
         decision.advance(SLICE)
     found = {"outcome": decision.outcome, "s": time.process_time() - began, "faults": []}
     if decision.path is not None:
-        found["faults"] = judge.faults(decision.path)
+        found["faults"] = validator.faults(decision.path)
     elif decision.outcome != "no path":
         began = time.process_time()
         search = ResolutionSearch(environment, asked(query), resolution=UNIT)
@@ -95,11 +100,11 @@ def recheck(problems: list[Problem], wanted: int) -> tuple[int, Counter[str]]:
     count, faults, seed = 0, Counter[str](), 0
     while count < wanted and problems:
         seed += 1
-        for query, environment, judge in problems:
+        for query, environment, validator in problems:
             search = RestartingRRT(environment, asked(query), seed=seed)
             for _ in range(3):
                 if search.advance(5000) and search.path is not None:
-                    faults.update(judge.faults(search.path))
+                    faults.update(validator.faults(search.path))
                     count += 1
             if count >= wanted:
                 break

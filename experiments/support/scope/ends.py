@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from anatomy.lung import Lung
-from experiments.support.scope.goals import end_goals, ends, goal_with_room
+from experiments.support.scope.goals import end_goals, ends, goal_with_clearance
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, joints
@@ -45,24 +45,24 @@ class Wall:
         gap = np.maximum(np.abs(local[:, None] - self._centres[index]) - 0.5 * self._spacing, 0.0)
         return np.sqrt((gap**2).sum(axis=2)).min(axis=1)
 
-    def room_mm(self, path: ScopePath) -> np.ndarray:
+    def clearance_mm(self, path: ScopePath) -> np.ndarray:
         """Return for every pose by how much its tip, and its share of the shaft, clear the scope's radius."""
         share = np.arange(0.0, 1.0, self.SPACING_MM / path.model.link_mm)[:, None]
-        room = np.zeros(path.count)
+        clearance = np.zeros(path.count)
         chains = joints(path.model, path.states)
         for number in range(path.count):
             ends = zip(chains[number, :-1], chains[number, 1:], strict=True)
             points = [a + share * (b - a) for a, b in ends] + [chains[number, -1:]]
             if number:
                 points.append(np.array([path.between(number, f)[9:12] for f in (0.25, 0.5, 0.75)]))
-            room[number] = self.distance_mm(np.concatenate(points)).min() - path.model.radius_mm
-        return room
+            clearance[number] = self.distance_mm(np.concatenate(points)).min() - path.model.radius_mm
+        return clearance
 
 
 def success(lung: Lung, radii: tuple[float, ...], retreats: int) -> list[dict[str, Any]]:
     """Return for every radius how many airway ends are reached, and how near the others are come to."""
     lumen, rows = lumen_of_lung(lung), []
-    judge = Wall(lumen)
+    wall = Wall(lumen)
     fields = [(goal, navigation_field(lumen, goal.voxel)) for goal in end_goals(lumen, lung)]
     for radius in radii:
         model = ScopeModel(radius_mm=radius, twist_low_deg=-90.0, bend_low_deg=-120.0)
@@ -76,9 +76,9 @@ def success(lung: Lung, radii: tuple[float, ...], retreats: int) -> list[dict[st
             reached += path.reached
             left.append(path.distance_mm)
             far += path.reached or path.potentials[path.nearest] <= field.potential[fits].min() + 1.0
-            room = judge.room_mm(path)
-            touching += int((room < 0.0).sum())
-            least = min(least, float(room.min()))
+            clearance = wall.clearance_mm(path)
+            touching += int((clearance < 0.0).sum())
+            least = min(least, float(clearance.min()))
             poses += path.count
         rows.append(
             {
@@ -86,7 +86,7 @@ def success(lung: Lung, radii: tuple[float, ...], retreats: int) -> list[dict[st
                 "near": int((np.array(left) <= NEAR_MM).sum()),
                 "as_far_as_a_ball": int(far),
                 "median_left_mm": float(np.median(left)),
-                "touching_poses": touching, "least_room_mm": least, "poses": poses,
+                "touching_poses": touching, "least_clearance_mm": least, "poses": poses,
                 "s_per_end": (time.process_time() - began) / len(fields),
             }
         )  # fmt: skip
@@ -99,7 +99,7 @@ def touching(lung: Lung, seeds: list[int]) -> dict[str, Any]:
     state = start_state(lumen, lung.tree, model)
     poses = touched = violating = paths_touched = paths = 0
     for point in ends(lung):
-        goal = goal_with_room(lumen, lung, point, model, 0)
+        goal = goal_with_clearance(lumen, lung, point, model, 0)
         advisor = Advisor(lumen, model, goal, PathSettings(retreats=0), reproduction=True)
         strict = ScopeEnvironment(model=model, field=advisor.field)
         for seed in seeds:

@@ -47,7 +47,7 @@ def end_goals(lumen: Lumen, lung: Lung) -> list[Goal]:
     return [goal_at(lumen, lung.tree.points_lps[point]) for point in ends(lung)]
 
 
-def goal_with_room(lumen: Lumen, lung: Lung, point: int, model: ScopeModel, spare_voxels: int) -> Goal:
+def goal_with_clearance(lumen: Lumen, lung: Lung, point: int, model: ScopeModel, spare_voxels: int) -> Goal:
     """Return the last voxel before an airway's end with so many voxels of clearance more than eq. 1 asks."""
     end = goal_at(lumen, lung.tree.points_lps[point])
     field = navigation_field(lumen, end.voxel, metric="voxels")

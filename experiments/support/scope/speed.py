@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.lung import Lung
 from experiments.support.machine import median_cpu_s
 from experiments.support.results import Result
-from experiments.support.scope.goals import PAPER_VOXELS, end_goals, ends, goal_with_room, paper_sized
+from experiments.support.scope.goals import PAPER_VOXELS, end_goals, ends, goal_with_clearance, paper_sized
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import best_motion
 from stages.scope.advisor.kinematics import ScopeModel
@@ -23,7 +23,7 @@ FIELD_S, MOTION_S, PATH_S = 10.0, 0.3, 31.0
 LOOK_AHEAD_MM = 5.0
 ARRIVED_MM = 0.5 * LOOK_AHEAD_MM + 0.5
 """By the printed rules a scope stops where its look-ahead goes as far beyond the goal as it is before it."""
-ROOM_VOXELS = 2
+SPARE_VOXELS = 2
 SPARE_MM = 0.25
 
 
@@ -31,7 +31,7 @@ def measure_speed(result: Result, lung: Lung, repeats: int) -> None:
     """Add rows for the field, the best motion and paths."""
     lumen, model = paper_sized(lung), ScopeModel()
     result.add("interior voxels", float(lumen.count), float(PAPER_VOXELS), note=f"{lung.name}, resampled")
-    goals = [goal_with_room(lumen, lung, point, model, ROOM_VOXELS) for point in ends(lung)]
+    goals = [goal_with_clearance(lumen, lung, point, model, SPARE_VOXELS) for point in ends(lung)]
     field_s = median_cpu_s(lambda: navigation_field(lumen, goals[0].voxel, metric="voxels"), repeats)
     result.add("navigation function with clearance", field_s, FIELD_S, "s")
     for rules, reproduction in (("printed rules", True), ("true radius", False)):
@@ -68,7 +68,7 @@ def _measure_rules(
 
 
 def _measure_retreats(result: Result, lumen: Lumen, lung: Lung, repeats: int) -> None:
-    """Measure paths with retreats, by true radius, to the last voxels with a little room to spare."""
+    """Measure paths with retreats, by true radius, to the last voxels with a little clearance to spare."""
     model = ScopeModel(twist_low_deg=-90.0, bend_low_deg=-120.0)
     state = start_state(lumen, lung.tree, model)
     width = lumen.width_from(lumen.nearest_voxel(lung.tree.carina_lps)[0])

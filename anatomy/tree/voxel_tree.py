@@ -1,4 +1,4 @@
-"""Lay a smooth, centred course through the lumen that never leaves it."""
+"""Lay a smooth, centred voxel tree through the lumen that never leaves it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HALVINGS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Course:
+class VoxelTree:
     """A rooted tree of positions, parents before children.
 
     Parameters
@@ -43,10 +43,10 @@ class Course:
     trunk_end: int
 
 
-def rooted_course(tree: SkeletonTree, root: int, trunk_end: int, prepared: PreparedLumen) -> Course:
+def rooted_voxel_tree(tree: SkeletonTree, root: int, trunk_end: int, prepared: PreparedLumen) -> VoxelTree:
     """Hang the skeleton on its root and walk every diagonal step by faces inside the lumen."""
     ijk: list[Int] = [tree.ijk[root]]
-    parent, course_trunk_end = [-1], 0
+    parent, last_of_trunk = [-1], 0
     stack = [(root, -1, 0)]
     while stack:
         node, came_from, at = stack.pop()
@@ -59,16 +59,16 @@ def rooted_course(tree: SkeletonTree, root: int, trunk_end: int, prepared: Prepa
                 parent.append(last)
                 last = len(ijk) - 1
             if other == trunk_end:
-                course_trunk_end = last
+                last_of_trunk = last
             stack.append((other, node, last))
-    return course_of(np.array(ijk, dtype=np.float64), np.array(parent), course_trunk_end, prepared.lumen)
+    return voxel_tree_of(np.array(ijk, dtype=np.float64), np.array(parent), last_of_trunk, prepared.lumen)
 
 
-def course_of(ijk: Float, parent: Int, trunk_end: int, lumen: Bool) -> Course:
-    """Make a course and mark the steps that leave the lumen."""
+def voxel_tree_of(ijk: Float, parent: Int, trunk_end: int, lumen: Bool) -> VoxelTree:
+    """Make a voxel tree and mark the steps that leave the lumen."""
     across = np.zeros(len(ijk), dtype=bool)
     across[1:] = ~segments_inside(lumen, ijk[parent[1:]], ijk[1:])
-    return Course(ijk=ijk, parent=parent, across_gap=across, trunk_end=trunk_end)
+    return VoxelTree(ijk=ijk, parent=parent, across_gap=across, trunk_end=trunk_end)
 
 
 def _between(begin: Int, end: Int, prepared: PreparedLumen) -> list[Int]:
@@ -81,23 +81,23 @@ def _between(begin: Int, end: Int, prepared: PreparedLumen) -> list[Int]:
     return []
 
 
-def centred_course(course: Course, prepared: PreparedLumen, rounds: int) -> Course:
+def centred(voxel_tree: VoxelTree, prepared: PreparedLumen, rounds: int) -> VoxelTree:
     """Move the positions to the middle of the lumen and smooth them, every step staying inside.
 
     Root, tips and both sides of a gap stay where they are.
     """
-    fixed = course.across_gap.copy()
-    fixed[course.parent[course.across_gap]] = True
+    fixed = voxel_tree.across_gap.copy()
+    fixed[voxel_tree.parent[voxel_tree.across_gap]] = True
     fixed[0] = True
-    fixed |= np.bincount(course.parent[1:], minlength=len(fixed)) == 0
+    fixed |= np.bincount(voxel_tree.parent[1:], minlength=len(fixed)) == 0
     spacing = prepared.grid.spacing_mm
-    average = _neighbour_average(course.parent)
-    mm = course.ijk * spacing
+    average = _neighbour_average(voxel_tree.parent)
+    mm = voxel_tree.ijk * spacing
     base = mm.copy()
     for _ in range(rounds):
-        mm += _centring_step(mm, course.parent, prepared.depth_mm, spacing) * ~fixed[:, None]
+        mm += _centring_step(mm, voxel_tree.parent, prepared.depth_mm, spacing) * ~fixed[:, None]
         mm += SMOOTHING * (average @ mm - mm) * ~fixed[:, None]
-    return _kept_inside(course, base / spacing, mm / spacing, prepared.lumen)
+    return _kept_inside(voxel_tree, base / spacing, mm / spacing, prepared.lumen)
 
 
 def _neighbour_average(parent: Int) -> Any:
@@ -116,7 +116,7 @@ def _neighbour_average(parent: Int) -> Any:
 
 
 def _centring_step(mm: Float, parent: Int, depth_mm: Float32, spacing_mm: Float) -> Float:
-    """Return a small step up the depth, perpendicular to the course."""
+    """Return a small step up the depth, perpendicular to the voxel tree."""
     from scipy.ndimage import map_coordinates
 
     voxel = float(spacing_mm.min())
@@ -134,17 +134,17 @@ def _centring_step(mm: Float, parent: Int, depth_mm: Float32, spacing_mm: Float)
     return gradient * (CENTRING_STEP_VOXELS * voxel)
 
 
-def _kept_inside(course: Course, base: Float, wanted: Float, lumen: Bool) -> Course:
+def _kept_inside(voxel_tree: VoxelTree, base: Float, wanted: Float, lumen: Bool) -> VoxelTree:
     """Draw positions back towards the skeleton until every step that can be inside is inside."""
     share = np.ones(len(base))
-    child = np.flatnonzero(~course.across_gap & (course.parent >= 0))
-    parent = course.parent[child]
+    child = np.flatnonzero(~voxel_tree.across_gap & (voxel_tree.parent >= 0))
+    parent = voxel_tree.parent[child]
     while True:
         ijk = base + share[:, None] * (wanted - base)
         bad = ~segments_inside(lumen, ijk[parent], ijk[child])
         bad &= (share[parent] > 0) | (share[child] > 0)
         if not bad.any():
-            return replace(course, ijk=ijk)
+            return replace(voxel_tree, ijk=ijk)
         touched = np.unique(np.concatenate((parent[bad], child[bad])))
         share[touched] /= 2
         share[share < 0.5**HALVINGS] = 0.0

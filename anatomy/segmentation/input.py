@@ -1,4 +1,4 @@
-"""Whether an image is a CT of the chest that can be segmented: what cannot be is refused, doubts are warned of."""
+"""Whether an image is a CT of the chest that can be segmented: refused where not, warned of where in doubt."""
 
 from __future__ import annotations
 

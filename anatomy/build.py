@@ -24,6 +24,7 @@ FORMAT = 3
 """Version of the processing: raise it when the same images give another lung."""
 
 PAD_VOXELS = 2
+"""One voxel around the lungs must be outside of them, and the fields look one farther."""
 
 NEIGHBOURS = 8
 """Centreline points that are looked at to find the branch of an airway voxel."""

@@ -18,6 +18,7 @@ from anatomy.kernels import field as kernel
 from anatomy.typed import Array, Float, Mask, UInt16
 
 MAX_STORED = np.iinfo(np.uint16).max
+"""Distances from this on, 256 mm, are stored as it: no device looks so far."""
 
 SOLID = 0.5
 """Obstacles are voxels as solid boxes."""
@@ -27,7 +28,9 @@ CENTRES = 0.0
 GEOMETRY_SHAPE = (3, 6)
 
 ROUNDING_MM = 2e-5
+"""Bounds the rounding of a stored distance below 256 mm in single precision."""
 FLOAT32_ROUNDING = 2.0**-24
+"""Half a unit in the last place of 1 in single precision."""
 
 
 def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:

@@ -12,7 +12,9 @@ from anatomy.errors import FrameError, GridMismatchError
 from anatomy.typed import Array, Bool, Float
 
 ORTHONORMAL_TOLERANCE = 1e-4
+"""Headers store directions in single precision with six digits or so."""
 AFFINE_TOLERANCE = 1e-9
+"""The last row of a homogeneous matrix is exact in every format."""
 
 
 def read_only(array: Array) -> Array:

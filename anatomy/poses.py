@@ -14,7 +14,10 @@ from anatomy.typed import Float
 ANTERIOR = np.array([0.0, -1.0, 0.0])
 SUPERIOR = np.array([0.0, 0.0, 1.0])
 NEARLY_PARALLEL = 0.9
+"""Within 26 degrees of the anterior axis the superior one is taken, so that the cross product is never
+small."""
 SHORTEST = 1e-9
+"""A shorter vector has no direction in double precision."""
 
 
 def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = None) -> Float:

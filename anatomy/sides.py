@@ -12,7 +12,9 @@ from anatomy.grid import Grid
 from anatomy.typed import Array, Float, Int32, Mask
 
 COARSE_VOXEL_MM = 2.4
+"""The lungs are told apart on voxels of about this side: fast, and finer than any gap that matters."""
 NECK_WIDTHS_MM = (0.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
+"""Erosions that are tried in turn: none if the lungs do not touch, up to the width of a broad bridge."""
 
 SMALLER_LUNG_SHARE = 0.1
 """The smaller of two lungs holds at least this share of the larger one."""

@@ -11,6 +11,7 @@ import math
 import numba
 
 SMALL_ANGLE = 1e-4
+"""Below it the series is exact to double precision, and the quotient is not."""
 
 
 @numba.njit(cache=True)

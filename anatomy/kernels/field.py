@@ -34,6 +34,7 @@ import numpy as np
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, OUTSIDE
 
 UNITS_PER_MM = 256.0
+"""A unit is 4 micrometres, far below a voxel, and 256 mm fit into uint16."""
 
 MIN_GAP_MM = 0.005
 """A proof that walks along a curve gives up where less clearance than this is to spare."""

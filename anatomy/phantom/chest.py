@@ -22,7 +22,9 @@ LOBES = {
 }
 
 CAGE_CENTRE_Z = -95.0
+"""Height below the carina at which the rib cage is widest."""
 EDGE_ROUNDING_MM = 9.0
+"""Lungs have no sharp edges; rounder ones would lose the recesses beside the heart."""
 
 
 def _bump(u: Array, centre: float, width: float) -> Array:

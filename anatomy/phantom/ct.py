@@ -9,14 +9,23 @@ from anatomy.phantom.rasterize import LABELS, Canvas
 from anatomy.typed import Array, Float32
 
 AIR_HU = -1000.0
+"""By definition of the scale."""
 PARENCHYMA_HU = -860.0
+"""Lung after breathing in."""
 GRAVITY_HU_PER_MM = 0.35
+"""Lung is denser towards the back of a patient who lies on it: about 70 HU over 200 mm."""
 WALL_HU = 0.0
+"""Walls are soft tissue that thin airways share with air."""
 SOLID_HU = 40.0
+"""Blood without contrast medium, and nodules."""
 FISSURE_HU, FISSURE_THICKNESS_MM = -400.0, 0.6
+"""A fissure is a double layer of pleura, thinner than a voxel."""
 TISSUE_HU = {"background": AIR_HU, "soft_tissue": 20.0, "mediastinum": 30.0, "heart": 40.0, "bone": 420.0}
+"""Usual values of these tissues."""
 BLUR_SIGMA_MM = 0.6
+"""Point spread of a usual reconstruction kernel: about 1.4 mm full width at half maximum."""
 LEAST_HU, GREATEST_HU = -1024, 3071
+"""Range of a CT of 12 bits."""
 
 
 def simulate_ct(canvas: Canvas, noise_hu: float, rng: np.random.Generator) -> Volume:

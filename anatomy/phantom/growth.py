@@ -20,11 +20,18 @@ from anatomy.typed import Float
 Clearance = Callable[[Float], Float]
 
 FEWEST_POINTS = 4
+"""A part with fewer points has no middle worth growing to."""
 SMALLEST_SHARE = 0.2
+"""No branch supplies less of its parent's points: real forks are this uneven at most."""
 STEP_MM = 1.5
+"""Distance of the points of a line: below the radius of all but the thinnest tubes, so that none has gaps."""
 DIAMETER_WEIGHT, DISTANCE_WEIGHT = 0.42, 0.22
+"""A branch's length is a mean of what its diameter and the distance ask for, set so that lengths are about
+three diameters."""
 PLEURA_MARGIN_MM = 1.0
+"""Tubes keep this far from the border of their lobe: a voxel of the usual CT."""
 ASIDE_RAD = (0.25, 0.5, 0.75)
+"""Turns that are tried in order around an obstacle, up to 43 degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 NODULE_OWNER = -1
+"""Nodules belong to no branch."""
 
 
 @njit(cache=True)

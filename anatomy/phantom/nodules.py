@@ -12,10 +12,15 @@ from anatomy.phantom.territory import Territory
 from anatomy.typed import Float
 
 LEAST_PLEURA_MM, GREATEST_PLEURA_MM = 5.0, 30.0
+"""Nodules of the outer third of the lung, which a bronchoscope cannot reach by itself."""
 LEAST_RADIUS_MM, GREATEST_RADIUS_MM = 3.0, 8.0
+"""From 6 mm across, where a nodule is followed up, to 16 mm."""
 TUBE_GAP_MM = 2.0
+"""A needle passes between a nodule and the next tube."""
 NODULE_GAP_MM = 25.0
+"""Nodules are far enough from each other to be targets of their own."""
 TUBES_LOOKED_AT = 8
+"""The tube with the nearest surface is among so many of the nearest centres, as radii differ little."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -24,9 +24,13 @@ from anatomy.typed import Mask
 
 Size = Literal["adult", "small"]
 SCALES: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 0.7})
+"""A small patient is a child of about ten years."""
 DEFAULT_SPACING_MM: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 1.25})
+"""As a usual reconstruction; coarser for the small patient, which tests are run on."""
 FINEST_MM, COARSEST_MM = 0.3, 2.5
+"""Finer voxels would take more memory than a workstation has; coarser ones cannot hold the bronchi."""
 GREATEST_NOISE_HU = 200.0
+"""Ten times the noise of a diagnostic CT."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -16,12 +16,19 @@ from anatomy.typed import Float, UInt8
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
 GAPLESS_RADIUS = 0.87
 AIRWAY_LIMIT_MM, VESSEL_LIMIT_MM = 1.8, 1.3
+"""Thinner lumens and vessels are not to be seen in a usual CT."""
 THINNEST_WALL_MM = 0.5
+"""About the wall of a bronchus of 2 mm."""
 CENTRAL_ARTERY_RADII_MM = (12.5, 9.5, 9.5)
+"""Pulmonary trunk, right and left pulmonary artery of an adult."""
 CENTRAL_BRANCHES = 3
+"""The trunk and the two main branches come first in the list."""
 CENTRAL_VEIN_MM = 6.0
+"""Veins from this diameter on lie outside the lung and may be drawn there."""
 VESSEL_GAP_MM = 0.3
+"""Tissue between a vessel and what it passes: thinner than a voxel, so that some touch, as in a CT."""
 NODULE_NEIGHBOUR_MM = 1.4
+"""Only tubes of a larger radius keep nodules away: thin ones run into them in patients, too."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -28,9 +28,13 @@ LABELS = {
     "bone": 11,
 }
 SLAB = 4
+"""Planes that are drawn at once: the arrays of a slab fit into the processor's cache."""
 HILUM_LPS = {-1.0: (-20.0, 5.0, -32.0), 1.0: (36.0, 8.0, -32.0)}
+"""Where bronchi and vessels enter the lungs of an adult, by the sign of x."""
 HILUM_WITHOUT_FISSURE_MM = 26.0
+"""Fissures end at the hilum, where the lobes hang together."""
 RIB_DISTANCE_MM, RIB_HEIGHT_MM, RIB_SLOPE = 25.0, 9.0, 0.45
+"""Distance, height and slope of ribs, about those of an adult."""
 
 
 @dataclass(kw_only=True, eq=False)

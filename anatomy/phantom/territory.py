@@ -11,7 +11,9 @@ from anatomy.phantom.chest import LOBES, Chest
 from anatomy.typed import Float, Float32, UInt8
 
 MAP_SPACING_MM = 3.0
+"""Fine enough for the borders of lobes, whose exact place the drawing decides."""
 TISSUE_PER_POINT_MM = 6.6
+"""Side of the cube that a point stands for: about as large as what a terminal branch of the tree supplies."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

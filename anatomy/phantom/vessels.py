@@ -13,11 +13,15 @@ from anatomy.phantom.territory import Territory
 from anatomy.typed import Bool, Float, Int
 
 SHEATH_MM = 0.5
+"""Arteries and airways share a sheath: about this much tissue lies between them."""
 OTHER_SIDE_SHARE = 0.3
+"""An artery changes sides only where this share of its radius is gained: they rarely do."""
 TRUNK_KNOTS = ((14.0, -46.0, -58.0), (10.0, -40.0, -40.0), (6.0, -31.0, -23.0))
+"""Points of the central vessels of an adult, LPS mm from the carina, as in atlases."""
 RIGHT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (-6.0, -22.0, -24.0))
 LEFT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (18.0, -17.0, -2.0), (30.0, 2.0, 3.0))
 LEFT_ARTERY_SIDE = (0.3, 0.7, 0.65)
+"""The left artery runs above and behind its bronchus, the right one in front."""
 RIGHT_ARTERY_SIDE = (0.0, -1.0, 0.0)
 RIGHT_MAIN, LEFT_MAIN = 1, 2
 CENTRAL_ARTERIES = ("pulmonary trunk", "right pulmonary artery", "left pulmonary artery")
@@ -32,10 +36,15 @@ LOBAR_VEINS = {
 }
 ATRIUM_LPS = (5.0, 8.0, -60.0)
 FAR_SHARE = 0.5
+"""Veins grow in the half of a lobe that is farther from airways: they run between segments."""
 RELAX_ROUNDS = 60
+"""Most vessels are free after 20 rounds; the last ones become thinner instead."""
 NEIGHBOURS = 12
+"""Enough of the nearest balls that the one whose surface is nearest is among them."""
 WATCHED_NEIGHBOURS = 6
+"""Points that may be pushed by their neighbours in the next round."""
 SQUEEZE = 0.5
+"""A vessel keeps at least half of its radius where it must pass between others."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 
 BOX_MARGIN_MM = 3.0
+"""More than the wall reaches beyond the lumen."""
 EDGE_MM = 3.0
 """How far the wall may lie from the rough central airway."""
 SMOOTH_MM = 0.6
@@ -28,6 +29,7 @@ SMOOTH_MM = 0.6
 NOISE_PERCENTILE = 97.0
 """So much of the lung lies below the shallowest minimum that is followed."""
 LEAST_DEPTH_HU = 20.0
+"""Below it the map holds only the noise of a low-dose CT."""
 SAMPLE_STEP = 7
 """Every so many voxels of the lung are looked at to learn its noise."""
 GREATEST_HU = 16_383

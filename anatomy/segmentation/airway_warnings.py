@@ -9,7 +9,9 @@ from anatomy.grid import Volume
 from anatomy.typed import Mask
 
 LEAST_TRACHEA_MM = 25.0
+"""A chest CT shows at least a quarter of the trachea, which is about 100 mm long."""
 LEAST_ENDS = 4
+"""A lung has three lobes or two, and some segments of each are always seen."""
 LEAST_SHARE = 0.2
 """A lung with fewer ends than this share of the other's has lost most of its airways."""
 GREATEST_LOOPS_SHARE = 0.25

@@ -12,6 +12,7 @@ from anatomy.segmentation.lungs import Lungs
 from anatomy.typed import Array, Int
 
 BOX_PAD_MM = 10.0
+"""More than any filter of the segmentation looks beyond a voxel of the lung."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

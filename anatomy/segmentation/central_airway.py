@@ -14,15 +14,20 @@ from anatomy.typed import Float, Int, Mask
 COLUMN_HU = -850.0
 """The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`."""
 COLUMN_MEDIAN_HU = -920.0
+"""The middle of a trachea is nearly pure air; lung is above this."""
 COLUMN_AREA_MM2 = (40.0, 800.0)
 """Cross-sections of a trachea, up to where it widens to the carina."""
 GREATEST_ELONGATION = 2.5
+"""A trachea that is flattened by breathing out is still rounder than this."""
 FROM_MIDLINE_MM = 50.0
+"""A trachea that is pushed aside stays within this distance of the middle of the image."""
 SHORTEST_COLUMN_MM = 20.0
+"""Bowel and emphysema hold shorter columns of air as wide as a trachea."""
 SEED_SHARE = 0.3
 """How far down the column the seed lies."""
 
 GROWTH_HU = tuple(float(t) for t in range(-960, -699, 20))
+"""Thresholds of the growth, from pure air to where every airway would leak into the lung."""
 GREATEST_STEP_SHARE, GREATEST_STEP_ML = 0.5, 12.0
 """Growing by more than both from one threshold to the next is a leak into the lung."""
 GREATEST_ML = 180.0

@@ -14,11 +14,15 @@ from anatomy.typed import Float, Int32, Mask
 GREATEST_LUNG_HU = -200.0
 """Denser than any inflated lung: trays, clamps, the heart."""
 LUNG_FROM_AIR_HU = 40.0
+"""Lung is at least this much above the air around it: several times the noise."""
 SMALLEST_LUNG_ML = 150.0
+"""As for lungs in a chest."""
 AIRWAY_CLOSING_MM = 15.0
 """Airways open to the outside of the lung are closed over this width before its hull is filled."""
 AIRWAY_BELOW_HU = -920.0
+"""Only air of a wide airway is below it; inflated lung is above."""
 LEAST_AIRWAY_RADIUS_MM = 2.5
+"""The main bronchus of a small lung has this radius; bullae in the lung rarely have."""
 
 
 def coarse_lung_ex_vivo(

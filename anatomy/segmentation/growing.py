@@ -18,9 +18,11 @@ AIR_HU = -1024
 GREATEST_LUMEN_ML = 400.0
 """More than the airways of any patient hold; what would make more is a leak."""
 FIRST_LEVEL_HU = 600.0
+"""Only the trachea and main bronchi are darker than their walls by this much."""
 LEVEL_RATIO = 0.92
 """Each level of the growth lies this much below the one before."""
 LEAST_LAYERS = 4
+"""A piece of fewer layers is too short to tell a leak from a fork."""
 FRONT_FACTOR, FRONT_SLACK_MM2 = 3.0, 200.0
 """A piece has burst whose front is this much larger than where it began."""
 WIDE_MM2 = 20.0
@@ -34,8 +36,9 @@ EDGE_MM = 1.2
 """The edge of a lumen is blurred over about so much."""
 
 WALL_LEAST_HU = -600.0
+"""T_abs of the paper: what is darker is lung or air, not wall."""
 WALL_DIFFERENCE_HU = 10.0
-"""T_abs and T_dif of the paper."""
+"""T_dif of the paper: from one layer of the wall to the next the CT falls by more than noise."""
 WALL_MM = 2.0
 """The wall reaches no farther than this beyond its first layer."""
 

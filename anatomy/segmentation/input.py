@@ -1,4 +1,4 @@
-"""Whether an image is a CT of the chest that can be segmented: refused where not, warned of where in doubt."""
+"""Whether an image is a CT of the chest that can be segmented: refused if not, warned of if in doubt."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ from anatomy.grid import Volume
 from anatomy.typed import Array
 
 AIR_HU, TISSUE_HU = -700.0, (-200.0, 200.0)
+"""Air of lungs and outside lies below, and soft tissue between the two others."""
 LEAST_SHARE = 0.002
 """Air and soft tissue each fill at least this share of a CT of the chest."""
 LEAST_PRESENT_HU = -400.0
 """The lowest value of an image whose offset of -1000 is missing is about 0, and above this."""
 LEAST_SIZE_MM = 100.0
+"""The lung of a small child is about so large."""
 SPACING_MM = (0.2, 2.5)
 """Sizes of voxels within a slice that are not doubted."""
 THICK_SLICE_MM = 3.0
+"""Segmental bronchi are 3 to 4 mm wide: thicker slices lose them."""
 THICKEST_SLICE_MM = 10.0
+"""Slices of routine scans end here; beyond, not even lobar bronchi are to be seen."""
 ODD_HU = 5000.0
 """Metal reaches the 3071 HU of most scanners; more than this is another scale."""
 

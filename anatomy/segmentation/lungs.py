@@ -23,7 +23,9 @@ from anatomy.typed import Float32, Int, Int32, Mask
 Progress = Callable[[str], None]
 
 FIRST_THRESHOLD_HU = -500.0
+"""Half-way between air and tissue: lungs of any CT are below it."""
 THRESHOLD_RANGE_HU = (-600.0, -300.0)
+"""The middle between lung and tissue of healthy and of dense lungs lies in this range."""
 TISSUE_HU = (-150.0, 250.0)
 """Soft tissue: its median is one side of the threshold, that of the lung the other."""
 
@@ -33,7 +35,9 @@ WALL_MM = 2.0
 """What is this close to the lumen of trachea and main bronchi is their wall, not lung."""
 
 SMALLEST_LUNG_ML = 150.0
+"""The smallest lung of a child after breathing out is about this large; bowel gas is less."""
 SMALLER_SHARE = 0.1
+"""A lung has at least this share of the other's volume; a smaller piece of air is something else."""
 GAS_HU, GAS_PERCENTILE = -975.0, 25.0
 """A piece is gas in the bowel, not lung, if this share of it lies below."""
 

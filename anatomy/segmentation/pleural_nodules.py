@@ -11,6 +11,7 @@ from anatomy.typed import Int, Mask
 NOTCH_MM = 12.0
 """Ball of the wider closing: notches of up to about 24 mm across become lung."""
 BELOW_HULL_MM = 15.0
+"""Half the diameter of the largest nodule that is not called a mass, 30 mm."""
 FROM_OTHER_LUNG_MM = 40.0
 """A notch of the chest wall lies near the convex hull of both lungs and far from the other lung; what does
 not may be the heart, the aorta or the hilum, and stays outside."""

@@ -13,9 +13,11 @@ from anatomy.grid import Grid, Volume
 from anatomy.segmentation.steps import Parts
 
 WIDENING = 1.6
+"""A bronchus is never so much wider than its parent; a leak is."""
 LEAST_WIDE_MM = 2.5
 """A branch this much wider than its parent, and at least so wide, looks like a leak into the lung."""
 USUAL_LUNGS_L = (1.5, 9.0)
+"""From a child to a large adult after breathing in."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,6 +18,7 @@ RING_VOXELS = (1.4, 2.0)
 N_PLACES = 400
 """In so many places of the lung it is learnt how much of a tube appears where there is none."""
 LEAST_PLACES = 50
+"""From fewer places no spread can be told."""
 LOOKED_AT = 100
 """So many voxels are looked at for each place."""
 WAY_STEP = 7
@@ -35,6 +36,7 @@ WALL_HU = 60.0
 END_REACH_MM = 2.0
 """No lumen so near to an end is farther from the trachea."""
 MOST_STARTS = 4096
+"""An airway has some hundred ends, each with six places behind it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 VESSEL_THRESHOLD = 0.25
 """Fixed on made cylinders and the phantom, see docs/segmentation.md."""
 LARGE_RADIUS_MM = 2.0 * math.sqrt(2.0)
+"""The scale of the paper's list next to the radius of 2.5 mm that it calls large."""
 REFERENCE_HU, BRIGHTEST_HU = 300.0, 200.0
 """I_ref and I_max of R_L."""
 LARGE_RESPONSE = 0.3
@@ -29,6 +30,7 @@ LARGE_RESPONSE = 0.3
 LEAST_LARGE_MM3 = 350.0
 """1000 voxels of 0.7 mm."""
 SIGMA_TOLERANCE_MM = 1e-6
+"""Rounding of scales that are given as decimals."""
 BLOOD_HU = 40.0
 """Blood without contrast medium."""
 SOLID_SHARE, EDGE_SHARE = 0.5, 0.35

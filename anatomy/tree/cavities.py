@@ -11,6 +11,8 @@ from anatomy.tree.voxel_tree import VoxelTree, voxel_tree_of
 VoxelPath = list[tuple[int, ...]]
 
 MARGIN_VOXELS = 6
+"""A path around a cavity is sought in the box of its ends and this many voxels more, wider than cavities
+are."""
 
 
 def around_cavities(voxel_tree: VoxelTree, prepared: PreparedLumen) -> VoxelTree:

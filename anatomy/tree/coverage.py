@@ -19,7 +19,9 @@ END_RADII = 1.5
 """At an end, a flat cap has its rim at 1.4 radii."""
 
 SLACK_VOXELS = 2.0
-MOST_WAYS = 500
+"""Roughness of the mask by so many voxels beyond the skeleton's spheres is no branch."""
+MOST_PATHS = 500
+"""An airway has some hundred branches; more paths than that come from noise in the mask."""
 
 
 def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
@@ -39,7 +41,7 @@ def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
     label = labels[tuple((missed - low).T)]
     for part in range(1, count + 1):
         open_voxels = missed[label == part]
-        for _ in range(MOST_WAYS):
+        for _ in range(MOST_PATHS):
             open_voxels = open_voxels[~_reached(open_voxels, skeleton, prepared)]
             if len(open_voxels) == 0:
                 break

@@ -11,6 +11,7 @@ from anatomy.tree_report import LoopOpened, TreeReport
 from anatomy.typed import Float, Int
 
 SAME_POINT_MM = 1e-3
+"""Files store points in single precision; true neighbours are a hundred times farther apart."""
 
 
 def spanned_graph(

@@ -15,12 +15,17 @@ LOOP_EDGES = 12
 """A ring of fewer skeleton voxels is roughness of the mask, not two airways that touch."""
 
 CONTACT_COST = 100.0
+"""A step across a mere contact counts as this many steps in the lumen: it is taken only where nothing else
+joins."""
 
 SPUR_VOXELS = 1.5
+"""A branch this far beyond the surface of its parent's sphere, or less, is roughness of the mask."""
 SPUR_RADII = 0.5
+"""The same as a share of the sphere's radius: wide airways have larger bumps."""
 SPUR_MAX_RADII = 3.0
+"""A branch longer than this many radii of its parent and `SPUR_MAX_MM` is no spur, wherever its tip lies."""
 SPUR_MAX_MM = 3.0
-"""A branch longer than this many radii of its parent and mm is no spur, wherever its tip lies."""
+"""Even the thinnest airways that a CT shows are longer than this."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,6 +21,7 @@ ADULT_RADIUS_MM = 5.0
 """The least radius of an adult trachea; lobar bronchi are thinner, and must not pass for one by size."""
 
 MIN_LENGTH_RADII = 3.0
+"""A trachea is about twelve radii long; of one that the image cuts, a quarter is enough to know it by."""
 MIN_CHILD_LENGTH_RADII = 6.0
 """A trachea is about 12 radii long at any age; bronchi are 4 to 7 [Weibel1963]."""
 

@@ -17,8 +17,11 @@ ROUNDS = 30
 """Rounds of centring and smoothing; together they reach about 4 voxels and smooth over about 2 mm."""
 
 CENTRING_STEP_VOXELS = 0.25
+"""Steps so short cannot jump across the middle of the lumen."""
 SMOOTHING = 0.5
+"""Each point moves half-way to the mean of its neighbours: more would let a line swing to and fro."""
 HALVINGS = 4
+"""A step that leaves the lumen is halved so often before it is given up: a sixteenth of it is nothing."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

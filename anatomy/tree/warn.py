@@ -10,7 +10,10 @@ ADULT_TRACHEA_MM = (5.0, 14.0)
 """Radii between which the trachea of an adult lies, wide disease included."""
 
 MAIN_LENGTH_RATIO = 0.8
+"""The left main bronchus is about twice as long as the right one; less than this share of it means a
+mirrored image."""
 SHORT_TRACHEA_RADII = 6.0
+"""A trachea is about twelve radii long; below half of that it is taken for cut."""
 
 
 def warnings_of(tree: AirwayTree) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ BACK_MM = np.array([3.0, 6.0])
 """The direction of an end is that from the middle of the lumen so far behind it: beyond the last voxels,
 which are ragged, and before the next fork."""
 SIDE_MM = 1.5
+"""Thin branches part farther from each other than this: none is missed between two places."""
 SIDES = 6
 """So many places, so far apart, behind an end are searched for the other branch of a fork: over 9 mm, as long
 as a thin branch."""

@@ -24,6 +24,7 @@ STATION_MM = 0.65
 LENGTH_MM = STATIONS * STATION_MM
 HALF = STATIONS // 2
 ANGLES = 8
+"""On a ring of two voxels' radius they are as far apart as voxels are."""
 ACROSS = np.stack([f(2.0 * np.pi * np.arange(ANGLES) / ANGLES) for f in (np.cos, np.sin)])
 OFFSETS_MM = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 """Where a stretch may begin beside the point it is sought from: the end of a lumen is known to a voxel."""

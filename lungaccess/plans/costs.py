@@ -40,4 +40,5 @@ def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> 
 def _obstacles(lung: Lung, with_fissures: bool) -> Obstacles:
     """Return the arrays of a lung as a `NeedleEnvironment` holds them."""
     bits = obstacle_bits(with_fissures)
-    return lung.obstacle_field(with_fissures=with_fissures).corners, lung.labels, lung.geometry, bits
+    field = lung.obstacle_field(with_fissures=with_fissures)
+    return Obstacles(field.corners, lung.labels, lung.geometry, bits)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from stages.needle import (
     CURVATURE,
     NO_MAP,
     ArcPath,
+    Limits,
     NeedleEnvironment,
     Objective,
     ObjectiveArrays,
@@ -31,8 +33,27 @@ from stages.needle import (
 from stages.scope import ScopeTip
 from stages.tube import Deployment, TubeJudge
 
-NeedleArrays = tuple[Obstacles, Float, ObjectiveArrays, bool, Float32]
-"""A needle among obstacles for the compiled kernels; see `lungaccess.coupled.kernels.candidate`."""
+
+class NeedleArrays(NamedTuple):
+    """A needle among obstacles, and what its path is to keep small, for the compiled kernels.
+
+    Parameters
+    ----------
+    obstacles : Obstacles
+    limits : Limits
+    objective : ObjectiveArrays
+    has_forbidden_voxels : bool
+        Whether a cost map forbids voxels, by infinite costs, that the objective does not weigh.
+    forbidden_map : (ni, nj, nk) float32
+        That cost map.
+    """
+
+    obstacles: Obstacles
+    limits: Limits
+    objective: ObjectiveArrays
+    has_forbidden_voxels: bool
+    forbidden_map: Float32
+
 
 BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"), (AIRWAY, "an airway"))
 """Names of obstacles; the first one of a voxel counts."""
@@ -126,7 +147,7 @@ class CandidateEvaluator:
         costs, objective = self.task.lung.cost, self.objective
         unseen = costs is not None and not objective.weighs_map and not np.isfinite(costs.array).all()
         forbidden = costs.array if unseen and costs is not None else NO_MAP
-        return (
+        return NeedleArrays(
             self.environment.obstacles,
             self.environment.limits,
             self.environment.objective_arrays(objective),

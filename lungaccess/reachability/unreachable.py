@@ -26,7 +26,6 @@ from lungaccess.reachability.kernels.unreachable import (
     rule_out,
 )
 from stages.needle import needle_environment
-from stages.needle.kernels import GOAL_TOLERANCE, REQUIRED
 from stages.scope import LEAVING_MM, MAX_TURN_AT_TIP_RAD, find_sites
 from stages.tube import tube_constants
 from stages.tube.kernels import MAX_EXTENSION
@@ -107,7 +106,7 @@ class UnreachableProof:
         )
         # Corners are rounded down, and between them a bound lacks at most half a diagonal of a voxel.
         self._loss_mm = 0.5 * float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
-        self._free = _free_regions(lung, float(self._limits[REQUIRED]), self._loss_mm, with_fissures)
+        self._free = _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)
         reach_mm = float(self._insertions.max())
         self._pieces = list(_pieces(lung, system, leaving, reach_mm))
 
@@ -168,7 +167,7 @@ class UnreachableProof:
             )
         lumen, leaving, hazards = self._masks
         depth = lung.lumen_depth
-        near = _near(lung, target, float(self._limits[GOAL_TOLERANCE]) + self._loss_mm)
+        near = _near(lung, target, self._limits.goal_tolerance_mm + self._loss_mm)
         regions = np.unique(self._free[near])
         passable = np.isin(self._free, regions[regions > 0])
         return (

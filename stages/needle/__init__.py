@@ -13,15 +13,16 @@ if TYPE_CHECKING:
     from stages.needle.device import Needle as Needle
     from stages.needle.environment import RRT_STEP_MM as RRT_STEP_MM
     from stages.needle.environment import NeedleEnvironment as NeedleEnvironment
-    from stages.needle.environment import Obstacles as Obstacles
     from stages.needle.environment import direct_arcs as direct_arcs
     from stages.needle.environment import needle_environment as needle_environment
     from stages.needle.environment import workspace_lengths as workspace_lengths
+    from stages.needle.kernels.cost import ObjectiveArrays as ObjectiveArrays
+    from stages.needle.kernels.limits import Limits as Limits
+    from stages.needle.kernels.proof import Obstacles as Obstacles
     from stages.needle.objective import NO_MAP as NO_MAP
     from stages.needle.objective import SHORTEST as SHORTEST
     from stages.needle.objective import TERMS as TERMS
     from stages.needle.objective import Objective as Objective
-    from stages.needle.objective import ObjectiveArrays as ObjectiveArrays
     from stages.needle.path import CURVATURE as CURVATURE
     from stages.needle.path import ArcPath as ArcPath
     from stages.needle.path import arc_transform as arc_transform

@@ -11,8 +11,8 @@ from anatomy.fields import corner_geometry
 from anatomy.grid import Grid, Volume
 from anatomy.kernels import field as field_kernel
 from anatomy.typed import Float, Int
-from stages.needle.environment import Obstacles
 from stages.needle.kernels import cost as kernel
+from stages.needle.kernels.proof import Obstacles
 from stages.needle.objective import TERMS, Term
 from stages.needle.path import ArcPath, _kernel_arcs
 
@@ -22,15 +22,15 @@ EXACT_BELOW_VOXELS = 8.0
 bound is less than 0.6 % off."""
 
 
-def obstacle_clearance_mm(arrays: Obstacles, points: Float) -> Float:
+def obstacle_clearance_mm(obstacles: Obstacles, points: Float) -> Float:
     """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle.
 
     Parameters
     ----------
-    arrays : tuple
+    obstacles : Obstacles
         See `NeedleEnvironment`: obstacles are taken as solid boxes or voxel centres as stated there.
     """
-    field, labels, geometry, bits = arrays
+    field, labels, geometry, bits = obstacles
     places = np.array(points, dtype=np.float64, order="C")
     clearance = np.zeros(len(places))
     field_kernel.bounds_at(field, geometry, places, clearance)
@@ -42,7 +42,7 @@ def obstacle_clearance_mm(arrays: Obstacles, points: Float) -> Float:
     return clearance
 
 
-def inverse_clearance(arrays: Obstacles, path: ArcPath) -> float:
+def inverse_clearance(obstacles: Obstacles, path: ArcPath) -> float:
     """Return the integral of 1 / clearance over the length of a path [Kuntz2015, eq. 1].
 
     By the trapezoid rule with steps of at most 0.1 mm; clearance is that of the needle's axis, no less than
@@ -50,11 +50,11 @@ def inverse_clearance(arrays: Obstacles, path: ArcPath) -> float:
 
     Parameters
     ----------
-    arrays : tuple
+    obstacles : Obstacles
         See `NeedleEnvironment`.
     """
     points, lengths = path.sample(SAMPLE_MM)
-    clearance = np.maximum(obstacle_clearance_mm(arrays, points), kernel.CLEARANCE_FLOOR_MM)
+    clearance = np.maximum(obstacle_clearance_mm(obstacles, points), kernel.CLEARANCE_FLOOR_MM)
     return float(np.trapezoid(1.0 / clearance, lengths))
 
 
@@ -95,7 +95,7 @@ def voxel_sum(cost_map: Volume | None, path: ArcPath) -> float:
 
 
 _EVALUATED: dict[str, Callable[[Obstacles, Volume | None, ArcPath], float]] = {
-    "inverse_clearance": lambda arrays, _map, path: inverse_clearance(arrays, path),
+    "inverse_clearance": lambda obstacles, _map, path: inverse_clearance(obstacles, path),
     "cost_map": lambda _arrays, cost_map, path: map_integral(cost_map, path),
     "voxel_sum": lambda _arrays, cost_map, path: voxel_sum(cost_map, path),
     "length_mm": lambda _arrays, _map, path: path.length_mm,
@@ -103,13 +103,13 @@ _EVALUATED: dict[str, Callable[[Obstacles, Volume | None, ArcPath], float]] = {
 
 
 def path_costs(
-    arrays: Obstacles, cost_map: Volume | None, path: ArcPath, terms: Iterable[Term] = TERMS
+    obstacles: Obstacles, cost_map: Volume | None, path: ArcPath, terms: Iterable[Term] = TERMS
 ) -> dict[str, float]:
     """Return costs of a path by their keys, exactly; see `stages.needle.objective.TERMS`.
 
     Parameters
     ----------
-    arrays : tuple
+    obstacles : Obstacles
         See `NeedleEnvironment`.
     cost_map : Volume or None
         Without a map its costs are 0.
@@ -117,7 +117,7 @@ def path_costs(
     terms : iterable of Term
         Which costs.
     """
-    return {term.key: _EVALUATED[term.key](arrays, cost_map, path) for term in terms}
+    return {term.key: _EVALUATED[term.key](obstacles, cost_map, path) for term in terms}
 
 
 def _crossings(grid: Grid, path: ArcPath) -> tuple[Int, Float]:

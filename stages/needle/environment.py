@@ -16,11 +16,11 @@ from anatomy.margins import Margins
 from anatomy.structures import OBSTACLES, obstacle_bits
 from anatomy.typed import Float, Int, Labels
 from stages.needle.device import Needle
-from stages.needle.kernels import limits as index
 from stages.needle.kernels import scan
-from stages.needle.objective import Objective, ObjectiveArrays
-
-Obstacles = tuple[Labels, Labels, Float, int]
+from stages.needle.kernels.cost import ObjectiveArrays
+from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Obstacles
+from stages.needle.objective import Objective
 
 RRT_STEP_MM = 20.0
 COST_STEP_MM = 0.5
@@ -40,10 +40,8 @@ class NeedleEnvironment:
         Distance that the needle's axis keeps from obstacles.
     goal_tolerance_mm : float
         How far from the target a path may end.
-    obstacles : tuple
-        Clearance field, labels, geometry and obstacle bits, for the kernels.
-    limits : (N_LIMITS,) float64
-        See `stages.needle.kernels.limits`.
+    obstacles : Obstacles
+    limits : Limits
     cost_map : Volume or None
         Cost of a mm of path at each voxel, on `grid`; infinite is an obstacle.
     """
@@ -53,7 +51,7 @@ class NeedleEnvironment:
     required_clearance_mm: float
     goal_tolerance_mm: float
     obstacles: Obstacles
-    limits: Float
+    limits: Limits
     cost_map: Volume | None
     _objectives: dict[Objective, ObjectiveArrays] = field(default_factory=dict, init=False, repr=False)
 
@@ -155,24 +153,25 @@ def _environment(
     for name, value in (("required clearance", required_mm), ("goal tolerance", goal_tolerance_mm)):
         if not 0.0 <= value < math.inf:
             raise SettingsError(f"The {name} is {value} mm", expected="a finite length of 0 or more")
-    limits = np.zeros(index.N_LIMITS)
-    limits[index.KAPPA] = needle.max_curvature_per_mm
-    limits[index.MAX_LENGTH] = needle.max_length_mm
-    limits[index.MAX_ANGLE] = math.radians(needle.max_angle_from_start_deg)
-    limits[index.MAX_TURN] = math.radians(needle.max_accumulated_turn_deg)
-    limits[index.REQUIRED] = required_mm
-    limits[index.RADIUS] = needle.radius_mm
-    limits[index.EXEMPT_LENGTH] = needle.exit_exemption_mm
-    limits[index.MAX_STEP] = RRT_STEP_MM
-    limits[index.COST_STEP] = COST_STEP_MM
-    limits[index.GOAL_TOLERANCE] = max(goal_tolerance_mm - ROUNDING_MM, 0.0)
+    limits = Limits(
+        kappa=float(needle.max_curvature_per_mm),
+        max_length_mm=float(needle.max_length_mm),
+        max_angle_rad=math.radians(needle.max_angle_from_start_deg),
+        max_turn_rad=math.radians(needle.max_accumulated_turn_deg),
+        required_mm=float(required_mm),
+        radius_mm=float(needle.radius_mm),
+        exempt_mm=float(needle.exit_exemption_mm),
+        max_step_mm=RRT_STEP_MM,
+        cost_step_mm=COST_STEP_MM,
+        goal_tolerance_mm=max(float(goal_tolerance_mm) - ROUNDING_MM, 0.0),
+    )
     return NeedleEnvironment(
         grid=grid,
         needle=needle,
         required_clearance_mm=required_mm,
         goal_tolerance_mm=goal_tolerance_mm,
-        obstacles=(clearance.corners, labels, clearance.geometry, bits),
-        limits=read_only(limits),
+        obstacles=Obstacles(clearance.corners, labels, clearance.geometry, bits),
+        limits=limits,
         cost_map=cost_map,
     )
 

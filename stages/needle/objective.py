@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.suggestion import did_you_mean
-from anatomy.typed import Float, Float32
+from anatomy.typed import Float32
 
-ObjectiveArrays = tuple[Float, Float32]
+if TYPE_CHECKING:
+    from stages.needle.kernels.cost import ObjectiveArrays
 
 MAX_CLEARANCE_MM = 256.0
 """No clearance field holds more, so that 1 / clearance has a least value."""
@@ -205,7 +207,7 @@ class Objective:
             If the objective weighs a map, and there is none, or one with negative costs, NaN, or no finite
             cost.
         """
-        from stages.needle.kernels import cost as index
+        from stages.needle.kernels.cost import ObjectiveArrays
 
         least_of_map = 0.0
         if not self.weighs_map:
@@ -223,15 +225,15 @@ class Objective:
                     f"The least cost of the cost map is {least_of_map:g}",
                     expected="costs of 0 or more, some of them finite, and no NaN",
                 )
-        weights = np.zeros(index.N_WEIGHTS)
-        weights[index.INVERSE_CLEARANCE] = self.inverse_clearance
-        weights[index.MAP_INTEGRAL] = self.cost_map
-        weights[index.LENGTH] = self.length
-        weights[index.VOXEL_SUM] = self.voxel_sum
-        weights[index.LEAST_RATE] = (
-            self.inverse_clearance / MAX_CLEARANCE_MM + self.cost_map * least_of_map + self.length
+        least_rate = self.inverse_clearance / MAX_CLEARANCE_MM + self.cost_map * least_of_map + self.length
+        return ObjectiveArrays(
+            inverse_clearance=float(self.inverse_clearance),
+            map_integral=float(self.cost_map),
+            length=float(self.length),
+            voxel_sum=float(self.voxel_sum),
+            least_rate=float(least_rate),
+            cost_map=cost_map,
         )
-        return weights, cost_map
 
 
 def _term(name: str) -> Term:
@@ -256,4 +258,4 @@ def _number(weight: str, stated: str) -> float:
 
 
 SHORTEST = Objective(length=1.0)
-"""Needle paths as a person steers them: roll, then insert along an arc."""
+"""The length of the path alone."""

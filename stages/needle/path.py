@@ -14,7 +14,6 @@ from anatomy.grid import read_only
 from anatomy.kernels import arcs as arc_kernels
 from anatomy.typed import Float, Int
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import least_cosine
 from stages.needle.kernels.cost import inverse_clearance_on_arc
@@ -159,7 +158,7 @@ def blocker_on_path(environment: NeedleEnvironment, path: ArcPath, branch: int) 
 
 def estimated_inverse_clearance(environment: NeedleEnvironment, path: ArcPath) -> float:
     """Return the integral of 1 / clearance along a path from the kernel's estimate of distances."""
-    step = environment.limits[index.COST_STEP]
+    step = environment.limits.cost_step_mm
     return float(
         sum(
             inverse_clearance_on_arc(environment.obstacles, step, pose, bend, length)

@@ -21,7 +21,6 @@ from experiments.support.cost_map.inflation import (
 )
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
-from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path
@@ -99,7 +98,7 @@ class TestInflatedSpace:
         ellipsoid = (steps.astype(float) ** 2 / axes**2).sum(axis=-1) <= 1 + 1e-12
         for bit in (VESSEL, AIRWAY):
             expected = ndimage.binary_dilation((canvas.labels & bit) != 0, structure=ellipsoid)
-            assert np.array_equal((environment.obstacles[1] & bit) != 0, expected)
+            assert np.array_equal((environment.obstacles.labels & bit) != 0, expected)
 
     def test_voxels_of_infinite_cost_are_obstacles(self) -> None:
         canvas = Canvas.empty([-10] * 3, [10] * 3, 1.0)
@@ -109,26 +108,24 @@ class TestInflatedSpace:
         assert environment.cost_map is not None
         barred = np.isinf(environment.cost_map.array)
         assert barred.sum() == 33, "a ball of radius 2 voxels"
-        assert np.array_equal(barred, environment.obstacles[1] == OUTSIDE)
+        assert np.array_equal(barred, environment.obstacles.labels == OUTSIDE)
         assert blocker_on_path(environment, along_z(1.5, 0.5), -1) == OUTSIDE
         assert (environment.cost_map.array[~barred] == 0.5).all()
 
     def test_the_rest_stays(self) -> None:
         before = single_voxel(1.5)
         after = inflated_environment(before)
-        assert before.limits[index.LOOKUP_STEP] == 0.0 and before.obstacles[1].sum() == VESSEL
-        assert (
-            after.limits[index.LOOKUP_STEP] == after.limits[index.MAX_STEP] == largest_step_mm([1] * 3, 1.5)
-        )
+        assert before.limits.lookup_step_mm == 0.0 and before.obstacles.labels.sum() == VESSEL
+        assert after.limits.lookup_step_mm == after.limits.max_step_mm == largest_step_mm([1] * 3, 1.5)
         assert after.grid is before.grid and after.needle is before.needle and after.cost_map is None
-        assert after.obstacles[0] is before.obstacles[0]
+        assert after.obstacles.clearance is before.obstacles.clearance
 
     def test_only_the_ends_of_steps_are_looked_up(self) -> None:
         """A slab one voxel thick lies between them, whatever its clearance."""
         environment = inflated_environment(single_voxel(1.5))
-        labels = np.zeros_like(environment.obstacles[1])
+        labels = np.zeros_like(environment.obstacles.labels)
         labels[:, :, 10] = VESSEL
-        arrays = (environment.obstacles[0], labels, *environment.obstacles[2:])
+        arrays = (environment.obstacles.clearance, labels, *environment.obstacles[2:])
         for low, found in ((-1.2, 0), (0.2, VESSEL), (-2.0, VESSEL)):
             pose = (0.0, 0.0, low, 0.0, 0.0, 1.0)
             assert (

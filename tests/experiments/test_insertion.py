@@ -135,7 +135,7 @@ class TestTheNeedle:
         plan = planned(BALL, AROUND)
         made = simulate(BALL, AROUND, plan, Errors(curvature_bias=0.02), closed_loop=False, seed=1)
         points = np.ascontiguousarray(made.lps_from_tip[:, :3, 3])
-        gap = brute_clearance(BALL.obstacles[1], BALL.grid, points, OBSTACLES, 30.0).min()
+        gap = brute_clearance(BALL.obstacles.labels, BALL.grid, points, OBSTACLES, 30.0).min()
         assert made.clearance_mm == pytest.approx(gap - BALL.needle.radius_mm, abs=1e-9)
 
     def test_a_plan_longer_than_the_needle_is_out_of_length(self) -> None:

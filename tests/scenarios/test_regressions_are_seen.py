@@ -11,7 +11,6 @@ import pytest
 import lungaccess as la
 from lungaccess.plans import evaluator
 from stages.needle.environment import NeedleEnvironment, needle_environment
-from stages.needle.kernels.limits import REQUIRED
 from tests.scenarios import runs
 from tests.scenarios.cases import CASES, COST_TOLERANCE, NEEDLE_PLANNERS
 from tests.scenarios.runs import answer_for, dearer, lost
@@ -55,8 +54,7 @@ def test_a_planner_without_the_clearance_test_is_refused(
 ) -> None:
     def careless_environment(*arguments: Any, **options: Any) -> NeedleEnvironment:
         environment = needle_environment(*arguments, **options)
-        limits = environment.limits.copy()
-        limits[REQUIRED] = 0.0
+        limits = environment.limits._replace(required_mm=0.0)
         return replace(environment, limits=limits, required_clearance_mm=0.0)
 
     monkeypatch.setattr(evaluator, "needle_environment", careless_environment)

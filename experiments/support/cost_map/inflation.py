@@ -21,7 +21,7 @@ from anatomy.inflation import grown_by_voxels, inflation_voxels
 from anatomy.structures import OUTSIDE
 from anatomy.typed import Int
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
+from stages.needle.kernels.proof import Obstacles
 from stages.needle.path import ArcPath, blocker_on_path
 
 LEAST_STEP_MM = 1e-3
@@ -84,13 +84,12 @@ def inflated_environment(environment: NeedleEnvironment) -> NeedleEnvironment:
         bits |= OUTSIDE if barred.any() else 0
         values = np.where(grown != 0, np.float32(math.inf), costs.array)
         costs = Volume(grid=costs.grid, array=np.asfortranarray(values, dtype=np.float32))
-    limits = environment.limits.copy()
-    limits[index.LOOKUP_STEP] = step
-    limits[index.MAX_STEP] = min(step, limits[index.MAX_STEP])
+    limits = environment.limits
+    limits = limits._replace(lookup_step_mm=step, max_step_mm=min(step, limits.max_step_mm))
     return replace(
         environment,
-        obstacles=(field, read_only(grown), geometry, bits),
-        limits=read_only(limits),
+        obstacles=Obstacles(field, read_only(grown), geometry, bits),
+        limits=limits,
         cost_map=costs,
     )
 
@@ -110,7 +109,7 @@ def refuting_labels(environment: NeedleEnvironment, paths: Iterable[ArcPath], br
     SettingsError
         If the environment is itself of the paper's mode.
     """
-    if environment.limits[index.LOOKUP_STEP] > 0.0:
+    if environment.limits.lookup_step_mm > 0.0:
         raise SettingsError(
             "Paths cannot be proved in an environment of inflated obstacles",
             expected="the environment from which it was made",

@@ -57,7 +57,7 @@ def candidates(case: Case, rng: np.random.Generator) -> Iterator[Query]:
     5 mm or more below the pleura, and no single arc leads to it.
     """
     environment, inner = case.environment, case.inner_lps
-    lung = np.asfortranarray((environment.obstacles[1] & OUTSIDE) == 0)
+    lung = np.asfortranarray((environment.obstacles.labels & OUTSIDE) == 0)
     depth = edt.edt(lung, anisotropy=tuple(environment.grid.spacing_mm), order="F")
     tissue = np.argwhere(depth > PLEURA_MM)
     while True:

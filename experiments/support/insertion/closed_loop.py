@@ -22,7 +22,7 @@ from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import LENGTH, ROLL, ArcPath, arc_transform, bend_direction
-from stages.needle.replanning.escaping import structure_name, with_limit
+from stages.needle.replanning.escaping import structure_name, with_limits
 from stages.needle.replanning.reaiming import pose_at
 from stages.needle.replanning.replanner import (
     DEFAULT_SETTINGS,
@@ -95,7 +95,7 @@ class _Needle:
     """The true needle: where its tip is, and whether it has hit something."""
 
     def __init__(self, environment: NeedleEnvironment, query: Query, truth: Truth) -> None:
-        self._environment = with_limit(environment, index.REQUIRED, environment.needle.radius_mm)
+        self._environment = with_limits(environment, required_mm=environment.needle.radius_mm)
         self._branch = query.branch
         self._truth = truth
         self.frame = np.array(query.lps_from_start)
@@ -245,7 +245,7 @@ def simulate(
             f"A simulation has a step of {step_mm} mm, a tolerance of {tolerance_mm} mm and a gain of {gain}",
             expected="a finite step above 0, a finite tolerance of at least 0, a gain above 0 and at most 1",
         )
-    longest_mm = float(environment.limits[index.MAX_LENGTH])
+    longest_mm = environment.limits.max_length_mm
     truth = Truth(errors, query, longest_mm - query.inserted_mm, seed)
     needle, belief, commands = _Needle(environment, query, truth), _Belief(query, gain), _Commands(plan)
     replanner = Replanner(
@@ -323,9 +323,7 @@ def _smallest_clearance(environment: NeedleEnvironment, branch: int, points: Flo
     field, labels, geometry, bits = environment.obstacles
     bounds = np.zeros(len(points))
     bounds_at(field, geometry, np.ascontiguousarray(points), bounds)
-    in_exit = (
-        (lengths < environment.limits[index.EXEMPT_LENGTH]) if branch >= 0 else np.zeros(len(points), bool)
-    )
+    in_exit = (lengths < environment.limits.exempt_mm) if branch >= 0 else np.zeros(len(points), bool)
     cap = float(bounds.min()) + 1.0
     while True:
         least = cap

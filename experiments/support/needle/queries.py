@@ -213,7 +213,7 @@ class Validator:
 
     def __init__(self, environment: NeedleEnvironment, query: Query) -> None:
         # From outside an obstacle, the nearest of its voxels has a free neighbour.
-        self._solid = (environment.obstacles[1] & OBSTACLES) != 0
+        self._solid = (environment.obstacles.labels & OBSTACLES) != 0
         surface = self._solid & ~binary_erosion(self._solid, border_value=1)
         self._tree = cKDTree(environment.grid.lps(np.argwhere(surface).astype(float)))
         self._environment = environment

@@ -1,11 +1,10 @@
 """Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
-`tube` is the tuple (scene, constants) of `stages.tube.kernels.deployment`.  `needle` is the tuple (obstacles,
-limits, objective, whether voxels of infinite cost exist that the objective does not see, a cost map) of
-`stages.needle.kernels`.  A choice has two parts.  `x` holds a row of `scope_poses`, the rotation in rad, and
-the insertions of outer and inner tube in mm.  `vias` are points (LPS mm) through which single arcs lead from
-the tube to the target.  A row of `scope_poses` (9,) is a scope tip: point, unit tangent, and the unit vector
-across the tangent from which the rotation counts.
+`tube` is the tuple (scene, constants) of `stages.tube.kernels.deployment`, `needle` a
+`lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x` holds a row of `scope_poses`, the
+rotation in rad, and the insertions of outer and inner tube in mm.  `vias` are points (LPS mm) through which
+single arcs lead from the tube to the target.  A row of `scope_poses` (9,) is a scope tip: point, unit
+tangent, and the unit vector across the tangent from which the rotation counts.
 """
 
 from __future__ import annotations
@@ -17,11 +16,6 @@ import numpy as np
 from anatomy.kernels.arcs import arc_to_point, normal_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels import (
-    COST_STEP,
-    KAPPA,
-    MAX_ANGLE,
-    MAX_LENGTH,
-    MAX_TURN,
     blocker_on_arc,
     cost_of_arc,
     least_cosine,
@@ -76,12 +70,12 @@ def _tube_tip(constants, base, normal, outer, inner):
 @inner_kernel
 def _needle_cost(needle, pose, vias, count, target, cost_limit):
     """Return the cost of the arcs through `count` vias; infinite beyond a limit or from `cost_limit` on."""
-    obstacles, limits, objective, sees_walls, walls = needle
+    limits = needle.limits
     length = 0.0
     turn = 0.0
     cost = 0.0
     start = pose
-    cosine = math.cos(limits[MAX_ANGLE] * (1.0 - ROUNDING))
+    cosine = math.cos(limits.max_angle_rad * (1.0 - ROUNDING))
     for m in range(count + 1):
         goal = target
         if m < count:
@@ -90,9 +84,9 @@ def _needle_cost(needle, pose, vias, count, target, cost_limit):
         length += arc
         turn += angle
         if (
-            bend[0] > limits[KAPPA] * (1.0 - ROUNDING)
-            or length > limits[MAX_LENGTH] * (1.0 - ROUNDING)
-            or turn > limits[MAX_TURN] * (1.0 - ROUNDING)
+            bend[0] > limits.kappa * (1.0 - ROUNDING)
+            or length > limits.max_length_mm * (1.0 - ROUNDING)
+            or turn > limits.max_turn_rad * (1.0 - ROUNDING)
             or arc < SHORTEST_ARC_MM
         ):
             return math.inf
@@ -100,11 +94,13 @@ def _needle_cost(needle, pose, vias, count, target, cost_limit):
         aside = bend[1] * start[3] + bend[2] * start[4] + bend[3] * start[5]
         if least_cosine(forward, aside, angle) < cosine:
             return math.inf
-        cost += cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, arc, m == 0)
+        cost += cost_of_arc(needle.obstacles, needle.objective, limits.cost_step_mm, pose, bend, arc, m == 0)
         if not cost < cost_limit:
             return math.inf
-        if sees_walls and map_costs_on_arc(walls, obstacles[2], pose, bend, arc, m == 0)[0] == math.inf:
-            return math.inf
+        if needle.has_forbidden_voxels:
+            geometry = needle.obstacles.geometry
+            if map_costs_on_arc(needle.forbidden_map, geometry, pose, bend, arc, m == 0)[0] == math.inf:
+                return math.inf
         if m < count:
             pose = pose_on_arc(pose, bend, arc)
     return cost
@@ -113,14 +109,13 @@ def _needle_cost(needle, pose, vias, count, target, cost_limit):
 @inner_kernel
 def _needle_clear(needle, pose, vias, count, target, branch):
     """Tell whether all arcs through the vias are proved clear."""
-    obstacles, limits, _objective, _sees_walls, _walls = needle
     length = 0.0
     for m in range(count + 1):
         goal = target
         if m < count:
             goal = (vias[m, 0], vias[m, 1], vias[m, 2])
         arc, bend, _angle = arc_to_point(pose, goal)
-        if blocker_on_arc(obstacles, limits, pose, bend, arc, length, branch) != 0:
+        if blocker_on_arc(needle.obstacles, needle.limits, pose, bend, arc, length, branch) != 0:
             return False
         length += arc
         pose = pose_on_arc(pose, bend, arc)

@@ -1,6 +1,6 @@
 """Compiled kernels of the coupled search: lower bounds of the cost, and the cost of many direct arcs.
 
-`needle` is that of `lungaccess.coupled.kernels.candidate`.
+`needle` is a `lungaccess.plans.evaluator.NeedleArrays`.
 """
 
 from __future__ import annotations
@@ -14,14 +14,6 @@ from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_estimate
 from stages.needle.kernels import (
     CLEARANCE_FLOOR_MM,
-    COST_STEP,
-    INVERSE_CLEARANCE,
-    KAPPA,
-    LEAST_RATE,
-    LENGTH,
-    MAX_ANGLE,
-    MAX_LENGTH,
-    MAX_TURN,
     blocker_on_arc,
     cost_of_arc,
 )
@@ -33,10 +25,10 @@ PRUNED_BY_BOUND = -2
 @inner_kernel
 def _clearance_bound(needle, x, y, z):
     """Return a distance in mm that the clearance at a point does not exceed."""
-    obstacles, _limits, _objective, _sees_walls, _walls = needle
-    geometry = obstacles[2]
+    geometry = needle.obstacles.geometry
     diagonal = math.sqrt(geometry[0, 4] + geometry[1, 4] + geometry[2, 4])
-    return max(distance_estimate(obstacles[0], geometry, x, y, z) + diagonal, CLEARANCE_FLOOR_MM)
+    estimate = distance_estimate(needle.obstacles.clearance, geometry, x, y, z)
+    return max(estimate + diagonal, CLEARANCE_FLOOR_MM)
 
 
 @inner_kernel
@@ -50,13 +42,13 @@ def _cost_bound(needle, begin_mm, end_mm, length):
     begin_mm, end_mm : float
         Clearance at the two ends, or more.
     """
-    weights = needle[2][0]
-    cost = weights[LENGTH] * length
-    if weights[INVERSE_CLEARANCE] > 0.0:
+    objective = needle.objective
+    cost = objective.length * length
+    if objective.inverse_clearance > 0.0:
         middle = min(max(0.5 * (length + end_mm - begin_mm), 0.0), length)
         total = math.log(1.0 + middle / begin_mm) + math.log(1.0 + (length - middle) / end_mm)
-        cost += weights[INVERSE_CLEARANCE] * total
-    return max(cost, weights[LEAST_RATE] * length)
+        cost += objective.inverse_clearance * total
+    return max(cost, objective.least_rate * length)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -93,7 +85,7 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
     float
         The cost of the cheapest clear arc, or `best`.
     """
-    obstacles, limits, objective, _sees_walls, _walls = needle
+    limits = needle.limits
     end = _clearance_bound(needle, target[0], target[1], target[2])
     for n in range(positions.shape[0]):
         x, y, z = positions[n]
@@ -102,20 +94,22 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
         length, bend, turn = arc_to_point(pose, target)
         costs[n] = math.inf
         if (
-            bend[0] > limits[KAPPA]
-            or length > limits[MAX_LENGTH]
-            or turn > min(limits[MAX_ANGLE], limits[MAX_TURN])
+            bend[0] > limits.kappa
+            or length > limits.max_length_mm
+            or turn > min(limits.max_angle_rad, limits.max_turn_rad)
         ):
             blockers[n] = -1
             continue
         if _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length) > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        costs[n] = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, True)
+        costs[n] = cost_of_arc(
+            needle.obstacles, needle.objective, limits.cost_step_mm, pose, bend, length, True
+        )
         if costs[n] > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        blockers[n] = blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branches[n])
+        blockers[n] = blocker_on_arc(needle.obstacles, limits, pose, bend, length, 0.0, branches[n])
         if blockers[n] == 0 and costs[n] < best:
             best = costs[n]
     return best

@@ -40,7 +40,6 @@ from lungaccess.reachability.kernels.deployment_boxes import (
     turned_vector,
 )
 from stages.needle.infeasibility.kernels import escape_depth
-from stages.needle.kernels import EXEMPT_LENGTH, GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MAX_LENGTH
 from stages.tube.kernels import (
     CURVED_LENGTH,
     INNER_CURVATURE,
@@ -106,13 +105,13 @@ def _may_look(cones, first, last, forward, tilt):
 def _outside_workspace(limits, seen, sums):
     """Tell whether no tip of a box has the target in its workspace; `seen`, `sums`: of `target_seen`."""
     _pose, rho, ahead, size, moved, second = seen
-    spare = limits[GOAL_TOLERANCE] + SPARE_MM
-    radius = 1.0 / limits[KAPPA]
-    forward_only = limits[MAX_ANGLE] <= 0.5 * math.pi
+    spare = limits.goal_tolerance_mm + SPARE_MM
+    radius = 1.0 / limits.kappa
+    forward_only = limits.max_angle_rad <= 0.5 * math.pi
     depth = escape_depth(rho, ahead, radius)
     if forward_only:
         depth = min(depth, ahead)
-    if depth + moved + spare < 0.0 or math.hypot(rho, ahead) - moved - spare > limits[MAX_LENGTH]:
+    if depth + moved + spare < 0.0 or math.hypot(rho, ahead) - moved - spare > limits.max_length_mm:
         return True
     if math.hypot(size + sums[0], sums[1]) + second + spare < radius:
         return True
@@ -131,8 +130,8 @@ def _tips_blocked(scene, tubes, limits, seen, family, box):
     away += half_inner
     if distance_bound(depth, depth_geometry, pose[0], pose[1], pose[2]) > away:
         return True, away
-    spare = limits[GOAL_TOLERANCE] + SPARE_MM
-    exempt = limits[EXEMPT_LENGTH]
+    spare = limits.goal_tolerance_mm + SPARE_MM
+    exempt = limits.exempt_mm
     if distance_bound(freed, geometry, pose[0], pose[1], pose[2]) > away + exempt + spare:
         return True, away
     most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
@@ -141,7 +140,7 @@ def _tips_blocked(scene, tubes, limits, seen, family, box):
     far = math.hypot(rho, ahead)
     length = max(FIRST_LOOK_MM, exempt)
     while length < far - away - spare:
-        around = away + length * angle + 0.5 * limits[KAPPA] * length * length
+        around = away + length * angle + 0.5 * limits.kappa * length * length
         if around > FARTHEST_LOOK_MM:
             break
         x, y, z = pose[0] + length * pose[3], pose[1] + length * pose[4], pose[2] + length * pose[5]
@@ -249,7 +248,7 @@ def may_reach(scene, tubes, insertions, limits, target, frame, knots, cones, box
     tilt = math.hypot(box[HALF + EAST], box[HALF + NORTH])
     if not _may_look(cones, int(box[FIRST_KNOT]), int(box[LAST_KNOT]), forward, tilt):
         return False, 0.0, 0.0
-    seen = target_seen(tubes, limits[KAPPA], target, frame, knots, box, sums, costs)
+    seen = target_seen(tubes, limits.kappa, target, frame, knots, box, sums, costs)
     if _outside_workspace(limits, seen, sums):
         return False, 0.0, 0.0
     family = tubes_of(tubes, knots, frame, box)

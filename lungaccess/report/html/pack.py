@@ -1,4 +1,4 @@
-"""SpaceArrays as text inside a page: deflated, in base64, with their type and shape beside them."""
+"""Arrays as text inside a page: deflated, in base64, with their type and shape beside them."""
 
 from __future__ import annotations
 

@@ -23,7 +23,6 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
 from stages.needle.infeasibility.kernels import reachability_pruning as pruning
 from stages.needle.infeasibility.kernels import reachable_sets as sets
-from stages.needle.kernels import limits as index
 from stages.needle.search.base import Query
 
 CUBES_MM = (0.5, 0.25)
@@ -120,9 +119,9 @@ class NoPathProof:
         self._environment = environment
         self._query = query
         self._max_bytes = max_bytes
-        self._required = float(environment.limits[index.REQUIRED])
-        self._exempt_mm = float(environment.limits[index.EXEMPT_LENGTH]) - query.inserted_mm
-        self._kappa = max(float(environment.limits[index.KAPPA]) * (1.0 + ROUNDING), LEAST_KAPPA)
+        self._required = environment.limits.required_mm
+        self._exempt_mm = environment.limits.exempt_mm - query.inserted_mm
+        self._kappa = max(environment.limits.kappa * (1.0 + ROUNDING), LEAST_KAPPA)
         self._tolerance = environment.goal_tolerance_mm + bounds.SPARE
         self._planes: list[Plane] = []
         self._coarse: list[Plane] = []
@@ -170,9 +169,9 @@ class NoPathProof:
         start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
         chord = query.target - start
         total = float(np.linalg.norm(chord))
-        length = float(environment.limits[index.MAX_LENGTH]) - query.inserted_mm + bounds.SPARE
-        turn = min(float(environment.limits[index.MAX_TURN]) - query.turned_rad, self._kappa * length)
-        if environment.limits[index.LOOKUP_STEP] > 0.0:
+        length = environment.limits.max_length_mm - query.inserted_mm + bounds.SPARE
+        turn = min(environment.limits.max_turn_rad - query.turned_rad, self._kappa * length)
+        if environment.limits.lookup_step_mm > 0.0:
             self._end("undecided", "paths of this environment need not be clear")
         elif turn > math.pi * (1.0 + ROUNDING):
             self._end("undecided", "the needle may turn by more than 180 degrees in all")
@@ -297,7 +296,7 @@ class NoPathProof:
         plane = self._allowed(number)
         pruning.prune_unreachable(
             plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
-            float(self._environment.limits[index.MAX_ANGLE]),
+            self._environment.limits.max_angle_rad,
         )  # fmt: skip
         if number > 0 and plane.bits.any():
             plane = plane.trimmed()

@@ -9,19 +9,11 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from stages.needle.kernels.connections import least_cosine as least_cosine
     from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM as CLEARANCE_FLOOR_MM
-    from stages.needle.kernels.cost import INVERSE_CLEARANCE as INVERSE_CLEARANCE
-    from stages.needle.kernels.cost import LEAST_RATE as LEAST_RATE
-    from stages.needle.kernels.cost import LENGTH as LENGTH
+    from stages.needle.kernels.cost import ObjectiveArrays as ObjectiveArrays
     from stages.needle.kernels.cost import cost_of_arc as cost_of_arc
     from stages.needle.kernels.cost import map_costs_on_arc as map_costs_on_arc
-    from stages.needle.kernels.limits import COST_STEP as COST_STEP
-    from stages.needle.kernels.limits import EXEMPT_LENGTH as EXEMPT_LENGTH
-    from stages.needle.kernels.limits import GOAL_TOLERANCE as GOAL_TOLERANCE
-    from stages.needle.kernels.limits import KAPPA as KAPPA
-    from stages.needle.kernels.limits import MAX_ANGLE as MAX_ANGLE
-    from stages.needle.kernels.limits import MAX_LENGTH as MAX_LENGTH
-    from stages.needle.kernels.limits import MAX_TURN as MAX_TURN
-    from stages.needle.kernels.limits import REQUIRED as REQUIRED
+    from stages.needle.kernels.limits import Limits as Limits
+    from stages.needle.kernels.proof import Obstacles as Obstacles
     from stages.needle.kernels.proof import blocker_on_arc as blocker_on_arc
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

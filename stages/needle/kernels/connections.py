@@ -18,7 +18,7 @@ import numba
 
 from anatomy.kernels.arcs import any_normal, arc_to_point
 from anatomy.kernels.compiling import inner_kernel
-from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN, TINY
+from stages.needle.kernels.limits import TINY
 
 
 @numba.njit(cache=True)
@@ -112,12 +112,12 @@ def length_ahead(rho, h, limits, max_angle, max_turn):
 
     Only a point that cannot be reached exactly is missed: by the arc of radius R that passes it nearest.
     """
-    kappa = limits[KAPPA]
+    kappa = limits.kappa
     length = shortest_path(rho, h, kappa, max_angle, max_turn)
-    if length < math.inf or limits[GOAL_TOLERANCE] == 0.0:
+    if length < math.inf or limits.goal_tolerance_mm == 0.0:
         return length
     turn, miss = nearest_turn(rho, h, kappa)
-    if miss > limits[GOAL_TOLERANCE] or turn > min(max_angle, max_turn):
+    if miss > limits.goal_tolerance_mm or turn > min(max_angle, max_turn):
         return math.inf
     return turn / kappa
 
@@ -133,8 +133,8 @@ def nearest_turn(rho, h, kappa):
 @numba.njit(cache=True)
 def workspace_length(rho, h, limits):
     """Return the length of the shortest path within all limits, inf outside the workspace (the trumpet)."""
-    length = length_ahead(rho, h, limits, limits[MAX_ANGLE], limits[MAX_TURN])
-    return length if length <= limits[MAX_LENGTH] else math.inf
+    length = length_ahead(rho, h, limits, limits.max_angle_rad, limits.max_turn_rad)
+    return length if length <= limits.max_length_mm else math.inf
 
 
 @numba.njit(cache=True)

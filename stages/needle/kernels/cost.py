@@ -1,9 +1,5 @@
 """What an arc costs, as estimated within the searches.
 
-`objective` is the tuple (weights, cost map): weights of the integral of 1 / clearance, of the line
-integral of the cost map, and of length; then the least cost of a mm anywhere, and the weight of the sum of
-the cost map over the set of voxels crossed.
-
 Voxels are found in closed form.  Along an arc every voxel coordinate is `a + b sin + c cos` of the angle
 turned, so that it is monotone between extrema half a circle apart.  The arc is cut at the extrema of all
 three; in such a piece no voxel is met twice, and the voxels at its two ends say how often each coordinate
@@ -13,6 +9,7 @@ crosses a face, and where is the root of a quadratic equation.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -20,31 +17,53 @@ import numpy as np
 from anatomy.kernels.arcs import SMALL_ANGLE, point_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_estimate
+from anatomy.typed import Float32
 from stages.needle.kernels.limits import TINY
 
 CLEARANCE_FLOOR_MM = 0.1
 """Nearer than this, 1 / clearance stays at its value here, so that the integral is finite."""
 
-INVERSE_CLEARANCE = 0
-MAP_INTEGRAL = 1
-LENGTH = 2
-LEAST_RATE = 3
-VOXEL_SUM = 4
-N_WEIGHTS = 5
-
 OFF_GRID = -1
+"""The number of every voxel beyond the grid."""
+
+
+class ObjectiveArrays(NamedTuple):
+    """The weights of the costs of a path, and the cost map.
+
+    Parameters
+    ----------
+    inverse_clearance : float
+        Weight of the integral of 1 / clearance.
+    map_integral : float
+        Weight of the line integral of the cost map, 1/mm.
+    length : float
+        Weight of length, 1/mm.
+    voxel_sum : float
+        Weight of the sum of the cost map over the set of voxels crossed.
+    least_rate : float
+        Least cost of a mm anywhere.
+    cost_map : (ni, nj, nk) float32
+        Infinite is an obstacle.
+    """
+
+    inverse_clearance: float
+    map_integral: float
+    length: float
+    voxel_sum: float
+    least_rate: float
+    cost_map: Float32
 
 
 @numba.njit(cache=True)
 def inverse_clearance_on_arc(obstacles, step, pose, bend, length):
     """Estimate the integral of 1 / clearance along an arc [Kuntz2015, eq. 1] by the trapezoid rule."""
-    field, _labels, geometry, _bits = obstacles
     count = max(int(math.ceil(length / step)), 1)
     total = 0.0
     for m in range(count + 1):
         x, y, z = point_on_arc(pose, bend, length * m / count)
         weight = 0.5 if m == 0 or m == count else 1.0
-        total += weight / max(distance_estimate(field, geometry, x, y, z), CLEARANCE_FLOOR_MM)
+        estimate = distance_estimate(obstacles.clearance, obstacles.geometry, x, y, z)
+        total += weight / max(estimate, CLEARANCE_FLOOR_MM)
     return total * length / count
 
 
@@ -243,13 +262,14 @@ def map_costs_on_arc(costs, geometry, pose, bend, length, first):
 @numba.njit(cache=True)
 def cost_of_arc(obstacles, objective, step, pose, bend, length, first):
     """Return the weighted cost of an arc; `first` tells whether its path starts with it."""
-    weights, costs = objective
-    total = weights[LENGTH] * length
-    if weights[INVERSE_CLEARANCE] > 0.0:
-        total += weights[INVERSE_CLEARANCE] * inverse_clearance_on_arc(obstacles, step, pose, bend, length)
-    if weights[MAP_INTEGRAL] > 0.0 or weights[VOXEL_SUM] > 0.0:
-        integral, voxel_sum = map_costs_on_arc(costs, obstacles[2], pose, bend, length, first)
+    total = objective.length * length
+    if objective.inverse_clearance > 0.0:
+        total += objective.inverse_clearance * inverse_clearance_on_arc(obstacles, step, pose, bend, length)
+    if objective.map_integral > 0.0 or objective.voxel_sum > 0.0:
+        integral, voxel_sum = map_costs_on_arc(
+            objective.cost_map, obstacles.geometry, pose, bend, length, first
+        )
         if integral == math.inf:
             return math.inf
-        total += weights[MAP_INTEGRAL] * integral + weights[VOXEL_SUM] * voxel_sum
+        total += objective.map_integral * integral + objective.voxel_sum * voxel_sum
     return total

@@ -1,12 +1,12 @@
 """The proof that an arc is clear of obstacles.
 
-`obstacles` is the tuple (clearance field, label volume, their geometry, obstacle bits), see
-`anatomy.kernels.field`; `pose` and `bend` are the tuples of `anatomy.kernels.arcs`.
+`pose` and `bend` are the tuples of `anatomy.kernels.arcs`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -15,7 +15,8 @@ from anatomy.kernels.arcs import point_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import LUMEN
-from stages.needle.kernels.limits import EXEMPT_LENGTH, LOOKUP_STEP, RADIUS, REQUIRED, TINY
+from anatomy.typed import Float, Labels, UInt16
+from stages.needle.kernels.limits import TINY
 
 PROBE_SPACING_MM = 1.5
 
@@ -24,16 +25,38 @@ _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
 
 
+class Obstacles(NamedTuple):
+    """What a needle collides with, see `anatomy.kernels.field`.
+
+    Parameters
+    ----------
+    clearance : (ni + 1, nj + 1, nk + 1) uint16
+        Clearance field at the corners of the voxels.
+    labels : (ni, nj, nk) uint16
+        See `anatomy.structures`.
+    geometry : (3, 6) float64
+        See `anatomy.fields.corner_geometry`.
+    bits : int
+        Structures that are obstacles.
+    """
+
+    clearance: UInt16
+    labels: Labels
+    geometry: Float
+    bits: int
+
+
 @inner_kernel
 def _early_blocker(obstacles, required, pose, bend, begin, length):
     """Look for an obstacle at a few points of an arc, the middle first; 0 if none is met."""
-    field, labels, geometry, bits = obstacles
     count = 1
     while (length - begin) / count > PROBE_SPACING_MM:
         for m in range(count):
             x, y, z = point_on_arc(pose, bend, begin + (length - begin) * (m + 0.5) / count)
-            if distance_bound(field, geometry, x, y, z) < required:
-                distance, label = exact_distance(labels, geometry, x, y, z, bits, _NOBODY, required)
+            if distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) < required:
+                distance, label = exact_distance(
+                    obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, _NOBODY, required
+                )
                 if distance < required:
                     return label
         count *= 2
@@ -43,12 +66,11 @@ def _early_blocker(obstacles, required, pose, bend, begin, length):
 @inner_kernel
 def _blocker_by_lookup(obstacles, step, pose, bend, length):
     """Look up the voxels at the ends of steps of an arc [Fu2018, fig. 6, right]: no proof."""
-    _field, labels, geometry, bits = obstacles
     count = max(int(math.ceil(length / step)), 1)
     for m in range(count + 1):
         x, y, z = point_on_arc(pose, bend, length * m / count)
-        label = label_at(labels, geometry, x, y, z)
-        if label & bits:
+        label = label_at(obstacles.labels, obstacles.geometry, x, y, z)
+        if label & obstacles.bits:
             return label
     return 0
 
@@ -59,33 +81,36 @@ def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
 
     Clearance is 1-Lipschitz: where it exceeds the required one by `gap`, the next `gap` mm are clear.
     The field's lower bound is tried first, then the exact distance to the voxels as solid boxes.
-    The first `limits[EXEMPT_LENGTH]` mm of the needle (this arc starts at `s0`) may be near the
+    The first `limits.exempt_mm` mm of the needle (this arc starts at `s0`) may be near the
     wall of the pierced `branch` (-1: none), but never nearer than the needle's radius to any lumen.
 
-    With `limits[LOOKUP_STEP]` nothing is proved: see `experiments.support.cost_map.inflation`.
+    With `limits.lookup_step_mm` voxels are looked up instead, and nothing is proved.
     """
-    if limits[LOOKUP_STEP] > 0.0:
-        return _blocker_by_lookup(obstacles, limits[LOOKUP_STEP], pose, bend, length)
-    field, labels, geometry, bits = obstacles
-    required = limits[REQUIRED]
+    if limits.lookup_step_mm > 0.0:
+        return _blocker_by_lookup(obstacles, limits.lookup_step_mm, pose, bend, length)
+    required = limits.required_mm
     reach = required + EXACT_REACH_MM
-    exempt = limits[EXEMPT_LENGTH] - s0 if branch >= 0 else 0.0
+    exempt = limits.exempt_mm - s0 if branch >= 0 else 0.0
     early = _early_blocker(obstacles, required, pose, bend, max(exempt, 0.0), length)
     if early != 0:
         return early
     s = 0.0
     while True:
         x, y, z = point_on_arc(pose, bend, s)
-        gap = distance_bound(field, geometry, x, y, z) - required
+        gap = distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) - required
         if gap < MIN_GAP_MM:
             in_exit = s < exempt - TINY
             spared = branch if in_exit else -1
-            distance, label = exact_distance(labels, geometry, x, y, z, bits, spared, reach)
+            distance, label = exact_distance(
+                obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, spared, reach
+            )
             gap = distance - required
             if in_exit:
-                lumen, lumen_label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
-                if lumen - limits[RADIUS] < gap:
-                    gap = lumen - limits[RADIUS]
+                lumen, lumen_label = exact_distance(
+                    obstacles.labels, obstacles.geometry, x, y, z, _LUMEN, _NOBODY, reach
+                )
+                if lumen - limits.radius_mm < gap:
+                    gap = lumen - limits.radius_mm
                     label = lumen_label
             if gap < MIN_GAP_MM:
                 return label

@@ -18,15 +18,6 @@ from anatomy.kernels.field import UNITS_PER_MM, distance_bound, exact_distance, 
 from anatomy.kernels.labels import AIRWAY
 from stages.needle.kernels.connections import seen_from, workspace_length
 from stages.needle.kernels.cost import inverse_clearance_on_arc
-from stages.needle.kernels.limits import (
-    COST_STEP,
-    EXEMPT_LENGTH,
-    KAPPA,
-    MAX_ANGLE,
-    MAX_LENGTH,
-    MAX_TURN,
-    REQUIRED,
-)
 from stages.needle.kernels.proof import PROBE_SPACING_MM, blocker_on_arc
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
@@ -54,27 +45,27 @@ _NOBODY = np.int64(-1)
 @inner_kernel
 def _least_clearance(obstacles, limits, pose, bend, length, s0, least):
     """Return a clearance that an arc is never below beyond the exempt length, at most `least`."""
-    field, _labels, geometry, _bits = obstacles
-    begin = min(max(limits[EXEMPT_LENGTH] - s0, 0.0), length)
+    begin = min(max(limits.exempt_mm - s0, 0.0), length)
     count = max(int(math.ceil((length - begin) / CLEARANCE_STEP_MM)), 1)
     half = 0.5 * (length - begin) / count
     for m in range(count + 1):
         x, y, z = point_on_arc(pose, bend, begin + (length - begin) * m / count)
-        least = min(least, distance_bound(field, geometry, x, y, z) - half)
+        least = min(least, distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) - half)
     return max(least, 0.0)
 
 
 @inner_kernel
 def _is_blocked(obstacles, required, x, y, z):
     """Tell whether a point is nearer than `required` to an obstacle; exact distances only where in doubt."""
-    field, labels, geometry, bits = obstacles
-    total, spread = interpolate_squared(field, geometry, x, y, z)
+    total, spread = interpolate_squared(obstacles.clearance, obstacles.geometry, x, y, z)
     if total - spread >= required * required:
         return False
     # See `anatomy.kernels.field`: the true distance is at most this.
     if math.sqrt(total) + math.sqrt(spread) + 1.0 / UNITS_PER_MM < required:
         return True
-    distance, _label = exact_distance(labels, geometry, x, y, z, bits, _NOBODY, required)
+    distance, _label = exact_distance(
+        obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, _NOBODY, required
+    )
     return distance < required
 
 
@@ -84,8 +75,8 @@ def _blocked_share(obstacles, limits, pose, bend, length, share):
 
     `share` is that place, as a share of the length beyond the exempt one.
     """
-    required = limits[REQUIRED]
-    begin = limits[EXEMPT_LENGTH]
+    required = limits.required_mm
+    begin = limits.exempt_mm
     if length <= begin:
         return -1.0
     x, y, z = point_on_arc(pose, bend, begin + (length - begin) * share)
@@ -111,9 +102,9 @@ def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
     length, bend, turn = arc_to_point(pose, q)
     if (
-        bend[0] > limits[KAPPA]
-        or length > limits[MAX_LENGTH]
-        or turn > min(limits[MAX_ANGLE], limits[MAX_TURN])
+        bend[0] > limits.kappa
+        or length > limits.max_length_mm
+        or turn > min(limits.max_angle_rad, limits.max_turn_rad)
     ):
         return math.inf
     share = _blocked_share(obstacles, limits, pose, bend, length, hints[entry])
@@ -122,10 +113,12 @@ def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
         return math.inf
     cost = -1.0
     if below < math.inf:
-        cost = inverse_clearance_on_arc(obstacles, limits[COST_STEP], pose, bend, length)
+        cost = inverse_clearance_on_arc(obstacles, limits.cost_step_mm, pose, bend, length)
     if cost >= below or blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branch) != 0:
         return math.inf
-    return cost if cost >= 0.0 else inverse_clearance_on_arc(obstacles, limits[COST_STEP], pose, bend, length)
+    return (
+        cost if cost >= 0.0 else inverse_clearance_on_arc(obstacles, limits.cost_step_mm, pose, bend, length)
+    )
 
 
 @inner_kernel
@@ -136,10 +129,10 @@ def _mark_candidates(limits, mixed, q, begin, end, marks):
     curvature is twice the offset over the squared chord.
     """
     # Slightly too wide: rounding may not exclude what the arc itself would pass.
-    lean = 0.999999 * math.cos(0.5 * min(limits[MAX_ANGLE], limits[MAX_TURN]))
+    lean = 0.999999 * math.cos(0.5 * min(limits.max_angle_rad, limits.max_turn_rad))
     lean2 = lean * lean
-    kappa2 = 1.000001 * 0.25 * limits[KAPPA] * limits[KAPPA]
-    longest2 = limits[MAX_LENGTH] * limits[MAX_LENGTH]
+    kappa2 = 1.000001 * 0.25 * limits.kappa * limits.kappa
+    longest2 = limits.max_length_mm * limits.max_length_mm
     for m in range(begin, end):
         dx = q[0] - mixed[0, m]
         dy = q[1] - mixed[1, m]
@@ -202,9 +195,10 @@ def _improved(obstacles, limits, starts, branches, q, best, chosen, hints):
 @inner_kernel
 def _has_clearance(obstacles, limits, q, bits):
     """Tell whether the needle's tip keeps the required clearance at a point."""
-    _field, labels, geometry, _bits = obstacles
-    required = limits[REQUIRED]
-    distance, _label = exact_distance(labels, geometry, q[0], q[1], q[2], bits, -1, required + 0.1)
+    required = limits.required_mm
+    distance, _label = exact_distance(
+        obstacles.labels, obstacles.geometry, q[0], q[1], q[2], bits, -1, required + 0.1
+    )
     return distance >= required
 
 
@@ -222,8 +216,7 @@ def reach_by_arcs(
 
     Parameters
     ----------
-    obstacles, limits : tuple, (N_LIMITS,) float64
-        See `proof` and `limits`.
+    obstacles, limits : Obstacles, Limits
     starts, branches, order, mixed
         See the module.
     points : (N, 3) float64, LPS mm
@@ -240,7 +233,7 @@ def reach_by_arcs(
     entries : (N,) int64
         Receives the start pose of what is reached, else -1.
     """
-    bits = obstacles[3]
+    bits = obstacles.bits
     for n in range(points.shape[0]):
         q = (points[n, 0], points[n, 1], points[n, 2])
         kinds[n] = NO_CLEARANCE
@@ -292,7 +285,7 @@ def _record_path(obstacles, limits, nodes, parents, last, row):
         arc = nodes[node]
         bend = (arc[BEND], arc[BEND + 1], arc[BEND + 2], arc[BEND + 3])
         pose = pose_of(nodes[parent])
-        if nodes[node, PATH_LENGTH] > limits[EXEMPT_LENGTH] or node == last:
+        if nodes[node, PATH_LENGTH] > limits.exempt_mm or node == last:
             begun = nodes[parent, PATH_LENGTH]
             least = _least_clearance(obstacles, limits, pose, bend, arc[ARC_LENGTH], begun, least)
         node = parent

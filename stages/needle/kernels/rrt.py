@@ -10,7 +10,7 @@ from anatomy.kernels.arcs import any_normal, arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import seen_from, workspace_length
-from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_LENGTH, MAX_STEP, MAX_TURN, MIN_ARC_MM
+from stages.needle.kernels.limits import MIN_ARC_MM
 from stages.needle.kernels.tree import (
     PATH_LENGTH,
     PATH_TURN,
@@ -32,7 +32,7 @@ def sample_between(start, goal, limits, state):
     holds the paths that turn by less than 180 degrees; where start and goal are 2 R apart or more and
     there is no such arc, from the cylinder of radius R about the line between them.
     """
-    radius = 1.0 / limits[KAPPA]
+    radius = 1.0 / limits.kappa
     ax = goal[0] - start[0]
     ay = goal[1] - start[1]
     az = goal[2] - start[2]
@@ -72,9 +72,9 @@ def _nearest(nodes, count, q, limits):
         length, bend, turn = arc_to_point(pose_of(node), q)
         if (
             length < best
-            and bend[0] <= limits[KAPPA]
-            and node[PATH_LENGTH] + length <= limits[MAX_LENGTH]
-            and node[PATH_TURN] + turn <= limits[MAX_TURN]
+            and bend[0] <= limits.kappa
+            and node[PATH_LENGTH] + length <= limits.max_length_mm
+            and node[PATH_TURN] + turn <= limits.max_turn_rad
         ):
             best = length
             nearest = m
@@ -88,8 +88,8 @@ def random_arc(pose, limits, state):
     ax, ay, az = any_normal(pose[3], pose[4], pose[5])
     bx, by, bz = pose[4] * az - pose[5] * ay, pose[5] * ax - pose[3] * az, pose[3] * ay - pose[4] * ax
     c, s = math.cos(roll), math.sin(roll)
-    kappa = limits[KAPPA] * min(2.0 * uniform(state), 1.0)
-    length = MIN_ARC_MM + limits[MAX_STEP] * uniform(state)
+    kappa = limits.kappa * min(2.0 * uniform(state), 1.0)
+    length = MIN_ARC_MM + limits.max_step_mm * uniform(state)
     return (kappa, c * ax + s * bx, c * ay + s * by, c * az + s * bz), length
 
 
@@ -104,8 +104,7 @@ def grow_rrt(
 
     Parameters
     ----------
-    obstacles, limits, objective : tuple, (N_LIMITS,) float64, tuple
-        See `proof`, `limits` and `cost`.
+    obstacles, limits, objective : Obstacles, Limits, ObjectiveArrays
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
     goal : (3,) float64, LPS mm
@@ -142,12 +141,12 @@ def grow_rrt(
             near = int(uniform(state) * count)
             bend, length = random_arc(pose_of(nodes[near]), limits, state)
         else:
-            q, drawn = sample_between(start, within(goal, limits[GOAL_TOLERANCE], state), limits, state)
+            q, drawn = sample_between(start, within(goal, limits.goal_tolerance_mm, state), limits, state)
             near = _nearest(nodes, count, q, limits) if drawn else -1
             if near < 0:
                 continue
             length, bend, _turn = arc_to_point(pose_of(nodes[near]), q)
-            length = min(length, limits[MAX_STEP])
+            length = min(length, limits.max_step_mm)
         if not add_arc(
             obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
         ):

@@ -7,7 +7,6 @@ import numba
 from anatomy.kernels.arcs import arc_to_point
 from stages.needle.kernels.connections import seen_from, workspace_length
 from stages.needle.kernels.cost import inverse_clearance_on_arc
-from stages.needle.kernels.limits import COST_STEP, KAPPA, MAX_ANGLE, MAX_LENGTH, MAX_TURN
 from stages.needle.kernels.proof import blocker_on_arc
 
 
@@ -36,12 +35,12 @@ def direct_arcs(obstacles, limits, positions, tangents, branches, target, blocke
         length, bend, turn = arc_to_point(pose, target)
         costs[n, 0] = length
         if (
-            bend[0] > limits[KAPPA]
-            or length > limits[MAX_LENGTH]
-            or turn > min(limits[MAX_ANGLE], limits[MAX_TURN])
+            bend[0] > limits.kappa
+            or length > limits.max_length_mm
+            or turn > min(limits.max_angle_rad, limits.max_turn_rad)
         ):
             blockers[n] = -1
             continue
         blockers[n] = blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branches[n])
         if blockers[n] == 0:
-            costs[n, 1] = inverse_clearance_on_arc(obstacles, limits[COST_STEP], pose, bend, length)
+            costs[n, 1] = inverse_clearance_on_arc(obstacles, limits.cost_step_mm, pose, bend, length)

@@ -18,7 +18,6 @@ import numba
 
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import seen_from, workspace_length
-from stages.needle.kernels.limits import KAPPA, MAX_ANGLE, MAX_LENGTH
 
 MIDDLE = 0
 DIRECTION = 3
@@ -69,13 +68,13 @@ def _out_of_reach(bound, target, limits):
     dz = target[2] - bound[MIDDLE + 2]
     far2 = dx * dx + dy * dy + dz * dz
     far = math.sqrt(far2)
-    if far - bound[DISTANCE] - ROUNDING_MM > limits[MAX_LENGTH]:
+    if far - bound[DISTANCE] - ROUNDING_MM > limits.max_length_mm:
         return True
-    if limits[MAX_ANGLE] > 0.5 * math.pi:
+    if limits.max_angle_rad > 0.5 * math.pi:
         return False
     off = bound[DISTANCE] + far * bound[ANGLE] + ROUNDING_MM
     h = dx * bound[DIRECTION] + dy * bound[DIRECTION + 1] + dz * bound[DIRECTION + 2]
-    radius = 1.0 / limits[KAPPA]
+    radius = 1.0 / limits.kappa
     if h < -off:
         return True
     rho = math.sqrt(max(far2 - h * h, 0.0))

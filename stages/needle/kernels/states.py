@@ -14,7 +14,7 @@ import numba
 
 from anatomy.kernels.arcs import any_normal, point_on_arc
 from anatomy.kernels.compiling import inner_kernel
-from stages.needle.kernels.limits import MAX_ANGLE, MAX_LENGTH, TINY
+from stages.needle.kernels.limits import TINY
 from stages.needle.kernels.proof import blocker_on_arc
 
 
@@ -79,7 +79,7 @@ def is_allowed(obstacles, limits, state, origin, branch):
     length = inserted_at(state, origin)
     _ex, _ey, (tx, ty, tz) = axes(state)
     cosine = tx * origin[3] + ty * origin[4] + tz * origin[5]
-    if not (length <= limits[MAX_LENGTH] + TINY and cosine >= math.cos(limits[MAX_ANGLE]) - 2.0 * TINY):
+    if not (length <= limits.max_length_mm + TINY and cosine >= math.cos(limits.max_angle_rad) - 2.0 * TINY):
         return False
     pose = (state[0], state[1], state[2], tx, ty, tz)
     nx, ny, nz = any_normal(tx, ty, tz)

@@ -22,14 +22,8 @@ from stages.needle.kernels.connections import (
     seen_from,
     shortest_legs,
 )
-from stages.needle.kernels.cost import LEAST_RATE, cost_of_arc
+from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.limits import (
-    COST_STEP,
-    GOAL_TOLERANCE,
-    KAPPA,
-    MAX_ANGLE,
-    MAX_LENGTH,
-    MAX_TURN,
     MIN_ARC_MM,
     TINY,
 )
@@ -65,7 +59,7 @@ def angle_kept(limits, reference, pose, bend, turn):
     """Tell whether an arc keeps the limit of the angle to `reference`; return the cosine at its end too."""
     forward = pose[3] * reference[0] + pose[4] * reference[1] + pose[5] * reference[2]
     aside = bend[1] * reference[0] + bend[2] * reference[1] + bend[3] * reference[2]
-    kept = least_cosine(forward, aside, turn) >= math.cos(limits[MAX_ANGLE]) - TINY
+    kept = least_cosine(forward, aside, turn) >= math.cos(limits.max_angle_rad) - TINY
     return kept, forward * math.cos(turn) + aside * math.sin(turn)
 
 
@@ -82,7 +76,7 @@ def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, b
     turn = bend[0] * length
     path_length = node[PATH_LENGTH] + length
     path_turn = node[PATH_TURN] + turn
-    if path_length > limits[MAX_LENGTH] or path_turn > limits[MAX_TURN] + TINY:
+    if path_length > limits.max_length_mm or path_turn > limits.max_turn_rad + TINY:
         return False
     kept, cosine = angle_kept(limits, reference_of(nodes[0]), pose, bend, turn)
     if not kept:
@@ -92,22 +86,22 @@ def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, b
     rho, h = seen_from(end, goal)
     ahead = 0.0
     missing = math.hypot(rho, h)
-    if missing > limits[GOAL_TOLERANCE] + TINY:
+    if missing > limits.goal_tolerance_mm + TINY:
         missing = 0.0
-        turn_left = limits[MAX_TURN] - path_turn
-        ahead = length_ahead(rho, h, limits, min(limits[MAX_ANGLE] + angle, math.pi), turn_left)
-    if path_length + ahead > limits[MAX_LENGTH] + limits[GOAL_TOLERANCE]:
+        turn_left = limits.max_turn_rad - path_turn
+        ahead = length_ahead(rho, h, limits, min(limits.max_angle_rad + angle, math.pi), turn_left)
+    if path_length + ahead > limits.max_length_mm + limits.goal_tolerance_mm:
         return False
-    rate = objective[0][LEAST_RATE]
-    if node[PATH_COST] + rate * (length + ahead - limits[GOAL_TOLERANCE]) >= best:
+    rate = objective.least_rate
+    if node[PATH_COST] + rate * (length + ahead - limits.goal_tolerance_mm) >= best:
         return False
     if blocker_on_arc(obstacles, limits, pose, bend, length, node[PATH_LENGTH], branch) != 0:
         return False
     cost = node[PATH_COST] + cost_of_arc(
-        obstacles, objective, limits[COST_STEP], pose, bend, length, near == 0
+        obstacles, objective, limits.cost_step_mm, pose, bend, length, near == 0
     )
     cost += rate * missing
-    if cost + rate * max(ahead - limits[GOAL_TOLERANCE], 0.0) >= best:
+    if cost + rate * max(ahead - limits.goal_tolerance_mm, 0.0) >= best:
         return False
     new = nodes[count]
     for m in range(6):
@@ -129,7 +123,7 @@ def add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, 
     All or nothing: if the second leg is refused, the first is dropped.
     """
     pose = pose_of(nodes[near])
-    first, first_length, second, second_length = shortest_legs(pose, q, limits[KAPPA])
+    first, first_length, second, second_length = shortest_legs(pose, q, limits.kappa)
     if not first_length + second_length < math.inf:
         return count
     at = near
@@ -157,16 +151,16 @@ def aim(pose, goal, limits, state):
     Half of the time it is the goal itself; where that cannot be reached, the nearest point of the arc of
     greatest curvature.
     """
-    if limits[GOAL_TOLERANCE] == 0.0:
+    if limits.goal_tolerance_mm == 0.0:
         return goal[0], goal[1], goal[2]
     if uniform(state) >= 0.5:
-        return within(goal, limits[GOAL_TOLERANCE], state)
+        return within(goal, limits.goal_tolerance_mm, state)
     rho, h = seen_from(pose, goal)
-    turn, miss = nearest_turn(rho, h, limits[KAPPA])
-    radius = 1.0 / limits[KAPPA]
-    if miss <= limits[GOAL_TOLERANCE] and math.hypot(radius - rho, h) < radius:
+    turn, miss = nearest_turn(rho, h, limits.kappa)
+    radius = 1.0 / limits.kappa
+    if miss <= limits.goal_tolerance_mm and math.hypot(radius - rho, h) < radius:
         _length, bend, _turn = arc_to_point(pose, goal)
-        return point_on_arc(pose, (limits[KAPPA], bend[1], bend[2], bend[3]), turn * radius)
+        return point_on_arc(pose, (limits.kappa, bend[1], bend[2], bend[3]), turn * radius)
     return goal[0], goal[1], goal[2]
 
 
@@ -193,7 +187,7 @@ def add_goal(obstacles, limits, objective, branch, nodes, parents, count, near, 
     length, bend, _turn = arc_to_point(pose, q)
     if length < MIN_ARC_MM:
         return count
-    if bend[0] <= limits[KAPPA] * (1.0 + TINY) and add_arc(
+    if bend[0] <= limits.kappa * (1.0 + TINY) and add_arc(
         obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
     ):
         return count + 1

@@ -7,14 +7,12 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from ompl import base
 
 from anatomy.kernels.field import MIN_GAP_MM
-from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
 from stages.needle.kernels import states
+from stages.needle.kernels.limits import Limits
 from stages.needle.ompl.planner import Question
 from stages.needle.ompl.states import numbers_of, put_numbers
 
@@ -45,16 +43,15 @@ def control_bounds(environment: NeedleEnvironment) -> Any:
     return bounds
 
 
-def _limits_of_steps(environment: NeedleEnvironment) -> Float:
+def _limits_of_steps(environment: NeedleEnvironment) -> Limits:
     """Return the limits by which steps are proved, so that whatever is proved as an arc passes.
 
     The proof refuses points that have less than MIN_GAP_MM to spare.  Between its points half of that is
     left at least; so arcs that passed, cut anywhere, pass again with so much less required clearance, and
     what passes this way still has all of it.
     """
-    limits = np.array(environment.limits)
-    limits[index.REQUIRED] = max(limits[index.REQUIRED] - 0.5 * MIN_GAP_MM, 0.0)
-    return limits
+    limits = environment.limits
+    return limits._replace(required_mm=max(limits.required_mm - 0.5 * MIN_GAP_MM, 0.0))
 
 
 def propagator(environment: NeedleEnvironment, question: Question) -> Callable[[Any, Any, float, Any], None]:

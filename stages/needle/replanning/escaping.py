@@ -6,16 +6,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-
-from anatomy.grid import read_only
 from anatomy.kernels.arcs import pose_on_arc
 from anatomy.kernels.field import EXACT_REACH_MM, exact_distance
 from anatomy.structures import BITS, LUMEN
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
+from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.objective import ObjectiveArrays
 from stages.needle.path import bend_direction
 from stages.needle.replanning.reaiming import Attempts, Bend, Root, Source, as_point, pose_at, root_after
 from stages.needle.search.base import Query
@@ -31,11 +27,9 @@ def structure_name(label: int) -> str:
     return next((name for name, bit in BITS.items() if label & bit), "nothing")
 
 
-def with_limit(environment: NeedleEnvironment, which: int, value: float) -> NeedleEnvironment:
-    """Return an environment with one limit changed, see `stages.needle.kernels.limits`."""
-    limits = np.array(environment.limits)
-    limits[which] = value
-    return replace(environment, limits=read_only(limits))
+def with_limits(environment: NeedleEnvironment, **limits: float) -> NeedleEnvironment:
+    """Return an environment with other limits, by the names of `stages.needle.kernels.limits.Limits`."""
+    return replace(environment, limits=environment.limits._replace(**limits))
 
 
 def blocker_at(
@@ -64,10 +58,10 @@ def tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, 
 
     Beyond the required clearance and a little more it is not measured.
     """
-    _field, labels, geometry, bits = environment.obstacles
+    _clearance, labels, geometry, bits = environment.obstacles
     reach = environment.required_clearance_mm + EXACT_REACH_MM
     point = as_point(query.lps_from_start[:3, 3])
-    in_exit = query.branch >= 0 and query.inserted_mm < environment.limits[index.EXEMPT_LENGTH]
+    in_exit = query.branch >= 0 and query.inserted_mm < environment.limits.exempt_mm
     spared = query.branch if in_exit else -1
     distance, label = exact_distance(labels, geometry, *point, bits, spared, reach)
     if in_exit:
@@ -89,8 +83,7 @@ def roots_of_tip(
     Parameters
     ----------
     environment : NeedleEnvironment
-    objective : tuple
-        See `stages.needle.kernels.cost`.
+    objective : ObjectiveArrays
     query : Query
         From the tip.
     longest_mm : float
@@ -102,7 +95,7 @@ def roots_of_tip(
         return [Root(query=query)], required
     clearance, _label = tip_clearance(environment, query)
     relaxed = min(max(environment.needle.radius_mm, clearance - SLACK_MM), required)
-    near = with_limit(environment, index.REQUIRED, relaxed)
+    near = with_limits(environment, required_mm=relaxed)
     roots = []
     for bend in _bends(environment, query):
         length = _length_to_clearance(environment, query, pose, bend, longest_mm)
@@ -120,7 +113,7 @@ def _bends(environment: NeedleEnvironment, query: Query) -> Iterator[Bend]:
         side = as_point(bend_direction(query.lps_from_start, 2.0 * math.pi * n / ROLLS))
         if n == 0:
             yield 0.0, *side
-        yield float(environment.limits[index.KAPPA]), *side
+        yield environment.limits.kappa, *side
 
 
 def _length_to_clearance(

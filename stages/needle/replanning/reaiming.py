@@ -14,7 +14,8 @@ from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
-from stages.needle.objective import Objective, ObjectiveArrays
+from stages.needle.kernels.cost import ObjectiveArrays
+from stages.needle.objective import Objective
 from stages.needle.path import LENGTH, ArcPath, arc_transform, path_from_tree
 from stages.needle.search.base import Query, RestartingRRT, root_of
 
@@ -129,8 +130,7 @@ class Attempts:
     Parameters
     ----------
     environment : NeedleEnvironment
-    objective : tuple
-        See `stages.needle.kernels.cost`.
+    objective : ObjectiveArrays
     root : Root
     most_points : int
         Most points to pass on a path.
@@ -212,9 +212,7 @@ class Attempts:
         length, bend, _turn = arc_to_point(tree.pose_of(self._nodes[count - 1]), point)
         if length < index.MIN_ARC_MM:
             return count
-        if bend[0] <= self._environment.limits[index.KAPPA] and self._arc(
-            count, bend, length, self.root.query.goal
-        ):
+        if bend[0] <= self._environment.limits.kappa and self._arc(count, bend, length, self.root.query.goal):
             return count + 1
         rows = self._legs(count, point)
         return rows if rows > count else 0

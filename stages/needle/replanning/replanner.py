@@ -25,7 +25,7 @@ from stages.needle.replanning.escaping import (
     roots_of_tip,
     structure_name,
     tip_clearance,
-    with_limit,
+    with_limits,
 )
 from stages.needle.replanning.reaiming import (
     Attempts,
@@ -143,7 +143,7 @@ def with_reserve(environment: NeedleEnvironment, reserve: float) -> NeedleEnviro
         raise SettingsError(f"The curvature reserve is {reserve}", expected="a share of at least 0, below 1")
     curvature = environment.needle.max_curvature_per_mm * (1.0 - reserve)
     needle = replace(environment.needle, max_curvature_per_mm=curvature)
-    return replace(with_limit(environment, index.KAPPA, curvature), needle=needle)
+    return replace(with_limits(environment, kappa=curvature), needle=needle)
 
 
 def _arrived(query: Query, miss_mm: float) -> Replan:
@@ -210,7 +210,7 @@ class Replanner:
         self._replans = 0
         self._begin_mm = query.inserted_mm
         self._turned_rad = query.turned_rad
-        exact = with_limit(environment, index.GOAL_TOLERANCE, 0.0)
+        exact = with_limits(environment, goal_tolerance_mm=0.0)
         self._variants = [exact]
         if settings.curvature_reserve > 0.0:
             self._variants.insert(0, with_reserve(exact, settings.curvature_reserve))
@@ -307,7 +307,7 @@ class Replanner:
         root, path = attempts.root, attempts.path
         arcs = root.arcs if path is None else np.concatenate([root.arcs, path.arcs])
         whole = ArcPath(lps_from_start=query.lps_from_start, arcs=arcs)
-        left = (1.0 - self._settings.curvature_reserve) * float(self._environment.limits[index.KAPPA])
+        left = (1.0 - self._settings.curvature_reserve) * self._environment.limits.kappa
         return Replan(
             path=whole,
             cost=attempts.total,
@@ -322,7 +322,7 @@ class Replanner:
         """Return the tightest arc towards the target if it passes near enough, or stay if the tip is."""
         best: Attempts | None = None
         least = min(away, self._settings.largest_miss_mm)
-        kappa = float(self._environment.limits[index.KAPPA])
+        kappa = self._environment.limits.kappa
         for root in roots:
             attempts = Attempts(self._environment, self._objective_arrays, root)
             pose, target = pose_at(root.query.lps_from_start), query.goal
@@ -339,9 +339,9 @@ class Replanner:
     def _out_of_reach(self, query: Query) -> tuple[Failure | None, str]:
         """Tell why no path leads to the target even in free space."""
         limits = self._environment.limits
-        left = float(limits[index.MAX_LENGTH]) - query.inserted_mm
+        left = limits.max_length_mm - query.inserted_mm
         if left <= index.MIN_ARC_MM:
-            return Failure.OUT_OF_LENGTH, f"All of the needle ({limits[index.MAX_LENGTH]:g} mm) is inserted"
+            return Failure.OUT_OF_LENGTH, f"All of the needle ({limits.max_length_mm:g} mm) is inserted"
         tolerance = self._environment.goal_tolerance_mm
         if tolerance == 0.0:
             at_target = (*query.goal, 0.0, 0.0, 1.0)
@@ -351,10 +351,10 @@ class Replanner:
                 return Failure.TARGET_BLOCKED, f"The target is nearer than {required:.2f} mm to {name}"
         pose, reference = pose_at(query.lps_from_start), tree.reference_of(root_of(query))
         angle = math.acos(float(np.clip(np.dot(pose[3:], reference), -1.0, 1.0)))
-        turn_left = float(limits[index.MAX_TURN]) - query.turned_rad
+        turn_left = limits.max_turn_rad - query.turned_rad
         length = length_ahead(
             *seen_from(pose, query.goal), limits,
-            min(float(limits[index.MAX_ANGLE]) + angle, math.pi), turn_left,
+            min(limits.max_angle_rad + angle, math.pi), turn_left,
         )  # fmt: skip
         if not length < math.inf:
             return Failure.OUT_OF_REACH, (

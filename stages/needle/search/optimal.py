@@ -68,7 +68,7 @@ class OptimalSearch(RestartingRRT):
             Ends of its arcs; nothing is followed whose last one lies beyond the goal tolerance.
         """
         missing = float(np.linalg.norm(points[-1] - self.query.target))
-        if len(points) > MAX_VIAS or missing > self.environment.limits[index.GOAL_TOLERANCE] + index.TINY:
+        if len(points) > MAX_VIAS or missing > self.environment.limits.goal_tolerance_mm + index.TINY:
             return False
         vias = np.zeros_like(self._vias)
         vias[: len(points), :3] = points

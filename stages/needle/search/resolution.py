@@ -16,9 +16,8 @@ from anatomy.kernels import arcs as arc_kernels
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.typed import Array, Float, Int, Int32, UInt8
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
-from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, INVERSE_CLEARANCE, LEAST_RATE
+from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, ObjectiveArrays
 from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.search.base import Query, root_of
@@ -203,7 +202,7 @@ class ResolutionSearch:
         duplicates: Cells | None = None,
         max_memory_mb: float = 1000.0,
     ) -> None:
-        if environment.limits[index.LOOKUP_STEP] > 0.0:
+        if environment.limits.lookup_step_mm > 0.0:
             raise SettingsError(
                 "The resolution search is asked for an environment whose arcs are looked up, not proved",
                 expected="an environment with a clearance field: the search goes on from what is proved",
@@ -218,14 +217,14 @@ class ResolutionSearch:
         self.duplicates = duplicates
         self.max_memory_mb = max_memory_mb
         self.objective = environment.objective_arrays(objective)
-        self._rates = _rates(self.objective[0], environment)
+        self._rates = _rates(self.objective, environment)
         self._merge = (EQUAL_CELL_MM, EQUAL_CELL_MM, False)
         if duplicates is not None:
             self._merge = (duplicates.position_mm, math.radians(duplicates.angle_deg), True)
-        self._words = _words(self.resolution, float(environment.limits[index.KAPPA]))
+        self._words = _words(self.resolution, environment.limits.kappa)
         self._reference = tree.reference_of(root_of(query))
         self._store = self._first_store()
-        left = environment.limits[index.MAX_LENGTH] - query.inserted_mm
+        left = environment.limits.max_length_mm - query.inserted_mm
         pieces = max(int(left / self.resolution.fine_mm), 0) + 2
         self._queue = _first_queue(pieces * len(self._words[4]) + rank_queue.LOOK_AHEAD + 1)
         self._state = np.zeros(rank_queue.STATE_SIZE, dtype=np.int64)
@@ -320,7 +319,7 @@ class ResolutionSearch:
         rows = [np.zeros(tree.NODE_COLUMNS)]
         for at in reversed(chain):
             parent, direction, steps = (int(v) for v in links[at, : kernel.NODE_RANK])
-            bend = kernel.bend_of(nodes, rolls, self.environment.limits[index.KAPPA], parent, direction)
+            bend = kernel.bend_of(nodes, rolls, self.environment.limits.kappa, parent, direction)
             rows.append(_row(fine_mm * steps, bend))
         for leg in range(2):
             length, *bend = self._best[kernel.BEST_LEGS + kernel.LEG_SIZE * leg :][: kernel.LEG_SIZE]
@@ -380,12 +379,12 @@ def _words(resolution: Resolution, kappa: float) -> Words:
     )
 
 
-def _rates(weights: Float, environment: NeedleEnvironment) -> tuple[float, float]:
+def _rates(objective: ObjectiveArrays, environment: NeedleEnvironment) -> tuple[float, float]:
     """Return the least cost of a mm in this environment, and what a mm costs by which a path ends short.
 
     The former counts the largest clearance that there is, where an objective knows none.
     """
-    least = float(weights[LEAST_RATE])
-    largest = max(float(environment.obstacles[0].max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
-    gain = weights[INVERSE_CLEARANCE] * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
-    return least + max(float(gain), 0.0), least
+    least = objective.least_rate
+    largest = max(float(environment.obstacles.clearance.max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
+    gain = objective.inverse_clearance * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
+    return least + max(gain, 0.0), least

@@ -67,7 +67,7 @@ class StateLatticeSearch:
     def __init__(self, environment: NeedleEnvironment, query: Query, objective: Objective) -> None:
         self._environment, self._query = environment, query
         self._objective = environment.objective_arrays(objective)
-        self._kappa = CURVATURE_SHARE * float(environment.limits[index.KAPPA])
+        self._kappa = CURVATURE_SHARE * environment.limits.kappa
         self._start, self._tangent = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
         ahead = query.target - self._start
         self._distance = float(np.linalg.norm(ahead))

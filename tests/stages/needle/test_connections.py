@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from anatomy.kernels.arcs import pose_on_arc
 from stages.needle.kernels import connections
+from stages.needle.kernels.limits import Limits
 
 RADIUS = 50.0
 KAPPA = 1 / RADIUS
@@ -137,17 +138,15 @@ def test_the_edge_of_the_spindle() -> None:
 
 
 def test_a_goal_just_out_of_reach_is_reached_within_the_tolerance() -> None:
-    from stages.needle.kernels import limits as index
+    def workspace_length(goal_tolerance_mm: float) -> float:
+        values = dict.fromkeys(Limits._fields, 0.0) | {"kappa": KAPPA, "max_length_mm": 150.0}
+        values |= {"max_angle_rad": math.pi / 2, "max_turn_rad": math.pi / 2}
+        limits = Limits(**values | {"goal_tolerance_mm": goal_tolerance_mm})
+        return float(connections.workspace_length(rho, h, limits))
 
-    limits = np.zeros(index.N_LIMITS)
-    limits[index.KAPPA] = KAPPA
-    limits[index.MAX_LENGTH] = 150.0
-    limits[index.MAX_ANGLE] = limits[index.MAX_TURN] = math.pi / 2
     turn = 0.7
     rho, h = (RADIUS - 0.8) * -math.cos(turn) + RADIUS, (RADIUS - 0.8) * math.sin(turn)
-    assert connections.workspace_length(rho, h, limits) == math.inf
-    limits[index.GOAL_TOLERANCE] = 0.7
-    assert connections.workspace_length(rho, h, limits) == math.inf
-    limits[index.GOAL_TOLERANCE] = 0.9
-    assert connections.workspace_length(rho, h, limits) == pytest.approx(turn * RADIUS)
+    assert workspace_length(0.0) == math.inf
+    assert workspace_length(0.7) == math.inf
+    assert workspace_length(0.9) == pytest.approx(turn * RADIUS)
     assert connections.nearest_turn(rho, h, KAPPA) == pytest.approx((turn, 0.8))

@@ -317,7 +317,9 @@ class TestSpaces:
         environment = scene(obstacles_as)
         points = np.random.default_rng(0).uniform([-15, -15, 0], [15, 15, 40], (300, 3))
         found = obstacle_clearance_mm(environment.obstacles, points)
-        centres = environment.grid.lps(np.argwhere((environment.obstacles[1] & OBSTACLES) != 0).astype(float))
+        centres = environment.grid.lps(
+            np.argwhere((environment.obstacles.labels & OBSTACLES) != 0).astype(float)
+        )
         gaps = np.maximum(np.abs(points[:, None] - centres) - obstacles_as, 0.0)
         exact = np.linalg.norm(gaps, axis=2).min(axis=1)
         edge = np.minimum(points - [-20, -20, -5], [20, 20, 45] - points).min(axis=1)

@@ -18,7 +18,7 @@ from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment, workspace_lengths
 from stages.needle.kernels import connections, proof, rrt, tree
 from stages.needle.kernels import cost as cost_kernels
-from stages.needle.kernels import limits as limits_index
+from stages.needle.kernels.limits import Limits
 from stages.needle.objective import SHORTEST
 from stages.needle.path import ArcPath, blocker_on_path, path_from_tree
 from tests.stages.scenes import Canvas, brute_clearance, line_tree, lung_of
@@ -26,13 +26,15 @@ from tests.stages.scenes import Canvas, brute_clearance, line_tree, lung_of
 RADIUS = 50.0
 
 
-def limits_of(**values: float) -> Float:
+def limits_of(**values: float) -> Limits:
     """Limits of a needle of 50 mm radius, 90 and 180 degrees, 150 mm."""
-    given_values = {"KAPPA": 1 / RADIUS, "MAX_LENGTH": 150.0, "MAX_ANGLE": math.pi / 2, "MAX_TURN": math.pi}
-    limits = np.zeros(limits_index.N_LIMITS)
-    for name, value in {**given_values, **values}.items():
-        limits[getattr(limits_index, name)] = value
-    return limits
+    needle = {
+        "kappa": 1 / RADIUS,
+        "max_length_mm": 150.0,
+        "max_angle_rad": math.pi / 2,
+        "max_turn_rad": math.pi,
+    }
+    return Limits(**dict.fromkeys(Limits._fields, 0.0) | needle | values)
 
 
 class TestWorkspace:
@@ -47,7 +49,7 @@ class TestWorkspace:
             math.pi * RADIUS / 2
         )
 
-    @pytest.mark.parametrize("limit", ["MAX_ANGLE", "MAX_TURN"])
+    @pytest.mark.parametrize("limit", ["max_angle_rad", "max_turn_rad"])
     def test_either_turning_limit_cuts_the_quarter_circle_off(self, limit: str) -> None:
         assert (
             connections.workspace_length(RADIUS, RADIUS, limits_of(**{limit: math.radians(89.9)})) == math.inf
@@ -55,10 +57,10 @@ class TestWorkspace:
 
     def test_length_limit(self) -> None:
         quarter = math.pi * RADIUS / 2
-        within, beyond = limits_of(MAX_LENGTH=quarter + 1e-6), limits_of(MAX_LENGTH=quarter - 1e-6)
+        within, beyond = limits_of(max_length_mm=quarter + 1e-6), limits_of(max_length_mm=quarter - 1e-6)
         assert connections.workspace_length(RADIUS, RADIUS, within) < math.inf
         assert connections.workspace_length(RADIUS, RADIUS, beyond) == math.inf
-        assert connections.workspace_length(0.0, 40.0, limits_of(MAX_LENGTH=39.9)) == math.inf
+        assert connections.workspace_length(0.0, 40.0, limits_of(max_length_mm=39.9)) == math.inf
 
     def test_quarter_circle_then_straight(self) -> None:
         found = connections.workspace_length(RADIUS + 30.0, RADIUS, limits_of())
@@ -69,8 +71,8 @@ class TestWorkspace:
         assert connections.workspace_length(rho, -1.0, limits_of()) == math.inf
 
     def test_inside_the_tightest_circle_only_a_path_of_more_than_half_a_turn_leads(self) -> None:
-        assert connections.workspace_length(RADIUS, 10.0, limits_of(MAX_LENGTH=500.0)) == math.inf
-        wide = limits_of(MAX_ANGLE=math.pi, MAX_TURN=3 * math.pi, MAX_LENGTH=500.0)
+        assert connections.workspace_length(RADIUS, 10.0, limits_of(max_length_mm=500.0)) == math.inf
+        wide = limits_of(max_angle_rad=math.pi, max_turn_rad=3 * math.pi, max_length_mm=500.0)
         assert math.pi * RADIUS < connections.workspace_length(RADIUS, 10.0, wide) < 2.5 * math.pi * RADIUS
 
     @given(angle=st.floats(1e-3, math.pi / 2), share=st.floats(0.05, 1.0))
@@ -79,14 +81,14 @@ class TestWorkspace:
         radius = RADIUS / share
         length = radius * angle
         found = connections.workspace_length(
-            radius * (1 - math.cos(angle)), radius * math.sin(angle), limits_of(MAX_LENGTH=length + 1e-9)
+            radius * (1 - math.cos(angle)), radius * math.sin(angle), limits_of(max_length_mm=length + 1e-9)
         )
         assert found <= length + 1e-9
 
     def test_is_the_shortest_of_all_arcs_followed_by_straight_lines(self) -> None:
         """Against a dense family of them, for points all over the half plane."""
         rng = np.random.default_rng(1)
-        limits = limits_of(MAX_ANGLE=math.radians(70.0), MAX_LENGTH=120.0)
+        limits = limits_of(max_angle_rad=math.radians(70.0), max_length_mm=120.0)
         angle = np.linspace(0.0, math.radians(70.0), 20001)
         for rho, h in rng.uniform([0.0, -20.0], [110.0, 120.0], (400, 2)):
             found = connections.workspace_length(rho, h, limits)
@@ -104,7 +106,7 @@ class TestWorkspace:
         """Ends of random curves within the limits lie inside, and the shortest path is no longer."""
         rng = np.random.default_rng(2)
         max_angle, max_turn = math.radians(80.0), math.radians(150.0)
-        limits = limits_of(MAX_ANGLE=max_angle, MAX_TURN=max_turn)
+        limits = limits_of(max_angle_rad=max_angle, max_turn_rad=max_turn)
         tested = 0
         for _ in range(3000):
             curvature = rng.choice([0.0, 1.0, rng.uniform()], 5) / RADIUS
@@ -152,8 +154,9 @@ def crowded_environments(draw: Any) -> tuple[Lung, Float, tuple[float, ...], tup
     canvas.labels[tuple(rng.integers(8, 14, 3))] = 0
     lung = lung_of(canvas.labels, canvas.grid, line_tree([0, 0, 0], [0, 0, 1], 1.0))
     radius = draw(st.sampled_from([0.1, 0.3, 0.5]))
-    limits = limits_of(REQUIRED=radius + draw(st.sampled_from([0.0, 0.3, 0.6])), RADIUS=radius)
-    limits[limits_index.EXEMPT_LENGTH] = draw(st.sampled_from([0.0, 1.0, 3.3]))
+    required = radius + draw(st.sampled_from([0.0, 0.3, 0.6]))
+    exempt = draw(st.sampled_from([0.0, 1.0, 3.3]))
+    limits = limits_of(required_mm=required, radius_mm=radius, exempt_mm=exempt)
     start = np.concatenate([rng.uniform(-2.0, 2.0, 3), np.zeros(3)])
     frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     start[3:] = frame[0]
@@ -175,9 +178,9 @@ def points_of_arc(pose: Any, bend: Any, length: float, step: float) -> tuple[Flo
 
 def spare_clearance(lung: Lung, limits: Float, points: Float, s: Float, branch: int) -> float:
     """The least clearance beyond what is required at the points, voxels as solid boxes, by the rules."""
-    required = limits[limits_index.REQUIRED]
+    required = limits.required_mm
     cap = required + 1.0
-    in_exit = (s < limits[limits_index.EXEMPT_LENGTH]) & (branch >= 0)
+    in_exit = (s < limits.exempt_mm) & (branch >= 0)
 
     def distance(where: Any, bits: int, exempt: int = -1) -> Float:
         return brute_clearance(lung.labels, lung.grid, points[where], bits, cap, exempt)
@@ -185,7 +188,7 @@ def spare_clearance(lung: Lung, limits: Float, points: Float, s: Float, branch: 
     spare = [distance(~in_exit, OBSTACLES) - required] if (~in_exit).any() else []
     if in_exit.any():
         spare.append(distance(in_exit, OBSTACLES, branch) - required)
-        spare.append(distance(in_exit, LUMEN) - limits[limits_index.RADIUS])
+        spare.append(distance(in_exit, LUMEN) - limits.radius_mm)
     return float(np.concatenate(spare).min())
 
 
@@ -217,7 +220,7 @@ class TestBlocker:
             assert spare >= -1e-9
         elif spare >= 0.01 + 0.01:
             # The end of the exemption falls between two samples: only there may the kernel know better.
-            edge = limits[limits_index.EXEMPT_LENGTH] - begun
+            edge = limits.exempt_mm - begun
             assert 0.0 <= edge <= length
             at = points_of_arc(pose, bend, max(edge, 1e-9), 1e9)[0][-1:]
             assert spare_clearance(lung, limits, at, np.array([np.inf]), branch) < 0.01
@@ -226,7 +229,7 @@ class TestBlocker:
         canvas = Canvas.empty([-10, -10, -10], [10, 10, 10], 0.5)
         canvas.add(canvas.ball([0, 0, 5], 1.0), VESSEL)
         lung = canvas.lung()
-        limits = limits_of(REQUIRED=1.0, RADIUS=0.5)
+        limits = limits_of(required_mm=1.0, radius_mm=0.5)
         bend = (0.0, 1.0, 0.0, 0.0)
         assert proof.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 8.0, 0.0, -1) == VESSEL
         assert proof.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 2.0, 0.0, -1) == 0
@@ -238,7 +241,7 @@ class TestBlocker:
     def test_no_start_outside_the_grid(self, start: tuple[float, float, float]) -> None:
         lung = Canvas.empty([-10, -10, -10], [10, 10, 10], 1.0).lung()
         pose = (*start, 0.0, 0.0, 1.0)
-        limits = limits_of(REQUIRED=1.0)
+        limits = limits_of(required_mm=1.0)
         assert proof.blocker_on_arc(arrays(lung), limits, pose, (0.0, 1.0, 0.0, 0.0), 1.0, 0.0, -1) == OUTSIDE
 
 
@@ -252,7 +255,7 @@ class TestExemption:
         x = canvas.points[..., 0]
         canvas.airway(x < -1, x < 2, 0)
         lung = canvas.lung()
-        values = limits_of(REQUIRED=0.9, RADIUS=0.4, EXEMPT_LENGTH=5.0, **limits)
+        values = limits_of(required_mm=0.9, radius_mm=0.4, exempt_mm=5.0, **limits)
         pose, bend = (0.0, 0, 0, 0, 0, 1.0), (0.0, 1.0, 0, 0)
         return int(proof.blocker_on_arc(arrays(lung), values, pose, bend, length, begun, branch))
 
@@ -273,7 +276,7 @@ class TestExemption:
         x = canvas.points[..., 0]
         canvas.airway(x < -1, x < 4, 0)
         environment = arrays(canvas.lung())
-        values = limits_of(REQUIRED=0.9, RADIUS=0.4, EXEMPT_LENGTH=5.0)
+        values = limits_of(required_mm=0.9, radius_mm=0.4, exempt_mm=5.0)
         for gap, clear in ((0.41, True), (0.39, False)):
             pose = (-1.0 + gap, 0.0, 0.0, 0.0, 0.0, 1.0)
             label = proof.blocker_on_arc(environment, values, pose, (0.0, 1.0, 0, 0), 3.0, 0.0, 0)
@@ -285,7 +288,7 @@ class TestExemption:
         x = canvas.points[..., 0]
         canvas.airway(x < -1, x < 2, 0)
         canvas.add(canvas.ball([0.0, 0.0, 3.0], 0.6), VESSEL)
-        values = limits_of(REQUIRED=0.9, RADIUS=0.4, EXEMPT_LENGTH=5.0)
+        values = limits_of(required_mm=0.9, radius_mm=0.4, exempt_mm=5.0)
         pose = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
         label = proof.blocker_on_arc(arrays(canvas.lung()), values, pose, (0.0, 1.0, 0, 0), 4.0, 0.0, 0)
         assert label & VESSEL
@@ -410,7 +413,7 @@ class TestRrt:
         assert np.linalg.norm(path.frames()[-1][:3, 3] - GOAL) < 1e-6
         assert blocker_on_path(environment, path, -1) == 0
         points, _ = path.sample(0.02)
-        gap = brute_clearance(environment.obstacles[1], environment.grid, points, OBSTACLES, 2.0)
+        gap = brute_clearance(environment.obstacles.labels, environment.grid, points, OBSTACLES, 2.0)
         assert gap.min() >= environment.required_clearance_mm - 1e-6
 
     @pytest.mark.parametrize(

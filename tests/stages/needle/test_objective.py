@@ -144,18 +144,18 @@ def test_a_map_of_obstacles_alone_is_refused() -> None:
 
 def test_the_kernels_see_one_type_of_map() -> None:
     """Else they would be compiled twice."""
-    _weights, given_map = Objective(cost_map=1.0).arrays(a_map())
-    _weights, none = SHORTEST.arrays(None)
-    _weights, not_looked_at = SHORTEST.arrays(a_map())
+    given_map = Objective(cost_map=1.0).arrays(a_map()).cost_map
+    none = SHORTEST.arrays(None).cost_map
+    not_looked_at = SHORTEST.arrays(a_map()).cost_map
     assert numba.typeof(given_map) == numba.typeof(none) == numba.typeof(not_looked_at)
     assert none is NO_MAP and not_looked_at is NO_MAP
-    _weights, converted = Objective(voxel_sum=1.0).arrays(a_map().astype(np.float64, order="C"))
+    converted = Objective(voxel_sum=1.0).arrays(a_map().astype(np.float64, order="C")).cost_map
     assert numba.typeof(converted) == numba.typeof(NO_MAP) and np.array_equal(converted, a_map())
 
 
 def test_the_least_cost_of_a_mm() -> None:
     def least(objective: Objective) -> float:
-        return float(objective.arrays(a_map(0.25))[0][kernel.LEAST_RATE])
+        return objective.arrays(a_map(0.25)).least_rate
 
     assert least(Objective(length=2.0)) == 2.0
     assert least(Objective(cost_map=3.0)) == pytest.approx(0.75)
@@ -185,7 +185,7 @@ def test_no_arc_costs_less(
     pose = (*place, math.cos(angle), 0.0, math.sin(angle))
     bend = (curvature, 0.0, 1.0, 0.0)
     cost = kernel.cost_of_arc(environment.obstacles, objective, 0.5, pose, bend, length, first)
-    assert cost >= objective[0][kernel.LEAST_RATE] * length * (1.0 - 1e-12)
+    assert cost >= objective.least_rate * length * (1.0 - 1e-12)
 
 
 def test_weights_add_up(environment: NeedleEnvironment) -> None:

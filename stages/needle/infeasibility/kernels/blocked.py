@@ -67,15 +67,16 @@ def clearance_above(obstacles, required, spare, exempt_branch, x, y, z):
 
     Where the clearance is at least `required - spare` and the field says so, `required` is returned.
     """
-    field, labels, geometry, bits = obstacles
-    squared, spread2 = interpolate_squared(field, geometry, x, y, z)
+    squared, spread2 = interpolate_squared(obstacles.clearance, obstacles.geometry, x, y, z)
     least = max(required - spare, 0.0)
     if squared > 0.0 and squared - spread2 >= least * least:
         return required
     above = math.sqrt(squared) + math.sqrt(spread2) + FIELD_STEP_MM
     if exempt_branch < 0 and squared > 0.0 and above < 0.5 * required:
         return above
-    return exact_distance(labels, geometry, x, y, z, bits, exempt_branch, required)[0]
+    return exact_distance(
+        obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, exempt_branch, required
+    )[0]
 
 
 @inner_kernel

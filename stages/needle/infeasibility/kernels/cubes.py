@@ -19,8 +19,7 @@ def flood(obstacles, required, exempt_branch, exempt_mm, scale, ends, frame, sid
 
     Parameters
     ----------
-    obstacles : tuple
-        See `stages.needle.kernels.proof`.
+    obstacles : Obstacles
     required : float
     exempt_branch : int, exempt_mm : float
         Branch whose airway voxels do not count less than so many mm away from the start.

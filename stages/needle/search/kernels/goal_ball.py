@@ -14,7 +14,7 @@ import numba
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, shortest_path
-from stages.needle.kernels.limits import GOAL_TOLERANCE, KAPPA, MAX_ANGLE, MIN_ARC_MM, TINY
+from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 
 
 @inner_kernel
@@ -62,14 +62,14 @@ def least_length(rho, h, limits, cosine, turn_left):
     ----------
     rho, h : float
         How far the goal is aside and ahead, mm.
-    limits : (N_LIMITS,) float64
+    limits : Limits
     cosine : float
         Cosine of the angle between the tip and the direction from which the limit of the angle counts.
     turn_left : float
         What is left of the accumulated turn, rad.
     """
-    tolerance = limits[GOAL_TOLERANCE]
-    kappa = limits[KAPPA]
+    tolerance = limits.goal_tolerance_mm
+    kappa = limits.kappa
     radius = 1.0 / kappa
     distance2 = rho * rho + h * h
     if distance2 <= tolerance * tolerance:
@@ -86,9 +86,9 @@ def least_length(rho, h, limits, cosine, turn_left):
     if not tolerance <= straight < math.inf:
         turn = turn_into_ball(rho, h, kappa, tolerance)
         length = turn / kappa
-    if turn <= limits[MAX_ANGLE] and turn <= turn_left or turn_left > math.pi:
+    if turn <= limits.max_angle_rad and turn <= turn_left or turn_left > math.pi:
         return length
-    allowed = min(limits[MAX_ANGLE] + math.acos(min(max(cosine, -1.0), 1.0)), turn_left)
+    allowed = min(limits.max_angle_rad + math.acos(min(max(cosine, -1.0), 1.0)), turn_left)
     return length if least_turn_into_ball(rho, h, kappa, tolerance) <= allowed + TINY else math.inf
 
 
@@ -100,7 +100,7 @@ def shortest_into_ball(pose, goal, limits):
     ahead of the second leg if the third length is not 0.  A goal inside the circle, farther from it than the
     tolerance, is reached exactly, by a path CC.
     """
-    kappa, tolerance = limits[KAPPA], limits[GOAL_TOLERANCE]
+    kappa, tolerance = limits.kappa, limits.goal_tolerance_mm
     rho, h = seen_from(pose, goal)
     first, first_length, second, second_length = shortest_legs(pose, goal, kappa)
     ahead = 0.0
@@ -129,8 +129,8 @@ def single_into_ball(pose, goal, limits):
     The length is 0 where there is none, or it would be too tight, turn by more than 180 degrees, or be empty.
     """
     length, bend, turn = arc_to_point(pose, goal)
-    if bend[0] > limits[KAPPA] * (1.0 + TINY) or turn > math.pi or length == math.inf:
+    if bend[0] > limits.kappa * (1.0 + TINY) or turn > math.pi or length == math.inf:
         return bend, 0.0
-    half = 0.5 * bend[0] * limits[GOAL_TOLERANCE]
-    length -= 2.0 * math.asin(min(half, 1.0)) / bend[0] if half > TINY else limits[GOAL_TOLERANCE]
+    half = 0.5 * bend[0] * limits.goal_tolerance_mm
+    length -= 2.0 * math.asin(min(half, 1.0)) / bend[0] if half > TINY else limits.goal_tolerance_mm
     return bend, length if length > MIN_ARC_MM else 0.0

@@ -10,13 +10,7 @@ from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import length_ahead, seen_from
-from stages.needle.kernels.cost import LEAST_RATE
 from stages.needle.kernels.limits import (
-    GOAL_TOLERANCE,
-    KAPPA,
-    MAX_LENGTH,
-    MAX_STEP,
-    MAX_TURN,
     MIN_ARC_MM,
     TINY,
 )
@@ -56,8 +50,8 @@ def _choose(nodes, count, q, limits, rate, cost_bound):
         node = nodes[m]
         pose = pose_of(node)
         rho, h = seen_from(pose, q)
-        length = length_ahead(rho, h, limits, math.pi, limits[MAX_TURN] - node[PATH_TURN])
-        if not node[PATH_LENGTH] + length <= limits[MAX_LENGTH]:
+        length = length_ahead(rho, h, limits, math.pi, limits.max_turn_rad - node[PATH_TURN])
+        if not node[PATH_LENGTH] + length <= limits.max_length_mm:
             continue
         if cost_bound < math.inf:
             measure = rate * length + max(node[PATH_COST] - cost_bound, 0.0)
@@ -88,7 +82,7 @@ def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, cou
         )
         if count > 1:
             return count, 0, True
-    rate = objective[0][LEAST_RATE]
+    rate = objective.least_rate
     for used in range(iterations):
         if count + ROWS_PER_STEP > nodes.shape[0]:
             return count, used, False
@@ -101,7 +95,7 @@ def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, cou
             ):
                 count += 1
         else:
-            end = within(goal, limits[GOAL_TOLERANCE], state)
+            end = within(goal, limits.goal_tolerance_mm, state)
             q, drawn = sample_between(start, end, limits, state)
             bound = math.inf
             if best < math.inf and uniform(state) >= CHEAPEST_SHARE:
@@ -128,8 +122,8 @@ def _extend(obstacles, limits, objective, branch, nodes, parents, count, near, q
     if uniform(state) < 0.5:
         return add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best)
     length, bend, _turn = arc_to_point(pose_of(nodes[near]), q)
-    length = min(length, limits[MAX_STEP])
-    if bend[0] > limits[KAPPA] or length < MIN_ARC_MM:
+    length = min(length, limits.max_step_mm)
+    if bend[0] > limits.kappa or length < MIN_ARC_MM:
         return count
     added = add_arc(
         obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
@@ -149,7 +143,7 @@ def build(obstacles, limits, objective, branch, goal, nodes, parents, vias, coun
         q = (vias[m, 0], vias[m, 1], vias[m, 2])
         if vias[m, 3] == ARC:
             length, bend, _turn = arc_to_point(pose_of(nodes[last]), q)
-            if length < MIN_ARC_MM or bend[0] > limits[KAPPA] * (1.0 + TINY):
+            if length < MIN_ARC_MM or bend[0] > limits.kappa * (1.0 + TINY):
                 return 0
             if not add_arc(
                 obstacles, limits, objective, branch, nodes, parents, last + 1, last, bend, length, goal, best
@@ -225,7 +219,7 @@ def _mutate(vias, trial, count, goal, limits, state):
     dy = trial[last, 1] - goal[1]
     dz = trial[last, 2] - goal[2]
     missing = math.sqrt(dx * dx + dy * dy + dz * dz)
-    allowed = limits[GOAL_TOLERANCE] * (1.0 - TINY)
+    allowed = limits.goal_tolerance_mm * (1.0 - TINY)
     scale = allowed / missing if missing > allowed else 1.0
     trial[last, 0] = goal[0] + scale * dx
     trial[last, 1] = goal[1] + scale * dy
@@ -240,7 +234,7 @@ def refine(obstacles, limits, objective, branch, goal, nodes, parents, vias, cou
     `vias` (N, 4) holds the path and gets the best one; rows of `nodes` but the root are scratch.
     """
     trial = vias.copy()
-    rate = objective[0][LEAST_RATE]
+    rate = objective.least_rate
     improved = 0
     for _ in range(tries):
         number = _mutate(vias, trial, count, goal, limits, state)

@@ -19,12 +19,6 @@ from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.limits import (
-    COST_STEP,
-    GOAL_TOLERANCE,
-    KAPPA,
-    MAX_ANGLE,
-    MAX_LENGTH,
-    MAX_TURN,
     TINY,
 )
 from stages.needle.kernels.proof import blocker_on_arc
@@ -250,10 +244,10 @@ def _estimate(nodes, row, rates, goal, limits, reference):
     """Return a cost below which no path within the limits leads by a node to the goal; inf if none does."""
     rho, h = seen_from(_pose(nodes, row), goal)
     cosine = nodes[row, 3] * reference[0] + nodes[row, 4] * reference[1] + nodes[row, 5] * reference[2]
-    ahead = least_length(rho, h, limits, cosine, limits[MAX_TURN] - nodes[row, PATH_TURN])
-    if nodes[row, PATH_LENGTH] + ahead > limits[MAX_LENGTH] + TINY:
+    ahead = least_length(rho, h, limits, cosine, limits.max_turn_rad - nodes[row, PATH_TURN])
+    if nodes[row, PATH_LENGTH] + ahead > limits.max_length_mm + TINY:
         return math.inf
-    missing = limits[GOAL_TOLERANCE] if ahead > 0.0 else math.hypot(rho, h)
+    missing = limits.goal_tolerance_mm if ahead > 0.0 else math.hypot(rho, h)
     return nodes[row, PATH_COST] + rates[0] * ahead + rates[1] * missing
 
 
@@ -272,7 +266,7 @@ def _push_level(
     fine_mm, rolls, arcs, primitives, first = words
     n_rolls, full, row = rolls.shape[0], arcs.shape[0] - 1, counts[NODES]
     forward = nodes[at, 3] * reference[0] + nodes[at, 4] * reference[1] + nodes[at, 5] * reference[2]
-    least = math.cos(limits[MAX_ANGLE])
+    least = math.cos(limits.max_angle_rad)
     rank = links[at, NODE_RANK] + 1 + level
     barred = links[at, DIRECTION] if links[at, STEPS] < full else -1
     best_estimate = math.inf
@@ -281,12 +275,12 @@ def _push_level(
         if direction == barred or steps >= proved[at, direction, USELESS]:
             continue
         length = steps * fine_mm
-        bend = bend_of(nodes, rolls, limits[KAPPA], at, direction)
+        bend = bend_of(nodes, rolls, limits.kappa, at, direction)
         turn = bend[0] * length
         nodes[row, PATH_LENGTH] = nodes[at, PATH_LENGTH] + length
         nodes[row, PATH_TURN] = nodes[at, PATH_TURN] + turn
         nodes[row, PATH_COST] = nodes[at, PATH_COST] + rates[0] * length
-        within = nodes[row, PATH_TURN] <= limits[MAX_TURN] + TINY
+        within = nodes[row, PATH_TURN] <= limits.max_turn_rad + TINY
         # The cosine of an angle falls by no more than the arc turns.
         if within and forward - turn < least:
             within = angle_kept(limits, reference, _pose(nodes, at), bend, turn)[0]
@@ -323,7 +317,7 @@ def _add(
     if steps >= proved[at, direction, USELESS]:
         return math.inf
     length = steps * fine_mm
-    bend = bend_of(nodes, rolls, limits[KAPPA], at, direction)
+    bend = bend_of(nodes, rolls, limits.kappa, at, direction)
     _follow(nodes, words, bend, at, direction, steps, row)
     nodes[row, PATH_LENGTH] = nodes[at, PATH_LENGTH] + length
     nodes[row, PATH_TURN] = nodes[at, PATH_TURN] + bend[0] * length
@@ -339,7 +333,7 @@ def _add(
             counts[REFUSED] += 1
             return math.inf
         proved[at, direction, CLEAR] = steps
-    cost = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, at == 0)
+    cost = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, at == 0)
     if cost > rates[0] * length:
         nodes[row, PATH_COST] = nodes[at, PATH_COST] + cost
         slot, duplicate = find_duplicate(nodes, seen, merge, n_rolls, row)
@@ -383,7 +377,7 @@ def _connect(obstacles, limits, objective, rates, branch, goal, reference, nodes
         for leg in range(3):
             if length > 0.0:
                 turn += bend[0] * length
-                within = begun + length <= limits[MAX_LENGTH] + TINY and turn <= limits[MAX_TURN] + TINY
+                within = begun + length <= limits.max_length_mm + TINY and turn <= limits.max_turn_rad + TINY
                 if not (
                     within
                     and found + rates[0] * length < most
@@ -391,7 +385,7 @@ def _connect(obstacles, limits, objective, rates, branch, goal, reference, nodes
                     and blocker_on_arc(obstacles, limits, pose, bend, length, begun, branch) == 0
                 ):
                     break
-                paid = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, is_start)
+                paid = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, is_start)
                 if leg == 2:
                     if paid <= rates[1] * missing * (1.0 + ROUNDING):
                         total = found + paid
@@ -429,8 +423,7 @@ def search_words(
 
     Parameters
     ----------
-    obstacles, limits, objective : tuple, (N_LIMITS,) float64, tuple
-        See `proof`, `limits` and `cost`.
+    obstacles, limits, objective : Obstacles, Limits, ObjectiveArrays
     rates : tuple of float
         Least cost of a mm of path, and what each mm costs by which the path ends short of the goal; no
         more than the former.
@@ -480,7 +473,7 @@ def search_words(
         at, level = counts[NODES] - 1, 0
         if counts[POPS] == 0:
             f = _estimate(nodes, at, rates, goal, limits, reference)
-            bend = bend_of(nodes, words[1], limits[KAPPA], at, words[1].shape[0])
+            bend = bend_of(nodes, words[1], limits.kappa, at, words[1].shape[0])
             begun = nodes[at, PATH_LENGTH]
             if blocker_on_arc(obstacles, limits, _pose(nodes, at), bend, 0.0, begun, branch) != 0:
                 f = math.inf

@@ -20,7 +20,6 @@ import numba
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.cost import cost_of_arc
-from stages.needle.kernels.limits import COST_STEP
 from stages.needle.kernels.proof import blocker_on_arc
 
 MOVES = 7
@@ -116,7 +115,7 @@ def _arc_cost(obstacles, limits, objective, branch, p, along, q, kappa, behind, 
     length, bend, _turn = arc_to_point(pose, q)
     if bend[0] > kappa:
         return math.inf
-    cost = cost_of_arc(obstacles, objective, limits[COST_STEP], pose, bend, length, first)
+    cost = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, first)
     if cost >= most or blocker_on_arc(obstacles, limits, pose, bend, length, behind, branch) != 0:
         return math.inf
     return cost

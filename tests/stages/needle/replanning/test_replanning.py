@@ -88,7 +88,7 @@ def angle_from(direction: Float, path: ArcPath) -> float:
 
 def clearances(environment: NeedleEnvironment, path: ArcPath) -> tuple[Float, Float]:
     points, lengths = path.sample(0.05)
-    return brute_clearance(environment.obstacles[1], environment.grid, points, OBSTACLES, 6.0), lengths
+    return brute_clearance(environment.obstacles.labels, environment.grid, points, OBSTACLES, 6.0), lengths
 
 
 class TestFound:

@@ -17,7 +17,7 @@ from anatomy.kernels.arcs import pose_on_arc
 from anatomy.structures import OBSTACLES
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment, workspace_lengths
-from stages.needle.kernels import limits as index
+from stages.needle.kernels.limits import Limits
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path
 from stages.needle.search.base import Query
@@ -52,7 +52,7 @@ def judge(environment: NeedleEnvironment, maze: Maze, path: ArcPath) -> None:
     """Walk a path in steps of 0.02 mm."""
     points, _ = path.sample(0.02)
     clearance = brute_clearance(
-        environment.obstacles[1], environment.grid, points, OBSTACLES, CLEARANCE_MM + 1.0
+        environment.obstacles.labels, environment.grid, points, OBSTACLES, CLEARANCE_MM + 1.0
     )
     assert clearance.min() >= CLEARANCE_MM - 1e-9
     assert blocker_on_path(environment, path, -1) == 0
@@ -120,8 +120,7 @@ class TestResolution:
     def test_no_search_where_nothing_is_proved(self) -> None:
         maze = in_box([])
         environment = maze.environment()
-        limits = environment.limits.copy()
-        limits[index.LOOKUP_STEP] = 0.5
+        limits = environment.limits._replace(lookup_step_mm=0.5)
         with pytest.raises(SettingsError, match="proved"):
             ResolutionSearch(replace(environment, limits=limits), maze.query)
 
@@ -132,11 +131,11 @@ class TestGoalBall:
     RADIUS = 30.0
 
     @classmethod
-    def limits(cls, tolerance: float, max_angle_deg: float) -> Float:
-        limits = np.zeros(index.N_LIMITS)
-        limits[index.KAPPA], limits[index.GOAL_TOLERANCE] = 1.0 / cls.RADIUS, tolerance
-        limits[index.MAX_ANGLE] = math.radians(max_angle_deg)
-        return limits
+    def limits(cls, tolerance: float, max_angle_deg: float) -> Limits:
+        values = dict.fromkeys(Limits._fields, 0.0) | {"kappa": 1.0 / cls.RADIUS}
+        return Limits(
+            **values | {"goal_tolerance_mm": tolerance, "max_angle_rad": math.radians(max_angle_deg)}
+        )
 
     @given(
         rho=st.floats(0.0, 60.0),
@@ -195,7 +194,7 @@ class TestGoalBall:
             assert math.dist(end_of(start, [*legs, (second, ahead)])[:3], goal) < 1e-6
         bend, length = goal_ball.single_into_ball(start, goal, limits)
         if length > 0.0:
-            assert bend[0] <= limits[index.KAPPA] * (1.0 + 1e-9)
+            assert bend[0] <= limits.kappa * (1.0 + 1e-9)
             assert math.dist(end_of(start, [(bend, length)])[:3], goal) == pytest.approx(left, abs=1e-5)
 
 

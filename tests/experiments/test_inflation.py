@@ -125,7 +125,7 @@ class TestInflatedSpace:
         environment = inflated_environment(single_voxel(1.5))
         labels = np.zeros_like(environment.obstacles.labels)
         labels[:, :, 10] = VESSEL
-        arrays = (environment.obstacles.clearance, labels, *environment.obstacles[2:])
+        arrays = environment.obstacles._replace(labels=labels)
         for low, found in ((-1.2, 0), (0.2, VESSEL), (-2.0, VESSEL)):
             pose = (0.0, 0.0, low, 0.0, 0.0, 1.0)
             assert (

@@ -140,7 +140,7 @@ N = 22
 
 
 @st.composite
-def crowded_environments(draw: Any) -> tuple[Lung, Float, tuple[float, ...], tuple[float, ...], float]:
+def crowded_environments(draw: Any) -> tuple[Lung, Limits, tuple[float, ...], tuple[float, ...], float]:
     """A small volume with obstacles strewn about, limits, and an arc that begins near its middle."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     spacing = np.array(draw(SPACINGS))
@@ -176,7 +176,7 @@ def points_of_arc(pose: Any, bend: Any, length: float, step: float) -> tuple[Flo
     )
 
 
-def spare_clearance(lung: Lung, limits: Float, points: Float, s: Float, branch: int) -> float:
+def spare_clearance(lung: Lung, limits: Limits, points: Float, s: Float, branch: int) -> float:
     """The least clearance beyond what is required at the points, voxels as solid boxes, by the rules."""
     required = limits.required_mm
     cap = required + 1.0
@@ -294,10 +294,10 @@ class TestExemption:
         assert label & VESSEL
 
 
-def arrays(lung: Lung) -> Any:
+def arrays(lung: Lung) -> proof.Obstacles:
     """What the kernels look at, without fissures."""
     field = lung.fields["obstacle"]
-    return field.corners, lung.labels, field.geometry, OBSTACLES
+    return proof.Obstacles(field.corners, lung.labels, field.geometry, OBSTACLES)
 
 
 def ball_environment(**changes: float) -> NeedleEnvironment:

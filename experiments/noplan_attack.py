@@ -25,7 +25,6 @@ import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.io.files import atomic_write
 from anatomy.typed import Float
-from lungaccess.cli.inputs import load_device
 from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
@@ -141,7 +140,7 @@ def main() -> None:
     parser.add_argument("--cache", default=None)
     options = parser.parse_args()
     lung = la.load_patient(options.patient, cache=options.cache)
-    system = load_device(options.system, options.allow_fissures)
+    system = la.load_system(options.system, fissures_allowed=options.allow_fissures)
     settings = {
         "lung": lung.key,
         "system": system_fingerprint(system),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -18,9 +18,8 @@ from lungaccess.cli.commands.advise import advise
 from lungaccess.cli.commands.alternatives import alternatives
 from lungaccess.cli.commands.certify import certify
 from lungaccess.cli.commands.check import check
-from lungaccess.cli.commands.common import BAD_INPUT, INTERRUPTED, NO_PLAN, OK
 from lungaccess.cli.commands.demo import demo
-from lungaccess.cli.commands.doctor import completion, doctor
+from lungaccess.cli.commands.doctor import doctor
 from lungaccess.cli.commands.export import export
 from lungaccess.cli.commands.info import info, presets
 from lungaccess.cli.commands.needle import needle
@@ -33,6 +32,7 @@ from lungaccess.cli.commands.segment import segment
 from lungaccess.cli.commands.study import study
 from lungaccess.cli.commands.tour import tour
 from lungaccess.cli.commands.tubes import tubes
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.terminal import error_console
 
 _TOO_LARGE = AnatomyError(
@@ -59,6 +59,20 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
+
+
+def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
+    """Print a script that lets a shell complete commands, options and choices.
+
+    Parameters
+    ----------
+    shell : str
+        bash, zsh or fish; docs/command_line.md says where the script goes.
+    """
+    terminal.console.file.write(app.generate_completion(prog_name="lungaccess", shell=shell))
+    return ExitCode.OK
+
+
 for _command in (
     plan, needle, certify, check, info, presets, demo, advise, alternatives, route, tour, tubes, risk, reach,
     segment, study, report, export, doctor, completion,
@@ -99,27 +113,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app.meta(_with_nodule_number(words), exit_on_error=False, error_console=error_console)
     except CycloptsError:
-        return BAD_INPUT
+        return ExitCode.BAD_INPUT
     except LungaccessError as error:
         return _explain(error)
     except MemoryError:
         terminal.show_error(_TOO_LARGE)
-        return BAD_INPUT
+        return ExitCode.BAD_INPUT
     except KeyboardInterrupt:
         error_console.print("interrupted")
-        return INTERRUPTED
-    return int(code or OK)
+        return ExitCode.INTERRUPTED
+    return int(code or ExitCode.OK)
 
 
-def _explain(error: LungaccessError) -> int:
+def _explain(error: LungaccessError) -> ExitCode:
     """Print an error for people and return the exit code that belongs to it."""
     from lungaccess.plans.no_plan import NoPlan
 
     if isinstance(error, NoPlan):
         terminal.show_no_plan(error)
-        return NO_PLAN
+        return ExitCode.NEGATIVE
     terminal.show_error(error)
-    return BAD_INPUT
+    return ExitCode.BAD_INPUT
 
 
 def _with_nodule_number(words: list[str]) -> list[str]:

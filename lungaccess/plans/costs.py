@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
 from stages import needle
-from stages.needle import ArcPath, Objective, Obstacles
+from stages.needle import TERMS, ArcPath, Objective, Obstacles
 
 
 def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fissures: bool) -> float:
@@ -30,6 +32,12 @@ def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fis
 def path_costs(lung: Lung, path: ArcPath, *, with_fissures: bool) -> dict[str, float]:
     """Return every cost of a needle path by its key; see `path_cost`."""
     return needle.path_costs(_obstacles(lung, with_fissures), lung.cost, path)
+
+
+def costs_in_words(stated: Mapping[str, float]) -> list[tuple[str, str]]:
+    """Return what people call each stated cost, with its unit, and its value; a weighted sum is one, too."""
+    words = {term.key: term.words_with_unit for term in TERMS}
+    return [(words.get(name) or Objective.of(name).words, f"{cost:.4g}") for name, cost in stated.items()]
 
 
 def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> Float:

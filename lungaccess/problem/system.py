@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import tomllib
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated
@@ -81,13 +82,15 @@ def preset_names() -> tuple[str, ...]:
     return tuple(sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml")))
 
 
-def load_system(name_or_path: str | os.PathLike[str]) -> System:
+def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool | None = None) -> System:
     """Read a system from a preset or from a TOML file.
 
     Parameters
     ----------
     name_or_path : str or path
         Name of a preset (see `preset_names`), or path of a file that ends in ``.toml``.
+    fissures_allowed : bool, optional
+        Whether fissures may be crossed, instead of what the system says; its name then says so, too.
 
     Returns
     -------
@@ -116,7 +119,11 @@ def load_system(name_or_path: str | os.PathLike[str]) -> System:
         )
     else:
         content = _read(Path(name_or_path))
-    return _parse_toml(content, given)
+    loaded = _parse_toml(content, given)
+    if fissures_allowed is None or fissures_allowed == loaded.fissures_allowed:
+        return loaded
+    rule = "fissures may be crossed" if fissures_allowed else "fissures are obstacles"
+    return replace(loaded, name=f"{loaded.name} ({rule})", fissures_allowed=fissures_allowed)
 
 
 def system_fingerprint(system: System) -> str:

@@ -28,6 +28,65 @@ class Target:
     origin: str
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StatedTarget:
+    """A target as a user states it, before any lung is looked at.
+
+    Parameters
+    ----------
+    lps_mm : (3,) float64 or None
+        A point, LPS mm; None for a nodule.
+    nodule : int
+        Number of a nodule, 1 for the largest, if there is no point.
+    origin : str
+        What the user wrote.
+    """
+
+    lps_mm: Float | None
+    nodule: int
+    origin: str
+
+    def resolve(self, lung: Lung) -> Target:
+        """Return the target in a lung; see `resolve_target`."""
+        if self.lps_mm is None:
+            return nodule_target(lung, self.nodule)
+        return point_target(lung, self.lps_mm, origin=self.origin)
+
+    def centre_lps(self, lung: Lung) -> Float:
+        """Return the point `(3,)` LPS mm, wherever it lies, or that of the nodule."""
+        return nodule_target(lung, self.nodule).lps_mm if self.lps_mm is None else self.lps_mm
+
+
+def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
+    """Return what a user states.
+
+    Parameters
+    ----------
+    text : str or None
+        A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm.
+    nodule : int or None
+        Number of a nodule.
+
+    Raises
+    ------
+    FrameError
+        If the text states no frame.
+    TargetError
+        If there is not exactly one of the two.
+    """
+    if (text is None) == (nodule is None):
+        raise TargetError(
+            "No target was given" if text is None else "Both a target and a nodule were given",
+            expected="either --target ras:x,y,z (or lps:x,y,z) or --nodule",
+            remedy="lungaccess plan --help shows examples",
+        )
+    if text is None:
+        return StatedTarget(lps_mm=None, nodule=nodule or 0, origin=f"nodule {nodule}")
+    from anatomy.io.frames import parse_point
+
+    return StatedTarget(lps_mm=parse_point(text), nodule=0, origin=f"point {text}")
+
+
 def resolve_target(lung: Lung, text: str | None = None, nodule: int | None = None) -> Target:
     """Return the target that a user names.
 
@@ -47,11 +106,9 @@ def resolve_target(lung: Lung, text: str | None = None, nodule: int | None = Non
     TargetError
         If there is no such nodule, or the point lies outside the lung or inside an obstacle.
     """
-    if text is not None:
-        from anatomy.io.frames import parse_point
-
-        return point_target(lung, parse_point(text), origin=f"point {text}")
-    return nodule_target(lung, 1 if nodule is None else nodule)
+    if text is None and nodule is None:
+        nodule = 1
+    return stated_target(text, None if text is not None else nodule).resolve(lung)
 
 
 def point_target(lung: Lung, lps_mm: Float, *, origin: str = "point") -> Target:

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from anatomy.typed import Float
+from lungaccess.plans.costs import costs_in_words
 from lungaccess.report import drawing, style
-from stages.needle import TERMS, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -89,7 +89,7 @@ def key_numbers(plan: Plan) -> list[tuple[str, list[Row]]]:
         ("Tube", _tube_rows(plan)),
         ("Needle", _needle_rows(plan)),
         ("Least distance found / required", _clearance_rows(plan)),
-        ("Cost", _cost_rows(plan)),
+        ("Cost", costs_in_words(plan.costs)),
     ]
 
 
@@ -151,14 +151,6 @@ def _least(plan: Plan, device: str, structure: str) -> str:
     if structure == "fissure" and not plan.fissures_are_obstacles:
         return "allowed"
     return f"{plan.required_clearance_mm[{'tube': 'inner_tube'}.get(device, device)]:.2f} mm"
-
-
-def _cost_rows(plan: Plan) -> list[Row]:
-    """Return every cost of a plan in the words of its kind, and that under its objective if that is a sum."""
-    words = {term.key: term.words_with_unit for term in TERMS}
-    return [
-        (words.get(name) or Objective.of(name).words, f"{value:.4g}") for name, value in plan.costs.items()
-    ]
 
 
 def text_panel(axes: Axes, plan: Plan) -> None:

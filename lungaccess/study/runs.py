@@ -14,10 +14,9 @@ from anatomy.errors import LungaccessError
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
 from anatomy.settings import to_mapping
-from lungaccess.cli.inputs import load_device
 from lungaccess.plans.assemble import software_version
 from lungaccess.problem.peripheral import peripheral_targets
-from lungaccess.problem.system import System, system_fingerprint
+from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
 from lungaccess.study.patients import Patient, open_patient, patient_of
 from lungaccess.study.settings import Case, PlannerChoice, Study
@@ -164,7 +163,7 @@ def runs_of(
         folder = Path(study.folder)
         patient = patient_of(case, folder, cache)
         name = str(folder / case.system) if case.system.endswith(".toml") else case.system
-        system = load_device(name, case.fissures_allowed)
+        system = load_system(name, fissures_allowed=case.fissures_allowed)
         targets = _targets(case, open_patient(patient, cache))
         for number, (point, origin) in enumerate(targets, start=1):
             yield from _runs_to(study, case, patient, system, number, point, origin)

@@ -9,6 +9,5 @@ import pytest
 
 
 def load_with(monkeypatch: pytest.MonkeyPatch, load: Callable[..., Any]) -> None:
-    """Replace `load_lung` in the commands that plan, check or show a patient."""
-    for name in ("check", "info", "needle", "plan"):
-        monkeypatch.setattr(f"lungaccess.cli.commands.{name}.load_lung", load)
+    """Replace `load_lung` in all commands."""
+    monkeypatch.setattr("lungaccess.cli.options.load_lung", load)

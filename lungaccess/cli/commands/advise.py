@@ -6,29 +6,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anatomy.io.files import require_writable_folder
-from anatomy.io.frames import parse_point
 from lungaccess.cli import terminal
-from lungaccess.cli.inputs import load_device, load_lung, require_one_target
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions, TargetOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
     from lungaccess.one_stage.scope import ScopeAdvice
 
-REACHED, NOT_REACHED = 0, 1
-
 
 def advise(
     patient: Path,
     *,
-    target: str | None = None,
-    nodule: int | None = None,
+    target: TargetOptions = TargetOptions(),
     lesion_radius: float = 5.0,
-    system: str = "lung-default",
+    system: str = DEFAULT_SYSTEM,
     seed: int = 0,
     out: Path = Path("lungaccess-advice"),
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Advise the bronchoscope: turn by turn to a lesion, or as near as it gets, and why not nearer.
 
     The goal is the airway voxel nearest to the lesion's centre, if possible one in the lesion where the scope
@@ -38,10 +34,6 @@ def advise(
     ----------
     patient : Path
         Folder of masks.
-    target : str
-        Centre of the lesion in mm with its frame: ras:x,y,z or lps:x,y,z.
-    nodule : int
-        Go to this nodule of the nodule mask.
     lesion_radius : float
         Radius of the lesion, mm.
     system : str
@@ -50,28 +42,23 @@ def advise(
         Seed of the random numbers.
     out : Path
         Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
-    from lungaccess.problem.target import nodule_target
+    from lungaccess.problem.system import load_system
 
-    require_one_target(target, nodule)
+    stated = target.stated()
     require_writable_folder(out)
-    device = load_device(system, None)
-    lung = load_lung(patient, cache)
-    centre = parse_point(target) if target is not None else nodule_target(lung, nodule or 1).lps_mm
+    device = load_system(system)
+    lung = output.load(patient)
     with progress("steering the scope"):
-        advice = advise_scope(lung, device, centre, lesion_radius, seed=seed)
+        advice = advise_scope(lung, device, stated.centre_lps(lung), lesion_radius, seed=seed)
     save_advice(advice, out)
-    if json:
+    if output.json:
         terminal.show_json(advice.as_json())
     else:
         _show(advice)
-        terminal.console.print(terminal.escaped(f"Written to {out}: {ADVICE_FILE}, {CAMERA_FILE}"))
-    return REACHED if advice.path.reached else NOT_REACHED
+        terminal.say(f"Written to {out}: {ADVICE_FILE}, {CAMERA_FILE}")
+    return ExitCode.of(advice.path.reached)
 
 
 def _show(advice: ScopeAdvice) -> None:
@@ -92,7 +79,7 @@ def _show(advice: ScopeAdvice) -> None:
         )
     terminal.show([terminal.table("bronchoscope", ("", ""), rows)])
     for number, one in enumerate(advice.instructions, start=1):
-        terminal.console.print(terminal.escaped(f"{number}. {one.text()}"))
+        terminal.say(f"{number}. {one.text()}")
     terminal.console.print()
     if advice.thinner:
         thinner = [

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import NO_PLAN, OK, verdict
-from lungaccess.cli.inputs import load_device, load_lung
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import PatientOptions
 
 
 def check(
@@ -14,9 +14,8 @@ def check(
     patient: Path,
     *,
     system: str | None = None,
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Judge a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
 
     Parameters
@@ -27,19 +26,18 @@ def check(
         Folder of the patient it was made for.
     system : str
         Judge against this preset or TOML file instead of the devices stated in the plan.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.checking import check as judge
+    from lungaccess.cli.plan_tables import check_tables
     from lungaccess.plans.plan import Plan
+    from lungaccess.problem.system import load_system
 
     stored = Plan.load(plan)
-    device = None if system is None else load_device(system, None)
-    report = judge(stored, load_lung(patient, cache, thick_slices=True), system=device)
-    if json:
+    device = None if system is None else load_system(system)
+    report = judge(stored, output.load(patient, thick_slices=True), system=device)
+    if output.json:
         terminal.show_json(report.to_mapping())
-        return OK if report.accepted else NO_PLAN
-    terminal.show(terminal.check_tables(report))
-    return verdict(report.accepted)
+        return ExitCode.of(report.accepted)
+    terminal.show(check_tables(report))
+    terminal.show_verdict(report.accepted)
+    return ExitCode.of(report.accepted)

@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from rich.panel import Panel
 
 from anatomy.errors import AnatomyError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import DEFAULT_SYSTEM, OK, require_budget
-from lungaccess.cli.commands.plan import search_and_report
-from lungaccess.cli.inputs import load_device
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions
+from lungaccess.cli.plan_search import PlanRequest, plan_and_report
 from lungaccess.cli.progress import progress
-from lungaccess.cli.terminal import console
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.cli.search import SearchRequest
 
-# The first nodule of this synthetic patient can be reached.
 DEMO_SEED = 2
+"""The first nodule of this synthetic patient can be reached."""
+DEMO_BUDGET_S = 3.0
+DEMO_SPACING_MM = 1.25
+"""Coarse enough that the patient is made within seconds, fine enough for the airways of the plan."""
 
 
 def demo(
     *,
     out: Path = Path("demo-output"),
-    budget: float = 3.0,
+    budget: float = DEMO_BUDGET_S,
     seed: int = DEMO_SEED,
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page about it.
 
     Parameters
@@ -40,27 +44,37 @@ def demo(
         Planning time in seconds.
     seed : int
         Seed of the patient and of the search.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
-    from lungaccess.cli.search import SearchRequest, demo_lung
+    from lungaccess.cli.anatomy_tables import anatomy_tables
+    from lungaccess.problem.target import stated_target
 
-    require_budget(budget, None)
+    search = SearchOptions(budget=budget, seed=seed)
     require_writable_folder(out)
     with progress("making a synthetic patient") as shown:
-        lung = demo_lung(seed, cache, shown.step)
-    if not json:
-        terminal.show(terminal.anatomy_tables(lung)[1:3])
-    request = SearchRequest(system=load_device(DEFAULT_SYSTEM, None), seed=seed, time_s=budget, cache=cache)
-    code = _first_reachable_nodule(lung, request, out, json)
-    if code == OK:
+        lung = demo_lung(seed, output.cache, shown.step)
+    if not output.json:
+        terminal.show(anatomy_tables(lung)[1:3])
+    target, system = stated_target(None, 1), SystemOptions().load()
+    request = PlanRequest(system=system, target=target, search=search, out=out, output=output)
+    code = _first_reachable_nodule(lung, request)
+    if code == ExitCode.OK:
         with progress("making the page"):
             _write_page(lung, out)
-        if not json:
-            console.print(terminal.what_to_look_at(out))
+        if not output.json:
+            terminal.console.print(what_to_look_at(out))
     return code
+
+
+def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> Lung:
+    """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
+
+    An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
+    """
+    from anatomy.phantom import make_phantom
+    from anatomy.store import open_lung
+
+    images = make_phantom(seed=seed, size="adult", spacing_mm=DEMO_SPACING_MM).images
+    return open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
 
 
 def _write_page(lung: Lung, out: Path) -> None:
@@ -73,17 +87,31 @@ def _write_page(lung: Lung, out: Path) -> None:
     plan_page(Plan.load(out / "plan.json"), lung, out / "report.html", options)
 
 
-def _first_reachable_nodule(lung: Lung, request: SearchRequest, out: Path, json: bool) -> int:
+def _first_reachable_nodule(lung: Lung, request: PlanRequest) -> ExitCode:
     """Plan to the nodules in their order until one can be reached."""
-    from dataclasses import replace
-
     from lungaccess.plans.no_plan import NoPlan
+    from lungaccess.problem.target import stated_target
 
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
-            return search_and_report(lung, replace(request, nodule=number), out, json)
+            return plan_and_report(lung, replace(request, target=stated_target(None, number)))
         except NoPlan as error:
             terminal.progress_console.print(f"Nodule {number} cannot be reached; trying the next one.")
             failure = error
     raise failure or AnatomyError("The synthetic patient has no nodule", remedy="Choose another --seed")
+
+
+def what_to_look_at(out: Path) -> Panel:
+    """Return a guide to the pictures of a plan."""
+    lines = (
+        f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its",
+        "wall at the diamond, the black needle passes the vessels and ends in the green nodule.",
+        "R and L are the patient's right and left. In the two cuts, no full red or grey reaches the",
+        "dashed lines; in the graph, no curve enters the red area outside the blue one.",
+        f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
+        f"{out / 'report.html'}: all of it in 3-D, playing along a slider; open it in a browser.",
+    )
+    return Panel(
+        "\n".join(terminal.escaped(line) for line in lines), title="what to look at", title_align="left"
+    )

@@ -1,50 +1,34 @@
-"""The commands `lungaccess doctor` and `lungaccess completion`: the installation and the shell."""
+"""The command `lungaccess doctor`: what is installed, and what has to be mended."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import OutputOptions
 
 if TYPE_CHECKING:
-    from lungaccess.cli.doctor import Folder, Health
-
-HEALTHY, SICK = 0, 1
+    from lungaccess.cli.installation import Folder, Health
 
 
-def doctor(*, json: bool = False, cache: Path | None = None) -> int:
+def doctor(*, cache: Path | None = None, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Show versions, machine, compiled kernels and folders; exit code 1 if something has to be mended.
 
     Parameters
     ----------
-    json : bool
-        Print JSON instead of tables.
     cache : Path
         Folder of prepared anatomies; the usual one if not given.
     """
-    from lungaccess.cli.doctor import examine
+    from lungaccess.cli.installation import examine
 
     health = examine(cache)
-    if json:
+    if output.json:
         terminal.show_json(health.to_mapping())
     else:
         _show(health)
-    return SICK if health.complaints else HEALTHY
-
-
-def completion(shell: Literal["bash", "zsh", "fish"], /) -> int:
-    """Print a script that lets a shell complete commands, options and choices.
-
-    Parameters
-    ----------
-    shell : str
-        bash, zsh or fish; docs/command_line.md says where the script goes.
-    """
-    from lungaccess.cli.app import app
-
-    terminal.console.file.write(app.generate_completion(prog_name="lungaccess", shell=shell))
-    return HEALTHY
+    return ExitCode.of(not health.complaints)
 
 
 def _show(health: Health) -> None:

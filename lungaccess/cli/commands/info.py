@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.table import Table
 
 from anatomy.io.files import require_writable_folder
-from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import OK, print_warnings
-from lungaccess.cli.inputs import load_lung
-from lungaccess.cli.terminal import console
+from lungaccess.cli import anatomy_tables, terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import OutputOptions, PatientOptions
+
+if TYPE_CHECKING:
+    from lungaccess.problem.system import System
 
 
-def info(patient: Path, *, out: Path | None = None, json: bool = False, cache: Path | None = None) -> int:
+def info(patient: Path, *, out: Path | None = None, output: PatientOptions = PatientOptions()) -> ExitCode:
     """Show what was understood of a patient: volumes, airway tree, sources and warnings.
 
     Parameters
@@ -20,44 +26,52 @@ def info(patient: Path, *, out: Path | None = None, json: bool = False, cache: P
         Folder of masks.
     out : Path
         Folder for tree.png, a picture of the airway tree.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
     if out is not None:
         require_writable_folder(out)
-    lung = load_lung(patient, cache, thick_slices=True)
-    if json:
-        from lungaccess.cli.records import lung_record
-
-        terminal.show_json(lung_record(lung))
+    lung = output.load(patient, thick_slices=True)
+    if output.json:
+        terminal.show_json(anatomy_tables.lung_record(lung))
     else:
-        terminal.show(terminal.anatomy_tables(lung))
-        print_warnings(lung)
+        terminal.show(anatomy_tables.anatomy_tables(lung))
+        terminal.show_warnings(lung.warnings)
     if out is not None:
         from lungaccess.report import tree_png
 
         picture = tree_png(lung, out / "tree.png")
-        if not json:
-            console.print(f"Picture of the tree: {picture}")
-    return OK
+        if not output.json:
+            terminal.say(f"Picture of the tree: {picture}")
+    return ExitCode.OK
 
 
-def presets(*, json: bool = False) -> int:
+def presets(*, output: OutputOptions = OutputOptions()) -> ExitCode:
     """List the systems that ship with lungaccess.
 
-    Parameters
-    ----------
-    json : bool
-        Print JSON, with every setting, instead of a table.
+    Its JSON holds every setting.
     """
     from anatomy.settings import to_mapping
     from lungaccess.problem.system import load_system, preset_names
 
     systems = {name: load_system(name) for name in preset_names()}
-    if json:
+    if output.json:
         terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
     else:
-        console.print(terminal.preset_table(systems))
-    return OK
+        terminal.console.print(_preset_table(systems))
+    return ExitCode.OK
+
+
+def _preset_table(systems: Mapping[str, System]) -> Table:
+    """Return one line a preset: the sizes that matter, and what it is."""
+    rows = [
+        (
+            name,
+            f"{system.scope.outer_diameter_mm:g}",
+            f"{system.tubes.outer.outer_diameter_mm:g} / {system.tubes.inner.outer_diameter_mm:g}",
+            f"{system.needle.diameter_mm:g}",
+            f"{1.0 / system.needle.max_curvature_per_mm:.0f}",
+            system.description,
+        )
+        for name, system in systems.items()
+    ]
+    headings = ("name", "scope, mm", "tubes, mm", "needle, mm", "least turning radius, mm", "what it is")
+    return terminal.table("Systems that ship with lungaccess (diameters)", headings, rows)

@@ -5,24 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+from rich.table import Table
+
 from anatomy.errors import SettingsError
 from anatomy.io.frames import Frame
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import (
-    DEFAULT_BUDGET_S,
-    DEFAULT_SYSTEM,
-    NO_PLAN,
-    OK,
-    ObjectiveText,
-    require_budget,
-)
-from lungaccess.cli.inputs import load_device, load_lung, require_one_target
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import BudgetOptions, ObjectiveText, PatientOptions, SystemOptions, TargetOptions
 from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.typed import Float
+    from lungaccess.one_stage.needle import NeedleAnswer
 
 NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 
@@ -32,18 +29,13 @@ def needle(
     *,
     start: str,
     frame: Frame = "lps",
-    target: str | None = None,
-    nodule: int | None = None,
-    system: str = DEFAULT_SYSTEM,
+    target: TargetOptions = TargetOptions(),
+    system: SystemOptions = SystemOptions(),
     planner: NeedlePlanner = "decide",
     objective: ObjectiveText = "length",
-    budget: float | None = None,
-    iterations: int | None = None,
-    seed: int = 0,
-    allow_fissures: bool | None = None,
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    budget: BudgetOptions = BudgetOptions(),
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Plan the needle alone from a given pose, or prove that no path exists.
 
     Parameters
@@ -55,41 +47,20 @@ def needle(
         column is the direction of insertion.
     frame : str
         Frame of the numbers in that file.
-    target : str
-        Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
-    nodule : int
-        Go to the centre of this nodule.
-    system : str
-        Preset or TOML file whose needle and margins are used.
     planner : str
         decide: a path, or a proof that there is none; rrt; optimal: better and better paths; resolution:
         the best path of pieces at a resolution, or the statement that it has none.
     objective : str
         What to make small: length, integral of 1/clearance, integral of the cost map, its sum over voxels, or
         a weighted sum such as length=1,cost-map=0.5.
-    budget : float
-        Planning time in seconds; 10 if neither this nor --iterations is given.
-    iterations : int
-        Number of iterations instead of a time.
-    seed : int
-        Seed of the random numbers.
-    allow_fissures : bool
-        Whether fissures may be crossed; as the system says if not given.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.one_stage.needle import plan_needle
-    from lungaccess.problem.target import resolve_target
 
-    require_one_target(target, nodule)
-    require_budget(budget, iterations)
-    weighed = Objective.of(objective)
-    device = load_device(system, allow_fissures)
-    lung = load_lung(patient, cache)
-    limit_s = DEFAULT_BUDGET_S if budget is None and iterations is None else budget
-    pose, aim = _start_pose(lung, start, frame), resolve_target(lung, target, nodule)
+    stated, weighed = target.stated(), Objective.of(objective)
+    device = system.load()
+    lung = output.load(patient)
+    limit_s = budget.time_s
+    pose, aim = _start_pose(lung, start, frame), stated.resolve(lung)
     with progress("searching" if limit_s is None else f"searching, at most {limit_s:g} s"):
         answer = plan_needle(
             lung,
@@ -98,15 +69,51 @@ def needle(
             aim,
             planner=planner,
             objective=weighed,
-            seed=seed,
-            iterations=iterations,
+            seed=budget.seed,
+            iterations=budget.iterations,
             time_s=limit_s,
         )
-    if json:
+    if output.json:
         terminal.show_json(answer.record())
     else:
-        terminal.show(terminal.needle_tables(answer))
-    return NO_PLAN if answer.path is None else OK
+        terminal.show(_tables(answer))
+    return ExitCode.of(answer.path is not None)
+
+
+def _tables(answer: NeedleAnswer) -> list[Table]:
+    """Return what a needle planner found: the outcome, and the path arc by arc."""
+    words = {
+        "path": "a path, proved clear",
+        "no path": "no path exists (proved against the masks)",
+        "nothing found": "nothing found within the limit; no proof either",
+    }
+    rows = [("outcome", words.get(answer.outcome, answer.outcome))]
+    if answer.branch >= 0:
+        rows.append(("taken to have pierced", f"branch {answer.branch}"))
+    path = answer.path
+    if path is None:
+        return [terminal.table("needle", ("", ""), rows)]
+    if answer.first_path_s is not None:
+        rows.append(("first path after", f"{1000.0 * answer.first_path_s:.1f} ms"))
+    rows += [
+        ("length", f"{path.length_mm:.2f} mm"),
+        ("largest angle from the start", f"{np.degrees(path.max_angle_from_start_rad()):.1f} deg"),
+        ("turning in all", f"{np.degrees(path.accumulated_turn_rad):.1f} deg"),
+    ]
+    rows += [(f"cost: {name}", f"{cost:.3f}") for name, cost in answer.costs.items()]
+    arcs = [
+        (
+            f"{n}",
+            f"{np.degrees(roll):.1f}",
+            f"{length:.2f}",
+            f"{1.0 / curvature:.1f}" if curvature else "straight",
+        )
+        for n, (length, roll, curvature) in enumerate(path.arcs, start=1)
+    ]
+    return [
+        terminal.table("needle", ("", ""), rows),
+        terminal.table("arcs", ("", "roll first, deg", "insert, mm", "radius, mm"), arcs),
+    ]
 
 
 def _start_pose(lung: Lung, start: str, frame: Frame) -> Float:

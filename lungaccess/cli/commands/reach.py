@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import OK
-from lungaccess.cli.inputs import load_device, load_lung
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -21,16 +20,14 @@ if TYPE_CHECKING:
 def reach(
     patient: Path,
     *,
-    system: str = "lung-default",
+    system: SystemOptions = SystemOptions(),
     spacing: float = 3.0,
     search: int = 0,
     compare: str | None = None,
-    allow_fissures: bool | None = None,
     out: Path = Path("lungaccess-reach"),
     page: Path | None = None,
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Map what a system reaches of the lung, and write the map as volumes for 3D Slicer and as a picture.
 
     A run that was stopped goes on where it was if it is started again with the same options.
@@ -39,34 +36,27 @@ def reach(
     ----------
     patient : Path
         Folder of masks.
-    system : str
-        Name of a preset, or path of a TOML file.
     spacing : float
         Side of the map's voxels, mm.
     search : int
         Random trees for each point that no single arc reaches; 0 for single arcs only.
     compare : str
         Further presets or TOML files to compare with, separated by commas.
-    allow_fissures : bool
-        Whether fissures may be crossed; as each system says if not given.
     out : Path
         Folder for the volumes, the pictures and reach.json.
     page : Path
         HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
+    from lungaccess.problem.system import load_system
     from lungaccess.reachability.reach_map import compare as compare_systems
     from lungaccess.report import reach_png
 
-    names = [system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
-    systems = [load_device(name, allow_fissures) for name in dict.fromkeys(names)]
+    names = [system.system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
+    systems = [load_system(name, fissures_allowed=system.allow_fissures) for name in dict.fromkeys(names)]
     folder = require_writable_folder(out)
     if page is not None:
         require_writable_folder(page.parent)
-    lung = load_lung(patient, cache)
+    lung = output.load(patient)
     with progress("scanning") as shown:
         maps = compare_systems(
             lung,
@@ -81,22 +71,21 @@ def reach(
         each.save(folder, stem)
         reach_png(each, lung, folder / f"{stem}.png")
     written = [record(each) for each in maps]
-    with atomic_write(folder / "reach.json") as temporary:
-        temporary.write_text(json_format.dumps(written, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "reach.json", written)
     if page is not None:
         from lungaccess.report.html import reach_page
 
         reach_page(maps, lung, page)
-    if json:
+    if output.json:
         terminal.show_json(written)
-        return OK
+        return ExitCode.OK
     terminal.show([_region_table(each) for each in maps])
     if len(maps) > 1:
         terminal.show([_comparison_table(maps)])
     files = ", ".join(f"{stem}.nrrd, {stem}-cost.nrrd, {stem}-clearance.nrrd, {stem}.png" for stem in stems)
     also = "" if page is None else f"; {page}"
-    terminal.console.print(terminal.escaped(f"Written to {out}: {files}, reach.json{also}"))
-    return OK
+    terminal.say(f"Written to {out}: {files}, reach.json{also}")
+    return ExitCode.OK
 
 
 def _stems(maps: tuple[ReachMap, ...]) -> list[str]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import OK
-from lungaccess.cli.inputs import load_lung
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -30,9 +30,8 @@ def report(
     samples: int = 2000,
     seed: int = 0,
     instructions: bool = True,
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Write a page about a stored plan: it plays in 3-D, with slices, charts, limits and risk; one HTML file.
 
     Parameters
@@ -56,10 +55,6 @@ def report(
         Seed of that estimate.
     instructions : bool
         Whether the scope's way is searched and told turn by turn.
-    json : bool
-        Print JSON instead of text.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.plans.plan import Plan
     from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page
@@ -73,11 +68,11 @@ def report(
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)
     stored = Plan.load(plan)
-    lung = load_lung(patient, cache)
+    lung = output.load(patient)
     image = ct if ct is not None else find_ct(patient)
     with progress("making the page"):
         options = PageOptions(
-            alternatives=_others(stored, lung, alternatives, cache) if alternatives else (),
+            alternatives=_others(stored, lung, alternatives, output) if alternatives else (),
             ct=None if image is None else read_ct(image),
             ct_name="" if image is None else image.name,
             cost_over_time=plan.with_name(HISTORY_FILE),
@@ -89,24 +84,23 @@ def report(
         if movie is not None:
             bronchoscopy_webp(stored, lung, movie)
     files = [str(file) for file in (page, movie) if file is not None]
-    if json:
+    if output.json:
         terminal.show_json({"files": files, "page_bytes": page.stat().st_size})
-        return OK
+        return ExitCode.OK
     written = ", ".join(files)
     size = page.stat().st_size / 1e6
-    terminal.console.print(terminal.escaped(f"Written: {written} (the page has {size:.1f} MB)"))
-    return OK
+    terminal.say(f"Written: {written} (the page has {size:.1f} MB)")
+    return ExitCode.OK
 
 
-def _others(plan: Plan, lung: Lung, count: int, cache: Path | None) -> tuple[Plan, ...]:
+def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple[Plan, ...]:
     """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it."""
     from lungaccess.coupled import alternatives as find
-    from lungaccess.coupled.atlas_store import open_atlas
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import Target
 
     target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
-    atlas = open_atlas(lung, plan.system, cache=cache)
+    atlas = output.open_atlas(lung, plan.system)
     try:
         menu = find(lung, plan.system, target, objective=plan.objective, count=count, atlas=atlas)
     except NoPlan:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import OK
-from lungaccess.cli.inputs import load_lung
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -27,9 +27,8 @@ def risk(
     radius: float | None = None,
     probability: float = 0.95,
     seed: int = 0,
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it, open loop.
 
     Parameters
@@ -48,10 +47,6 @@ def risk(
         Probability of success that the tolerances keep.
     seed : int
         Seed of the random numbers.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.plans.plan import Plan
     from lungaccess.risk.assessment import assess
@@ -60,16 +55,16 @@ def risk(
 
     model = ErrorModel() if errors is None else load_errors(errors)
     stored = Plan.load(plan)
-    lung = load_lung(patient, cache)
+    lung = output.load(patient)
     with progress("deviating the plan"):
         report = assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
     with progress("looking for the largest errors"):
         kept = tolerances(stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius)
-    if json:
+    if output.json:
         terminal.show_json(record(report, kept))
     else:
         terminal.show([_outcome_table(report), _tolerance_table(kept)])
-    return OK
+    return ExitCode.OK
 
 
 def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]:

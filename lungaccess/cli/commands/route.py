@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from anatomy.errors import SettingsError
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import Frame, parse_point
 from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
     from stages.scope.route import Route
-
-PROVED, NO_ROUTE = 0, 1
 
 
 def route(
@@ -32,9 +31,8 @@ def route(
     frame: Frame | None = None,
     pixel: float | None = None,
     out: Path = Path("lungaccess-route"),
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, and draw it.
 
     Parameters
@@ -63,10 +61,6 @@ def route(
         Size of a pixel of a drawing, mm.
     out : Path
         Folder for route.json and route.png.
-    json : bool
-        Print JSON instead of a table.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
     from lungaccess.one_stage.route import open_source, record, widest_end
     from lungaccess.report.route import route_png
@@ -85,19 +79,18 @@ def route(
     require_writable_folder(out)
     with progress("route") as shown:
         shown.step("reading the tubes")
-        opened = open_source(source, frame=frame, pixel_mm=pixel, cache=cache)
+        opened = open_source(source, frame=frame, pixel_mm=pixel, cache=output.cache)
         shown.step("planning")
         first = widest_end(opened.centreline) if begin is None else begin
         found = try_route(opened.centreline, first, end, limits, repair=repair, seed=seed)
     written = record(opened, found)
-    with atomic_write(out / "route.json") as temporary:
-        temporary.write_text(json_format.dumps(written, indent=2) + "\n", encoding="utf-8")
+    write_json(out / "route.json", written)
     route_png(opened.name, opened.centreline, found, out / "route.png")
-    if json:
+    if output.json:
         terminal.show_json(written)
-        return PROVED if found.proved else NO_ROUTE
+        return ExitCode.of(found.proved)
     terminal.show([terminal.table(f"Route along {opened.name}", ("", "", "limit"), _rows(found, written))])
-    terminal.console.print(terminal.escaped(f"Written to {out}: route.json, route.png"))
+    terminal.say(f"Written to {out}: route.json, route.png")
     return _verdict(found)
 
 
@@ -114,12 +107,12 @@ def _rows(found: Route, written: dict[str, object]) -> list[terminal.Row]:
     ]  # fmt: skip
 
 
-def _verdict(found: Route) -> int:
+def _verdict(found: Route) -> ExitCode:
     from stages.scope.route import NoRouteError, require_proved
 
     try:
         require_proved(found)
     except NoRouteError as error:
         terminal.show_error(error)
-        return NO_ROUTE
-    return PROVED
+        return ExitCode.NEGATIVE
+    return ExitCode.OK

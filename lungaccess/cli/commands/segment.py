@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.panel import Panel
-
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import parse_point
 from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import OutputOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -48,8 +47,8 @@ def segment(
     totalsegmentator: Path | None = None,
     name: str = "",
     pictures: bool = True,
-    json: bool = False,
-) -> int:
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
     """Segment a chest CT into lungs, airway, vessels and cost map: a folder that the other commands take.
 
     Run it again after correcting a mask in the folder: only what depends on the mask is done again.
@@ -134,18 +133,15 @@ def segment(
             shown.step("pictures", STEP_SHARES["pictures"])
             segmentation_png(volume, result.parts, out / "segmentation.png")
     warnings = [*result.warnings, *quality.warnings]
-    with atomic_write(out / "quality.json") as temporary:
-        record = quality.to_mapping() | {"warnings": warnings}
-        temporary.write_text(json_format.dumps(record, indent=2) + "\n", encoding="utf-8")
-    if json:
+    record = quality.to_mapping() | {"warnings": warnings}
+    write_json(out / "quality.json", record)
+    if output.json:
         terminal.show_json(record)
-        return 0
+        return ExitCode.OK
     terminal.show(_tables(result, quality))
-    if warnings:
-        text = terminal.escaped("\n".join(f"- {warning}" for warning in warnings))
-        terminal.console.print(Panel(text, title="warnings", title_align="left", border_style="yellow"))
-    terminal.console.print(terminal.escaped(_written(result)))
-    return 0
+    terminal.show_warnings(warnings)
+    terminal.say(_written(result))
+    return ExitCode.OK
 
 
 def _tables(result: Segmentation, quality: Quality) -> list[Table]:

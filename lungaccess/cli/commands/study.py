@@ -10,7 +10,8 @@ from cyclopts import App, Parameter
 
 from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import OK
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import OutputOptions, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from lungaccess.study.summary import Group
 
-NOT_ALL = 1
 
 study = App(name="study", help="Run many plans from one file, into one file of results.")
 
@@ -30,9 +30,8 @@ def run(
     out: Path = Path("results.db"),
     scheduler: str | None = None,
     workers: Annotated[int | None, Parameter(name="--workers")] = None,
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Make the runs of a study that the results do not have yet; exit code 1 if one could not be made.
 
     Stop it at any time and start it again: it goes on from what is stored.
@@ -47,10 +46,6 @@ def run(
         Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
     workers : int
         How many processes on this machine; as many as it has cores if not given.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where prepared anatomies and atlases are kept, on every machine.
     """
     from lungaccess.study.driver import run_study
     from lungaccess.study.settings import read_study
@@ -63,10 +58,12 @@ def run(
         )
     asked = read_study(study)
     with progress(asked.name) as shown:
-        done = run_study(asked, out, scheduler=scheduler, workers=workers, cache=cache, tell=shown.step)
-    if json:
+        done = run_study(
+            asked, out, scheduler=scheduler, workers=workers, cache=output.cache, tell=shown.step
+        )
+    if output.json:
         terminal.show_json(asdict(done) | {"results": str(out), "groups": [asdict(g) for g in summary(out)]})
-        return NOT_ALL if done.failed else OK
+        return ExitCode.of(not done.failed)
     terminal.show([_table(asked.name, summary(out))])
     terminal.console.print(
         terminal.escaped(
@@ -76,32 +73,36 @@ def run(
     )
     if done.failed:
         terminal.console.print(f"[bold red]{done.failed} could not be made; start the study again.[/]")
-    return NOT_ALL if done.failed else OK
+    return ExitCode.of(not done.failed)
 
 
 @study.command
-def show(results: Path, *, json: bool = False) -> int:
+def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Show what is stored, by case and planner.
 
     Parameters
     ----------
     results : Path
         Results file.
-    json : bool
-        Print JSON instead of a table.
     """
     from lungaccess.study.summary import summary
 
     groups = summary(results)
-    if json:
+    if output.json:
         terminal.show_json([asdict(group) for group in groups])
     else:
         terminal.show([_table(str(results), groups)])
-    return OK
+    return ExitCode.OK
 
 
 @study.command
-def export(results: Path, *, csv: Path | None = None, parquet: Path | None = None, json: bool = False) -> int:
+def export(
+    results: Path,
+    *,
+    csv: Path | None = None,
+    parquet: Path | None = None,
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
     """Write the tables of the results as CSV or Parquet.
 
     Parameters
@@ -112,8 +113,6 @@ def export(results: Path, *, csv: Path | None = None, parquet: Path | None = Non
         Folder for runs.csv, progress.csv, findings.csv, rejections.csv and plans.csv.
     parquet : Path
         Folder for the same as Parquet.
-    json : bool
-        Print JSON instead of text.
     """
     from lungaccess.study.export import export_csv, export_parquet
 
@@ -121,35 +120,33 @@ def export(results: Path, *, csv: Path | None = None, parquet: Path | None = Non
         raise SettingsError("Nothing to export to was given", expected="--csv FOLDER or --parquet FOLDER")
     written = [] if csv is None else export_csv(results, csv)
     written += [] if parquet is None else export_parquet(results, parquet)
-    if json:
+    if output.json:
         terminal.show_json({"written": [str(path) for path in written]})
-        return OK
+        return ExitCode.OK
     for path in written:
-        terminal.console.print(terminal.escaped(f"Written to {path}"))
-    return OK
+        terminal.say(f"Written to {path}")
+    return ExitCode.OK
 
 
 @study.command
-def compare(first: Path, second: Path, *, json: bool = False) -> int:
+def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Compare two results files, but for times and memory; exit code 1 if they differ.
 
     Parameters
     ----------
     first, second : Path
         Results files.
-    json : bool
-        Print JSON instead of text.
     """
     from lungaccess.study.compare import differences
 
     found = differences(first, second)
-    if json:
+    if output.json:
         terminal.show_json(found)
-        return NOT_ALL if found else OK
+        return ExitCode.of(not found)
     for each in found:
-        terminal.console.print(terminal.escaped(each))
+        terminal.say(each)
     terminal.console.print("They differ." if found else "They hold the same runs with the same answers.")
-    return NOT_ALL if found else OK
+    return ExitCode.of(not found)
 
 
 def _table(title: str, groups: list[Group]) -> Table:

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import json as json_format
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from anatomy.errors import SettingsError
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
-from lungaccess.cli.inputs import load_lung
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
     from lungaccess.one_stage.tour import TourAnswer
     from stages.scope.tour import Itinerary
 
-ALL_REACHED, SOME_LEFT_OUT = 0, 1
-
 
 def tour(
     patient: Path,
     *,
     targets: Path,
-    system: str = "lung-default",
+    system: str = DEFAULT_SYSTEM,
     require_plan: bool = True,
     closed: bool = False,
     reading: Literal["printed", "reduced"] = "printed",
@@ -32,9 +30,8 @@ def tour(
     speed: float = 10.0,
     per_lesion: float = 300.0,
     out: Path = Path("lungaccess-tour"),
-    json: bool = False,
-    cache: Path | None = None,
-) -> int:
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
     """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out.
 
     Parameters
@@ -61,12 +58,7 @@ def tour(
         Time that each lesion takes besides, s.
     out : Path
         Folder for tour.json and tour.png.
-    json : bool
-        Print JSON instead of tables.
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
     """
-    from lungaccess.coupled.atlas_store import open_atlas
     from lungaccess.one_stage.tour import plan_tour, read_lesions, record
     from lungaccess.problem.system import load_system
     from lungaccess.report.tour import tour_png
@@ -81,10 +73,9 @@ def tour(
     lesions = read_lesions(targets)
     require_writable_folder(out)
     device = load_system(system)
-    lung, atlas = load_lung(patient, cache), None
+    lung, atlas = output.load(patient), None
     if require_plan:
-        with progress("enumerating what scope and tubes can do") as shown:
-            atlas = open_atlas(lung, device, cache=cache, progress=shown.share)
+        atlas = output.open_atlas(lung, device)
     with progress("planning the tour"):
         answer = plan_tour(
             lung,
@@ -95,17 +86,16 @@ def tour(
             tissue_weight=tissue_weight,
             atlas=atlas,
         )
-    with atomic_write(out / "tour.json") as temporary:
-        temporary.write_text(json_format.dumps(record(answer), indent=2) + "\n", encoding="utf-8")
+    write_json(out / "tour.json", record(answer))
     tour_png(answer, lung, out / "tour.png")
-    if json:
+    if output.json:
         terminal.show_json(record(answer))
-        return SOME_LEFT_OUT if answer.left_out else ALL_REACHED
+        return ExitCode.of(not answer.left_out)
     _show(answer, speed, per_lesion)
-    terminal.console.print(terminal.escaped(f"Written to {out}: tour.json, tour.png"))
+    terminal.say(f"Written to {out}: tour.json, tour.png")
     for number, why in answer.left_out.items():
-        terminal.console.print(terminal.escaped(f"Left out, lesion {number}: {why}."))
-    return SOME_LEFT_OUT if answer.left_out else ALL_REACHED
+        terminal.say(f"Left out, lesion {number}: {why}.")
+    return ExitCode.of(not answer.left_out)
 
 
 def _show(answer: TourAnswer, speed: float, per_lesion: float) -> None:

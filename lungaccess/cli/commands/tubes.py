@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -16,20 +18,18 @@ if TYPE_CHECKING:
     from lungaccess.one_stage.tubes import TubeAnswer
     from stages.tube import DesignProposal, SequenceComparison
 
-ACCEPTABLE, REFUSED = 0, 1
-
 
 def tubes(
     *,
     outer: float,
     inner: float,
-    system: str = "lung-default",
+    system: str = DEFAULT_SYSTEM,
     rotate: float = 0.0,
     relative: float = 0.0,
     propose: bool = False,
     out: Path = Path("tubes.png"),
-    json: bool = False,
-) -> int:
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
     """Deploy the tubes alone: tip, stability, sideways motion and a picture; exit code 1 if they would snap.
 
     Parameters
@@ -48,8 +48,6 @@ def tubes(
         Compare sequences to the same place, and look for designs that sweep less.
     out : Path
         PNG file for the picture.
-    json : bool
-        Print JSON instead of tables.
     """
     from lungaccess.one_stage.tubes import deploy_tubes, load_tubes
 
@@ -63,11 +61,11 @@ def tubes(
         rotation_rad=math.radians(rotate),
         relative_rad=math.radians(relative),
     )
-    _show_json(answer, propose) if json else _show_tables(answer, propose)
+    _show_json(answer, propose) if output.json else _show_tables(answer, propose)
     _draw(answer, out)
-    if not json:
-        terminal.console.print(terminal.escaped(f"Written to {out}"))
-    return ACCEPTABLE if answer.acceptable else REFUSED
+    if not output.json:
+        terminal.say(f"Written to {out}")
+    return ExitCode.of(answer.acceptable)
 
 
 def _show_tables(answer: TubeAnswer, propose: bool) -> None:
@@ -79,7 +77,7 @@ def _show_tables(answer: TubeAnswer, propose: bool) -> None:
     comparison = compare_sequences(answer)
     terminal.show([_sequence_table(comparison)])
     for name, why in comparison.refused.items():
-        terminal.console.print(terminal.escaped(f"{name}: refused. {why}\n"))
+        terminal.say(f"{name}: refused. {why}\n")
     if answer.system is not None:
         terminal.show([_design_table(*design_choices(answer))])
 

@@ -10,7 +10,8 @@ import pytest
 
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
-from lungaccess.cli.app import BAD_INPUT, main
+from lungaccess.cli.app import main
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage.scope import advise_scope
 from lungaccess.problem.system import System, load_system
 from stages.scope.advisor.instructions import instructions_along
@@ -84,5 +85,5 @@ def test_the_command_writes_what_it_shows(
     assert "Generation 0" in shown
     camera = json.loads((out / "camera.mrk.json").read_text())
     assert camera["markups"][0]["coordinateSystem"] == "LPS"
-    assert main([*arguments]) == BAD_INPUT
-    assert main([*arguments, "--target", "1,2,3"]) == BAD_INPUT
+    assert main([*arguments]) == ExitCode.BAD_INPUT
+    assert main([*arguments, "--target", "1,2,3"]) == ExitCode.BAD_INPUT

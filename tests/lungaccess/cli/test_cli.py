@@ -18,9 +18,9 @@ import pytest
 from anatomy.errors import AnatomyError, FrameError
 from lungaccess.checking import CheckReport, Finding
 from lungaccess.cli import app as cli
-from lungaccess.cli import search as run
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.common import DEFAULT_BUDGET_S, DEFAULT_SYSTEM
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import DEFAULT_BUDGET_S, DEFAULT_SYSTEM
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from tests.lungaccess.loading import load_with
@@ -83,11 +83,11 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         return CheckReport(accepted=seen["accepted"], findings=(bad,))
 
     load_with(monkeypatch, lambda *_, **__: toy_lung)
-    monkeypatch.setattr(run, "_atlas", lambda *_: None)
-    monkeypatch.setattr(run, "_planner", lambda: search)
+    monkeypatch.setattr("lungaccess.coupled.open_atlas", lambda *_, **__: None)
+    monkeypatch.setattr("lungaccess.coupled.plan", search)
     monkeypatch.setattr(
-        "lungaccess.problem.target.resolve_target",
-        lambda lung, text, nodule: SimpleNamespace(named=(text, nodule), lps_mm=toy_plan.target_lps),
+        "lungaccess.problem.target.StatedTarget.resolve",
+        lambda stated, lung: SimpleNamespace(named=stated.origin, lps_mm=toy_plan.target_lps),
     )
     monkeypatch.setattr(import_module("lungaccess.checking"), "check", judge)
     return seen
@@ -153,7 +153,7 @@ def test_an_accepted_plan_writes_everything_and_exits_0(
     toy_commands: dict[str, Any], toy_plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert cli.main(["plan", "toy", "--target", "lps:1,2,3", "--out", str(out)]) == cli.OK
+    assert cli.main(["plan", "toy", "--target", "lps:1,2,3", "--out", str(out)]) == ExitCode.OK
     assert {file.name for file in out.iterdir()} == WRITTEN
     assert Plan.load(out / "plan.json").digest == toy_plan.digest
     with (out / "cost_over_time.csv").open(newline="", encoding="utf-8") as file:
@@ -169,7 +169,7 @@ def test_a_refused_plan_exits_1_and_says_why(
     toy_commands: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     toy_commands["accepted"] = False
-    assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == cli.NO_PLAN
+    assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == ExitCode.NEGATIVE
     text = capsys.readouterr().out
     assert "refuses" in text and "needle.clearance.vessel" in text
 
@@ -178,7 +178,7 @@ def test_no_plan_exits_1_with_counted_reasons(
     toy_commands: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     toy_commands["plans"] = []
-    assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == cli.NO_PLAN
+    assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == ExitCode.NEGATIVE
     text = capsys.readouterr().out
     assert "12" in text and "near a vessel" in text and "A thinner scope" in text
     assert not (tmp_path / "plan.json").exists()
@@ -188,7 +188,7 @@ def test_a_missing_cost_map_is_bad_input(
     toy_commands: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["plan", "toy", "--nodule", "--objective", "cost-map", "--out", str(tmp_path)]
-    assert cli.main(words) == cli.BAD_INPUT
+    assert cli.main(words) == ExitCode.BAD_INPUT
     assert "no cost map" in capsys.readouterr().err
 
 
@@ -200,8 +200,8 @@ def test_an_interruption_keeps_the_best_plan(
         yield toy_plan
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "_planner", lambda: search)
-    assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == cli.OK
+    monkeypatch.setattr("lungaccess.coupled.plan", search)
+    assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == ExitCode.OK
     assert (tmp_path / "plan.json").exists()
 
 
@@ -209,11 +209,11 @@ def test_an_interruption_keeps_the_best_plan(
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--nodule"], (None, 1)),
-        (["--nodule", "--seed", "4"], (None, 1)),
-        (["--nodule", "2"], (None, 2)),
-        (["--nodule=3"], (None, 3)),
-        (["--target", "ras:-1,2,3"], ("ras:-1,2,3", None)),
+        (["--nodule"], "nodule 1"),
+        (["--nodule", "--seed", "4"], "nodule 1"),
+        (["--nodule", "2"], "nodule 2"),
+        (["--nodule=3"], "nodule 3"),
+        (["--target", "ras:-1,2,3"], "point ras:-1,2,3"),
     ],
 )
 def test_targets_are_understood(
@@ -247,7 +247,7 @@ def test_the_user_decides_about_fissures(
     assert (system.name == DEFAULT_SYSTEM) is not allowed
 
 
-@pytest.mark.parametrize(("accepted", "code"), [(True, cli.OK), (False, cli.NO_PLAN)])
+@pytest.mark.parametrize(("accepted", "code"), [(True, ExitCode.OK), (False, ExitCode.NEGATIVE)])
 def test_check_exits_with_its_verdict(
     accepted: bool, code: int, toy_commands: dict[str, Any], toy_plan: Plan, tmp_path: Path
 ) -> None:
@@ -265,10 +265,10 @@ def test_check_shows_value_limit_and_margin(
     toy_plan.save(tmp_path / "plan.json")
     words = ["check", str(tmp_path / "plan.json"), "toy"]
     toy_commands["accepted"] = False
-    assert cli.main(words) == cli.NO_PLAN
+    assert cli.main(words) == ExitCode.NEGATIVE
     row = next(line for line in capsys.readouterr().out.splitlines() if "needle.clearance.vessel" in line)
     assert " ".join(row.split()) == "refused needle.clearance.vessel 0.4 mm at least 1 -0.6 why"
-    assert cli.main([*words, "--json"]) == cli.NO_PLAN
+    assert cli.main([*words, "--json"]) == ExitCode.NEGATIVE
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert finding["margin"] == pytest.approx(-0.6)
     assert (finding["stage"], finding["side"], finding["ok"]) == ("needle", "at least", False)
@@ -280,7 +280,7 @@ def test_the_demonstration_ends_with_an_accepted_plan(
 ) -> None:
     out = tmp_path / "out"
     words = ["demo", "--budget", "1", "--out", str(out), "--cache", str(tmp_path / "cache")]
-    assert cli.main(words) == cli.OK, capsys.readouterr().out
+    assert cli.main(words) == ExitCode.OK, capsys.readouterr().out
     assert {file.name for file in out.iterdir()} == WRITTEN | {"report.html"}
 
 
@@ -298,7 +298,7 @@ def test_the_demonstration_ends_with_an_accepted_plan(
     ],
 )
 def test_bad_usage_exits_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(words) == cli.BAD_INPUT
+    assert cli.main(words) == ExitCode.BAD_INPUT
     assert capsys.readouterr().err
 
 
@@ -319,7 +319,7 @@ def test_bad_usage_exits_2(words: list[str], capsys: pytest.CaptureFixture[str])
 def test_bad_requests_exit_2_before_the_patient_is_read(
     words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["plan", "toy", *words, "--out", str(tmp_path)]) == cli.BAD_INPUT
+    assert cli.main(["plan", "toy", *words, "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
     captured = capsys.readouterr()
     assert message in captured.err and "Traceback" not in captured.err
 
@@ -330,7 +330,7 @@ def test_an_unwritable_output_folder_is_found_before_planning(
     command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("not a folder")
-    assert cli.main([*command, "--out", str(tmp_path / "file" / "out")]) == cli.BAD_INPUT
+    assert cli.main([*command, "--out", str(tmp_path / "file" / "out")]) == ExitCode.BAD_INPUT
     assert "cannot be written" in capsys.readouterr().err
 
 
@@ -342,14 +342,14 @@ def test_a_typed_error_is_a_panel_and_exits_2(
         raise error("The mask [airway] is empty", expected="one voxel", remedy="Look at it")
 
     load_with(monkeypatch, fail)
-    assert cli.main(["info", "toy"]) == cli.BAD_INPUT
+    assert cli.main(["info", "toy"]) == ExitCode.BAD_INPUT
     text = capsys.readouterr().err
     for part in ("The mask [airway] is empty.", "one voxel", "Look at it"):
         assert part in text
 
 
 def test_a_missing_plan_exits_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["check", str(tmp_path / "plan.json"), "toy"]) == cli.BAD_INPUT
+    assert cli.main(["check", str(tmp_path / "plan.json"), "toy"]) == ExitCode.BAD_INPUT
     assert "plan.json" in capsys.readouterr().err
 
 
@@ -358,5 +358,5 @@ def test_lack_of_memory_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
         raise MemoryError
 
     load_with(monkeypatch, fail)
-    assert cli.main(["info", "toy"]) == cli.BAD_INPUT
+    assert cli.main(["info", "toy"]) == ExitCode.BAD_INPUT
     assert "not enough memory" in capsys.readouterr().err

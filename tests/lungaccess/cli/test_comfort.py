@@ -26,9 +26,10 @@ import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.suggestion import did_you_mean
+from lungaccess.cli import anatomy_tables, installation, plan_search, progress, terminal
 from lungaccess.cli import app as cli
-from lungaccess.cli import doctor, progress, records, terminal
-from lungaccess.cli.inputs import STEP_SHARES
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.options import STEP_SHARES, OutputOptions
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, preset_names
 from tests.lungaccess.loading import load_with
@@ -77,17 +78,17 @@ def commands() -> dict[str, Any]:
 def test_every_command_has_one_style_of_json() -> None:
     found = commands()
     assert {"plan", "demo", "info", "export", "doctor", "tour"} <= set(found)
-    without = {
-        name for name, function in found.items() if "json" not in inspect.signature(function).parameters
-    }
-    assert without == WITHOUT_RESULT
-    for name in set(found) - without:
-        option = inspect.signature(found[name]).parameters["json"]
-        assert (option.annotation, option.default, option.kind) == ("bool", False, option.KEYWORD_ONLY), name
+    options = {name: inspect.signature(function).parameters for name, function in found.items()}
+    assert {name for name, each in options.items() if "output" not in each} == WITHOUT_RESULT
+    assert not [name for name, each in options.items() if "json" in each]
+    for name in set(found) - WITHOUT_RESULT:
+        option = options[name]["output"]
+        assert isinstance(option.default, OutputOptions) and not option.default.json, name
+        assert option.kind == option.KEYWORD_ONLY, name
 
 
 def test_presets_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["presets", "--json"]) == cli.OK
+    assert cli.main(["presets", "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     assert set(found) == set(preset_names())
     assert found["lung-default"]["needle"]["diameter_mm"] == 1.0
@@ -103,12 +104,12 @@ def test_quiet_prints_json_and_errors_alone(
         return code, capsys.readouterr()
 
     code, said = run("presets")
-    assert (code, said.out, said.err) == (cli.OK, "", "")
+    assert (code, said.out, said.err) == (ExitCode.OK, "", "")
     code, said = run("presets", "--json")
-    assert code == cli.OK and set(json.loads(said.out)) == set(preset_names())
+    assert code == ExitCode.OK and set(json.loads(said.out)) == set(preset_names())
     code, said = run("plan", "toy", "--nodule", "--system", "no-such-system")
-    assert code == cli.BAD_INPUT and said.out == "" and "no-such-system" in said.err
-    assert cli.main(["presets"]) == cli.OK
+    assert code == ExitCode.BAD_INPUT and said.out == "" and "no-such-system" in said.err
+    assert cli.main(["presets"]) == ExitCode.OK
     assert "lung-default" in capsys.readouterr().out
 
 
@@ -134,19 +135,18 @@ def test_a_plan_as_json_says_what_the_check_says(
     toy_lung: Any, toy_plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    from lungaccess.cli import search as run
     from lungaccess.plans.no_plan import NoPlan
 
     target = SimpleNamespace(lps_mm=toy_plan.target_lps)
     load_with(monkeypatch, lambda *_, **__: toy_lung)
-    monkeypatch.setattr("lungaccess.problem.target.resolve_target", lambda *_: target)
+    monkeypatch.setattr("lungaccess.problem.target.StatedTarget.resolve", lambda *_: target)
     for name in ("overview_png", "tree_png", "cost_over_time_png"):
         monkeypatch.setattr(f"lungaccess.report.{name}", lambda *_: None)
     report = SimpleNamespace(accepted=True, refusals=())
     monkeypatch.setattr(import_module("lungaccess.checking"), "check", lambda *_, **__: report)
-    monkeypatch.setattr(run, "run_search", lambda *_: (toy_plan, []))
+    monkeypatch.setattr(plan_search, "run_search", lambda *_: (toy_plan, []))
     words = ["plan", "toy", "--nodule", "--json", "--out", str(tmp_path)]
-    assert cli.main(words) == cli.OK
+    assert cli.main(words) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)
     assert said["found"] and said["accepted"] and said["digest"] == toy_plan.digest
     assert said["costs"] == dict(toy_plan.costs) and "plan.json" in said["files"]
@@ -154,8 +154,8 @@ def test_a_plan_as_json_says_what_the_check_says(
     def fail(*_: Any) -> None:
         raise NoPlan("No way", reasons={"too near a vessel": 3}, advice="A thinner scope")
 
-    monkeypatch.setattr(run, "run_search", fail)
-    assert cli.main(words) == cli.NO_PLAN
+    monkeypatch.setattr(plan_search, "run_search", fail)
+    assert cli.main(words) == ExitCode.NEGATIVE
     assert json.loads(capsys.readouterr().out) == {
         "found": False,
         "accepted": False,
@@ -166,12 +166,12 @@ def test_a_plan_as_json_says_what_the_check_says(
 
 
 def test_a_lung_as_json_agrees_with_its_tables(small_lung: Any) -> None:
-    record = json.loads(json.dumps(records.lung_record(small_lung), allow_nan=False))
+    record = json.loads(json.dumps(anatomy_tables.lung_record(small_lung), allow_nan=False))
     assert record["tree"]["branches"] == small_lung.tree.n_branches
     assert sum(record["tree"]["branches_by_generation"]) == small_lung.tree.n_branches
     lumen = float(small_lung.mask("lumen").array.sum()) * small_lung.grid.voxel_volume_mm3 / 1000.0
     assert record["volumes_ml"]["lumen"] == pytest.approx(lumen)
-    rows = {row[0]: row[1] for row in terminal._volume_rows(small_lung)}
+    rows = {row[0]: row[1] for row in anatomy_tables._volume_rows(small_lung)}
     assert rows["lumen"] == f"{lumen:.1f}"
 
 
@@ -193,7 +193,7 @@ def test_a_lung_as_json_agrees_with_its_tables(small_lung: Any) -> None:
 def test_what_was_meant_is_guessed(
     words: list[str], meant: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert cli.main([*words, "--out", str(tmp_path)] if words[0] == "reach" else words) == cli.BAD_INPUT
+    assert cli.main([*words, "--out", str(tmp_path)] if words[0] == "reach" else words) == ExitCode.BAD_INPUT
     said = " ".join(capsys.readouterr().err.split())
     assert (
         f'Did you mean "{meant}"?' in said
@@ -319,7 +319,7 @@ def test_ctrl_c_keeps_the_best_plan(more: tuple[str, ...], patient: Path, tmp_pa
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=HANGS_AFTER_S)
     said += err
-    assert process.returncode == cli.OK, said + out
+    assert process.returncode == ExitCode.OK, said + out
     assert "Traceback" not in said and "the best plan so far is kept" in said
     assert Plan.load(tmp_path / "out" / "plan.json").costs["inverse_clearance"] > 0.0
     if "--json" in more:
@@ -334,7 +334,7 @@ def test_ctrl_c_before_the_first_plan_exits_130(patient: Path, tmp_path: Path) -
         assert process.poll() is None
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=HANGS_AFTER_S)
-    assert process.returncode == cli.INTERRUPTED
+    assert process.returncode == ExitCode.INTERRUPTED
     assert "interrupted" in err and "Traceback" not in err
     assert not (tmp_path / "out" / "plan.json").exists()
     assert not list((tmp_path / "cache").glob("*")), "nothing half made is left"
@@ -343,7 +343,7 @@ def test_ctrl_c_before_the_first_plan_exits_130(patient: Path, tmp_path: Path) -
 # Commands on a patient ---------------------------------------------------------------------------
 
 
-def answer_of(words: list[str], capsys: pytest.CaptureFixture[str], code: int = cli.OK) -> Any:
+def answer_of(words: list[str], capsys: pytest.CaptureFixture[str], code: int = ExitCode.OK) -> Any:
     """Run a command with --json and return what it says; its standard output is JSON and nothing else."""
     assert cli.main([*words, "--json"]) == code
     return json.loads(capsys.readouterr().out)
@@ -382,14 +382,14 @@ def test_advice_as_json(patient: Path, tmp_path: Path, capsys: pytest.CaptureFix
     code = cli.main(words)
     advice = json.loads(capsys.readouterr().out)
     assert advice == json.loads((tmp_path / "advice.json").read_text())
-    assert code == (cli.OK if advice["reached"] else cli.NO_PLAN)
+    assert code == (ExitCode.OK if advice["reached"] else ExitCode.NEGATIVE)
 
 
 # Doctor and completion ---------------------------------------------------------------------------
 
 
 def test_the_doctor_sees_every_library(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["doctor", "--json", "--cache", str(tmp_path)]) == cli.OK
+    assert cli.main(["doctor", "--json", "--cache", str(tmp_path)]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     versions = {each["name"]: each["version"] for each in found["libraries"]}
     assert {"numpy", "numba", "SimpleITK", "cyclopts"} <= set(versions)
@@ -397,13 +397,13 @@ def test_the_doctor_sees_every_library(tmp_path: Path, capsys: pytest.CaptureFix
     assert found["cores"] >= found["usable_cores"] >= 1
     assert found["kernels"]["modules"] > 30
     assert found["cache"]["path"] == str(tmp_path) and found["complaints"] == []
-    assert cli.main(["doctor"]) == cli.OK
+    assert cli.main(["doctor"]) == ExitCode.OK
     assert "compiled kernels" in capsys.readouterr().out
 
 
 def test_the_doctor_complains(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
-    missing = doctor.Library(name="numba", required=">=0.60", version=None)
-    monkeypatch.setattr(doctor, "_libraries", lambda: (missing,))
+    missing = installation.Library(name="numba", required=">=0.60", version=None)
+    monkeypatch.setattr(installation, "_libraries", lambda: (missing,))
     monkeypatch.setenv("LUNGACCESS_DATA", str(tmp_path / "nowhere"))
     (tmp_path / "file").write_text("")
     assert cli.main(["doctor", "--cache", str(tmp_path / "file" / "cache")]) == 1
@@ -427,23 +427,23 @@ def test_kernels_are_warm_if_no_older_than_their_source(
     for source in sources:
         source.write_text("")
         os.utime(source, (100.0, 100.0))
-    monkeypatch.setattr(doctor, "_kernel_sources", lambda: iter(sources))
-    assert doctor.kernel_cache().state == "cold"
+    monkeypatch.setattr(installation, "_kernel_sources", lambda: iter(sources))
+    assert installation.kernel_cache().state == "cold"
     for source, states in zip(sources, (("cold", "partly warm"), ("partly warm", "warm")), strict=True):
         index = place / f"{source.stem}.f-12.py311.nbi"
         index.write_bytes(b"12345")
         for time, state in zip((99.0, 101.0), states, strict=True):
             os.utime(index, (time, time))
-            assert doctor.kernel_cache().state == state
-    assert doctor.kernel_cache().size_bytes == 10
-    assert doctor.kernel_cache().folders == (str(home),)
+            assert installation.kernel_cache().state == state
+    assert installation.kernel_cache().size_bytes == 10
+    assert installation.kernel_cache().folders == (str(home),)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_knows_commands_options_and_choices(
     shell: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    assert cli.main(["completion", shell]) == cli.OK
+    assert cli.main(["completion", shell]) == ExitCode.OK
     script = capsys.readouterr().out
     for word in (*" ".join(commands()).split(), "voxel-sum", "allow-fissures"):
         assert word in script, word

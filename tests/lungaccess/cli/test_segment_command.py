@@ -16,6 +16,7 @@ from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume
 from anatomy.phantom import Phantom
 from lungaccess.cli import app as cli
+from lungaccess.cli.exit_code import ExitCode
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -32,7 +33,7 @@ def _one_line(text: str) -> str:
 
 
 def _refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert cli.main(["segment", *words]) == cli.BAD_INPUT
+    assert cli.main(["segment", *words]) == ExitCode.BAD_INPUT
     shown = capsys.readouterr().err
     assert "Traceback" not in shown
     return _one_line(shown)
@@ -43,7 +44,7 @@ def test_a_ct_becomes_a_patient_that_info_reads(
 ) -> None:
     out = tmp_path / "patient"
     centre = ",".join(f"{x:.2f}" for x in small_phantom.nodules[0].centre_lps)
-    assert cli.main(["segment", str(ct_file), "--out", str(out), "--target", f"lps:{centre}"]) == cli.OK
+    assert cli.main(["segment", str(ct_file), "--out", str(out), "--target", f"lps:{centre}"]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "right lung" in shown
     assert "ends" in shown
@@ -54,16 +55,16 @@ def test_a_ct_becomes_a_patient_that_info_reads(
     assert both == pytest.approx(truth_l, rel=0.03)
     assert quality["airway"]["ends"] >= 10
     assert len(load_patient(out).targets_lps) == 1
-    assert cli.main(["info", str(out), "--cache", str(tmp_path / "cache")]) == cli.OK
+    assert cli.main(["info", str(out), "--cache", str(tmp_path / "cache")]) == ExitCode.OK
 
 
 def test_the_second_run_says_that_nothing_was_to_do(
     ct_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["segment", str(ct_file), "--out", str(tmp_path / "patient"), "--no-pictures"]
-    assert cli.main(words) == cli.OK
+    assert cli.main(words) == ExitCode.OK
     capsys.readouterr()
-    assert cli.main(words) == cli.OK
+    assert cli.main(words) == ExitCode.OK
     assert "all was up to date" in _one_line(capsys.readouterr().out)
     assert not (tmp_path / "patient" / "segmentation.png").exists()
 
@@ -82,11 +83,11 @@ def test_planning_on_thick_slices_must_be_allowed(
     )
     words = (str(tmp_path / "ct.nii.gz"), "--out", str(tmp_path / "patient"))
     assert "5.0 mm apart" in _refused(capsys, *words)
-    assert cli.main(["segment", *words, "--thick-slices", "--no-pictures"]) == cli.OK
+    assert cli.main(["segment", *words, "--thick-slices", "--no-pictures"]) == ExitCode.OK
     capsys.readouterr()
     plan = ["plan", str(tmp_path / "patient"), "--target", "lps:50,0,0", "--iterations", "1"]
     plan += ["--out", str(tmp_path / "plan"), "--cache", str(tmp_path / "cache")]
-    assert cli.main(plan) == cli.BAD_INPUT
+    assert cli.main(plan) == ExitCode.BAD_INPUT
     assert "--thick-slices" in _one_line(capsys.readouterr().err)
     cli.main([*plan, "--thick-slices"])
     assert "slices 5.0 mm apart" not in _one_line(capsys.readouterr().err)
@@ -208,7 +209,7 @@ def test_a_folder_without_dicom_is_refused(tmp_path: Path, capsys: pytest.Captur
 def test_a_real_scan_with_its_nodule(data_dir: Path, tmp_path: Path) -> None:
     folder, out = data_dir / "ct" / "lidc-0314", tmp_path / "patient"
     words = ["segment", str(folder / "ct.nii.gz"), "--out", str(out)]
-    assert cli.main([*words, "--nodule-contours", str(folder / "nodule_contours.json")]) == cli.OK
+    assert cli.main([*words, "--nodule-contours", str(folder / "nodule_contours.json")]) == ExitCode.OK
     quality = json.loads((out / "quality.json").read_text())
     assert quality["airway"]["ends"] >= 20
     images = load_patient(out)

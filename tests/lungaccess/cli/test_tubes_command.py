@@ -13,6 +13,7 @@ import pytest
 from anatomy.errors import SettingsError
 from lungaccess.cli import app as cli
 from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage.tubes import TubePair, compare_sequences, deploy_tubes, design_choices, load_tubes
 from lungaccess.problem.system import load_system
 from stages.tube.shape import centreline
@@ -77,7 +78,7 @@ def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 
 
 def test_tables_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(tmp_path, "--outer", "30", "--inner", "50", "--propose") == cli.OK
+    assert run(tmp_path, "--outer", "30", "--inner", "50", "--propose") == ExitCode.OK
     text = capsys.readouterr().out
     for words in ("stable", "largest sideways sweep", "2.451 mm", "at most 1 mm", "follow-the-leader", "tip"):
         assert words in text
@@ -93,7 +94,7 @@ def test_the_tip_is_that_of_the_planner(
     rotate: float, outer: float, inner: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--outer", f"{outer}", "--inner", f"{inner}", "--rotate", f"{rotate}", "--json"]
-    assert run(tmp_path, *words) == cli.OK
+    assert run(tmp_path, *words) == ExitCode.OK
     found = printed(capsys)
     tubes = load_system("lung-default").tubes
     s = [inner, inner - 1e-4]
@@ -106,7 +107,7 @@ def test_the_tip_is_that_of_the_planner(
 
 @pytest.mark.usefixtures("no_picture")
 def test_json_with_proposals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(tmp_path, "--outer", "30", "--inner", "50", "--propose", "--json") == cli.OK
+    assert run(tmp_path, "--outer", "30", "--inner", "50", "--propose", "--json") == ExitCode.OK
     found = printed(capsys)
     assert found["sequences"][0]["name"] == "together"
     assert "inner first" in found["refused_sequences"]
@@ -121,7 +122,7 @@ def test_relative_rotation_of_two_curved_tubes(tmp_path: Path, capsys: pytest.Ca
     common = ["--system", str(file), "--outer", "40", "--inner", "60", "--json"]
     tips = []
     for relative in ("0", "120"):
-        assert run(tmp_path, *common, "--relative", relative) == cli.OK
+        assert run(tmp_path, *common, "--relative", relative) == ExitCode.OK
         found = printed(capsys)
         tips.append(found["tip_angles_rad"])
     assert np.ptp(tips[0]) == pytest.approx(0.0, abs=1e-9)
@@ -133,11 +134,11 @@ def test_a_snap_exits_1_and_says_where(tmp_path: Path, capsys: pytest.CaptureFix
     file = tmp_path / "snapping.toml"
     file.write_text(SNAPPING)
     words = ["--system", str(file), "--outer", "60", "--inner", "80", "--relative", "75"]
-    assert run(tmp_path, *words, "--propose") == cli.NO_PLAN
+    assert run(tmp_path, *words, "--propose") == ExitCode.NEGATIVE
     text = capsys.readouterr().out
     assert "SNAPS" in text and "insert all tubes" in text
     assert (tmp_path / "tubes.png").read_bytes()[:8] == PNG
-    assert run(tmp_path, *words, "--json") == cli.NO_PLAN
+    assert run(tmp_path, *words, "--json") == ExitCode.NEGATIVE
     found = printed(capsys)
     assert found["snap"]["move"] == "insert all tubes"
     assert 24.0 < found["snap"]["insertions_mm"][0] < 58.0
@@ -160,7 +161,7 @@ def test_a_snap_exits_1_and_says_where(tmp_path: Path, capsys: pytest.CaptureFix
 def test_bad_input_exits_2(
     words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(tmp_path, *words) == cli.BAD_INPUT
+    assert run(tmp_path, *words) == ExitCode.BAD_INPUT
     captured = capsys.readouterr()
     assert message in captured.err and "Traceback" not in captured.err
     assert list(tmp_path.iterdir()) == []
@@ -168,7 +169,7 @@ def test_bad_input_exits_2(
 
 def test_the_picture_must_be_a_png(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["tubes", "--outer", "10", "--inner", "30", "--out", str(tmp_path / "tubes.jpg")]
-    assert cli.main(words) == cli.BAD_INPUT
+    assert cli.main(words) == ExitCode.BAD_INPUT
     assert ".png" in capsys.readouterr().err
 
 
@@ -224,9 +225,9 @@ def test_choices_need_the_limits_of_a_system(tmp_path: Path) -> None:
 
 
 def test_help_explains_every_option(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["--help"]) == cli.OK
+    assert cli.main(["--help"]) == ExitCode.OK
     assert "tubes" in capsys.readouterr().out
-    assert cli.main(["tubes", "--help"]) == cli.OK
+    assert cli.main(["tubes", "--help"]) == ExitCode.OK
     text = capsys.readouterr().out
     for option in ("outer", "inner", "system", "rotate", "relative", "propose", "out", "json"):
         assert f"--{option}" in text

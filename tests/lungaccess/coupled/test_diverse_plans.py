@@ -157,7 +157,7 @@ def test_an_atlas_serves_another_needle(small_lung: Lung, atlas: la.Atlas) -> No
 
 
 def test_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lungaccess.cli.commands.alternatives.load_lung", lambda *_: small_lung)
+    monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_lung)
     words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]
     assert cli.main([*words, "--out", str(tmp_path / "plans"), "--cache", str(tmp_path)]) == 0
     saved = sorted(path.name for path in (tmp_path / "plans").iterdir())

@@ -12,7 +12,8 @@ from anatomy.errors import SettingsError, TargetError
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose
-from lungaccess.cli.app import BAD_INPUT, OK, main
+from lungaccess.cli.app import main
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage.needle import pierced_branch, plan_needle
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import nodule_target
@@ -87,8 +88,8 @@ def test_command(
     np.savetxt(start, start_beside(small_lung, 8.0))
     command = ["needle", str(folder), "--nodule", "1", "--system", "ultrathin", "--iterations", "2000"]
     command += ["--cache", str(tmp_path / "cache")]
-    assert main([*command, "--start", str(start)]) == OK
+    assert main([*command, "--start", str(start)]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "proved clear" in shown and "insert, mm" in shown
-    assert main([*command, "--start", "99"]) == BAD_INPUT
-    assert main([*command, "--start", str(tmp_path / "none.txt")]) == BAD_INPUT
+    assert main([*command, "--start", "99"]) == ExitCode.BAD_INPUT
+    assert main([*command, "--start", str(tmp_path / "none.txt")]) == ExitCode.BAD_INPUT

@@ -17,7 +17,8 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.images import read_volume
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, OBSTACLES, OUTSIDE
-from lungaccess.cli.app import BAD_INPUT, OK, main
+from lungaccess.cli.app import main
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.reachability.layers import _earlier_neighbours
 from lungaccess.reachability.reach_map import KINDS, NOT_COUNTED, ReachMap, compare, reach_grid, reachability
 from lungaccess.reachability.regions import LEFT, RIGHT, lung_regions
@@ -265,17 +266,17 @@ def test_bad_input_is_refused(
 def test_the_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr("lungaccess.problem.patients.load_patient", lambda *_args, **_options: small_lung)
     command = ["reach", "patient", "--system", "ultrathin", "--spacing", "30", "--out", str(tmp_path)]
-    assert main([*command, "--json"]) == OK
+    assert main([*command, "--json"]) == ExitCode.OK
     (written,) = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in written["regions"]] == ["right lung", "left lung", "total"]
     assert set(written["regions"][0]["shares"]) == set(KINDS)
     assert json.loads((tmp_path / "reach.json").read_text()) == [written]
     assert (tmp_path / "reach.png").read_bytes().startswith(PNG)
     assert read_volume(tmp_path / "reach.nrrd").array.any()
-    assert main([*command, "--compare", "lung-default"]) == OK
+    assert main([*command, "--compare", "lung-default"]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "ultrathin" in shown and "lung-default" in shown and "gained" in shown
     for stem in ("reach-1-ultrathin", "reach-2-lung-default"):
         assert (tmp_path / f"{stem}.nrrd").is_file() and (tmp_path / f"{stem}.png").is_file()
-    assert main([*command, "--spacing", "0"]) == BAD_INPUT
-    assert main([*command, "--compare", "nonesuch"]) == BAD_INPUT
+    assert main([*command, "--spacing", "0"]) == ExitCode.BAD_INPUT
+    assert main([*command, "--compare", "nonesuch"]) == ExitCode.BAD_INPUT

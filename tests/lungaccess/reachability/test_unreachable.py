@@ -20,7 +20,8 @@ from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import bending_directions
 from anatomy.typed import Float
-from lungaccess.cli.app import BAD_INPUT, main
+from lungaccess.cli.app import main
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import point_target
 from lungaccess.reachability.kernels import deployment_boxes as boxes
@@ -372,5 +373,5 @@ def test_the_command(
     assert said["boxes"] > 0
     main([*words, "--target", f"lps:{target}", "--most-boxes", "1000"])
     assert "proved" in capsys.readouterr().out
-    assert main([*words, "--target", f"lps:{target}", "--most-boxes", "0"]) == BAD_INPUT
-    assert main(words) == BAD_INPUT
+    assert main([*words, "--target", f"lps:{target}", "--most-boxes", "0"]) == ExitCode.BAD_INPUT
+    assert main(words) == ExitCode.BAD_INPUT

@@ -22,7 +22,8 @@ from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.structures import VESSEL
-from lungaccess.cli.app import BAD_INPUT, OK, main
+from lungaccess.cli.app import main
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.curves import arc_lengths
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import (
@@ -492,12 +493,12 @@ def test_the_command_writes_page_and_movie(
     plans: tuple[Plan, ...], small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plans[0].save(tmp_path / "plan.json")
-    monkeypatch.setattr("lungaccess.cli.commands.report.load_lung", lambda *_: small_lung)
+    monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_lung)
     monkeypatch.setattr(
         "lungaccess.report.html.bronchoscopy_webp", lambda _plan, _lung, path: Path(path).touch()
     )
     arguments = ["report", str(tmp_path / "plan.json"), str(tmp_path), "--samples", "50", "--no-instructions"]
-    assert main([*arguments, "--movie", str(tmp_path / "new" / "fly.webp")]) == OK
+    assert main([*arguments, "--movie", str(tmp_path / "new" / "fly.webp")]) == ExitCode.OK
     assert (tmp_path / "new" / "fly.webp").exists()
     assert report_data(tmp_path / "report.html")["ct"] is None
     assert "No CT was given" in (tmp_path / "report.html").read_text()
@@ -505,11 +506,11 @@ def test_the_command_writes_page_and_movie(
 
 @pytest.mark.parametrize("wrong", [["--alternatives", "-1"], ["--samples", "-5"]])
 def test_negative_numbers_are_bad_input(wrong: list[str], tmp_path: Path) -> None:
-    assert main(["report", str(tmp_path / "plan.json"), str(tmp_path), *wrong]) == BAD_INPUT
+    assert main(["report", str(tmp_path / "plan.json"), str(tmp_path), *wrong]) == ExitCode.BAD_INPUT
 
 
 def test_a_plan_that_is_none_is_bad_input(tmp_path: Path) -> None:
-    assert main(["report", str(tmp_path / "plan.json"), str(tmp_path)]) == BAD_INPUT
+    assert main(["report", str(tmp_path / "plan.json"), str(tmp_path)]) == ExitCode.BAD_INPUT
 
 
 # The reachability map ----------------------------------------------------------------------------

@@ -17,7 +17,8 @@ import lungaccess as la
 from anatomy.errors import FileError, PlanFileError, SettingsError
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from lungaccess.cli.app import BAD_INPUT, OK, main
+from lungaccess.cli.app import main
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessment import assess, safest
@@ -342,7 +343,7 @@ def test_the_command(
     plan.save(tmp_path / "plan.json")
     (tmp_path / "errors.toml").write_text("scope_position_mm = 0.25\nneedle_roll_deg = 1\n")
     command = ["risk", str(tmp_path / "plan.json"), "patient", "--samples", "200"]
-    assert main([*command, "--errors", str(tmp_path / "errors.toml"), "--json"]) == OK
+    assert main([*command, "--errors", str(tmp_path / "errors.toml"), "--json"]) == ExitCode.OK
     written = json.loads(capsys.readouterr().out)
     assert written["errors"]["scope_position_mm"] == 0.25
     assert written["errors"]["tube_rotation_deg"] == ErrorModel().tube_rotation_deg
@@ -350,6 +351,6 @@ def test_the_command(
     report = assess(plan, small_lung, model=stated, samples=200)
     assert written["succeeds"]["probability"] == report.succeeds.value
     assert [each["kind"] for each in written["tolerances"]] == list(UNITS)
-    assert main(command) == OK
+    assert main(command) == ExitCode.OK
     assert "succeeds" in capsys.readouterr().out
-    assert main([*command, "--radius", "-1"]) == BAD_INPUT
+    assert main([*command, "--radius", "-1"]) == ExitCode.BAD_INPUT

@@ -321,7 +321,7 @@ def test_the_command_says_what_it_wrote(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     report = CheckReport(accepted=accepted, findings=())
-    monkeypatch.setattr("lungaccess.cli.commands.export.load_lung", lambda *_: small_lung)
+    monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_lung)
     monkeypatch.setattr(
         "lungaccess.slicer.export_slicer",
         lambda *_, **__: Exported(files=("scene.mrml",), report=report),

@@ -17,6 +17,7 @@ import pytest
 
 from lungaccess.cli import app as cli
 from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
 from lungaccess.study.answers import NO_PLAN, TIMEOUT
 from lungaccess.study.export import export_csv, export_parquet
 from lungaccess.study.results import ResultsFile
@@ -112,7 +113,7 @@ def test_export_without_pyarrow(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert cli.main(["study", "export", str(path), "--parquet", str(tmp_path / "p")]) == cli.BAD_INPUT
+    assert cli.main(["study", "export", str(path), "--parquet", str(tmp_path / "p")]) == ExitCode.BAD_INPUT
     assert "pip install 'lungaccess[study]'" in capsys.readouterr().err
     assert cli.main(["study", "export", str(path), "--csv", str(tmp_path / "c")]) == 0
 
@@ -151,7 +152,7 @@ def test_bad_input_is_explained(
     monkeypatch.chdir(tmp_path)
     Path("study.toml").write_text(TOML)
     Path("wrong.toml").write_text(TOML.replace("seeds", "sedes"))
-    assert cli.main(["study", *words]) == cli.BAD_INPUT
+    assert cli.main(["study", *words]) == ExitCode.BAD_INPUT
     found = capsys.readouterr()
     assert expected in found.err
     assert "Traceback" not in found.err
@@ -185,7 +186,7 @@ def test_ctrl_c_leaves_a_complete_file(tmp_path: Path, cache: Path) -> None:
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
         said = process.communicate()[1]
-    assert process.returncode == cli.INTERRUPTED
+    assert process.returncode == ExitCode.INTERRUPTED
     assert "Traceback" not in said
     assert not path.with_name("r.db-wal").exists()
     assert 5 <= stored(path) < 80

@@ -1,0 +1,130 @@
+"""What was understood of a patient, as tables and as plain values."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from lungaccess.cli import terminal
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
+
+
+def lung_record(lung: Lung) -> dict[str, Any]:
+    """Return what was understood of a patient."""
+    tree, report = lung.tree, lung.tree.report
+    ml = lung.grid.voxel_volume_mm3 / 1000.0
+    return {
+        "name": lung.name,
+        "kind": lung.kind,
+        "key": lung.key,
+        "grid": {
+            "shape": list(lung.grid.shape),
+            "spacing_mm": lung.grid.spacing_mm.tolist(),
+            "lps_from_ijk": lung.grid.lps_from_ijk.tolist(),
+        },
+        "breath_hold": lung.breath_hold,
+        "volumes_ml": {name: count * ml for name, count in structure_voxels(lung).items()},
+        "has_cost_map": lung.cost is not None,
+        "starts": len(lung.starts),
+        "targets_lps": [point.tolist() for point in lung.targets_lps],
+        "tree": {
+            "branches": tree.n_branches,
+            "carina_lps": tree.carina_lps.tolist(),
+            "branches_by_generation": np.bincount(tree.generation).tolist(),
+            "components_dropped": report.components_dropped,
+            "voxels_dropped": report.voxels_dropped,
+            "repairs": [
+                {"kind": kind, "lps": each.position_lps.tolist(), "length_mm": each.length_mm}
+                for kind, each in _repairs(lung)
+            ],
+        },
+        "sources": dict(lung.sources),
+        "warnings": list(lung.warnings),
+    }
+
+
+def structure_voxels(lung: Lung) -> dict[str, int]:
+    """Return how many voxels each structure has that is there."""
+    from anatomy import structures
+
+    counts = {"inside the lung": int(np.count_nonzero((lung.labels & structures.OUTSIDE) == 0))}
+    for name in ("airway", "lumen", "vessel", "fissure"):
+        counts[name] = int(np.count_nonzero(lung.labels & structures.BITS[name]))
+    if lung.nodules is not None:
+        counts["nodules"] = int(np.count_nonzero(lung.nodules.array))
+    return {name: count for name, count in counts.items() if count}
+
+
+def anatomy_tables(lung: Lung) -> list[Table]:
+    """Return what was understood of a patient: structures, airway tree by generation, sources."""
+    made = [
+        terminal.table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
+        terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
+        terminal.table(
+            "Airway tree",
+            ("generation", "branches", "mean radius, mm", "least radius, mm", "mean length, mm"),
+            _generation_rows(lung),
+        ),
+        terminal.table(
+            "Repairs of the airway tree", ("repair", "at LPS, mm", "length, mm"), _repair_rows(lung)
+        ),
+        terminal.table(
+            "Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]
+        ),
+    ]
+    return [each for each in made if each.row_count]
+
+
+def _patient_rows(lung: Lung) -> list[terminal.Row]:
+    rows: list[terminal.Row] = [
+        ("working grid", lung.grid.describe()),
+        ("carina, LPS mm", ", ".join(f"{c:.1f}" for c in lung.tree.carina_lps)),
+        ("breath hold", lung.breath_hold or "not stated"),
+        ("fissures", "given" if lung.has_fissures else "not given"),
+        ("cost map", "given" if lung.cost is not None else "not given"),
+        ("start poses, targets", f"{len(lung.starts)}, {len(lung.targets_lps)}"),
+    ]
+    dropped = lung.tree.report.components_dropped
+    if dropped:
+        rows.append(("airway pieces left out", f"{dropped} ({lung.tree.report.voxels_dropped} voxels)"))
+    return rows
+
+
+def _repair_rows(lung: Lung) -> list[terminal.Row]:
+    """Return every change the airway tree needed, with its place."""
+    return [
+        (kind, ", ".join(f"{c:.1f}" for c in each.position_lps), f"{each.length_mm:.1f}")
+        for kind, each in _repairs(lung)
+    ]
+
+
+def _repairs(lung: Lung) -> list[tuple[str, GapBridged | LoopOpened | SpurPruned]]:
+    """Return every change the airway tree needed, with its kind."""
+    report = lung.tree.report
+    return [
+        *(("gap bridged", each) for each in report.gaps_bridged),
+        *(("loop opened", each) for each in report.loops_opened),
+        *(("spur pruned", each) for each in report.spurs_pruned),
+    ]
+
+
+def _volume_rows(lung: Lung) -> list[terminal.Row]:
+    ml = lung.grid.voxel_volume_mm3 / 1000.0
+    return [(name, f"{count * ml:.1f}", f"{count}") for name, count in structure_voxels(lung).items()]
+
+
+def _generation_rows(lung: Lung) -> list[terminal.Row]:
+    tree = lung.tree
+    rows: list[terminal.Row] = []
+    for generation in range(int(tree.generation.max()) + 1):
+        branches = np.flatnonzero(tree.generation == generation)
+        radius = np.asarray(tree.branch_mean_radius_mm)[branches]
+        length = np.asarray(tree.branch_length_mm)[branches]
+        figures = (f"{radius.mean():.2f}", f"{radius.min():.2f}", f"{length.mean():.1f}")
+        rows.append((f"{generation}", f"{len(branches)}", *figures))
+    return rows

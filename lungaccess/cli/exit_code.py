@@ -1,0 +1,23 @@
+"""How a command ends, for shells and scripts."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """The exit codes of every command."""
+
+    OK = 0
+    """Done; of a question: yes.  A plan was found and the independent check accepts it."""
+    NEGATIVE = 1
+    """Of a question: no.  There is no plan, the check refuses it, or not all of what was asked was done."""
+    BAD_INPUT = 2
+    """The input is bad, and the error says how."""
+    INTERRUPTED = 130
+    """The user pressed Ctrl-C; shells state the same number."""
+
+    @classmethod
+    def of(cls, positive: bool) -> ExitCode:
+        """Return `OK` for a positive outcome, `NEGATIVE` for another."""
+        return cls.OK if positive else cls.NEGATIVE

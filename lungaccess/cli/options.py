@@ -1,0 +1,236 @@
+"""Options that several commands take: each is defined, explained and read once.
+
+Every class is a group of options that cyclopts flattens into those of a command.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from cyclopts import Parameter
+
+from anatomy.errors import SettingsError
+from lungaccess.cli.progress import progress
+from stages.needle import TERMS, Objective
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.coupled.atlas import Atlas
+    from lungaccess.problem.system import System
+    from lungaccess.problem.target import StatedTarget
+
+    ObjectiveText = str
+else:
+    ObjectiveText = Literal[tuple(term.option for term in TERMS)] | str
+"""The costs by name, for help and completion, or a weighted sum; `Objective.of` reads it."""
+
+Method = Literal[
+    "atlas", "kuntz2015", "kuntz2015-without-rejection", "reference", "reference-without-rejection"
+]
+DEFAULT_SYSTEM = "lung-default"
+DEFAULT_BUDGET_S = 10.0
+"""Long enough that the best cost of most targets has settled, short enough to wait for."""
+
+STEP_SHARES = {
+    "reading images": 0.02,
+    "airway tree": 0.12,
+    "labels": 0.24,
+    "clearance to airway": 0.45,
+    "clearance to vessel": 0.57,
+    "clearance to pleura": 0.69,
+    "clearance to fissure": 0.80,
+}
+"""Share of the preparation that is done when a step begins, as measured on CT of 512 x 512 x 500 voxels."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """How a command answers.
+
+    Parameters
+    ----------
+    json : bool
+        Print JSON instead of text and tables.
+    """
+
+    json: bool = False
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PatientOptions(OutputOptions):
+    """How a command answers, and where it keeps what it prepares.
+
+    Parameters
+    ----------
+    cache : Path
+        Folder where the prepared anatomy is kept for the next command.
+    """
+
+    cache: Path | None = None
+
+    def load(self, patient: Path, *, thick_slices: bool = False) -> Lung:
+        """Return a patient's lung; see `load_lung`."""
+        return load_lung(patient, self.cache, thick_slices)
+
+    def open_atlas(self, lung: Lung, system: System) -> Atlas:
+        """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
+        from lungaccess.coupled import open_atlas
+
+        with progress("enumerating what scope and tubes can do") as shown:
+            return open_atlas(lung, system, cache=self.cache, progress=shown.share)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class TargetOptions:
+    """Where to go.
+
+    Parameters
+    ----------
+    target : str
+        Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
+    nodule : int
+        Go to the centre of this nodule of the nodule mask; 1, the largest, if no number follows.
+    """
+
+    target: str | None = None
+    nodule: int | None = None
+
+    def stated(self) -> StatedTarget:
+        """Return what the user states, before any patient is read.
+
+        Raises
+        ------
+        FrameError
+            If a point states no frame.
+        TargetError
+            If there is not exactly one of point and nodule.
+        """
+        from lungaccess.problem.target import stated_target
+
+        return stated_target(self.target, self.nodule)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SystemOptions:
+    """With which devices.
+
+    Parameters
+    ----------
+    system : str
+        Name of a preset (see `lungaccess presets`) or path of a TOML file.
+    allow_fissures : bool
+        Whether fissures may be crossed; as the system says if not given.
+    """
+
+    system: str = DEFAULT_SYSTEM
+    allow_fissures: bool | None = None
+
+    def load(self) -> System:
+        """Return the system, with its rule about fissures replaced if the user states one."""
+        from lungaccess.problem.system import load_system
+
+        return load_system(self.system, fissures_allowed=self.allow_fissures)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class BudgetOptions:
+    """How long to search.
+
+    Parameters
+    ----------
+    budget : float
+        Planning time in seconds; 10 if neither this nor --iterations is given.
+    iterations : int
+        Number of iterations instead of a time: the same seed then gives the same plan.
+    seed : int
+        Seed of the random numbers.
+
+    Raises
+    ------
+    SettingsError
+        Unless time and iterations are numbers that a search can end with.
+    """
+
+    budget: float | None = None
+    iterations: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.budget is not None and not 0.0 < self.budget < float("inf"):
+            raise SettingsError(f"--budget is {self.budget:g} s", expected="a finite time above 0")
+        if self.iterations is not None and self.iterations < 1:
+            raise SettingsError(f"--iterations is {self.iterations}", expected="at least 1")
+
+    @property
+    def time_s(self) -> float | None:
+        """Planning time; None for as long as the iterations take."""
+        return DEFAULT_BUDGET_S if self.budget is None and self.iterations is None else self.budget
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(BudgetOptions):
+    """How to search for plans, and how long.
+
+    Parameters
+    ----------
+    objective : str
+        What to make small: integral of 1/clearance, integral of the patient's cost map, its sum over the
+        voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5.
+    method : str
+        Search over the deployment atlas; Algorithm 1 of Kuntz et al. 2015; or reference: the same as
+        printed, with collisions of surface meshes, slow.
+    processes : int
+        How many processes refine the plan at the same time.
+    """
+
+    objective: ObjectiveText = "inverse-clearance"
+    method: Method = "atlas"
+    processes: int = 1
+
+
+def require_map(lung: Lung, objective: Objective) -> None:
+    """Raise SettingsError if an objective weighs a cost map that the patient does not have."""
+    if objective.weighs_map and lung.cost is None:
+        raise SettingsError(
+            f"Patient {lung.name} has no cost map",
+            expected=f"a cost map among the patient's files for --objective {objective}",
+            remedy="Choose inverse-clearance or length",
+        )
+
+
+def load_lung(patient: Path, cache: Path | None, thick_slices: bool) -> Lung:
+    """Return a patient's lung, and show what is being done meanwhile.
+
+    Raises
+    ------
+    SettingsError
+        If the masks were made from thick slices, unless `thick_slices` accepts them.
+    """
+    from lungaccess.problem.patients import load_patient
+
+    if not thick_slices:
+        _refuse_thick_slices(patient)
+    with progress(f"reading {patient}") as shown:
+        return load_patient(
+            patient, cache=cache, progress=lambda step: shown.step(step, STEP_SHARES.get(step))
+        )
+
+
+def _refuse_thick_slices(patient: Path) -> None:
+    from anatomy.io.own_masks import thick_slices_mm
+
+    distance_mm = thick_slices_mm(patient)
+    if distance_mm:
+        raise SettingsError(
+            f"The masks of {patient} were made from slices {distance_mm:.1f} mm apart",
+            expected="slices that show small airways and vessels: at most 3 mm",
+            remedy="Segment a thinner reconstruction; `lungaccess plan --thick-slices` plans all the same",
+        )

@@ -32,7 +32,7 @@ def explain(task: Task, atlas: Atlas, blocked: Counter[str], iterations: int) ->
         f"No plan to the target after {iterations} iterations: {_main_reason(arcs, blocked)}",
         reasons=_reasons(arcs, blocked),
         advice=_advice(arcs, direct, changes),
-        plans_with_changes={str(change): change.plan for change in changes},
+        counterfactuals={str(change): change.plan for change in changes},
     )
 
 

@@ -23,8 +23,8 @@ class NoPlan(LungaccessError):  # noqa: N818
         How many sites, deployments or needle paths each reason ruled out.
     advice : str
         The smallest change of device that would make the target reachable, if one was found.
-    plans_with_changes : mapping of str to Plan
-        For each change of one parameter that was found to help, a plan with it.
+    counterfactuals : mapping of str to Plan
+        For each change of one device parameter that makes the target reachable, a plan with that change.
     """
 
     def __init__(
@@ -33,9 +33,9 @@ class NoPlan(LungaccessError):  # noqa: N818
         *,
         reasons: Mapping[str, int],
         advice: str = "",
-        plans_with_changes: Mapping[str, Plan] | None = None,
+        counterfactuals: Mapping[str, Plan] | None = None,
     ) -> None:
-        self.plans_with_changes: Mapping[str, Plan] = MappingProxyType(dict(plans_with_changes or {}))
+        self.counterfactuals: Mapping[str, Plan] = MappingProxyType(dict(counterfactuals or {}))
         self.reasons: Mapping[str, int] = MappingProxyType(dict(reasons))
         self.advice = advice
         super().__init__(found, remedy=advice)

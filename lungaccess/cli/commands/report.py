@@ -102,7 +102,7 @@ def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple
     target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
     atlas = output.open_atlas(lung, plan.system)
     try:
-        menu = find(lung, plan.system, target, objective=plan.objective, count=count, atlas=atlas)
+        found = find(lung, plan.system, target, objective=plan.objective, count=count, atlas=atlas)
     except NoPlan:
         return ()
-    return tuple(each.plan for each in menu)
+    return tuple(each.plan for each in found)

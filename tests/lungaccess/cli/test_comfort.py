@@ -251,9 +251,9 @@ def test_steps_are_shown_with_an_estimate(screen: StringIO) -> None:
 
 def test_a_search_shows_best_cost_and_estimate(screen: StringIO) -> None:
     with progress.SearchDisplay(10.0, None) as shown:
-        shown.update("climb", 5.0, 3, None)
+        shown.update("local search", 5.0, 3, None)
         shown.better(5.0, 1.25)
-        shown.update("climb", 6.0, 3, 1.25)
+        shown.update("local search", 6.0, 3, 1.25)
         shown._progress.refresh()
         shown.interrupted()
     said = screen.getvalue()
@@ -365,10 +365,10 @@ def test_alternatives_and_needle_as_json(
 ) -> None:
     common = ["--nodule", "1", "--system", "ultrathin", "--cache", str(patient.parent / "cache")]
     words = ["alternatives", str(patient), *common, "--count", "2", "--out", str(tmp_path)]
-    menu = answer_of(words, capsys)
-    assert menu and all(each["accepted"] for each in menu)
-    first = Plan.load(menu[0]["plan"])
-    assert menu[0]["criteria"]["inverse_clearance"] == pytest.approx(first.costs["inverse_clearance"])
+    found = answer_of(words, capsys)
+    assert found and all(each["accepted"] for each in found)
+    first = Plan.load(found[0]["plan"])
+    assert found[0]["criteria"]["inverse_clearance"] == pytest.approx(first.costs["inverse_clearance"])
     np.savetxt(tmp_path / "pose.txt", first.tube.lps_from_tip)
     start = ["--start", str(tmp_path / "pose.txt"), "--iterations", "2000"]
     path = answer_of(["needle", str(patient), *common, *start], capsys)["path"]

@@ -165,7 +165,7 @@ class TestAdvice:
             except la.NoPlan as error:
                 named = [
                     (float(re.search(r"curvature of (\d+) mm instead of 121 mm", change)[1]), made)
-                    for change, made in error.plans_with_changes.items()
+                    for change, made in error.counterfactuals.items()
                     if "curvature" in change
                 ]
                 if not named:
@@ -190,7 +190,7 @@ class TestAdvice:
             try:
                 list(la.plan(small_lung, THICK, target, atlas=atlas_of(THICK), iterations=0))
             except la.NoPlan as error:
-                for change, made in error.plans_with_changes.items():
+                for change, made in error.counterfactuals.items():
                     seen.add("needle" if "needle" in change else "scope")
                     assert la.check(made, small_lung).accepted, change
                     assert made.system != THICK
@@ -208,10 +208,10 @@ class TestAdvice:
             try:
                 list(la.plan(small_lung, thick, target, atlas=atlas, iterations=0))
             except la.NoPlan as error:
-                changes = [change for change in error.plans_with_changes if "bronchoscope" in change]
+                changes = [change for change in error.counterfactuals if "bronchoscope" in change]
                 if not changes:
                     continue
-                made = error.plans_with_changes[changes[0]]
+                made = error.counterfactuals[changes[0]]
                 assert la.check(made, small_lung).accepted
                 needed = made.system.scope.outer_diameter_mm
                 assert f"diameter of {needed:g} mm instead of 4.5 mm" in changes[0]
@@ -227,11 +227,11 @@ class TestAdvice:
                 list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
             except la.NoPlan as error:
                 shares = []
-                for change in error.plans_with_changes:
+                for change in error.counterfactuals:
                     needed, present = map(float, re.findall(r"([\d.]+) mm", change))
                     shares.append(abs(needed - present) / present)
                 assert shares == sorted(shares)
-                first = next(iter(error.plans_with_changes), "")
+                first = next(iter(error.counterfactuals), "")
                 assert not first or error.advice.lower().startswith(first)
 
 

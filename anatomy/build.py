@@ -14,9 +14,10 @@ from anatomy.errors import AnatomyError
 from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
+from anatomy.morphology import bounds, window
 from anatomy.patient import PatientImages
 from anatomy.sides import septum
-from anatomy.typed import Array, Int, Mask, UInt16
+from anatomy.typed import Array, Mask, UInt16
 
 Progress = Callable[[str], None]
 
@@ -41,9 +42,9 @@ class WorkingBox:
 
     def __init__(self, images: PatientImages) -> None:
         tissue = images.lung.array | images.lumen.array
-        low, high = _bounds(tissue)
+        low, high = bounds(tissue)
         self._start = low - PAD_VOXELS
-        self._stop = high + 1 + PAD_VOXELS
+        self._stop = high + PAD_VOXELS
         self.grid: Grid = images.grid.crop(self._start, self._stop)
 
     def cut(self, array: Array) -> Array:
@@ -55,17 +56,6 @@ class WorkingBox:
         target = tuple(slice(s.start - a, s.stop - a) for s, a in zip(source, self._start, strict=True))
         out[target] = array[source]
         return out
-
-
-def _bounds(mask: Mask) -> tuple[Int, Int]:
-    """Return the lowest and highest index of a True voxel along each axis."""
-    low, high = [], []
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        hits = np.flatnonzero(mask.any(axis=others))
-        low.append(hits[0])
-        high.append(hits[-1])
-    return np.asarray(low), np.asarray(high)
 
 
 def build_lung(
@@ -229,11 +219,10 @@ def _field_arrays(
 
 def _lumen_depth(lumen: Volume, keep: Callable[[str, Array], Array]) -> DistanceField:
     """Make the field of the depth inside the lumen, on the lumen's own box."""
-    low, high = _bounds(lumen.array)
-    grid = lumen.grid.crop(low - 1, high + 2)
+    low, high = bounds(lumen.array)
+    grid = lumen.grid.crop(low - 1, high + 1)
     solid = np.ones(grid.shape, dtype=bool, order="F")
-    window = tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))
-    solid[1:-1, 1:-1, 1:-1] = ~lumen.array[window]
+    solid[1:-1, 1:-1, 1:-1] = ~lumen.array[window(low, high)]
     field = distance_field("lumen_depth", solid, grid)
     stored = keep("lumen_depth", field.corners)
     return DistanceField(name=field.name, corners=stored, geometry=field.geometry)

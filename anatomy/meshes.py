@@ -26,7 +26,8 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, read_only
-from anatomy.typed import Array, Float, Int, Mask
+from anatomy.morphology import bounds, window
+from anatomy.typed import Float, Int, Mask
 
 _RING = ((0, 0), (1, 0), (1, 1), (0, 1))
 
@@ -116,21 +117,14 @@ def smooth_surface(volume: Volume) -> SurfaceMesh:
 
     if not volume.array.any():
         raise AnatomyError("An empty mask has no surface", expected="a mask with at least one voxel")
-    low, high = _bounds(volume.array)
-    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    padded = np.pad(volume.array[window], 1).astype(np.float32)
+    low, high = bounds(volume.array)
+    padded = np.pad(volume.array[window(low, high)], 1).astype(np.float32)
     vertices, faces, _, _ = marching_cubes(padded, level=0.5, gradient_direction="ascent")
     return SurfaceMesh(
         vertices_lps=volume.grid.lps(vertices + low - 1.0),
         faces=faces,
         bound_mm=0.5 * float(np.linalg.norm(volume.grid.spacing_mm)),
     )
-
-
-def _bounds(mask: Array) -> tuple[Int, Int]:
-    """Return the first index and the index beyond the last of the voxels of `mask`."""
-    along = [np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis))) for axis in range(3)]
-    return np.asarray([hits[0] for hits in along]), np.asarray([hits[-1] + 1 for hits in along])
 
 
 class MeshDistance:

@@ -1,8 +1,13 @@
-"""Growing of masks by whole voxels."""
+"""Masks by whole voxels: their bounds, and growing."""
 
 from __future__ import annotations
 
-from anatomy.typed import Mask
+import numpy as np
+
+from anatomy.typed import Array, Int, Mask
+
+Window = tuple[slice, slice, slice]
+"""A box of voxels, as an index of arrays."""
 
 
 def grown_by_one(mask: Mask) -> Mask:
@@ -15,3 +20,27 @@ def grown_by_one(mask: Mask) -> Mask:
         grown[upper] |= mask[lower]
         mask = grown
     return mask
+
+
+def bounds(mask: Array, pad: int | Int = 0) -> tuple[Int, Int]:
+    """Return `low` and `high` such that every voxel of a mask has `low <= ijk < high`; zeros if it is empty.
+
+    Parameters
+    ----------
+    mask : (ni, nj, nk) bool
+    pad : int or (3,) int
+        Voxels by which the bounds are wider, as far as the array reaches.
+    """
+    low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
+    lines = (mask.any(axis=(1, 2)), mask.any(axis=(0, 2)), mask.any(axis=(0, 1)))
+    for axis, line in enumerate(lines):
+        hits = np.flatnonzero(line)
+        if hits.size:
+            low[axis], high[axis] = hits[0], hits[-1] + 1
+    return np.maximum(low - pad, 0), np.minimum(high + pad, mask.shape)
+
+
+def window(low: Int, high: Int) -> Window:
+    """Return the voxels `low <= ijk < high` as an index."""
+    i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    return i, j, k

@@ -29,7 +29,7 @@ SMALLEST_GROWN_MM = 1.25
 MIDDLE_WEIGHT = 0.4
 """Segmental bronchi turn partly towards what they supply: wholly would lose the template."""
 BALANCE_ROUNDS = 25
-"""After so many rounds the shares of the segments change no more."""
+"""Shares need only be about equal: each round moves the weights half-way."""
 DIRECTION_JITTER = 0.07
 """Four degrees or so: patients differ, and segments keep their place."""
 LENGTH_JITTER = 0.08

@@ -28,7 +28,7 @@ SCALES: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 0.7})
 DEFAULT_SPACING_MM: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 1.25})
 """As a usual reconstruction; coarser for the small patient, which tests are run on."""
 FINEST_MM, COARSEST_MM = 0.3, 2.5
-"""Finer voxels would take more memory than a workstation has; coarser ones cannot hold the bronchi."""
+"""Each image of finer voxels would take gigabytes; coarser ones cannot hold the bronchi."""
 GREATEST_NOISE_HU = 200.0
 """Ten times the noise of a diagnostic CT."""
 

@@ -38,7 +38,7 @@ ATRIUM_LPS = (5.0, 8.0, -60.0)
 FAR_SHARE = 0.5
 """Veins grow in the half of a lobe that is farther from airways: they run between segments."""
 RELAX_ROUNDS = 60
-"""Most vessels are free after 20 rounds; the last ones become thinner instead."""
+"""Where vessels still touch after so many rounds, they become thinner instead."""
 NEIGHBOURS = 12
 """Enough of the nearest balls that the one whose surface is nearest is among them."""
 WATCHED_NEIGHBOURS = 6

@@ -10,8 +10,8 @@ import numpy as np
 
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Volume, read_only
+from anatomy.morphology import Window, bounds, window
 from anatomy.segmentation.airway_warnings import airway_warnings
-from anatomy.segmentation.coarse import bounds, window
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.local_minima import local_minima_map
 from anatomy.typed import Array, Float, Int16, Mask
@@ -126,10 +126,8 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     )
 
 
-def _box(mask: Mask, spacing_mm: Float) -> tuple[slice, slice, slice]:
-    low, high = bounds(mask)
-    margin = np.ceil(BOX_MARGIN_MM / spacing_mm).astype(np.int64)
-    return window(np.maximum(low - margin, 0), np.minimum(high + margin, mask.shape))
+def _box(mask: Mask, spacing_mm: Float) -> Window:
+    return window(*bounds(mask, np.ceil(BOX_MARGIN_MM / spacing_mm).astype(np.int64)))
 
 
 def _hounsfield(values: Array) -> Int16:
@@ -153,9 +151,8 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
 
     air = ground.smooth < ground.dark_hu
     certain = rough & air
-    low, high = bounds(certain)
     reach = int(np.ceil(EDGE_MM / ground.spacing_mm.min()))
-    inner = window(np.maximum(low - reach, 0), np.minimum(high + reach, rough.shape))
+    inner = window(*bounds(certain, reach))
     certain[inner] = ndimage.binary_dilation(certain[inner], iterations=reach, mask=air[inner])
     labels, _ = ndimage.label(certain)
     label = int(labels[seed]) if all(0 <= n < m for n, m in zip(seed, labels.shape, strict=True)) else 0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from anatomy.grid import Grid, Volume
-from anatomy.segmentation.coarse import bounds, window
+from anatomy.morphology import bounds, window
 from anatomy.segmentation.lungs import Lungs
 from anatomy.typed import Array, Int
 

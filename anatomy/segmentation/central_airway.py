@@ -8,7 +8,8 @@ import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
-from anatomy.segmentation.coarse import CoarseCt, bounds, window
+from anatomy.morphology import bounds, window
+from anatomy.segmentation.coarse import CoarseCt
 from anatomy.typed import Float, Int, Mask
 
 COLUMN_HU = -850.0

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from anatomy.grid import Grid, Volume
+from anatomy.morphology import bounds
 from anatomy.typed import Array, Float, Float32, Int, Mask
 
 COARSE_MM = 1.5
@@ -113,23 +114,6 @@ class CoarseCt:
 
     def _reversed_axes(self) -> tuple[int, ...]:
         return tuple(axis for axis in range(3) if self.flipped[axis])
-
-
-def bounds(mask: Mask) -> tuple[Int, Int]:
-    """Return `low` and `high` such that every True voxel has `low <= ijk < high`; zeros if there is none."""
-    low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
-    lines = (mask.any(axis=(1, 2)), mask.any(axis=(0, 2)), mask.any(axis=(0, 1)))
-    for axis, line in enumerate(lines):
-        hits = np.flatnonzero(line)
-        if hits.size:
-            low[axis], high[axis] = hits[0], hits[-1] + 1
-    return low, high
-
-
-def window(low: Int, high: Int) -> tuple[slice, slice, slice]:
-    """Return the slices of a box."""
-    i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    return i, j, k
 
 
 def _block_means(values: Array, step: tuple[int, ...]) -> Float32:

@@ -6,7 +6,8 @@ import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
-from anatomy.segmentation.coarse import CoarseCt, bounds, window
+from anatomy.morphology import bounds, window
+from anatomy.segmentation.coarse import CoarseCt
 from anatomy.sides import grow_sides
 from anatomy.typed import Array, Int32, Mask, UInt8
 

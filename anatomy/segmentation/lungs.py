@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, read_only
-from anatomy.morphology import grown_by_one
+from anatomy.morphology import bounds, grown_by_one, window
 from anatomy.segmentation.central_airway import CentralAirway, find_central_airway
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
-from anatomy.segmentation.coarse import CoarseCt, bounds, window
+from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right
 from anatomy.segmentation.outside_air import outside_air
 from anatomy.segmentation.pleural_nodules import notches
@@ -169,9 +169,7 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
 
 def _filled(mask: Mask, grid: Grid) -> Mask:
     """Close and fill a mask in the box around it."""
-    low, high = bounds(mask)
-    pad = np.ceil(2.0 * CLOSING_MM / grid.spacing_mm).astype(np.int64)
-    box = window(np.maximum(low - pad, 0), np.minimum(high + pad, mask.shape))
+    box = window(*bounds(mask, np.ceil(2.0 * CLOSING_MM / grid.spacing_mm).astype(np.int64)))
     filled = np.array(mask, order="F")
     if mask.any():
         filled[box] = without_holes(closed(np.asfortranarray(mask[box]), CLOSING_MM, grid.spacing_mm))

@@ -12,8 +12,8 @@ import numpy as np
 from anatomy.errors import FileError, GridMismatchError
 from anatomy.grid import Grid
 from anatomy.io.files import read_text
+from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm, largest_piece
-from anatomy.segmentation.coarse import bounds, window
 from anatomy.typed import Float, Int16, Mask
 
 RIM_MM = 2.0
@@ -180,8 +180,7 @@ def without_nodule(vessels: Mask, nodule: Mask, grid: Grid) -> Mask:
     if not nodule.any():
         return cleared
     pad = np.ceil((RIM_MM + 2.0 * ATTACHED_MM) / grid.spacing_mm).astype(np.int64)
-    low, high = bounds(nodule)
-    box = window(np.maximum(low - pad, 0), np.minimum(high + pad, nodule.shape))
+    box = window(*bounds(nodule, pad))
     distance = distance_mm(~nodule[box], grid.spacing_mm)
     gone = distance <= RIM_MM
     pieces, count = ndimage.label(cleared[box] & ~gone)

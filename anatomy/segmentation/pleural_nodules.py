@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
-from anatomy.segmentation.coarse import CoarseCt, bounds, window
+from anatomy.segmentation.coarse import CoarseCt
 from anatomy.typed import Int, Mask
 
 NOTCH_MM = 12.0
@@ -40,8 +41,7 @@ def _notches_of(ct: CoarseCt, side: Mask, other: Mask, hull: Mask, closing_mm: f
     """Return the notches of one lung that lie near the hull of both."""
     found = np.zeros(side.shape, dtype=np.bool_, order="F")
     pad = np.ceil(2.0 * NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64)
-    low, high = bounds(side)
-    box = window(np.maximum(low - pad, 0), np.minimum(high + pad, side.shape))
+    box = window(*bounds(side, pad))
     filled = without_holes(closed(np.asfortranarray(side[box]), closing_mm, ct.spacing_mm))
     added = closed(filled, NOTCH_MM, ct.spacing_mm) & ~filled & (ct.hu[box] < SOFT_HU) & hull[box]
     core = distance_mm(added, ct.spacing_mm) > LEAST_HALF_THICKNESS_MM

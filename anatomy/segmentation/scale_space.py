@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.morphology import Window, bounds, window
 from anatomy.typed import Float, Float32, Int16, Mask, UInt8
 
 SIGMAS_MM = (1.0, math.sqrt(2.0), 2.0, 2.0 * math.sqrt(2.0), 4.0)
@@ -24,8 +25,6 @@ LEAST_HU = -1024
 """Scanners write lower values where they measured nothing."""
 LOST_WEIGHT = 1e-5
 """Share of a Gaussian's weight that its ends may lose."""
-
-Box = tuple[slice, slice, slice]
 
 
 @dataclass(kw_only=True, eq=False)
@@ -46,7 +45,7 @@ class ScaleSpace:
         Threads that share the planes; the results do not depend on it.
     """
 
-    box: Box
+    box: Window
     spacing_mm: Float
     hu: Int16 | Float32
     n_scales: UInt8
@@ -90,13 +89,9 @@ class ScaleSpace:
                 f"The CT has the type {hu.dtype}", expected="Hounsfield units, int16 or float32"
             )
         spacing = np.asarray(spacing_mm, dtype=np.float64)
-        inner = _bounds(lung)
-        reach = np.ceil(REACH_SIGMAS * SIGMAS_MM[-1] / spacing).astype(np.int64)
-        grown = [
-            slice(max(s.start - int(r), 0), min(s.stop + int(r), n))
-            for s, r, n in zip(inner, reach, hu.shape, strict=True)
-        ]
-        box = (grown[0], grown[1], grown[2])
+        if not lung.any():
+            raise AnatomyError("The lung mask is empty", expected="at least one voxel of lung")
+        box = window(*bounds(lung, np.ceil(REACH_SIGMAS * SIGMAS_MM[-1] / spacing).astype(np.int64)))
         kind = np.float32 if hu.dtype.kind == "f" else np.int16
         image = np.maximum(np.asfortranarray(hu[box]).T, LEAST_HU).astype(kind, copy=False)
         return cls(
@@ -187,18 +182,6 @@ def _scales_that_apply(lung: Mask, spacing: Float, threads: int) -> UInt8:
     for limit in DEEPER_THAN_MM:
         count += depth > limit
     return count
-
-
-def _bounds(mask: Mask) -> Box:
-    """Return the box of the True voxels."""
-    spans = []
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        (where,) = np.nonzero(mask.any(axis=others))
-        if not where.size:
-            raise AnatomyError("The lung mask is empty", expected="at least one voxel of lung")
-        spans.append(slice(int(where[0]), int(where[-1]) + 1))
-    return spans[0], spans[1], spans[2]
 
 
 def _processors() -> int:

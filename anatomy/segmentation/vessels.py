@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 VESSEL_THRESHOLD = 0.25
 """Fixed on made cylinders and the phantom, see docs/segmentation.md."""
 LARGE_RADIUS_MM = 2.0 * math.sqrt(2.0)
-"""The scale of the paper's list next to the radius of 2.5 mm that it calls large."""
+"""One of the paper's scales: from this radius on vessels are obstacles, thinner ones are costs."""
 REFERENCE_HU, BRIGHTEST_HU = 300.0, 200.0
 """I_ref and I_max of R_L."""
 LARGE_RESPONSE = 0.3

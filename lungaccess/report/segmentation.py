@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from anatomy.grid import Grid, Volume
+from anatomy.morphology import bounds
 from anatomy.segmentation.steps import Parts
 from anatomy.typed import Array, Float, Int, Mask
 from lungaccess.report import style
@@ -42,7 +43,8 @@ def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> 
     anatomy.errors.FileError
         If the file cannot be written.
     """
-    low, high = _box(parts.left | parts.right | parts.lumen, ct.grid)
+    pad = np.ceil(MARGIN_MM / ct.grid.spacing_mm).astype(np.int64)
+    low, high = bounds(parts.left | parts.right | parts.lumen, pad)
     axis_of = [int(np.argmax(np.abs(ct.grid.lps_from_ijk[row, :3]))) for row in range(3)]
     figure = style.new_figure(SLICES * PANEL_IN, 3 * PANEL_IN + 0.7)
     panels = figure.subplots(3, SLICES, squeeze=False)
@@ -58,17 +60,6 @@ def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> 
     figure.legend(handles=_legend(), loc="lower center", ncol=8, fontsize=9, frameon=False)
     figure.subplots_adjust(left=0.005, right=0.995, top=0.975, bottom=0.045, wspace=0.02, hspace=0.09)
     return style.save_png(figure, path)
-
-
-def _box(mask: Mask, grid: Grid) -> tuple[Int, Int]:
-    """Return `low` and `high` of the voxels around a mask, a little wider."""
-    low, high = [], []
-    for axis in range(3):
-        hits = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
-        pad = int(np.ceil(MARGIN_MM / grid.spacing_mm[axis]))
-        low.append(max(int(hits[0]) - pad, 0))
-        high.append(min(int(hits[-1]) + 1 + pad, grid.shape[axis]))
-    return np.array(low), np.array(high)
 
 
 def _panel(

@@ -11,7 +11,8 @@ import numpy as np
 from anatomy.grid import Volume
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
-from anatomy.typed import Mask, UInt8
+from anatomy.morphology import bounds
+from anatomy.typed import UInt8
 
 _LIST = "Segmentation category and type - 3D Slicer General Anatomy list"
 _STRUCTURE = "SCT^123037004^Anatomical Structure"
@@ -87,7 +88,8 @@ def _header(labels: UInt8, segments: tuple[Segment, ...]) -> Mapping[str, str]:
         "Segmentation_ReferenceImageExtentOffset": "0 0 0",
     }
     for number, segment in enumerate(segments):
-        where = _extent(labels == segment.value)
+        low, high = bounds(labels == segment.value)
+        where = np.stack([low, high - 1], axis=1).ravel().tolist()
         header |= {
             f"Segment{number}_ID": f"Segment_{segment.value}",
             f"Segment{number}_Name": segment.name,
@@ -100,12 +102,3 @@ def _header(labels: UInt8, segments: tuple[Segment, ...]) -> Mapping[str, str]:
             f"Segment{number}_Tags": f"TerminologyEntry:{segment.terminology}|",
         }
     return header
-
-
-def _extent(mask: Mask) -> list[int]:
-    """Return the first and last index of a mask along i, j and k."""
-    bounds = []
-    for axis in range(3):
-        hits = np.flatnonzero(mask.any(axis=tuple(a for a in range(3) if a != axis)))
-        bounds += [int(hits[0]), int(hits[-1])]
-    return bounds

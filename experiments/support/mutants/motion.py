@@ -8,16 +8,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.typed import Float
-from experiments.support.mutants.mutant import (
-    Case,
-    Mutant,
-    Mutation,
-    Rng,
-    changed,
-    far,
-    random_direction,
-    signed,
-)
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng, changed, direction, far, signed
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath
 
@@ -48,11 +39,11 @@ def route_moved(case: Case, rng: Rng) -> Mutant | None:
     """The route, or one point of it, lies beside the axis."""
     points = case.plan.scope.points_lps.copy()
     if rng.integers(2):
-        points += signed(rng, 0.03, 20.0) * random_direction(rng)
+        points += signed(rng, 0.03, 20.0) * direction(rng)
     else:
         n = int(rng.integers(1, len(points) - 1))
         along = points[n + 1] - points[n - 1]
-        aside = np.cross(along, random_direction(rng))
+        aside = np.cross(along, direction(rng))
         points[n] += far(rng, 0.4, 10.0) * aside / np.linalg.norm(aside)
     return Mutant(plan=changed(case.plan, scope__points_lps=points))
 
@@ -111,7 +102,7 @@ def tube_edited(case: Case, rng: Rng) -> Mutant | None:
 def exit_edited(case: Case, rng: Rng) -> Mutant | None:
     """Another place, angle or branch of the exit."""
     way_out = case.plan.tube.exit
-    point = way_out.point_lps + far(rng, 0.1, 20.0) * random_direction(rng)
+    point = way_out.point_lps + far(rng, 0.1, 20.0) * direction(rng)
     branch = int(rng.choice(np.setdiff1d(np.arange(-1, case.lung.tree.n_branches + 1), [way_out.branch])))
     edits: list[dict[str, Any]] = [
         {"tube__exit__point_lps": point},
@@ -177,7 +168,7 @@ def needle_statement_edited(case: Case, rng: Rng) -> Mutant | None:
         "needle__length_mm": needle.length_mm + signed(rng, 1e-5, 20.0),
         "needle__accumulated_turn_rad": needle.accumulated_turn_rad + signed(rng, 2e-3, 1.0),
         "needle__max_angle_from_start_rad": needle.max_angle_from_start_rad + signed(rng, 2e-3, 1.0),
-        "needle__end_lps": needle.end_lps + far(rng, 0.01, 20.0) * random_direction(rng),
+        "needle__end_lps": needle.end_lps + far(rng, 0.01, 20.0) * direction(rng),
         "needle__arcs": (),
     }
     key = str(rng.choice(list(edits)))

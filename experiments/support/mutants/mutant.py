@@ -89,7 +89,7 @@ def with_system(plan: Plan, system: System) -> Plan:
     )
 
 
-def random_direction(rng: Rng) -> Float:
+def direction(rng: Rng) -> Float:
     """Return a random direction `(3,)`."""
     vector = rng.standard_normal(3)
     return np.asarray(vector / np.linalg.norm(vector))

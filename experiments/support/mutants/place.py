@@ -15,8 +15,8 @@ from experiments.support.mutants.mutant import (
     Mutation,
     Rng,
     changed,
+    direction,
     far,
-    random_direction,
     rotation,
     signed,
 )
@@ -88,7 +88,7 @@ def mirrored(case: Case, rng: Rng) -> Mutant | None:
 
 def rotated(case: Case, rng: Rng) -> Mutant | None:
     """A stage, or all, turned about an axis through the carina."""
-    turn = rotation(random_direction(rng), float(np.deg2rad(signed(rng, 0.3, 180.0))))
+    turn = rotation(direction(rng), float(np.deg2rad(signed(rng, 0.3, 180.0))))
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     matrix[:3, 3] = case.lung.tree.carina_lps - turn @ case.lung.tree.carina_lps
@@ -143,7 +143,7 @@ def pose_edited(case: Case, rng: Rng) -> Mutant | None:
     elif kind == 1:
         pose[:3, :3] = pose[:3, :3] @ rotation(np.array([0.0, 0.0, 1.0]), np.deg2rad(signed(rng, 0.05, 90.0)))
     elif kind == 2:
-        pose[:3, 3] += far(rng, 0.01, 20.0) * random_direction(rng)
+        pose[:3, 3] += far(rng, 0.01, 20.0) * direction(rng)
     elif kind == 3:
         pose = np.linalg.inv(pose)
     elif kind == 4:

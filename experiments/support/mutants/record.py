@@ -14,8 +14,8 @@ from experiments.support.mutants.mutant import (
     Mutation,
     Rng,
     changed,
+    direction,
     far,
-    random_direction,
     signed,
     with_system,
 )
@@ -119,9 +119,9 @@ def identity_edited(case: Case, rng: Rng) -> Mutant | None:
 def target_moved(case: Case, rng: Rng) -> Mutant | None:
     """The target is not where the needle ends, or not the one asked for."""
     size = far(rng, 0.01, 30.0)
-    point = case.plan.target_lps + size * random_direction(rng)
+    point = case.plan.target_lps + size * direction(rng)
     if case.plan.target_origin.startswith("nodule"):
-        point = case.plan.target_lps + 150.0 * random_direction(rng)
+        point = case.plan.target_lps + 150.0 * direction(rng)
         return Mutant(plan=changed(case.plan, target_lps=point))
     return Mutant(plan=changed(case.plan, target_lps=point), asked=bool(rng.integers(2)))
 

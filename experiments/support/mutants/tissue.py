@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.typed import Float
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng, changed, random_direction
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng, changed, direction
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath, direct_path
@@ -69,7 +69,7 @@ def needle_elsewhere(case: Case, rng: Rng) -> Mutant | None:
 def beside(points: Float, tangents: Float, least: int, within_mm: float, rng: Rng) -> Float:
     """Return a point less than `within_mm` beside one of the points from number `least` on."""
     n = int(rng.integers(least, len(points)))
-    aside = np.cross(tangents[n], random_direction(rng))
+    aside = np.cross(tangents[n], direction(rng))
     share = float(rng.uniform(0.0, 0.98))
     return np.asarray(points[n] + share * within_mm * aside / np.linalg.norm(aside))
 

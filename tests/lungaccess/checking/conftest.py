@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume, transform_points
+from experiments.support.mutants.mutant import changed
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, load_system, system_fingerprint
@@ -292,21 +292,6 @@ def toy_tube(
         follow_the_leader_error_mm=0.0,
     )
     return tube, points, last
-
-
-def changed(record: Any, **values: Any) -> Any:
-    """Replace values in nested records, as `changed(plan, tube__exit__branch=2)`; the digest follows."""
-    nested: dict[str, dict[str, Any]] = {}
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        head, _, rest = key.partition("__")
-        if rest:
-            nested.setdefault(head, {})[rest] = value
-        else:
-            flat[head] = value
-    for head, inner in nested.items():
-        flat[head] = changed(getattr(record, head), **inner)
-    return dataclasses.replace(record, **flat)
 
 
 def relabelled(lung: Any, edit: Callable[[np.ndarray, np.ndarray], None]) -> Any:

@@ -170,7 +170,7 @@ def test_a_known_voxel_is_where_it_was(reach: ReachMap, small_lung: Lung, tmp_pa
     back = read_volume(written[0])
     assert back.array[tuple(np.rint(back.grid.ijk(point)).astype(int))] == DIRECT
     assert small_lung.grid.contains(point)
-    assert b"environment: left-posterior-superior" in written[0].read_bytes()[:2000]
+    assert b"space: left-posterior-superior" in written[0].read_bytes()[:2000]
 
 
 def test_the_grid_covers_the_lung(small_lung: Lung) -> None:

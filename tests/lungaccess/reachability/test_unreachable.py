@@ -24,6 +24,7 @@ from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import point_target
+from lungaccess.reachability.kernels import blocked
 from lungaccess.reachability.kernels import deployment_boxes as boxes
 from lungaccess.reachability.kernels import unreachable as kernel
 from lungaccess.reachability.unreachable import UnreachableProof
@@ -53,10 +54,10 @@ def sampled(tubes, frame, knots, box, s):  # type: ignore[no-untyped-def]
 
 
 @numba.njit
-def not_ruled_out(scene, tubes, insertions, limits, target, frame, knots, cones, box):  # type: ignore[no-untyped-def]
+def not_ruled_out(environment, tubes, insertions, limits, target, frame, knots, cones, box):  # type: ignore[no-untyped-def]
     sums, costs = np.zeros(3), np.zeros(6)
     return kernel.may_reach(
-        scene,
+        environment,
         tubes,
         insertions,
         limits,
@@ -71,8 +72,8 @@ def not_ruled_out(scene, tubes, insertions, limits, target, frame, knots, cones,
 
 
 @numba.njit
-def way_blocked(scene, tubes, frame, knots, box):  # type: ignore[no-untyped-def]
-    return kernel._way_blocked(scene, tubes, boxes.tubes_of(tubes, knots, frame, box), box)
+def all_blocked(environment, tubes, frame, knots, box):  # type: ignore[no-untyped-def]
+    return blocked.tubes_blocked(environment, tubes, boxes.tubes_of(tubes, knots, frame, box), box)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +203,7 @@ def test_the_sweep_changes_no_faster_than_stated(tubes: Float) -> None:
     rng = np.random.default_rng(4)
     bend = float(np.abs(tubes[:2]).max() * tubes[CURVED_LENGTH])
     slope = 2.0 + 3.0 * bend
-    assert kernel.sweep_slope.py_func(bend) == slope
+    assert blocked.sweep_slope.py_func(bend) == slope
     for outer, inner in rng.uniform(0.0, 60.0, (3000, 2)):
         step = rng.normal(0.0, 0.05, 2)
         other = np.maximum([outer, inner] + step, 0.0)
@@ -252,10 +253,10 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
     """Deployments as near to a limit as it gets, between one that can be and one that cannot."""
     rng = np.random.default_rng(6)
     deploying = scene_of(small_lung, with_fissures=False)
-    scene = proof._scene(plans[0].target_lps)
+    environment = proof._environment(plans[0].target_lps)
     trace, tip = np.zeros(N_TRACE), np.zeros(9)
     at_limits: Counter[int] = Counter()
-    blocked = 0
+    n_blocked = 0
 
     def judged(frame: Float, place: Float, values: Float) -> int:
         turned = Rotation.from_rotvec(values[0] * frame[0] + values[1] * frame[1]).as_matrix()
@@ -276,7 +277,7 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
         inner = rng.uniform(2.0, 46.0)
         values = np.array([*rng.normal(0.0, 0.4, 2), rng.uniform(-3.1, 3.1), rng.uniform(0.0, inner), inner])
         if judged(piece.frame, place, values) != ACCEPTED:
-            blocked += way_blocked(scene, tubes, piece.frame, piece.knots, box_around(values, m))
+            n_blocked += all_blocked(environment, tubes, piece.frame, piece.knots, box_around(values, m))
             continue
         other = values + rng.normal(0.0, 1.0, 5) * [0.3, 0.3, 1.0, 5.0, 5.0]
         why = judged(piece.frame, place, other)
@@ -290,8 +291,8 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
         at_limits[why] += 1
         for _ in range(8):
             box = box_around(values, m)
-            assert not way_blocked(scene, tubes, piece.frame, piece.knots, box), (values, box, why)
-    assert blocked > 3000
+            assert not all_blocked(environment, tubes, piece.frame, piece.knots, box), (values, box, why)
+    assert n_blocked > 3000
     assert sum(at_limits.values()) > 100
     assert at_limits[NEAR_VESSEL] > 30
 
@@ -303,7 +304,7 @@ def test_what_a_plan_reaches_is_never_ruled_out(proof: UnreachableProof, plans: 
     for plan in plans:
         target, place = plan.target_lps, plan.scope.lps_from_scope_tip[:3, 3]
         assert not proof.prove(target, most_boxes=3000).proved
-        scene = proof._scene(target)
+        environment = proof._environment(target)
         tested = 0
         for piece in proof._pieces:
             for m, (begin, end) in enumerate(pairwise(piece.knots)):
@@ -317,7 +318,7 @@ def test_what_a_plan_reaches_is_never_ruled_out(proof: UnreachableProof, plans: 
                     middles = values + rng.uniform(-1.0, 1.0, 5) * halves
                     box = np.array([*middles, *halves, m, m + 1])
                     assert not_ruled_out(
-                        scene, proof._tubes, proof._insertions, proof._limits, target,
+                        environment, proof._tubes, proof._insertions, proof._limits, target,
                         piece.frame, piece.knots, piece.cones, box,
                     ), (values, box)  # fmt: skip
                     tested += 1

@@ -1,0 +1,197 @@
+"""What rules out a box of deployments by the anatomy: blocked tips, and tubes that meet a hazard."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.field import distance_bound, exact_distance
+from anatomy.kernels.labels import LUMEN
+from lungaccess.reachability.kernels.deployment_boxes import HALF, INNER, OUTER, SPARE_MM, heading, sample_of
+from stages.tube.kernels import (
+    CURVED_LENGTH,
+    INNER_CURVATURE,
+    INNER_RADIUS,
+    MARGIN,
+    OUTER_RADIUS,
+    OVERLAP_CURVATURE,
+    lateral_sweep,
+)
+
+UNNOTICED_MM = 0.05
+"""A tube that is farther than this from all lumen has left it noticeably; see `deployment.march`."""
+FIRST_LOOK_MM, FARTHEST_LOOK_MM = 5.0, 40.0
+"""The path of the needle is looked at from so far ahead of the tip on, as long as it is known so well."""
+LOOSE_SWEEP_MM = 0.3
+"""The sweep of a box is looked at where it is known so well."""
+EXACT_BELOW_MM = 1.0
+"""Where tubes of a box differ by less, distances to hazards and lumen are taken exactly."""
+LEAST_STEP_MM, GREATEST_STEP_MM = 0.05, 4.0
+"""Of samples; the least is no less than the step of `deployment.march` where it leaves the lumen."""
+
+
+class ProofEnvironment(NamedTuple):
+    """What a proof of one target looks at; fields of distances are those of `anatomy.kernels.field`.
+
+    Parameters
+    ----------
+    lumen, may_be_left, hazards : (ni + 1, nj + 1, nk + 1) uint16
+        Distance to the lumen, to the lumen that tubes may leave, and to what they keep clear of.
+    depth : (ni + 1, nj + 1, nk + 1) uint16
+        Depth in the lumen.
+    passable : (ni + 1, nj + 1, nk + 1) uint16
+        Distance to where the needle may pass before the target.
+    labels : (ni, nj, nk) uint16
+    geometry, depth_geometry : (3, 5) float64
+        Of the labels and the distances, and of the depth.
+    hazard_bits : int
+        Structures that tubes keep clear of.
+    loss_mm : float
+        By so much a bound of these fields may fall short of the distance.
+    """
+
+    lumen: np.ndarray
+    may_be_left: np.ndarray
+    hazards: np.ndarray
+    depth: np.ndarray
+    passable: np.ndarray
+    labels: np.ndarray
+    geometry: np.ndarray
+    depth_geometry: np.ndarray
+    hazard_bits: int
+    loss_mm: float
+
+
+@inner_kernel
+def tips_blocked(environment, tubes, limits, seen, family, box):
+    """Tell whether all tips are in the lumen or blocked ahead, and how far tips are from the middle."""
+    pose, rho, ahead, _size, _moved, _second = seen
+    _middle, _forward, _normal, bounds, _outer, _inner = family
+    _place, tilt, roll, sharing, _first_outer, opening = bounds
+    half_inner = box[HALF + INNER]
+    _point, away = sample_of(tubes, family, box[INNER])
+    away += half_inner
+    if distance_bound(environment.depth, environment.depth_geometry, pose[0], pose[1], pose[2]) > away:
+        return True, away
+    spare = limits.goal_tolerance_mm + SPARE_MM
+    exempt = limits.exempt_mm
+    if (
+        distance_bound(environment.passable, environment.geometry, pose[0], pose[1], pose[2])
+        > away + exempt + spare
+    ):
+        return True, away
+    most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
+    turned = sharing + opening + most * half_inner
+    angle = turned + tilt + roll * min(abs(math.sin(heading(tubes, box[OUTER], box[INNER]))) + turned, 1.0)
+    far = math.hypot(rho, ahead)
+    length = max(FIRST_LOOK_MM, exempt)
+    while length < far - away - spare:
+        around = away + length * angle + 0.5 * limits.kappa * length * length
+        if around > FARTHEST_LOOK_MM:
+            break
+        x, y, z = pose[0] + length * pose[3], pose[1] + length * pose[4], pose[2] + length * pose[5]
+        if distance_bound(environment.passable, environment.geometry, x, y, z) > around:
+            return True, away
+        length += around
+    return False, away
+
+
+@inner_kernel
+def _lacking(environment, point, away, required):
+    """Return how much clearance all tubes lack that pass within `away` of a point, mm.
+
+    Below 0 if some may lack none; then no tube that goes on from there lacks any for as many mm.
+    """
+    gap = distance_bound(environment.hazards, environment.geometry, point[0], point[1], point[2]) + away
+    if gap >= required or away >= EXACT_BELOW_MM:
+        return required - gap - environment.loss_mm
+    exact, label = exact_distance(
+        environment.labels,
+        environment.geometry,
+        point[0],
+        point[1],
+        point[2],
+        environment.hazard_bits,
+        -1,
+        required,
+    )
+    return required - (exact if label != 0 else required) - away
+
+
+@inner_kernel
+def _is_out(environment, point, away):
+    """Tell whether all tubes that pass within `away` of a point are noticeably out of every lumen there."""
+    required = away + UNNOTICED_MM
+    bound = distance_bound(environment.lumen, environment.geometry, point[0], point[1], point[2])
+    if bound > required or bound + environment.loss_mm < required or away >= EXACT_BELOW_MM:
+        return bound > required
+    _exact, label = exact_distance(
+        environment.labels, environment.geometry, point[0], point[1], point[2], LUMEN, -1, required
+    )
+    return label == 0
+
+
+@inner_kernel
+def tubes_blocked(environment, tubes, family, box):
+    """Tell whether all tubes of a box leave no airway, or one that they must not leave, or meet a hazard.
+
+    A tube leaves between the last sample that is in the lumen for all of the box and the first that is
+    outside for all; there and beyond it keeps clear of hazards, and out of every lumen.
+    """
+    outer, inner = box[OUTER], box[INNER]
+    half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]
+    most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
+    loose = (half_outer + half_inner) * sweep_slope(most * tubes[CURVED_LENGTH])
+    sweep = 0.0
+    if loose < LOOSE_SWEEP_MM and inner > tubes[CURVED_LENGTH]:
+        sweep = max(lateral_sweep(tubes, min(outer, inner), inner) - loose, 0.0)
+    shortest, longest = max(inner - half_inner, 0.0), inner + half_inner
+    may_leave = meets = out = False
+    s = 0.0
+    while True:
+        point, away = sample_of(tubes, family, s)
+        step = min(max(away, LEAST_STEP_MM), GREATEST_STEP_MM)
+        radius = tubes[OUTER_RADIUS] if s <= outer - half_outer else tubes[INNER_RADIUS]
+        lacking = _lacking(environment, point, away, radius + tubes[MARGIN] + sweep)
+        deep = (
+            distance_bound(environment.depth, environment.depth_geometry, point[0], point[1], point[2]) - away
+        )
+        if out:
+            if s <= shortest and (deep > 0.0 or lacking > SPARE_MM):
+                return True
+            to_lumen = distance_bound(environment.lumen, environment.geometry, point[0], point[1], point[2])
+            step = max(step, min(-lacking, to_lumen))
+        else:
+            to_allowed = distance_bound(
+                environment.may_be_left, environment.geometry, point[0], point[1], point[2]
+            )
+            may_here = to_allowed <= away + step + UNNOTICED_MM
+            meets_here = lacking > step
+            if deep > 0.0 and s <= shortest:
+                may_leave, meets = may_here, meets_here
+            else:
+                may_leave, meets = may_leave or may_here, meets and meets_here
+            out = _is_out(environment, point, away)
+            if out and (not may_leave or meets or (lacking > SPARE_MM and s <= shortest)):
+                return True
+            if deep > step:
+                step = deep
+        if s >= longest:
+            return not may_leave
+        s = min(s + step, longest)
+
+
+@inner_kernel
+def sweep_slope(bend):
+    """Return how fast the lateral sweep may change with an insertion, mm a mm; `bend` (rad) is curvature x
+    length.
+
+    The sweep is the distance of two points: the tip when it first got there, and the body of the final
+    shape.  Where the tip is sampled moves with the insertion by at most as much; the first point moves by at
+    most 1 + `bend` with it, the second by 1; and the final shape at a fixed place changes by at most `bend`
+    with each insertion, the first by `bend` with the outer.
+    """
+    return 2.0 + 3.0 * bend

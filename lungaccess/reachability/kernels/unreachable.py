@@ -184,7 +184,8 @@ def rule_out(environment, tubes, insertions, limits, target, frame, knots, cones
     ----------
     environment, frame, knots, cones
         See the module.
-    tubes, limits : (N_TUBES,), (N_LIMITS,) float64
+    tubes : (N_TUBES,) float64
+    limits : Limits
     insertions : (N,) float64
         See `greatest_insertions`.
     target : (3,) float64

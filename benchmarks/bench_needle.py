@@ -10,7 +10,8 @@ from benchmarks.fresh import FreshProcess
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
 

@@ -31,8 +31,9 @@ from lungaccess.problem.target import point_target
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform
+from stages.needle.query import Query
 from stages.needle.replanning.replanner import ITERATIONS, Replanner, ReplanSettings, with_reserve
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.search.base import RestartingRRT
 
 OBJECTIVE = Objective(inverse_clearance=1.0)
 PLANNING_ITERATIONS = 3000

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from stages.needle.path import arc_transform as arc_transform
     from stages.needle.path import bend_direction as bend_direction
     from stages.needle.path import direct_path as direct_path
+    from stages.needle.query import Query as Query
     from stages.needle.reach import DEFAULT_ARCS as DEFAULT_ARCS
     from stages.needle.reach import DIRECT as DIRECT
     from stages.needle.reach import NO_CLEARANCE as NO_CLEARANCE
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from stages.needle.reach import UNREACHED as UNREACHED
     from stages.needle.reach import Reached as Reached
     from stages.needle.reach import ReachScan as ReachScan
-    from stages.needle.search.base import Query as Query
     from stages.needle.search.base import Search as Search
     from stages.needle.search.optimal import OptimalSearch as OptimalSearch
     from stages.needle.search.planners import PLANNERS as PLANNERS

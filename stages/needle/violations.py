@@ -12,7 +12,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels.connections import least_cosine
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.path import ArcPath, bend_direction
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 
 SAME_MM = 1e-6
 SAME_RAD = 1e-6

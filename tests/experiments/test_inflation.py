@@ -24,7 +24,8 @@ from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT
 from tests.stages.scenes import Canvas
 
 NEEDLE = Needle(diameter_mm=1.0, max_curvature_per_mm=0.05)

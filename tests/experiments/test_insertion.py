@@ -22,8 +22,9 @@ from experiments.support.insertion.truth import Errors, Truth
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.path import ArcPath, arc_transform, direct_path
+from stages.needle.query import Query
 from stages.needle.replanning.replanner import Failure, ReplanSettings, with_reserve
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.search.base import RestartingRRT
 from tests.stages.scenes import Canvas, brute_clearance
 
 KAPPA = 1 / 40

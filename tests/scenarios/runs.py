@@ -12,7 +12,7 @@ import lungaccess as la
 from anatomy.poses import pose
 from lungaccess.one_stage.needle import plan_needle
 from lungaccess.problem.target import point_target
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 from stages.needle.violations import violation
 from tests.scenarios.cases import (
     NEEDLE_DEVICE,

@@ -18,7 +18,8 @@ from stages.needle.costs import voxel_sum
 from stages.needle.environment import NeedleEnvironment, direct_arcs, workspace_lengths
 from stages.needle.objective import SHORTEST
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT
 
 EXIT_MM = (5.0, 9.0)
 MAX_EXIT_ANGLE_DEG = 60.0

@@ -18,7 +18,8 @@ from stages.needle.costs import map_integral, obstacle_clearance_mm, voxel_sum
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT
 from stages.needle.search.portfolio import PortfolioSearch
 
 SLICE_ITERATIONS = 100

@@ -22,6 +22,7 @@ from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import LENGTH, ROLL, ArcPath, arc_transform, bend_direction
+from stages.needle.query import Query
 from stages.needle.replanning.escaping import structure_name, with_limits
 from stages.needle.replanning.reaiming import pose_at
 from stages.needle.replanning.replanner import (
@@ -32,7 +33,6 @@ from stages.needle.replanning.replanner import (
     Replanner,
     ReplanSettings,
 )
-from stages.needle.search.base import Query
 
 STEP_MM = 0.25
 TOLERANCE_MM = 2.0

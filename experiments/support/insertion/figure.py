@@ -13,7 +13,7 @@ from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
 from experiments.support.insertion.repeated import Study
 from lungaccess.report import style
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 
 OPEN, CLOSED = style.TUBE, style.SCOPE
 LEVEL_COLOURS = (style.NODULE, style.SCOPE, style.VESSEL)

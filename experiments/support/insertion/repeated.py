@@ -21,8 +21,8 @@ from lungaccess.risk.statistics import Share
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
+from stages.needle.query import Query
 from stages.needle.replanning.replanner import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
-from stages.needle.search.base import Query
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float
 from stages.needle.path import arc_transform, bend_direction
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 
 KNOT_MM = 1.0
 """Spacing of the random walks; between two knots they are linear."""

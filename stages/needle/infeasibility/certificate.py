@@ -13,28 +13,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.typed import Float, Int, UInt64
+from anatomy.typed import Float, Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
 from stages.needle.infeasibility.kernels import reachability_pruning as pruning
 from stages.needle.infeasibility.kernels import reachable_sets as sets
-from stages.needle.search.base import Query
+from stages.needle.infeasibility.path_bounds import ROUNDING, PathBounds
+from stages.needle.infeasibility.plane import Plane
+from stages.needle.query import Query
 
+# None of these numbers can make the proof wrong: they trade time and memory for how much is proved.
 CUBES_MM = (0.5, 0.25)
-FIRST_CELL_MM = 0.5
-LARGEST_SLOPE_CELL = 0.17
+"""Sides of the cubes, the faster ones first."""
+FIRST_CELL_MM, LARGEST_SLOPE_CELL = 0.5, 0.17
+"""Largest sides of the first cells: of the size of a voxel, and of about 10 degrees."""
 LEVELS = 9
+"""How often cells are halved at most: then positions are known to 2 um."""
 CELLS_PER_BOW = 16.0
 """Planes are moved nearer to each other where curvature times their distance squared is more."""
 DEPTH_SHARE = 0.1
 """Distance of the planes as a share of the radius of curvature."""
 SLOPE_CHANGE_EDGES = np.array([0.5, 0.75, 0.92, 1.0])
+"""Classes of slope change, see `step_sets`: finer where the bound on the position falls fast."""
 PROBES_PER_DEPTH = 8
+"""Depths of a slab at which clearance is looked at."""
 SLACK_RATIO = 1.08
 """Of the amounts of missing clearance that are told apart."""
 SLACKS = 48
@@ -42,33 +48,9 @@ LARGEST_DEPTH_MM = 12.5
 LEAST_KAPPA = 1e-5
 """In 1/mm; what bends less is taken to bend so much, for the sake of rounding."""
 LEAST_DISTANCE_MM = 1e-3
-ROUNDING = 1e-8
 STEEPEST = 0.995
 """Largest sine of the angle between paths and the planes' normal for which planes are tried."""
 MAX_BYTES = 1 << 30
-
-
-@dataclass(frozen=True)
-class Plane:
-    """States on one plane: bits (V, U, Y, W) and the cell numbers (v, u, y, x) of their first cell."""
-
-    bits: UInt64
-    window: Int
-
-    def trimmed(self) -> Plane:
-        """Return the same without empty rows and columns at the edges."""
-        box = np.zeros(8, dtype=np.int64)
-        bitmaps.extent(self.bits, box)
-        v0, v1, u0, u1, y0, y1, w0, w1 = (int(n) for n in box)
-        bits = self.bits[v0 : v1 + 1, u0 : u1 + 1, y0 : y1 + 1, w0 : w1 + 1]
-        return Plane(np.ascontiguousarray(bits), self.window + np.array([v0, u0, y0, 64 * w0]))
-
-    @property
-    def ends(self) -> Int:
-        """Cell numbers of the last cell."""
-        nv, nu, rows, words = self.bits.shape
-        last: Int = self.window + np.array([nv, nu, rows, 64 * words]) - 1
-        return last
 
 
 class _TooMuchError(Exception):
@@ -191,7 +173,13 @@ class NoPathProof:
             column = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
             column /= np.linalg.norm(column)
             self._frame = np.stack([start, normal, np.cross(normal, column), column])
-            self._bound(total, length)
+            self._paths = PathBounds.of(total, self._tolerance, self._kappa, length)
+            local = self._frame[1:] @ query.lps_from_start[:3, 2]
+            self._along = float(local[0])
+            self._scale = np.zeros(bounds.SCALE_SIZE)
+            self._scale[bounds.KAPPA] = self._kappa
+            if self._along > 0.0:
+                self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
 
     def _clearance_at_most(self, point: Float) -> float:
         exempt = self._query.branch if self._exempt_mm > 0.0 else -1
@@ -199,61 +187,30 @@ class NoPathProof:
             blocked.clearance_above(self._environment.obstacles, self._required, 0.0, exempt, *point)
         )
 
-    def _bound(self, total: float, length: float) -> None:
-        """Bound the places and the angle to the line that a path of at most `length` mm can have."""
-        radius = 1.0 / self._kappa
-        widest = total + self._tolerance
-        self._ends = np.zeros(bounds.ENDS_SIZE)
-        self._ends[: bounds.LONGEST] = total, self._tolerance
-        self._ends[bounds.SPINDLE_RADIUS] = math.inf
-        self._steepest = 1.0
-        longest = length
-        if widest < 2.0 * radius:
-            half = math.asin(0.5 * widest / radius)
-            tilt = math.asin(self._tolerance / total)
-            offset = radius * math.cos(half)
-            self._ends[bounds.SPINDLE_MIDDLE :] = 0.5 * widest, offset, radius + widest * tilt
-            self._steepest = math.sin(min(half + tilt + ROUNDING, 0.5 * math.pi))
-            longest = min(longest, 2.0 * half * radius)
-        longest += self._tolerance
-        self._ends[bounds.LONGEST] = longest
-        self._aside = 0.5 * math.sqrt(longest**2 - total**2) + bounds.SPARE
-        self._before = 0.5 * (longest - total) + bounds.SPARE
-        if widest < 2.0 * radius:
-            self._aside = min(self._aside, radius + widest * tilt - offset)
-        local = self._frame[1:] @ self._query.lps_from_start[:3, 2]
-        self._along = float(local[0])
-        self._scale = np.zeros(bounds.SCALE_SIZE)
-        self._scale[bounds.KAPPA] = self._kappa
-        if self._along > 0.0:
-            self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
-
     def _parted(self, side: float) -> bool:
         """Tell whether cubes that no path can pass part the target from the start."""
         if self._along <= 0.0:
             return False
-        beside = math.ceil(self._aside / side) + 1
-        before = math.ceil(self._before / side) + 1
-        shape = (
-            np.array([before + math.ceil(self._ends[bounds.TOTAL] / side) + before, 2 * beside, 2 * beside])
-            + 1
-        )
+        beside = math.ceil(self._paths.aside_mm / side) + 1
+        before = math.ceil(self._paths.before_mm / side) + 1
+        between = math.ceil(self._paths.ends[bounds.TOTAL] / side)
+        shape = np.array([before + between + before, 2 * beside, 2 * beside]) + 1
         size = math.prod(int(n) for n in shape)
         if 5 * size > self._max_bytes or size >= 1 << 31:
             return False
         return not cubes.flood(
             self._environment.obstacles, self._required, self._query.branch, self._exempt_mm, self._scale,
-            self._ends, self._frame, side, np.array([-before, -beside, -beside]), np.zeros(shape,
-            dtype=np.bool_), np.zeros(size, dtype=np.int32),
+            self._paths.ends, self._frame, side, np.array([-before, -beside, -beside]),
+            np.zeros(shape, dtype=np.bool_), np.zeros(size, dtype=np.int32),
         )  # fmt: skip
 
     def _aim_planes(self) -> None:
         """Choose the planes and the direction from which the limit of the angle counts."""
-        last = float(self._ends[bounds.TOTAL]) - self._tolerance
+        last = float(self._paths.ends[bounds.TOTAL]) - self._tolerance
         self._count = math.ceil(last / min(DEPTH_SHARE / self._kappa, LARGEST_DEPTH_MM))
         self._depth = last / self._count
-        self._proved_steepest = self._steepest <= STEEPEST
-        sine = self._steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
+        self._proved_steepest = self._paths.steepest <= STEEPEST
+        sine = self._paths.steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
         self._scale[bounds.TOP_SINE] = sine
         if self._along <= 0.0 or math.sqrt(max(1.0 - self._along**2, 0.0)) >= sine:
             self._end("undecided", "the start looks away from the target")
@@ -295,7 +252,7 @@ class NoPathProof:
         """Add a plane: the states reached from the plane before, or the start."""
         plane = self._allowed(number)
         pruning.prune_unreachable(
-            plane.bits, plane.window, self._scale, self._ends, number * self._depth, self._reference,
+            plane.bits, plane.window, self._scale, self._paths.ends, number * self._depth, self._reference,
             self._environment.limits.max_angle_rad,
         )  # fmt: skip
         if number > 0 and plane.bits.any():
@@ -332,12 +289,7 @@ class NoPathProof:
             return Plane(np.ones((1, 1, 1, 1), dtype=np.uint64), np.zeros(4, dtype=np.int64))
         if self._coarse and not (self._split and number % 2):
             coarse = self._coarse[number // 2 if self._split else number]
-            halved = np.array([not self._split, not self._split, True, True])
-            shape = np.where(halved, 2 * np.array(coarse.bits.shape) + 1, coarse.bits.shape)
-            self._require(8 * math.prod(int(n) for n in shape))
-            bits = np.zeros(tuple(shape), dtype=np.uint64)
-            bitmaps.refine(coarse.bits, not self._split, bits)
-            return Plane(bits, np.where(halved, 2 * coarse.window - 1, coarse.window))
+            return coarse.refined(directions=not self._split, require=self._require)
         low, high = self._reached(self._planes[-1].window, self._planes[-1].ends, 1, number)
         if self._coarse:
             after = self._coarse[number // 2 + 1]
@@ -372,8 +324,9 @@ class NoPathProof:
             least[axis + 2] += min(moves) - aside
             most[axis + 2] += max(moves) + aside
             middle = number * self._depth * first
-            least[axis + 2] = max(least[axis + 2], math.floor((-self._aside - middle) / self.cell_mm) - 1)
-            most[axis + 2] = min(most[axis + 2], math.ceil((self._aside - middle) / self.cell_mm) + 1)
+            farthest = self._paths.aside_mm
+            least[axis + 2] = max(least[axis + 2], math.floor((-farthest - middle) / self.cell_mm) - 1)
+            most[axis + 2] = min(most[axis + 2], math.ceil((farthest - middle) / self.cell_mm) + 1)
             most[axis + 2] = max(most[axis + 2], least[axis + 2])
         return least, most
 
@@ -416,14 +369,7 @@ class NoPathProof:
         last = self._count * self._depth
         probes = self._depth / PROBES_PER_DEPTH * np.arange(-PROBES_PER_DEPTH // 2, PROBES_PER_DEPTH // 2 + 1)
         probes = probes[(here + probes > -1e-9) & (here + probes < last + 1e-9)]
-        low, high = plane.window, plane.ends
-        corners = np.zeros((len(probes), 2), dtype=np.int64)
-        shape = np.zeros((len(probes), 2), dtype=np.int64)
-        for axis in (0, 1):
-            move = probes * self.slope_cell / self.cell_mm
-            ends = np.stack([move * low[axis], move * high[axis]])
-            corners[:, axis] = low[axis + 2] + np.floor(ends.min(axis=0)) - 1
-            shape[:, axis] = high[axis + 2] + np.ceil(ends.max(axis=0)) + 2 - corners[:, axis]
+        corners, shape = plane.probed_cells(np.asarray(probes * self.slope_cell / self.cell_mm))
         rows, words = int(shape[:, 0].max()), -(-int(shape[:, 1].max()) // 64)
         slacks = bounds.HALF_DIAGONAL * self.cell_mm * SLACK_RATIO ** np.arange(SLACKS)
         self._require(len(probes) * rows * words * (8 + 64 + 8 * SLACKS))

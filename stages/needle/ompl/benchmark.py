@@ -15,7 +15,7 @@ from anatomy.io.files import atomic_write, require_writable_folder
 from stages.needle.ompl.planner import NeedlePlanner, not_written
 from stages.needle.ompl.problem import NeedleProblem
 from stages.needle.ompl.runs import Outcome, PlannerRuns, log_with_outcomes, summary
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 
 
 def benchmark(

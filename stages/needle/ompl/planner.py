@@ -18,7 +18,8 @@ from anatomy.typed import Float
 from stages.needle.kernels import states, tree
 from stages.needle.ompl.states import numbers_of, put_numbers, write_state
 from stages.needle.path import ArcPath, arc_transform
-from stages.needle.search.base import Query, Search, TreeSearch
+from stages.needle.query import Query
+from stages.needle.search.base import Search, TreeSearch
 from stages.needle.violations import SAME_MM
 
 ROUNDING_MM = 1e-6

@@ -14,7 +14,8 @@ from stages.needle.ompl.motion import ARC_STEPS, control_bounds, position_bounds
 from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question
 from stages.needle.ompl.states import path_of, put_numbers
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query, Search
+from stages.needle.query import Query
+from stages.needle.search.base import Search
 from stages.needle.search.planners import PLANNERS
 from stages.needle.violations import violation
 

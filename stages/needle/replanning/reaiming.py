@@ -17,7 +17,8 @@ from stages.needle.kernels import tree
 from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.objective import Objective
 from stages.needle.path import LENGTH, ArcPath, arc_transform, path_from_tree
-from stages.needle.search.base import Query, RestartingRRT, root_of
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT, root_of
 
 LOOK_AHEADS_MM = (5.0, 10.0, 20.0, 40.0)
 """How far ahead the plan that is being followed is met again."""

@@ -20,6 +20,7 @@ from stages.needle.kernels import tree
 from stages.needle.kernels.connections import length_ahead, nearest_turn, seen_from
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import CURVATURE, ArcPath
+from stages.needle.query import Query
 from stages.needle.replanning.escaping import (
     blocker_at,
     roots_of_tip,
@@ -36,7 +37,7 @@ from stages.needle.replanning.reaiming import (
     pose_at,
     waypoints_ahead,
 )
-from stages.needle.search.base import Query, root_of
+from stages.needle.search.base import root_of
 
 ITERATIONS = 1500
 """Iterations of the search in a replan; see docs/replanning.md for what they take."""

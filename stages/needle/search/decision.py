@@ -8,7 +8,8 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query, Search
+from stages.needle.query import Query
+from stages.needle.search.base import Search
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
 

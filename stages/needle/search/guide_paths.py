@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import Objective
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.state_lattice import SKEWS, StateLatticeSearch, via_points
 

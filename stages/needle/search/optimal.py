@@ -10,7 +10,8 @@ from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT
 from stages.needle.search.kernels import optimal
 
 MAX_VIAS = 64

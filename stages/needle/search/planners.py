@@ -6,7 +6,8 @@ from typing import Protocol
 
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.search.base import Query, RestartingRRT, Search
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT, Search
 from stages.needle.search.decision import Decision
 from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.resolution import ResolutionSearch

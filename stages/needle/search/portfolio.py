@@ -12,7 +12,7 @@ import numpy as np
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 from stages.needle.search.guide_paths import GuidePathFinder, Work
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.successive_halving import successive_halving

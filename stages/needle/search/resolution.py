@@ -20,9 +20,11 @@ from stages.needle.kernels import tree
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, ObjectiveArrays
 from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
 from stages.needle.path import ArcPath, path_from_tree
-from stages.needle.search.base import Query, root_of
+from stages.needle.query import Query
+from stages.needle.search.base import root_of
 from stages.needle.search.kernels import rank_queue
 from stages.needle.search.kernels import resolution as kernel
+from stages.needle.search.kernels import resolution_nodes as node_kernel
 
 T = TypeVar("T", bound=np.generic)
 Words = tuple[float, Float, Float, Int, Int]
@@ -234,15 +236,18 @@ class ResolutionSearch:
         self._best = np.zeros(kernel.BEST_SIZE)
 
     def _first_store(self) -> Store:
-        nodes = np.zeros((FIRST_NODES, kernel.NODE_COLUMNS))
-        links = np.zeros((FIRST_NODES, kernel.LINK_COLUMNS), dtype=np.int32)
+        nodes = np.zeros((FIRST_NODES, node_kernel.NODE_COLUMNS))
+        links = np.zeros((FIRST_NODES, node_kernel.LINK_COLUMNS), dtype=np.int32)
         proved = np.zeros((FIRST_NODES, self.resolution.fine_rolls + 1, 2), dtype=np.uint8)
         start, root = self.query.lps_from_start, nodes[0]
         root[:6] = *start[:3, 3], *start[:3, 2]
-        root[kernel.NORMAL : kernel.NORMAL + 3] = start[:3, 0]
-        root[kernel.PATH_LENGTH], root[kernel.PATH_TURN] = self.query.inserted_mm, self.query.turned_rad
+        root[node_kernel.NORMAL : node_kernel.NORMAL + 3] = start[:3, 0]
+        root[node_kernel.PATH_LENGTH], root[node_kernel.PATH_TURN] = (
+            self.query.inserted_mm,
+            self.query.turned_rad,
+        )
         links[0] = -1, -1, 0, 0
-        proved[0, :, kernel.USELESS] = self.resolution.steps + 1
+        proved[0, :, node_kernel.USELESS] = self.resolution.steps + 1
         return nodes, links, proved, np.zeros(4 * FIRST_NODES, dtype=np.int32)
 
     @property
@@ -299,7 +304,7 @@ class ResolutionSearch:
         if self._may_double(self._store):
             nodes, links, proved, seen = self._store
             larger = np.zeros(2 * len(seen), dtype=np.int32)
-            kernel.rehash(nodes, self._merge, seen, larger)
+            node_kernel.rehash(nodes, self._merge, seen, larger)
             self._store = _doubled(nodes), _doubled(links), _doubled(proved), larger
 
     def _more_entries(self) -> None:
@@ -315,11 +320,11 @@ class ResolutionSearch:
         at = int(self._best[kernel.BEST_NODE])
         while at != 0:
             chain.append(at)
-            at = int(links[at, kernel.PARENT])
+            at = int(links[at, node_kernel.PARENT])
         rows = [np.zeros(tree.NODE_COLUMNS)]
         for at in reversed(chain):
-            parent, direction, steps = (int(v) for v in links[at, : kernel.NODE_RANK])
-            bend = kernel.bend_of(nodes, rolls, self.environment.limits.kappa, parent, direction)
+            parent, direction, steps = (int(v) for v in links[at, : node_kernel.NODE_RANK])
+            bend = node_kernel.bend_of(nodes, rolls, self.environment.limits.kappa, parent, direction)
             rows.append(_row(fine_mm * steps, bend))
         for leg in range(2):
             length, *bend = self._best[kernel.BEST_LEGS + kernel.LEG_SIZE * leg :][: kernel.LEG_SIZE]

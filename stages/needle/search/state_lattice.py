@@ -12,7 +12,7 @@ from stages.needle.environment import NeedleEnvironment, workspace_lengths
 from stages.needle.kernels import limits as index
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 from stages.needle.search.kernels import state_lattice as kernel
 
 MOST_STATES = 1 << 15

@@ -16,7 +16,7 @@ from anatomy.structures import VESSEL
 from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 from tests.stages.scenes import Canvas
 
 CLEARANCE_MM = 1.0

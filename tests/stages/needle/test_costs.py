@@ -28,7 +28,8 @@ from stages.needle.kernels import cost as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT
 from tests.stages.scenes import Canvas
 
 UNIT = Grid.from_spacing((40, 40, 40), (1.0, 1.0, 1.0), (0.5, 0.5, 0.5))

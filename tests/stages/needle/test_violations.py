@@ -13,7 +13,7 @@ from anatomy.structures import VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import needle_environment
 from stages.needle.path import ArcPath
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 from stages.needle.violations import largest_angle_rad, violation
 from tests.stages.scenes import Canvas
 

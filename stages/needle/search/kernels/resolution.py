@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numba
-import numpy as np
 
 from anatomy.kernels.arcs import pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
@@ -25,32 +24,22 @@ from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.kernels.tree import angle_kept
 from stages.needle.search.kernels.goal_ball import least_length, shortest_into_ball, single_into_ball
 from stages.needle.search.kernels.rank_queue import WAITING, pop, push
-
-ROUNDING = 1e-9
-"""Share of the best cost by which a path must be cheaper to be looked for."""
-# A type of its own: for each literal argument a function would be compiled anew.
-_NOT_ACROSS = np.int64(0)
-
-SAME = 1e-6
-"""Poses that differ by less than this, in mm and in each component of a direction, are equal."""
-
-# Columns of `nodes`: pose (6), first direction of bending (3), path length, accumulated turn, path cost.
-NORMAL = 6
-PATH_LENGTH = 9
-PATH_TURN = 10
-PATH_COST = 11
-NODE_COLUMNS = 12
-
-# Columns of `links`: node before, direction and steps of the primitive from there, rank.
-PARENT = 0
-DIRECTION = 1
-STEPS = 2
-NODE_RANK = 3
-LINK_COLUMNS = 4
-
-# Of a node and a direction, `proved` holds the most steps proved clear, and the least that are of no use.
-CLEAR = 0
-USELESS = 1
+from stages.needle.search.kernels.resolution_nodes import (
+    CLEAR,
+    DIRECTION,
+    NODE_RANK,
+    PARENT,
+    PATH_COST,
+    PATH_LENGTH,
+    PATH_TURN,
+    ROUNDING,
+    STEPS,
+    USELESS,
+    bend_of,
+    find_duplicate,
+    follow,
+    node_pose,
+)
 
 # What `best` holds: its last node, then length and bend of each of the two legs from there to the goal.
 BEST_NODE = 0
@@ -75,174 +64,9 @@ FULL_OF_ENTRIES = 4
 
 
 @inner_kernel
-def _pose(nodes, at):
-    return nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3], nodes[at, 4], nodes[at, 5]
-
-
-@numba.njit(cache=True)
-def bend_of(nodes, rolls, kappa, at, direction):
-    """Return the bend of a primitive from a node; the direction after the last is straight."""
-    tx, ty, tz = nodes[at, 3], nodes[at, 4], nodes[at, 5]
-    ux, uy, uz = nodes[at, NORMAL], nodes[at, NORMAL + 1], nodes[at, NORMAL + 2]
-    if direction == rolls.shape[0]:
-        return 0.0, ux, uy, uz
-    c, s = rolls[direction, 0], rolls[direction, 1]
-    return (
-        kappa,
-        c * ux + s * (ty * uz - tz * uy),
-        c * uy + s * (tz * ux - tx * uz),
-        c * uz + s * (tx * uy - ty * ux),
-    )
-
-
-@inner_kernel
-def _follow(nodes, words, bend, at, direction, steps, row):
-    """Fill a row with the pose after a primitive, and the first direction of bending carried there."""
-    fine_mm, rolls, arcs = words[0], words[1], words[2]
-    if direction == rolls.shape[0]:
-        length = steps * fine_mm
-        for m in range(3):
-            nodes[row, m] = nodes[at, m] + length * nodes[at, 3 + m]
-            nodes[row, 3 + m] = nodes[at, 3 + m]
-            nodes[row, NORMAL + m] = nodes[at, NORMAL + m]
-        return
-    ahead, aside, c, s = arcs[steps, 0], arcs[steps, 1], arcs[steps, 2], arcs[steps, 3]
-    norm2 = 0.0
-    for m in range(3):
-        tangent, normal = nodes[at, 3 + m], bend[1 + m]
-        nodes[row, m] = nodes[at, m] + ahead * tangent + aside * normal
-        nodes[row, 3 + m] = c * tangent + s * normal
-        # Of the first direction of bending, only its part along the normal turns.
-        turned = (c - 1.0) * normal - s * tangent
-        nodes[row, NORMAL + m] = nodes[at, NORMAL + m] + rolls[direction, 0] * turned
-        norm2 += nodes[row, 3 + m] * nodes[row, 3 + m]
-    scale = 1.0 / math.sqrt(norm2)
-    dot = 0.0
-    for m in range(3):
-        nodes[row, 3 + m] *= scale
-        dot += nodes[row, 3 + m] * nodes[row, NORMAL + m]
-    norm2 = 0.0
-    for m in range(3):
-        nodes[row, NORMAL + m] -= dot * nodes[row, 3 + m]
-        norm2 += nodes[row, NORMAL + m] * nodes[row, NORMAL + m]
-    scale = 1.0 / math.sqrt(norm2)
-    for m in range(3):
-        nodes[row, NORMAL + m] *= scale
-
-
-@inner_kernel
-def _hash(nodes, row, merge, across):
-    """Return a number, at least 0, of the cell that holds a node's pose.
-
-    Of the cell across the nearest face instead, along each axis whose bit is set in `across`.
-    """
-    h = 0
-    for m in range(6):
-        size = merge[0] if m < 3 else merge[1]
-        cell = math.floor(nodes[row, m] / size)
-        if across >> m & 1:
-            cell += 1.0 if nodes[row, m] / size - cell > 0.5 else -1.0
-        h = (h ^ int(cell)) * 0x2545F4914F6CDD1D
-        h ^= h >> 29
-    return h & 0x7FFFFFFFFFFFFFFF
-
-
-@inner_kernel
-def _at_faces(nodes, row, merge):
-    """Return the axes, as bits, along which an equal pose may lie in the next cell."""
-    bits = 0
-    for m in range(6):
-        size = merge[0] if m < 3 else merge[1]
-        if math.floor((nodes[row, m] - SAME) / size) != math.floor((nodes[row, m] + SAME) / size):
-            bits |= 1 << m
-    return bits
-
-
-@inner_kernel
-def _in_one_cell(nodes, a, b, merge):
-    for m in range(6):
-        size = merge[0] if m < 3 else merge[1]
-        if math.floor(nodes[a, m] / size) != math.floor(nodes[b, m] / size):
-            return False
-    return True
-
-
-@inner_kernel
-def _equal(nodes, a, b, n_rolls):
-    """Tell whether two poses are equal up to rounding, and their directions of bending are the same set."""
-    for m in range(6):
-        if abs(nodes[a, m] - nodes[b, m]) > SAME:
-            return False
-    tx, ty, tz = nodes[a, 3], nodes[a, 4], nodes[a, 5]
-    ux, uy, uz = nodes[a, NORMAL], nodes[a, NORMAL + 1], nodes[a, NORMAL + 2]
-    wx, wy, wz = nodes[b, NORMAL], nodes[b, NORMAL + 1], nodes[b, NORMAL + 2]
-    c = ux * wx + uy * wy + uz * wz
-    s = (ty * uz - tz * uy) * wx + (tz * ux - tx * uz) * wy + (tx * uy - ty * ux) * wz
-    rolls = math.atan2(s, c) * n_rolls / (2.0 * math.pi)
-    return abs(rolls - round(rolls)) < n_rolls * SAME
-
-
-@inner_kernel
-def _no_worse(nodes, a, b):
-    """Tell whether what can follow node `b` can follow node `a` at no more cost; their poses are equal."""
-    return (
-        nodes[a, PATH_COST] <= nodes[b, PATH_COST] * (1.0 + ROUNDING)
-        and nodes[a, PATH_LENGTH] <= nodes[b, PATH_LENGTH] + SAME
-        and nodes[a, PATH_TURN] <= nodes[b, PATH_TURN] + SAME
-    )
-
-
-@inner_kernel
-def _in_chain(nodes, seen, merge, n_rolls, row, slot):
-    """Look through the nodes that the hash table holds from a slot on; see `find_duplicate`."""
-    while seen[slot] != 0:
-        kept = seen[slot] - 1
-        if merge[2]:
-            if _in_one_cell(nodes, kept, row, merge):
-                return slot, nodes[kept, PATH_COST] <= nodes[row, PATH_COST] * (1.0 + ROUNDING)
-        elif _equal(nodes, kept, row, n_rolls):
-            if _no_worse(nodes, kept, row):
-                return slot, True
-            if _no_worse(nodes, row, kept):
-                return slot, False
-        slot = (slot + 1) & (seen.shape[0] - 1)
-    return slot, False
-
-
-@numba.njit(cache=True)
-def find_duplicate(nodes, seen, merge, n_rolls, row):
-    """Return the slot of a row in the hash table, and whether a node there makes the row superfluous.
-
-    Else the slot is free, or that of a node which the row makes superfluous.  See `search_words`.
-    """
-    last = seen.shape[0] - 1
-    slot, duplicate = _in_chain(
-        nodes, seen, merge, n_rolls, row, _hash(nodes, row, merge, _NOT_ACROSS) & last
-    )
-    faces = 0 if merge[2] or duplicate else _at_faces(nodes, row, merge)
-    for across in range(1, faces + 1):
-        if across & ~faces == 0 and not duplicate:
-            begin = _hash(nodes, row, merge, across) & last
-            duplicate = _in_chain(nodes, seen, merge, n_rolls, row, begin)[1]
-    return slot, duplicate
-
-
-@numba.njit(cache=True)
-def rehash(nodes, merge, seen, larger):
-    """Move the nodes in the hash table `seen` to a larger one, whose size is a power of two, all 0."""
-    last = larger.shape[0] - 1
-    for m in range(seen.shape[0]):
-        if seen[m] != 0:
-            slot = _hash(nodes, seen[m] - 1, merge, _NOT_ACROSS) & last
-            while larger[slot] != 0:
-                slot = (slot + 1) & last
-            larger[slot] = seen[m]
-
-
-@inner_kernel
 def _estimate(nodes, row, rates, goal, limits, reference):
     """Return a cost below which no path within the limits leads by a node to the goal; inf if none does."""
-    rho, h = seen_from(_pose(nodes, row), goal)
+    rho, h = seen_from(node_pose(nodes, row), goal)
     cosine = nodes[row, 3] * reference[0] + nodes[row, 4] * reference[1] + nodes[row, 5] * reference[2]
     ahead = least_length(rho, h, limits, cosine, limits.max_turn_rad - nodes[row, PATH_TURN])
     if nodes[row, PATH_LENGTH] + ahead > limits.max_length_mm + TINY:
@@ -283,10 +107,10 @@ def _push_level(
         within = nodes[row, PATH_TURN] <= limits.max_turn_rad + TINY
         # The cosine of an angle falls by no more than the arc turns.
         if within and forward - turn < least:
-            within = angle_kept(limits, reference, _pose(nodes, at), bend, turn)[0]
+            within = angle_kept(limits, reference, node_pose(nodes, at), bend, turn)[0]
         estimate = math.inf
         if within:
-            _follow(nodes, words, bend, at, direction, steps, row)
+            follow(nodes, words, bend, at, direction, steps, row)
             estimate = _estimate(nodes, row, rates, goal, limits, reference)
         if estimate >= most:
             counts[PRUNED] += 1
@@ -318,7 +142,7 @@ def _add(
         return math.inf
     length = steps * fine_mm
     bend = bend_of(nodes, rolls, limits.kappa, at, direction)
-    _follow(nodes, words, bend, at, direction, steps, row)
+    follow(nodes, words, bend, at, direction, steps, row)
     nodes[row, PATH_LENGTH] = nodes[at, PATH_LENGTH] + length
     nodes[row, PATH_TURN] = nodes[at, PATH_TURN] + bend[0] * length
     nodes[row, PATH_COST] = nodes[at, PATH_COST] + rates[0] * length
@@ -326,7 +150,7 @@ def _add(
     if duplicate:
         counts[DUPLICATES] += 1
         return math.inf
-    pose = _pose(nodes, at)
+    pose = node_pose(nodes, at)
     if steps > proved[at, direction, CLEAR]:
         if blocker_on_arc(obstacles, limits, pose, bend, length, nodes[at, PATH_LENGTH], branch) != 0:
             proved[at, direction, USELESS] = steps
@@ -362,7 +186,7 @@ def _connect(obstacles, limits, objective, rates, branch, goal, reference, nodes
 
     A path ends where it first is within the goal tolerance, or goes on to the goal where that costs no more.
     """
-    start = _pose(nodes, at)
+    start = node_pose(nodes, at)
     for single in range(2):
         first, first_length, second, second_length, ahead = shortest_into_ball(start, goal, limits)
         if single:
@@ -475,7 +299,7 @@ def search_words(
             f = _estimate(nodes, at, rates, goal, limits, reference)
             bend = bend_of(nodes, words[1], limits.kappa, at, words[1].shape[0])
             begun = nodes[at, PATH_LENGTH]
-            if blocker_on_arc(obstacles, limits, _pose(nodes, at), bend, 0.0, begun, branch) != 0:
+            if blocker_on_arc(obstacles, limits, node_pose(nodes, at), bend, 0.0, begun, branch) != 0:
                 f = math.inf
             slot, _duplicate = find_duplicate(nodes, store[3], merge, words[1].shape[0], at)
             store[3][slot] = at + 1

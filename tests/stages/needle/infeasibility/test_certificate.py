@@ -14,7 +14,8 @@ from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.infeasibility.kernels import bitmaps
-from stages.needle.search.base import Query, RestartingRRT
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT
 
 SIDE = 64
 ROW = np.arange(SIDE)

@@ -43,7 +43,8 @@ from stages.needle.ompl import (
     write_state,
 )
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path
-from stages.needle.search.base import Query, RestartingRRT, Search
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT, Search
 from stages.needle.search.planners import PLANNERS
 from tests.stages.scenes import Canvas
 

@@ -21,9 +21,10 @@ from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path, direct_path
+from stages.needle.query import Query
 from stages.needle.replanning.reaiming import LEAST_GAIN, Attempts, Root, Source
 from stages.needle.replanning.replanner import Failure, Replan, Replanner, ReplanSettings, with_reserve
-from stages.needle.search.base import Query, RestartingRRT, root_of
+from stages.needle.search.base import RestartingRRT, root_of
 from tests.stages.scenes import Canvas, brute_clearance, line_tree
 
 KAPPA = 1 / 40

@@ -13,7 +13,8 @@ from anatomy.structures import OUTSIDE, VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels, needle_environment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.search.base import Query, RestartingRRT, luby
+from stages.needle.query import Query
+from stages.needle.search.base import RestartingRRT, luby
 from stages.needle.search.decision import Decision
 from stages.needle.search.optimal import OptimalSearch
 from tests.stages.needle.proved import assert_proved

@@ -20,9 +20,9 @@ from stages.needle.environment import NeedleEnvironment, workspace_lengths
 from stages.needle.kernels.limits import Limits
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, blocker_on_path
-from stages.needle.search.base import Query
+from stages.needle.query import Query
 from stages.needle.search.kernels import goal_ball, rank_queue
-from stages.needle.search.kernels import resolution as kernel
+from stages.needle.search.kernels import resolution_nodes as node_kernel
 from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
 from tests.stages.needle import mazes
 from tests.stages.needle.mazes import CLEARANCE_MM, Maze, in_box, winding_maze
@@ -435,7 +435,7 @@ class TestDuplicates:
         kinds: dict[tuple[float, ...], list[Float]] = {}
         for node in nodes:
             pose = tuple(np.round(node[:6], 3) + 0.0)
-            kinds.setdefault(pose, []).append(node[kernel.PATH_LENGTH : kernel.NODE_COLUMNS])
+            kinds.setdefault(pose, []).append(node[node_kernel.PATH_LENGTH : node_kernel.NODE_COLUMNS])
         for same in kinds.values():
             for number, earlier in enumerate(same):
                 for later in same[number + 1 :]:
@@ -468,20 +468,20 @@ class TestDuplicates:
         for node in search._store[0][: search.counts.nodes]:
             sizes = np.repeat([cells.position_mm, math.radians(cells.angle_deg)], 3)
             cell = tuple(np.floor(node[:6] / sizes).astype(int))
-            assert node[kernel.PATH_COST] < cheapest.get(cell, math.inf)
-            cheapest[cell] = node[kernel.PATH_COST]
+            assert node[node_kernel.PATH_COST] < cheapest.get(cell, math.inf)
+            cheapest[cell] = node[node_kernel.PATH_COST]
 
     def test_of_equal_poses_one_may_be_dearer_but_turned_less(self) -> None:
         """Then both are kept, because a limit could stop either."""
-        nodes, seen = np.zeros((4, kernel.NODE_COLUMNS)), np.zeros(16, dtype=np.int32)
+        nodes, seen = np.zeros((4, node_kernel.NODE_COLUMNS)), np.zeros(16, dtype=np.int32)
         nodes[:, :6] = 1.0, 2.0, 3.0, 0.0, 0.0, 1.0
-        nodes[:, kernel.NORMAL] = 1.0
+        nodes[:, node_kernel.NORMAL] = 1.0
         values = [(20.0, 1.0, 20.0), (19.0, 1.1, 19.0), (19.0, 0.9, 20.0), (20.0, 1.0, 20.0)]
-        nodes[:, kernel.PATH_LENGTH :] = values
+        nodes[:, node_kernel.PATH_LENGTH :] = values
         merge = (1e-3, 1e-3, False)
         slots = []
         for row, superfluous in enumerate((False, False, False, True)):
-            slot, found = kernel.find_duplicate(nodes, seen, merge, 4, row)
+            slot, found = node_kernel.find_duplicate(nodes, seen, merge, 4, row)
             assert found == superfluous
             slots.append(slot)
             if not found:
@@ -490,27 +490,27 @@ class TestDuplicates:
         assert slots[2] == slots[0], "this one is better in all, and takes the other's place"
 
     def test_equal_poses_on_both_sides_of_a_face_between_cells(self) -> None:
-        nodes, seen = np.zeros((3, kernel.NODE_COLUMNS)), np.zeros(16, dtype=np.int32)
+        nodes, seen = np.zeros((3, node_kernel.NODE_COLUMNS)), np.zeros(16, dtype=np.int32)
         nodes[:, 5] = 1.0
-        nodes[:, kernel.NORMAL] = 1.0
+        nodes[:, node_kernel.NORMAL] = 1.0
         nodes[1, [0, 1, 4]] = 1e-12, -1e-12, -1e-12
         nodes[2, 0] = 1e-3 - 1e-12
         merge = (1e-3, 1e-3, False)
-        seen[kernel.find_duplicate(nodes, seen, merge, 4, 0)[0]] = 1
-        assert kernel.find_duplicate(nodes, seen, merge, 4, 1)[1]
-        assert not kernel.find_duplicate(nodes, seen, merge, 4, 2)[1], "in the same cell, but not equal"
+        seen[node_kernel.find_duplicate(nodes, seen, merge, 4, 0)[0]] = 1
+        assert node_kernel.find_duplicate(nodes, seen, merge, 4, 1)[1]
+        assert not node_kernel.find_duplicate(nodes, seen, merge, 4, 2)[1], "in the same cell, but not equal"
 
     @pytest.mark.parametrize(("roll", "equal"), [(0.0, True), (0.25, True), (0.1, False)])
     def test_equal_poses_with_other_directions_of_bending_are_not_equal(
         self, roll: float, equal: bool
     ) -> None:
-        nodes, seen = np.zeros((2, kernel.NODE_COLUMNS)), np.zeros(16, dtype=np.int32)
+        nodes, seen = np.zeros((2, node_kernel.NODE_COLUMNS)), np.zeros(16, dtype=np.int32)
         nodes[:, 5] = 1.0
         angle = 2.0 * math.pi * roll
-        nodes[:, kernel.NORMAL : kernel.NORMAL + 2] = (1.0, 0.0), (math.cos(angle), math.sin(angle))
-        slot, _found = kernel.find_duplicate(nodes, seen, (1e-3, 1e-3, False), 4, 0)
+        nodes[:, node_kernel.NORMAL : node_kernel.NORMAL + 2] = (1.0, 0.0), (math.cos(angle), math.sin(angle))
+        slot, _found = node_kernel.find_duplicate(nodes, seen, (1e-3, 1e-3, False), 4, 0)
         seen[slot] = 1
-        assert kernel.find_duplicate(nodes, seen, (1e-3, 1e-3, False), 4, 1)[1] == equal
+        assert node_kernel.find_duplicate(nodes, seen, (1e-3, 1e-3, False), 4, 1)[1] == equal
 
 
 class TestRunning:

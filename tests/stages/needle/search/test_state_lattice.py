@@ -18,8 +18,8 @@ from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
+from stages.needle.query import Query
 from stages.needle.search import guide_paths
-from stages.needle.search.base import Query
 from stages.needle.search.guide_paths import ARCS_PER_ITERATION, CELLS, LAYERS, LEAST_GAIN, GuidePathFinder
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.portfolio import PortfolioSearch

@@ -101,5 +101,5 @@ class Planning:
         workspace_lengths(self.environment, entries.positions, entries.tangents, self.target.lps_mm)
 
     def time_check(self, target: list[float]) -> None:
-        """Judge a plan."""
+        """Check a plan."""
         la.check(self.found, self.lung)

@@ -17,6 +17,7 @@ BOX_VALUES = (100_000, 100_000, 40_000, 20_000, 100_000)
 """Most values of the boxes, in this order: clearance, spared, wall, lumen, map.  From a finer lattice every
 second (third, ...) value is taken along the axes of the smallest spacing."""
 CLEARANCE, SPARED, WALL, LUMEN_SHARE, MAP = range(5)
+"""Places of the boxes in that order."""
 FEWEST = 6
 """Fewest values along an axis: a cubic B-spline needs four, and the cells at the ends one more each."""
 LUMEN_WIDTH_MM = 0.945

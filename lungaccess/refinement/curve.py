@@ -10,8 +10,11 @@ from anatomy.typed import Float
 from stages.needle import ArcPath, arc_transform, bend_direction
 
 AIM_STEPS = 6
+"""Newton steps converge quadratically: what has not arrived after these does not."""
 AIM_MM = 1e-10
+"""Largest distance of an aimed path from the target: far below what a plan states, above rounding."""
 PROBE = 1e-6
+"""Step of the central differences in scaled variables: their error is then some 1e-10."""
 LENGTH_SCALE_MM = 5.0
 """What a mm of length counts against a share of the greatest curvature where an aim is corrected."""
 

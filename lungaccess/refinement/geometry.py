@@ -16,6 +16,7 @@ from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM, SLOPE_MM, W
 SERIES_TERMS = 14
 """Up to an angle of 2 pi the series are off by less than 1e-6."""
 RADIUS_STEP_MM = 0.2
+"""Length over which the radius changes at the end of the outer tube, so that it has derivatives."""
 STRAIGHTNESS = 1e-3
 """Rounds off the turn of an arc at no curvature, as a share of the greatest; it is never understated."""
 

@@ -21,9 +21,10 @@ from anatomy.typed import Float
 from lungaccess.refinement.boxes import BOX_VALUES, CLEARANCE, LUMEN_SHARE, MAP, SPARED, WALL, FieldBox
 from lungaccess.refinement.geometry import Geometry
 from lungaccess.refinement.layout import SLOPE_MM, Layout, Numbers
+from stages.needle.kernels import CLEARANCE_FLOOR_MM
 
-CLEARANCE_FLOOR_MM = 0.1
 FLOOR_WIDTH_MM = 0.05
+"""Width over which the floor of the clearance is rounded, so that the objective has derivatives."""
 ORDERS = (
     *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
     *((2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2)),

@@ -37,6 +37,7 @@ ROTATION = 1
 OUTER = 2
 INNER = 3
 N_CHOICE = 4
+"""Places of the numbers of a choice in `x`, and how many they are."""
 
 ROUNDING = 1e-9
 """Share of each limit that stays unused, so that rounding does not carry a plan beyond the limit."""

@@ -38,7 +38,7 @@ class Controls:
 
 
 class Tree:
-    """States reached so far, as growing arrays; row 0 is the start."""
+    """The states that are reached, as growing arrays; row 0 is the start."""
 
     def __init__(self, lps_from_start: Float) -> None:
         self.count = 1
@@ -163,7 +163,7 @@ class NeedleRRT:
     def _towards_goal(self, tree: Tree, goal_lps: Float, branch: int) -> bool:
         """Extend the state nearest to the goal towards it; tell whether it got there.
 
-        A state whose step to the goal is blocked stays so, and is passed over from then on.
+        A state whose step to the goal is blocked is not tried again.
         """
         controls = tree.controls_to(goal_lps, self._needle.max_curvature_per_mm)
         lengths = np.where(tree.goal_blocked[: tree.count], np.inf, controls.length_mm)
@@ -226,8 +226,9 @@ class NeedleRRT:
 def sample_ahead(lps_from_start: Float, goal_lps: Float, needle: Needle, rng: np.random.Generator) -> Float:
     """Draw a point `(3,)` uniformly from the needle's workspace [Kuntz2015, fig. 4].
 
-    The workspace of a single arc: no nearer than a circle of the least radius R lets it, at most 45 degrees
-    aside, which turns the needle by 90; and as far ahead as SPREAD times the distance of the goal.
+    The workspace is that of a single arc.  A circle of the least radius R bounds it aside; no point lies more
+    than 45 degrees aside, which turns the needle by 90.  The farthest lies SPREAD times as far ahead as the
+    goal is away.
     """
     radius = needle.min_radius_of_curvature_mm
     farthest = SPREAD * float(np.linalg.norm(goal_lps - lps_from_start[:3, 3]))

@@ -82,7 +82,7 @@ class Obstacles:
     with_fissures : bool
         Whether fissures are obstacles.
     reach_mm : float
-        How far from the pierced branch `other_airways` is asked for.
+        `other_airways` is exact within this distance of the pierced branch.
     """
 
     def __init__(self, lung: Lung, *, with_fissures: bool, reach_mm: float) -> None:

@@ -28,6 +28,7 @@ FOUND = "found"
 LOOKS_BACK = "the scope's tip looks sideways behind a fork"
 OUT_OF_WORKSPACE = "the target lies outside the needle's workspace"
 NO_PATH = "the RRT found no path"
+"""What can become of a placement, besides the reasons why tubes are refused."""
 RRT_ITERATIONS = 50
 """About what 0.05 s of [Kuntz2015] hold here."""
 

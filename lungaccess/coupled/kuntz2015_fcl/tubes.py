@@ -14,7 +14,9 @@ from stages.needle import ArcPath, arc_transform
 from stages.tube import REASONS, Deployment, kernels, tube_constants
 
 NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
+"""The meshes of these are one solid, so that the reason does not tell them apart."""
 LABEL_STEP_MM = 0.05
+"""Spacing of the samples whose voxels are looked up, about a tenth of a voxel."""
 SAMPLES_PER_CONTACT = 5
 """Every so many samples it is asked whether the tube touches the wall from inside."""
 EXIT_SAMPLES = 51

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-from lungaccess.study.driver import run_study
-from lungaccess.study.settings import study_of
-from lungaccess.study.summary import summary
+from lungaccess.study import run_study, study_of, summarise
 
 if __name__ == "__main__":  # the worker processes import this file
     study = study_of(
@@ -26,7 +24,7 @@ if __name__ == "__main__":  # the worker processes import this file
         }
     )
     run_study(study, Path("results.db"), workers=1)
-    groups = summary(Path("results.db"))
+    groups = summarise(Path("results.db"))
     figure, ax = plt.subplots(figsize=(5, 4))
     ax.bar([group.case for group in groups], [100 * group.solved_share for group in groups])
     ax.set(ylabel="targets with a plan, %", title=f"{groups[0].runs} peripheral targets")

@@ -25,7 +25,7 @@ NOT_A_NAME = ("anatomy.seg.nrrd", "experiments.NAME")
 FILE = re.compile(rf"^(?:{PACKAGES}|docs|results|examples)/[\w./-]+$")
 TEST = re.compile(r"^(tests/[\w./-]+\.py)::(\w+)$")
 IN_TICKS = re.compile(r"`([^`\n]+)`")
-IMPORT = re.compile(rf"^from ((?:{PACKAGES})[\w.]*) import (.+)$", re.MULTILINE)
+IMPORT = re.compile(rf"^from ((?:{PACKAGES})[\w.]*) import (?:\(([^)]*)\)|(.+)$)", re.MULTILINE)
 STUDY = re.compile(r"python -m (experiments\.[a-z]\w+)")
 
 
@@ -72,8 +72,9 @@ def named(text: str) -> list[str]:
     ticked = [match[0] for each in ticks if (match := NAME.match(each))]
     imported = [
         f"{module}.{name.split(' as ')[0].strip()}"
-        for module, names in IMPORT.findall(text)
-        for name in names.split(",")
+        for module, many, few in IMPORT.findall(text)
+        for name in (many or few).split(",")
+        if name.strip()
     ]
     return [*ticked, *imported, *STUDY.findall(text)]
 

@@ -58,7 +58,7 @@ class Tolerance:
     alone: Share
 
 
-def tolerances(
+def find_tolerances(
     plan: Plan,
     lung: Lung,
     *,

@@ -50,7 +50,7 @@ class Group:
     cost: float | None
 
 
-def summary(path: Path) -> list[Group]:
+def summarise(path: Path) -> list[Group]:
     """Summarise a results file by case, objective and planner.
 
     Raises

@@ -51,7 +51,7 @@ def risk(
     from lungaccess.plans.plan import Plan
     from lungaccess.risk.assessment import assess
     from lungaccess.risk.errors import ErrorModel, load_errors
-    from lungaccess.risk.tolerances import tolerances
+    from lungaccess.risk.tolerances import find_tolerances
 
     model = ErrorModel() if errors is None else load_errors(errors)
     stored = Plan.load(plan)
@@ -59,7 +59,9 @@ def risk(
     with progress("deviating the plan"):
         report = assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
     with progress("looking for the largest errors"):
-        kept = tolerances(stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius)
+        kept = find_tolerances(
+            stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius
+        )
     if output.json:
         terminal.show_json(record(report, kept))
     else:

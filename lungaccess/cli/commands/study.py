@@ -49,7 +49,7 @@ def run(
     """
     from lungaccess.study.driver import run_study
     from lungaccess.study.settings import read_study
-    from lungaccess.study.summary import summary
+    from lungaccess.study.summary import summarise
 
     if workers is not None and (workers < 1 or scheduler is not None):
         raise SettingsError(
@@ -62,9 +62,11 @@ def run(
             asked, out, scheduler=scheduler, workers=workers, cache=output.cache, tell=shown.step
         )
     if output.json:
-        terminal.show_json(asdict(done) | {"results": str(out), "groups": [asdict(g) for g in summary(out)]})
+        terminal.show_json(
+            asdict(done) | {"results": str(out), "groups": [asdict(g) for g in summarise(out)]}
+        )
         return ExitCode.of(not done.failed)
-    terminal.show([_table(asked.name, summary(out))])
+    terminal.show([_table(asked.name, summarise(out))])
     terminal.console.print(
         terminal.escaped(
             f"{done.runs} runs: {done.stored_before} were stored, {done.added} added in {done.wall_s:.1f} s. "
@@ -85,9 +87,9 @@ def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     results : Path
         Results file.
     """
-    from lungaccess.study.summary import summary
+    from lungaccess.study.summary import summarise
 
-    groups = summary(results)
+    groups = summarise(results)
     if output.json:
         terminal.show_json([asdict(group) for group in groups])
     else:

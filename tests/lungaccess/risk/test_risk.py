@@ -34,7 +34,7 @@ from lungaccess.risk.deviations import (
 from lungaccess.risk.errors import CURVATURE, UNITS, ErrorModel, load_errors
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.statistics import Share
-from lungaccess.risk.tolerances import LARGEST, Tolerance, tolerances
+from lungaccess.risk.tolerances import LARGEST, Tolerance, find_tolerances
 from stages.needle.path import arc_transform
 from stages.tube.shape import centreline
 from tests.stages.scenes import brute_clearance
@@ -251,7 +251,7 @@ def test_interval_of_wilson_1927() -> None:
 
 @pytest.fixture(scope="module")
 def found(plan: Plan, small_lung: Lung) -> dict[str, Tolerance]:
-    kept = tolerances(plan, small_lung, samples=500, radius_mm=3.0)
+    kept = find_tolerances(plan, small_lung, samples=500, radius_mm=3.0)
     return {each.kind: each for each in kept}
 
 
@@ -321,7 +321,7 @@ def test_bad_input_is_refused(plan: Plan, small_lung: Lung, tmp_path: Path) -> N
         assess(plan, small_lung, samples=0)
     for probability in (0.0, 1.0, math.nan):
         with pytest.raises(SettingsError, match="probability"):
-            tolerances(plan, small_lung, probability=probability)
+            find_tolerances(plan, small_lung, probability=probability)
     wrong: list[dict[str, Any]] = [
         {"scope_position_mm": -1.0}, {"needle_curvature_low_factor": 1.1}, {"needle_roll_deg": math.nan},
         {"scope_position": 1.0},

@@ -22,7 +22,7 @@ from lungaccess.study.answers import NO_PLAN, TIMEOUT
 from lungaccess.study.export import export_csv, export_parquet
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.runs import Run
-from lungaccess.study.summary import summary
+from lungaccess.study.summary import summarise
 from lungaccess.study.tables import QUERIES, TEXTS, TRUTHS
 from tests.lungaccess.study.toys import toy_answer
 
@@ -67,7 +67,7 @@ def path(tmp_path: Path, runs: list[Run]) -> Path:
 
 
 def test_the_summary_counts_what_could_be_made(path: Path) -> None:
-    (group,) = summary(path)
+    (group,) = summarise(path)
     assert (group.case, group.planner, group.runs, group.failed) == ("coarse", "atlas", 4, 1)
     assert group.solved_share == pytest.approx(2 / 3)
     assert group.accepted_share == 1.0

@@ -88,17 +88,19 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
 
 
 def _distances(plan: Plan) -> list[terminal.Row]:
+    """Return each distance and the least one allowed; a fissure that may be crossed has none."""
     return [
-        (device, structure, f"{value:.2f}", _least(plan, device, structure))
+        (
+            device,
+            structure,
+            f"{value:.2f}",
+            ""
+            if structure == "fissure" and not plan.fissures_are_obstacles
+            else f"{plan.least_required_clearance_mm(device):.2f}",
+        )
         for device in ("tube", "needle")
         for structure, value in plan.clearance_mm[device].items()
     ]
-
-
-def _least(plan: Plan, device: str, structure: str) -> str:
-    if structure == "fissure" and not plan.fissures_are_obstacles:
-        return ""
-    return f"{plan.required_clearance_mm[{'tube': 'inner_tube'}.get(device, device)]:.2f}"
 
 
 def check_tables(report: CheckReport, *, refusals_only: bool = False) -> list[Table]:

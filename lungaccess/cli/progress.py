@@ -11,12 +11,13 @@ from rich.text import Text
 from lungaccess.cli.terminal import escaped, progress_console
 
 BAR_WIDTH = 24
-HONEST_SHARE = 0.02
-"""From less than this share no time is extrapolated."""
+"""Leaves room for the description and the times on a line of 80 characters."""
+LEAST_SHARE = 0.02
+"""From less than this share no time is extrapolated: its error would be larger than the time itself."""
 
 
 class _Times(ProgressColumn):
-    """Time that has passed, and the time left as far as it can be told."""
+    """Time that has passed, and the time left as far as it can be estimated."""
 
     def render(self, task: Task) -> Text:
         """Return the text of the column."""
@@ -29,7 +30,7 @@ class _Times(ProgressColumn):
 
 
 def remaining_s(passed_s: float, completed: float, total: float | None) -> float | None:
-    """Return the time left if all goes on as before; None if too little is done to tell.
+    """Return the time left if all goes on as before; None if too little is done for an estimate.
 
     Examples
     --------
@@ -38,7 +39,7 @@ def remaining_s(passed_s: float, completed: float, total: float | None) -> float
     >>> remaining_s(10.0, 0.0, 1.0) is None
     True
     """
-    if not total or completed < HONEST_SHARE * total:
+    if not total or completed < LEAST_SHARE * total:
         return None
     return max(passed_s * (total - completed) / completed, 0.0)
 
@@ -55,7 +56,22 @@ def _bar(*more: ProgressColumn) -> Progress:
     )
 
 
-class StepDisplay:
+class _Shown:
+    """Something whose progress is shown within a `with` statement."""
+
+    _progress: Progress
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+
+class StepDisplay(_Shown):
     """Shows work that is done in steps.
 
     The bar moves back and forth as long as nobody knows which share is done.
@@ -69,15 +85,6 @@ class StepDisplay:
         self._description = description
         self._progress = _bar()
         self._task = self._progress.add_task(escaped(description), total=None)
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
 
     def step(self, words: str, share: float | None = None) -> None:
         """Say what is being done now, and the share of all that is done; None if it is not known."""
@@ -97,7 +104,7 @@ def progress(description: str) -> StepDisplay:
     return StepDisplay(description)
 
 
-class SearchDisplay:
+class SearchDisplay(_Shown):
     """Shows a search while it runs: what it does, how much of the budget is used, the best cost."""
 
     def __init__(self, time_s: float | None, iterations: int | None) -> None:
@@ -105,15 +112,6 @@ class SearchDisplay:
         self._progress = _bar(TextColumn("{task.fields[best]}"))
         total = float(iterations) if iterations is not None else time_s
         self._task = self._progress.add_task("searching", total=total, best="no plan yet")
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
 
     def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
         """Show the state of the search."""

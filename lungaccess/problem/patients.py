@@ -24,7 +24,7 @@ def load_patient(
     cache : path, optional
         Folder for prepared anatomies; `anatomy.cache.default_cache()` if None.
     progress : callable, optional
-        Told each step as it begins.
+        Receives each step as it begins.
 
     Raises
     ------

@@ -10,9 +10,11 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Float
 
 PLEURA_MM = (5.0, 25.0)
+"""Distances from the pleura between which targets count as peripheral: near it, but not at it."""
 CLEAR_MM = 3.0
+"""Least clearance of a target, about twice what the presets' needles require with their margins."""
 DRAWS_A_POINT = 100_000
-"""So many points drawn in a row without a target end the search for one."""
+"""So many random points in a row without a target end the search for one; a lung needs some hundred."""
 
 
 def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
@@ -34,7 +36,7 @@ def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
     Raises
     ------
     TargetError
-        If one side has no room for such a target.
+        If one side has no such target.
     """
     rng = np.random.default_rng(seed)
     points = [_peripheral_point(lung, rng, side) for side in (1.0, -1.0) for _ in range(per_lung)]

@@ -15,6 +15,7 @@ STATUS = (
 )  # fmt: skip
 """OMPL's words for the end of a run, by number."""
 UNKNOWN, INVALID_GOAL, TIMEOUT, EXACT, CRASH = 0, 2, 4, 6, 7
+"""The numbers of those that runs end with."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from lungaccess.study.results import ResultsFile
 from lungaccess.study.tables import QUERIES, TIMES, table
 
 MOST = 20
-"""So many differences are told."""
+"""So many differences are listed: enough to see what kind they are."""
 
 
 def differences(first: Path, second: Path) -> list[str]:

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import math
-import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lungaccess.study.answers import CRASH, UNKNOWN, Answer
+from lungaccess.study.cluster import Backlog, connect, interruptions_noted, require_dask
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.runs import Problem, Run, runs_of
 from lungaccess.study.settings import Study, StudyError
@@ -23,23 +19,8 @@ if TYPE_CHECKING:
     from distributed import Client
 
 RETRIES = 2
-"""How often a run that could not be made is tried again at once."""
-WAITING_A_WORKER = 3
-LEAST_WAITING = 4
-COUNT_WORKERS_EVERY_S = 5.0
-CONNECT_S = 20.0
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-DASK_CONFIG = {
-    # Dask would warn whenever this process is busy with a patient.
-    "distributed.admin.tick.limit": "1h",
-    # It keeps as many events, with the runs that they concern: memory grows until the logs are full.
-    "distributed.admin.low-level-log-length": 100,
-    "distributed.admin.log-length": 200,
-    # Set before a worker starts: numba refuses to compile if it finds another number later.
-    **{f"distributed.nanny.pre-spawn-environ.{name}": 1 for name in ONE_THREAD},
-}
-
-Tell = Callable[[str, float | None], None]
+"""How often a run that could not be made is tried again at once: workers and disks may fail for a moment."""
+Progress = Callable[[str, float | None], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +54,7 @@ def run_study(
     scheduler: str | None = None,
     workers: int | None = None,
     cache: Path | None = None,
-    tell: Tell | None = None,
+    progress: Progress | None = None,
 ) -> StudyDone:
     """Make the runs of a study that a results file does not have, and store them there one by one.
 
@@ -88,8 +69,8 @@ def run_study(
         How many processes on this machine; as many as there are cores if None.
     cache : Path, optional
         Folder of prepared anatomies and atlases, on every machine; the usual one if None.
-    tell : callable, optional
-        Told what is being done, and the share of the missing runs that is done.
+    progress : callable, optional
+        Receives what is being done, and the share of the missing runs that is done.
 
     Raises
     ------
@@ -101,16 +82,16 @@ def run_study(
         If a patient, a system or a target of the study cannot be read.
     """
     began = time.perf_counter()
-    say = tell or (lambda _words, _share: None)
+    say = progress or (lambda _words, _share: None)
     require_dask()
     with ResultsFile(path, create=True) as results:
-        runs = list(runs_of(study, cache=cache, tell=lambda words: say(words, None)))
+        runs = list(runs_of(study, cache=cache, progress=lambda words: say(words, None)))
         stored = results.finished_keys()
         missing = [run for run in runs if run.key not in stored]
         added = failed = 0
         if missing:
             say("starting workers", None)
-            with _client(scheduler, workers) as client, _interruptions_noted() as stop_if_interrupted:
+            with connect(scheduler, workers) as client, interruptions_noted() as stop_if_interrupted:
                 _prepare(client, missing, cache, say)
                 for done, (run, answer) in enumerate(_answers(client, missing, cache), start=1):
                     new = results.add(run, answer)
@@ -127,93 +108,7 @@ def run_study(
     )
 
 
-def require_dask() -> None:
-    """Raise StudyError unless the libraries of studies are installed."""
-    try:
-        import distributed  # noqa: F401
-    except ImportError as error:
-        raise StudyError(
-            f"Studies need a library that is not installed ({error})",
-            expected="dask.distributed",
-            remedy="pip install 'lungaccess[study]'",
-        ) from error
-
-
-@contextlib.contextmanager
-def _client(scheduler: str | None, workers: int | None) -> Iterator[Client]:
-    """Connect to a scheduler, or start processes on this machine and stop them afterwards."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(DASK_CONFIG))
-        try:
-            if scheduler is None:
-                # Patients are mapped from files: dask would take that memory for a leak and stop a worker.
-                with _interruptions_ignored():
-                    cluster = LocalCluster(
-                        n_workers=workers or os.cpu_count() or 1,
-                        threads_per_worker=1,
-                        processes=True,
-                        memory_limit=0,
-                        dashboard_address="127.0.0.1:0",
-                        silence_logs=50,
-                    )
-                stack.enter_context(cluster)
-                client = Client(cluster)
-            else:
-                client = Client(scheduler, timeout=CONNECT_S)
-        except (OSError, ValueError, TypeError) as error:
-            raise StudyError(
-                f"No dask scheduler answers at {scheduler or 'this machine'} ({error})",
-                expected="an address such as tcp://host:8786 where `dask scheduler` runs",
-                remedy="Start it, or leave --scheduler out",
-            ) from error
-        yield stack.enter_context(client)
-
-
-@contextlib.contextmanager
-def _interruptions_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C, as processes that are started meanwhile will for all their life: it is for this one."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextlib.contextmanager
-def _interruptions_noted() -> Iterator[Callable[[], None]]:
-    """Yield a function that raises KeyboardInterrupt if Ctrl-C was pressed in the meantime.
-
-    Python drops exceptions that are raised while an object is being deleted, as dask's futures are all the
-    time: such an interruption would be lost.
-    """
-    pressed = threading.Event()
-
-    def stop_if_interrupted() -> None:
-        if pressed.is_set():
-            raise KeyboardInterrupt
-
-    def note(*_signal: object) -> None:
-        pressed.set()
-        raise KeyboardInterrupt
-
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
-        yield stop_if_interrupted
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield stop_if_interrupted
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _prepare(client: Client, runs: list[Run], cache: Path | None, say: Tell) -> None:
+def _prepare(client: Client, runs: list[Run], cache: Path | None, say: Progress) -> None:
     """Let one worker for each patient and system make the atlas, before all of them need it."""
     problems: dict[Any, Problem] = {}
     for run in runs:
@@ -248,9 +143,9 @@ def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tu
 
     waiting, under_way = iter(runs), dict[str, Run]()
     finished = as_completed(with_results=True, raise_errors=False)
-    room = _Room(client)
+    backlog = Backlog(client)
     while True:
-        for run in islice(waiting, max(0, room.count() - len(under_way))):
+        for run in islice(waiting, max(0, backlog.limit() - len(under_way))):
             key = task_key(run)
             future = client.submit(answer, run, cache, key=key, pure=False, retries=RETRIES)
             under_way[key] = run
@@ -271,22 +166,6 @@ def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tu
 def task_key(run: Run) -> str:
     """Return what dask calls a run; it keeps statistics by the word before the dash, one for all runs."""
     return f"run-{run.key}"
-
-
-class _Room:
-    """How many runs may be under way, by the number of workers, which is asked for now and then."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-        self._asked_s = -math.inf
-        self._count = LEAST_WAITING
-
-    def count(self) -> int:
-        """Return how many runs may be under way."""
-        if time.monotonic() - self._asked_s > COUNT_WORKERS_EVERY_S:
-            self._count = max(LEAST_WAITING, WAITING_A_WORKER * len(self._client.nthreads()))
-            self._asked_s = time.monotonic()
-        return self._count
 
 
 def _failed(run: Run, raised: Any) -> Answer:

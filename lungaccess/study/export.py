@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 BATCH = 5000
+"""Rows of a group in a Parquet file: large enough to compress well, small enough to hold in memory."""
 
 
 def export_csv(path: Path, folder: Path) -> list[Path]:

@@ -44,6 +44,7 @@ from lungaccess.study.runs import Problem, Run
 from lungaccess.study.settings import StudyError
 
 KEPT_PATIENTS = 2
+"""Runs come case by case, so that a worker needs the last patient and sometimes the next."""
 MIB = 2.0**20
 ANSWERS = (AnatomyError, PlanFileError, SettingsError, TargetError)
 """Errors that the run would end with on any machine, at any time."""
@@ -52,7 +53,7 @@ _one_at_a_time = threading.Lock()
 
 
 class Opened(NamedTuple):
-    """A patient and what is judged with."""
+    """A patient and the check that belongs to it."""
 
     lung: Lung
     checker: Checker

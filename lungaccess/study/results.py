@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import json
-import platform
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,16 +12,14 @@ from typing import Any, Self
 
 from anatomy.errors import FileError
 from anatomy.settings import to_mapping
-from lungaccess.plans.assemble import software_version
 from lungaccess.study.answers import Answer
+from lungaccess.study.file_errors import BUSY_S, damaged, file_errors
+from lungaccess.study.rows import add_rest, experiment_row, problem_row, run_row
 from lungaccess.study.runs import Problem, Run
 from lungaccess.study.schema import APPLICATION_ID, FORMAT, statements
-from stages.needle import TERMS
 
-BUSY_S = 60.0
 BATCH = 1000
-COST_COLUMNS = {term.key: term.key for term in TERMS} | {"length_mm": "solution_length"}
-"""The column of each cost; OMPL's benchmarks have one for the length."""
+"""Rows that are read at once: a few of them take no time, and all of them would fill the memory."""
 
 
 class ResultsFile:
@@ -47,7 +43,7 @@ class ResultsFile:
         self.path = Path(path)
         if not create and not self.path.is_file():
             raise FileError(f"There is no file {path}", expected="a results file of `lungaccess study run`")
-        with _told(self.path):
+        with file_errors(self.path):
             self._connection = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
             try:
                 self._begin()
@@ -78,7 +74,7 @@ class ResultsFile:
         self._connection.execute("PRAGMA foreign_keys = ON")
         verdict = self._connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
         if verdict != "ok":
-            raise _damaged(self.path, verdict)
+            raise damaged(self.path, verdict)
 
     def _is_new(self) -> bool:
         """Tell whether there is nothing in the file, which another process may be about to change."""
@@ -108,10 +104,10 @@ class ResultsFile:
         FileError
             If the file cannot be read.
         """
-        with _told(self.path):
+        with file_errors(self.path):
             cursor = self._connection.execute(query, values)
         while True:
-            with _told(self.path):
+            with file_errors(self.path):
                 batch = cursor.fetchmany(BATCH)
             if not batch:
                 return
@@ -125,7 +121,7 @@ class ResultsFile:
         FileError
             If the file cannot be read.
         """
-        with _told(self.path):
+        with file_errors(self.path):
             found = self._connection.execute(f"SELECT * FROM ({query}) LIMIT 0").description
         return tuple(each[0] for each in found)
 
@@ -144,16 +140,16 @@ class ResultsFile:
         FileError
             If the disk is full, another program holds the file for too long, or it is damaged.
         """
-        with _told(self.path), self._transaction() as connection:
+        with file_errors(self.path), self._transaction() as connection:
             connection.execute(
                 "DELETE FROM runs WHERE key = ? AND id IN (SELECT runid FROM outcomes WHERE failed)",
                 (run.key,),
             )
             experiment, planner = self._experiment(run.problem), self._planner(run)
-            made = connection.execute(*_run_row(run, answer, experiment, planner))
+            made = connection.execute(*run_row(run, answer, experiment, planner))
             if made.rowcount == 0:
                 return False
-            _add_rest(connection, int(made.lastrowid or 0), answer)
+            add_rest(connection, int(made.lastrowid or 0), answer)
             connection.execute(
                 "UPDATE experiments SET totaltime = totaltime + ?, runcount = (SELECT max(n) FROM "
                 "(SELECT count(*) AS n FROM runs WHERE experimentid = ? GROUP BY plannerid)) WHERE id = ?",
@@ -180,9 +176,9 @@ class ResultsFile:
         ).fetchone()
         if known:
             return int(known[0])
-        made = self._connection.execute(*_experiment_row(problem))
+        made = self._connection.execute(*experiment_row(problem))
         number = int(made.lastrowid or 0)
-        self._connection.execute(*_problem_row(problem, number))
+        self._connection.execute(*problem_row(problem, number))
         return number
 
     def _planner(self, run: Run) -> int:
@@ -193,118 +189,3 @@ class ResultsFile:
             "SELECT id FROM plannerConfigs WHERE name = ? AND settings = ?", row
         ).fetchone()
         return int(found[0])
-
-
-def _insert(table: str, row: dict[str, Any], how: str = "INSERT") -> tuple[str, tuple[Any, ...]]:
-    places = ", ".join("?" * len(row))
-    return f"{how} INTO {table} ({', '.join(row)}) VALUES ({places})", tuple(row.values())
-
-
-def _experiment_row(problem: Problem) -> tuple[str, tuple[Any, ...]]:
-    row = {
-        "name": problem.case,
-        "totaltime": 0.0,
-        "timelimit": problem.time_s or 0.0,
-        "memorylimit": 0.0,
-        "version": f"lungaccess {software_version()}",
-        "hostname": platform.node(),
-        "date": datetime.datetime.now().isoformat(sep=" ", timespec="seconds"),
-        "setup": json.dumps(problem.to_mapping() | {"devices": to_mapping(problem.system)}, sort_keys=True),
-        "target": problem.target,
-        "start": problem.start,
-    }
-    return _insert("experiments", row)
-
-
-def _problem_row(problem: Problem, experiment: int) -> tuple[str, tuple[Any, ...]]:
-    x, y, z = problem.target_lps
-    row = {
-        "experimentid": experiment,
-        "key": problem.key,
-        "case_name": problem.case,
-        "patient": problem.patient_name,
-        "lung": problem.patient.key,
-        "system": problem.system.name,
-        "fissures_allowed": problem.system.fissures_allowed,
-        "objective": problem.objective,
-        "target": problem.target,
-        "origin": problem.origin,
-        "x_lps_mm": x,
-        "y_lps_mm": y,
-        "z_lps_mm": z,
-        "start": problem.start,
-        "iterations": problem.iterations,
-        "time_s": problem.time_s,
-    }
-    return _insert("problems", row)
-
-
-def _run_row(run: Run, answer: Answer, experiment: int, planner: int) -> tuple[str, tuple[Any, ...]]:
-    first = answer.improvements[0].time_s if answer.improvements else None
-    row = {
-        "experimentid": experiment,
-        "plannerid": planner,
-        "time": answer.time_s,
-        "memory": answer.memory_mb,
-        "iterations": answer.iterations,
-        "solved": answer.solved,
-        "correct_solution": answer.accepted,
-        "status": answer.status,
-        "cpu_time": answer.cpu_s,
-        "first_solution_time": first,
-        "solutions": len(answer.improvements),
-        "seed": run.seed,
-        "cost": answer.costs.get(run.problem.objective),
-        **{column: answer.costs.get(key) for key, column in COST_COLUMNS.items()},
-        "key": run.key,
-    }
-    return _insert("runs", row, "INSERT OR IGNORE")
-
-
-def _add_rest(connection: sqlite3.Connection, run: int, answer: Answer) -> None:
-    outcome = (run, answer.outcome, answer.failed, answer.message, answer.advice)
-    connection.execute("INSERT INTO outcomes VALUES (?, ?, ?, ?, ?)", outcome)
-    if answer.plan:
-        connection.execute("INSERT INTO plans VALUES (?, ?, ?)", (run, answer.digest, answer.plan))
-    points = [(run, each.time_s, each.cost, each.iteration) for each in answer.improvements]
-    connection.executemany("INSERT INTO progress VALUES (?, ?, ?, ?)", points)
-    names = ("name", "ok", "value", "limit", "side", "tolerance", "unit", "detail")
-    findings = [(run, n, *(each[name] for name in names)) for n, each in enumerate(answer.findings, start=1)]
-    connection.executemany(f"INSERT INTO findings VALUES (?, ?{', ?' * len(names)})", findings)
-    counted = [(run, reason, count) for reason, count in answer.rejections.items()]
-    connection.executemany("INSERT INTO rejections VALUES (?, ?, ?)", counted)
-
-
-@contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Turn what SQLite raises into a FileError that says what to do."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-        if code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
-            raise FileError(
-                f"{path} cannot be written: {error}",
-                expected="room on the disk",
-                remedy="What is stored is sound: make room and start the study again, it goes on from there",
-            ) from error
-        if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-            raise FileError(
-                f"{path} has been locked by another program for {BUSY_S:g} s",
-                remedy="Close that program and start the study again, it goes on from there",
-            ) from error
-        if code in (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT):
-            raise _damaged(path, str(error)) from error
-        raise FileError(
-            f"{path} cannot be used: {error}",
-            expected="a folder that exists and may be written to",
-            remedy="Choose another file with --out",
-        ) from error
-
-
-def _damaged(path: Path, why: str) -> FileError:
-    return FileError(
-        f"{path} is damaged or is not a database: {why}",
-        expected="a results file of `lungaccess study run`",
-        remedy="Restore it from a copy, or choose another file with --out and run the study again",
-    )

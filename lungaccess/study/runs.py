@@ -149,7 +149,7 @@ class Run:
 
 
 def runs_of(
-    study: Study, *, cache: Path | None = None, tell: Callable[[str], None] | None = None
+    study: Study, *, cache: Path | None = None, progress: Callable[[str], None] | None = None
 ) -> Iterator[Run]:
     """Yield the runs of a study, case by case; each patient is opened once to find the targets.
 
@@ -159,7 +159,7 @@ def runs_of(
         If a patient or a system cannot be read, a target cannot be understood, or there is no such nodule.
     """
     for case in study.case:
-        (tell or (lambda _words: None))(f"targets of {case.name}")
+        (progress or (lambda _words: None))(f"targets of {case.name}")
         folder = Path(study.folder)
         patient = patient_of(case, folder, cache)
         name = str(folder / case.system) if case.system.endswith(".toml") else case.system

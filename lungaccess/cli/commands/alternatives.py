@@ -69,7 +69,7 @@ def alternatives(
     if output.json:
         terminal.show_json(_records(found, accepted, out))
         return ExitCode.of(not refused)
-    terminal.show([terminal.table(f"Ways to the target in {lung.name}", COLUMNS, _rows(found))])
+    terminal.show([terminal.table(f"Plans to the target in {lung.name}", COLUMNS, _rows(found))])
     terminal.say(f"Written to {out}; the check refuses {refused} of {len(found)}")
     return ExitCode.of(not refused)
 

@@ -16,25 +16,25 @@ def check(
     system: str | None = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Judge a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
+    """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
 
     Parameters
     ----------
     plan : Path
-        The plan.json to judge.
+        The plan.json to check.
     patient : Path
         Folder of the patient it was made for.
     system : str
-        Judge against this preset or TOML file instead of the devices stated in the plan.
+        Check against this preset or TOML file instead of the devices stated in the plan.
     """
-    from lungaccess.checking import check as judge
+    from lungaccess.checking import check as check_plan
     from lungaccess.cli.plan_tables import check_tables
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
 
     stored = Plan.load(plan)
     device = None if system is None else load_system(system)
-    report = judge(stored, output.load(patient, thick_slices=True), system=device)
+    report = check_plan(stored, output.load(patient, thick_slices=True), system=device)
     if output.json:
         terminal.show_json(report.to_mapping())
         return ExitCode.of(report.accepted)

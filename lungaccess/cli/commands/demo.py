@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 DEMO_SEED = 2
 """The first nodule of this synthetic patient can be reached."""
 DEMO_BUDGET_S = 3.0
+"""The cost has settled by then, and a first visitor does not wait long."""
 DEMO_SPACING_MM = 1.25
 """Coarse enough that the patient is made within seconds, fine enough for the airways of the plan."""
 

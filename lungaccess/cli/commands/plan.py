@@ -28,7 +28,7 @@ def plan(
     out: Path = Path("lungaccess-plan"),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the way to a target, check the plan, and write plan, pictures and cost over time.
+    """Plan the access to a target, check the plan, and write plan, pictures and cost over time.
 
     Parameters
     ----------

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
 
 HISTORY_FILE = "cost_over_time.csv"
+"""The command `plan` writes it beside the plan."""
 
 
 def report(
@@ -54,7 +55,7 @@ def report(
     seed : int
         Seed of that estimate.
     instructions : bool
-        Whether the scope's way is searched and told turn by turn.
+        Whether instructions for the scope are searched and listed turn by turn.
     """
     from lungaccess.plans.plan import Plan
     from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page

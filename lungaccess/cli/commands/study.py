@@ -59,7 +59,7 @@ def run(
     asked = read_study(study)
     with progress(asked.name) as shown:
         done = run_study(
-            asked, out, scheduler=scheduler, workers=workers, cache=output.cache, tell=shown.step
+            asked, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
         )
     if output.json:
         terminal.show_json(

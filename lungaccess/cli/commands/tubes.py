@@ -1,4 +1,4 @@
-"""The command `lungaccess tubes`: one deployment of the tubes, judged and drawn."""
+"""The command `lungaccess tubes`: one deployment of the tubes, checked against its limits and drawn."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def _draw(answer: TubeAnswer, out: Path) -> None:
         ]
     if answer.snap is not None:
         out_mm = ", ".join(f"{length:.1f}" for length in reversed(answer.snap.insertions_mm.tolist()))
-        notes += ["SNAPS on the way, at insertions", f"of {out_mm} mm (outer, inner)"]
+        notes += ["SNAPS during deployment, at insertions", f"of {out_mm} mm (outer, inner)"]
     tubes_png(
         answer.final,
         out,

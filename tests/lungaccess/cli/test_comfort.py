@@ -222,7 +222,7 @@ def test_a_name_with_a_letter_missing_is_found(name: str, place: int) -> None:
 @given(st.floats(0.0, 1e4), st.floats(0.0, 1.0))
 def test_the_time_left_is_in_proportion(passed_s: float, share: float) -> None:
     left = progress.remaining_s(passed_s, share, 1.0)
-    if share < progress.HONEST_SHARE:
+    if share < progress.LEAST_SHARE:
         assert left is None
     else:
         assert left is not None

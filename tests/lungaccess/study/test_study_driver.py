@@ -16,6 +16,7 @@ import pytest
 from distributed import LocalCluster
 
 from anatomy.errors import FileError
+from lungaccess.study import cluster as cluster_of_study
 from lungaccess.study import driver, one_run
 from lungaccess.study.answers import Answer
 from lungaccess.study.compare import differences
@@ -66,7 +67,9 @@ def test_a_study_goes_on_from_what_is_stored(
         results.add(runs[1], toy_answer(runs[1]))
 
     def start(study: Study) -> StudyDone:
-        return run_study(study, path, scheduler=cluster, cache=cache, tell=lambda *said: told.append(said))
+        return run_study(
+            study, path, scheduler=cluster, cache=cache, progress=lambda *said: told.append(said)
+        )
 
     done = start(study_of(content()))
     assert (done.runs, done.stored_before, done.added, done.failed) == (4, 1, 3, 0)
@@ -107,13 +110,13 @@ def test_a_run_that_cannot_be_made_is_stored_and_made_again(
 
 COUNT_THREADS = """
 import numba
-from lungaccess.study import driver
+from lungaccess.study import cluster
 
 def threads():
     return numba.config.NUMBA_NUM_THREADS
 
 if __name__ == "__main__":
-    with driver._client(None, 1) as client:
+    with cluster.connect(None, 1) as client:
         print(client.submit(threads).result())
 """
 
@@ -151,7 +154,7 @@ def test_an_interruption_ends_a_study_also_while_something_is_being_deleted(
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_study(study_of(content()), path, scheduler=cluster, cache=cache, tell=tell)
+            run_study(study_of(content()), path, scheduler=cluster, cache=cache, progress=tell)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
@@ -180,7 +183,7 @@ def test_only_a_few_runs_wait_at_the_scheduler_and_nothing_of_the_others_stays(
         study = study_of(content(seeds=list(range(30))))
         assert run_study(study, tmp_path / "r.db", scheduler=cluster, cache=cache).added == 60
     assert len(waiting) == 60
-    assert max(waiting) <= driver.LEAST_WAITING + 1
+    assert max(waiting) <= cluster_of_study.LEAST_RUNS + 1
     assert beginnings[-1] == beginnings[0], "statistics that dask keeps for good"
 
 
@@ -275,7 +278,7 @@ def test_a_worker_killed_midway_loses_nothing(tmp_path: Path, cache: Path) -> No
             workers[0].kill()
             killed.append(workers[0].pid)
 
-    done = run_study(study, disturbed, workers=1, cache=cache, tell=kill)
+    done = run_study(study, disturbed, workers=1, cache=cache, progress=kill)
     assert (done.added, done.failed, len(killed)) == (24, 0, 2)
     assert differences(quiet, disturbed) == []
 
@@ -302,7 +305,7 @@ def test_a_separate_scheduler_with_workers_gives_the_same(tmp_path: Path, cache:
         import json
 
         address = json.loads(file.read_text())["address"]
-        done = run_study(study, there, scheduler=address, cache=cache, tell=kill)
+        done = run_study(study, there, scheduler=address, cache=cache, progress=kill)
     assert (done.added, done.failed) == (24, 0)
     assert first.returncode == -signal.SIGKILL
     assert differences(here, there) == []

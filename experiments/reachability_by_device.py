@@ -21,7 +21,7 @@ from anatomy.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.system import System
-from lungaccess.reachability.reach_map import reachability
+from lungaccess.reachability.reach_map import map_reach
 from lungaccess.report import style
 
 
@@ -55,7 +55,7 @@ def shares_of(lung: Lung, system: System, size: Size) -> Iterator[tuple[float, F
             needle = replace(atlas.system.needle, max_curvature_per_mm=1.0 / radius)
             # Deployments do not depend on the needle.
             same = replace(atlas, system=replace(atlas.system, needle=needle))
-            found = reachability(lung, same.system, spacing_mm=size.spacing_mm, atlas=same)
+            found = map_reach(lung, same.system, spacing_mm=size.spacing_mm, atlas=same)
             reached.append(found.total.reached)
         yield diameter, np.array(reached)
 

@@ -23,18 +23,39 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree as AirwayTree
     from anatomy.errors import LungaccessError as LungaccessError
     from anatomy.lung import Lung as Lung
+    from lungaccess.checking import CheckReport as CheckReport
     from lungaccess.checking import check as check
-    from lungaccess.coupled.atlas import Atlas as Atlas
-    from lungaccess.coupled.atlas import build_atlas as build_atlas
-    from lungaccess.coupled.planner import plan as plan
+    from lungaccess.coupled import Alternative as Alternative
+    from lungaccess.coupled import Atlas as Atlas
+    from lungaccess.coupled import alternatives as alternatives
+    from lungaccess.coupled import build_atlas as build_atlas
+    from lungaccess.coupled import open_atlas as open_atlas
+    from lungaccess.coupled import plan as plan
+    from lungaccess.one_stage.needle import plan_needle as plan_needle
+    from lungaccess.one_stage.scope import advise_scope as advise_scope
+    from lungaccess.one_stage.tour import plan_tour as plan_tour
+    from lungaccess.one_stage.tubes import deploy_tubes as deploy_tubes
     from lungaccess.plans.no_plan import NoPlan as NoPlan
     from lungaccess.plans.plan import Plan as Plan
-    from lungaccess.problem.patients import load_patient as load_patient
-    from lungaccess.problem.system import System as System
-    from lungaccess.problem.system import load_system as load_system
-    from lungaccess.problem.system import preset_names as preset_names
-    from lungaccess.problem.target import Target as Target
-    from lungaccess.problem.target import resolve_target as resolve_target
+    from lungaccess.problem import System as System
+    from lungaccess.problem import Target as Target
+    from lungaccess.problem import load_patient as load_patient
+    from lungaccess.problem import load_system as load_system
+    from lungaccess.problem import peripheral_targets as peripheral_targets
+    from lungaccess.problem import point_target as point_target
+    from lungaccess.problem import preset_names as preset_names
+    from lungaccess.problem import resolve_target as resolve_target
+    from lungaccess.reachability.reach_map import compare_reach as compare_reach
+    from lungaccess.reachability.reach_map import map_reach as map_reach
+    from lungaccess.reachability.unreachable import UnreachableProof as UnreachableProof
+    from lungaccess.report.html import plan_page as plan_page
+    from lungaccess.risk.assessment import assess as assess
+    from lungaccess.risk.errors import ErrorModel as ErrorModel
+    from lungaccess.risk.errors import load_errors as load_errors
+    from lungaccess.risk.tolerances import tolerances as tolerances
+    from lungaccess.slicer import export_slicer as export_slicer
+    from lungaccess.study.driver import run_study as run_study
+    from lungaccess.study.settings import read_study as read_study
     from stages.needle import Objective as Objective
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -188,7 +188,7 @@ def reach_grid(lung: Lung, spacing_mm: float) -> Grid:
     return Grid(shape=(int(size[0]), int(size[1]), int(size[2])), lps_from_ijk=matrix)
 
 
-def reachability(
+def map_reach(
     lung: Lung,
     system: System,
     *,
@@ -256,7 +256,7 @@ def reachability(
     )
 
 
-def compare(
+def compare_reach(
     lung: Lung,
     systems: Iterable[System],
     *,
@@ -271,7 +271,7 @@ def compare(
     Parameters
     ----------
     lung, spacing_mm, arcs, trees, work
-        See `reachability`.
+        See `map_reach`.
     systems : iterable of System
     progress : callable, optional
         Told the name of the system and the share of its layers done.
@@ -285,9 +285,7 @@ def compare(
                 progress(name, share)
 
         maps.append(
-            reachability(
-                lung, system, spacing_mm=spacing_mm, arcs=arcs, trees=trees, work=work, progress=tell
-            )
+            map_reach(lung, system, spacing_mm=spacing_mm, arcs=arcs, trees=trees, work=work, progress=tell)
         )
     return tuple(maps)
 

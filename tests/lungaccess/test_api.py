@@ -24,6 +24,8 @@ FACADES = (
     "anatomy.segmentation",
     "anatomy.tree",
     "lungaccess",
+    "lungaccess.coupled",
+    "lungaccess.problem",
     "stages.needle",
     "stages.needle.kernels",
     "stages.scope",

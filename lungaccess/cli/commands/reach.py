@@ -48,7 +48,7 @@ def reach(
         HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
     """
     from lungaccess.problem.system import load_system
-    from lungaccess.reachability.reach_map import compare as compare_systems
+    from lungaccess.reachability.reach_map import compare_reach
     from lungaccess.report import reach_png
 
     names = [system.system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
@@ -58,7 +58,7 @@ def reach(
         require_writable_folder(page.parent)
     lung = output.load(patient)
     with progress("scanning") as shown:
-        maps = compare_systems(
+        maps = compare_reach(
             lung,
             systems,
             spacing_mm=spacing,

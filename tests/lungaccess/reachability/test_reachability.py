@@ -20,7 +20,14 @@ from anatomy.structures import AIRWAY, FISSURE, OBSTACLES, OUTSIDE
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.reachability.layers import _earlier_neighbours
-from lungaccess.reachability.reach_map import KINDS, NOT_COUNTED, ReachMap, compare, reach_grid, reachability
+from lungaccess.reachability.reach_map import (
+    KINDS,
+    NOT_COUNTED,
+    ReachMap,
+    compare_reach,
+    map_reach,
+    reach_grid,
+)
 from lungaccess.reachability.regions import LEFT, RIGHT, lung_regions
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment
 from stages.needle.path import direct_path
@@ -44,7 +51,7 @@ def environment(small_lung: Lung, atlas: la.Atlas) -> NeedleEnvironment:
 
 @pytest.fixture(scope="module")
 def reach(small_lung: Lung, atlas: la.Atlas) -> ReachMap:
-    return reachability(small_lung, SYSTEM, spacing_mm=SPACING_MM, atlas=atlas)
+    return map_reach(small_lung, SYSTEM, spacing_mm=SPACING_MM, atlas=atlas)
 
 
 def arcs_to(
@@ -109,7 +116,7 @@ def test_the_clearance_is_kept(
 
 def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     plain, searched, again = (
-        reachability(small_lung, SYSTEM, spacing_mm=14.0, atlas=atlas, trees=trees) for trees in (0, 1, 1)
+        map_reach(small_lung, SYSTEM, spacing_mm=14.0, atlas=atlas, trees=trees) for trees in (0, 1, 1)
     )
     gained = searched.kinds.array == SEARCHED
     assert gained.any()
@@ -134,14 +141,14 @@ def stop_at(share: float) -> Callable[[float], None]:
 
 def test_a_stopped_run_goes_on(small_lung: Lung, atlas: la.Atlas, reach: ReachMap, tmp_path: Path) -> None:
     with pytest.raises(StoppedError):
-        reachability(
+        map_reach(
             small_lung, SYSTEM, spacing_mm=SPACING_MM, atlas=atlas, work=tmp_path, progress=stop_at(0.7)
         )
     layers = sorted(tmp_path.glob(".reach-*/layer-*.npz"))
     assert len(layers) > 3
     layers[0].write_bytes(layers[0].read_bytes()[:40])
     layers[1].write_bytes(b"")
-    resumed = reachability(small_lung, SYSTEM, spacing_mm=SPACING_MM, atlas=atlas, work=tmp_path)
+    resumed = map_reach(small_lung, SYSTEM, spacing_mm=SPACING_MM, atlas=atlas, work=tmp_path)
     assert 0 < resumed.resumed_layers == len(layers) - 2
     for name in ("kinds", "cost", "clearance_mm"):
         assert np.array_equal(getattr(resumed, name).array, getattr(reach, name).array)
@@ -150,9 +157,9 @@ def test_a_stopped_run_goes_on(small_lung: Lung, atlas: la.Atlas, reach: ReachMa
 
 def test_another_question_does_not_go_on(small_lung: Lung, atlas: la.Atlas, tmp_path: Path) -> None:
     with pytest.raises(StoppedError):
-        reachability(small_lung, SYSTEM, spacing_mm=14.0, atlas=atlas, work=tmp_path, progress=stop_at(0.9))
+        map_reach(small_lung, SYSTEM, spacing_mm=14.0, atlas=atlas, work=tmp_path, progress=stop_at(0.9))
     other = replace(atlas, system=replace(SYSTEM, needle=replace(SYSTEM.needle, max_length_mm=60.0)))
-    begun = reachability(small_lung, other.system, spacing_mm=14.0, atlas=other, work=tmp_path)
+    begun = map_reach(small_lung, other.system, spacing_mm=14.0, atlas=other, work=tmp_path)
     assert begun.resumed_layers == 0
     assert list(tmp_path.glob(".reach-*/layer-*.npz"))
 
@@ -237,7 +244,7 @@ def test_devices_are_compared(small_lung: Lung) -> None:
     stiff = replace(SYSTEM, name="stiff", needle=replace(SYSTEM.needle, max_curvature_per_mm=0.002))
     thick = replace(SYSTEM, name="thick", scope=replace(SYSTEM.scope, outer_diameter_mm=15.0))
     told: list[str] = []
-    maps = compare(
+    maps = compare_reach(
         small_lung, (SYSTEM, stiff, thick), spacing_mm=25.0, progress=lambda name, _share: told.append(name)
     )
     shares = [each.total.reached for each in maps]
@@ -253,9 +260,9 @@ def test_bad_input_is_refused(
 ) -> None:
     for spacing in (0.1, 100.0, float("nan")):
         with pytest.raises(SettingsError, match="spacing"):
-            reachability(small_lung, SYSTEM, spacing_mm=spacing, atlas=atlas)
+            map_reach(small_lung, SYSTEM, spacing_mm=spacing, atlas=atlas)
     with pytest.raises(SettingsError, match="atlas was made for"):
-        reachability(small_lung, la.load_system("lung-default"), atlas=atlas)
+        map_reach(small_lung, la.load_system("lung-default"), atlas=atlas)
     with pytest.raises(SettingsError, match="at least 1 arc"):
         ReachScan(environment, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), arcs=0)
     finer = Volume(grid=reach_grid(small_lung, 10.0), array=np.zeros(reach_grid(small_lung, 10.0).shape))

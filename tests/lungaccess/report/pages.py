@@ -8,7 +8,7 @@ import lungaccess as la
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
-from lungaccess.reachability.reach_map import ReachMap, reachability
+from lungaccess.reachability.reach_map import ReachMap, map_reach
 from lungaccess.report.html import PageOptions, plan_page, reach_page
 
 SYSTEM = la.load_system("ultrathin")
@@ -24,7 +24,7 @@ def make_plans(lung: Lung) -> tuple[Plan, ...]:
 def make_reach(lung: Lung) -> ReachMap:
     """Return a coarse map."""
     atlas = la.build_atlas(lung, SYSTEM, rotations=8, stop_spacing_mm=6.0, site_spacing_mm=5.0)
-    return reachability(lung, SYSTEM, spacing_mm=9.0, atlas=atlas)
+    return map_reach(lung, SYSTEM, spacing_mm=9.0, atlas=atlas)
 
 
 def plan_file(plans: tuple[Plan, ...], lung: Lung, ct: Volume | None, folder: Path) -> Path:

@@ -216,7 +216,7 @@ def test_without_dask_the_error_says_what_to_install(
 
 
 def test_no_scheduler(tmp_path: Path, study: Study, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver, "CONNECT_S", 0.2)
+    monkeypatch.setattr(cluster_of_study, "CONNECT_S", 0.2)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:abc"):
         with pytest.raises(StudyError, match="No dask scheduler answers"):
             run_study(study, tmp_path / "r.db", scheduler=address, cache=cache)

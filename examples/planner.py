@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import lungaccess as la
-from lungaccess.coupled import METHODS, DirectArcs, Step, evaluated_step
+from lungaccess.coupled import METHODS, DirectArcs, Incumbent, Step, evaluated_step
 
 
 class RandomArcs:
@@ -23,12 +23,10 @@ class RandomArcs:
         self.order = np.random.default_rng(task.seed).permutation(self.arcs.in_workspace)
 
     def steps(self) -> Iterator[Step]:
-        best = float("inf")
+        incumbent = Incumbent()
         for iteration, entry in enumerate(self.order, start=1):
             candidate = self.arcs.candidate(int(entry))
-            step = evaluated_step(self.arcs.evaluator, "random arcs", candidate, iteration)
-            yield step if step.cost < best else Step(iteration=iteration, phase=step.phase)
-            best = min(best, step.cost)
+            yield incumbent.improved(evaluated_step(self.arcs.evaluator, "random arcs", candidate, iteration))
 
 
 METHODS["random-arcs"] = RandomArcs

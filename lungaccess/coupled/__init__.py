@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from lungaccess.coupled.planner import atlas_event as atlas_event
     from lungaccess.coupled.planner import plan as plan
     from lungaccess.coupled.search.atlas_search import AtlasSearch as AtlasSearch
+    from lungaccess.coupled.search.base import Incumbent as Incumbent
     from lungaccess.coupled.search.base import ParallelSearch as ParallelSearch
     from lungaccess.coupled.search.base import PlanSearch as PlanSearch
     from lungaccess.coupled.search.base import Step as Step

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from lungaccess.coupled.atlas import Atlas
@@ -114,7 +114,7 @@ class Incumbent:
         if step.candidate is not None and step.cost < self.cost:
             self.step = step
             return step
-        return replace(step, candidate=None)
+        return Step(iteration=step.iteration, phase=step.phase)
 
 
 def evaluated_step(

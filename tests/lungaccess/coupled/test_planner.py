@@ -20,6 +20,7 @@ from lungaccess.coupled import (
     METHODS,
     AtlasSearch,
     DirectArcs,
+    Incumbent,
     ProgressEvent,
     SearchSettings,
     Step,
@@ -304,12 +305,11 @@ class NearestArcs:
         self.blocked = self._arcs.evaluator.blocked
 
     def steps(self) -> Iterator[Step]:
-        best = math.inf
+        incumbent = Incumbent()
         for iteration, entry in enumerate(self._arcs.in_workspace.tolist(), start=1):
             candidate = self._arcs.candidate(entry)
             step = evaluated_step(self._arcs.evaluator, "nearest arcs", candidate, iteration)
-            yield step if step.cost < best else Step(iteration=iteration, phase=step.phase)
-            best = min(best, step.cost)
+            yield incumbent.improved(step)
 
 
 class TestOwnSearch:

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import FileError, FrameError
 from anatomy.grid import transform_points
-from anatomy.io.files import atomic_write
+from anatomy.io.files import atomic_write, require_suffix
 from anatomy.io.frames import LPS_FROM, Frame
 from anatomy.io.vtk_xml import VtkFile, VtkPiece, read_vtk_xml
 from anatomy.tree import tree_from_graph
@@ -136,8 +136,7 @@ def write_centerlines(path: str | Path, tree: AirwayTree) -> None:
     FileError
         If the name does not end in .vtp, or the file cannot be written.
     """
-    if Path(path).suffix.lower() != ".vtp":
-        raise FileError(f"{path} does not end in .vtp", expected="a .vtp file", remedy="Rename the file")
+    require_suffix(path, ".vtp")
     lines = []
     for b in range(tree.n_branches):
         nodes = tree.branch_points(b).tolist()

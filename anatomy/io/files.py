@@ -75,6 +75,20 @@ def require_writable_folder(folder: str | Path) -> Path:
     return folder
 
 
+def require_suffix(path: str | Path, suffix: str) -> None:
+    """Refuse a file to be written whose name does not end in `suffix`, in lower or upper case.
+
+    Raises
+    ------
+    FileError
+        If it ends differently.
+    """
+    if Path(path).suffix.lower() != suffix:
+        raise FileError(
+            f"{path} does not end in {suffix}", expected=f"a {suffix} file", remedy="Rename the file"
+        )
+
+
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Give a temporary name beside `path`, and rename it to `path` when the block succeeds.

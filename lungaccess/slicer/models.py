@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import FileError
 from anatomy.grid import Volume
-from anatomy.io.files import atomic_write
+from anatomy.io.files import atomic_write, require_suffix
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, smooth_surface
 from anatomy.typed import Float
@@ -129,8 +128,7 @@ def write_ply(path: str | Path, mesh: SurfaceMesh) -> None:
     FileError
         If the name does not end in .ply, or the file cannot be written.
     """
-    if Path(path).suffix.lower() != ".ply":
-        raise FileError(f"{path} does not end in .ply", expected="a .ply file", remedy="Rename the file")
+    require_suffix(path, ".ply")
     header = "\n".join(
         (
             "ply",

@@ -100,27 +100,27 @@ def test_a_doubled_slice_is_noticed(tmp_path, landmark):
         read_dicom(tmp_path)
 
 
-def test_uneven_spacing_is_noticed(tmp_path, landmark):
+@pytest.mark.parametrize(
+    ("moved", "error", "words"),
+    [
+        pytest.param(lambda y, z: (y, z + 0.02 * (z - 23) ** 2), FileError, "mm apart", id="uneven spacing"),
+        pytest.param(
+            lambda y, z: (y + np.tan(np.radians(12)) * (z - 23), z),
+            FrameError,
+            r"tilted by 12\.00 degrees",
+            id="tilted gantry",
+        ),
+    ],
+)
+def test_slices_that_are_no_grid_are_noticed(tmp_path, landmark, moved, error, words):
     write_series(tmp_path, landmark)
 
-    def stretch(header):
+    def move(header):
         x, y, z = (float(v) for v in header.ImagePositionPatient)
-        header.ImagePositionPatient = [x, y, z + 0.02 * (z - 23) ** 2]
+        header.ImagePositionPatient = [x, *moved(y, z)]
 
-    edit_slices(tmp_path, stretch)
-    with pytest.raises(FileError, match="mm apart"):
-        read_dicom(tmp_path)
-
-
-def test_a_tilted_gantry_is_noticed(tmp_path, landmark):
-    write_series(tmp_path, landmark)
-
-    def tilt(header):
-        x, y, z = (float(v) for v in header.ImagePositionPatient)
-        header.ImagePositionPatient = [x, y + np.tan(np.radians(12)) * (z - 23), z]
-
-    edit_slices(tmp_path, tilt)
-    with pytest.raises(FrameError, match=r"tilted by 12\.00 degrees"):
+    edit_slices(tmp_path, move)
+    with pytest.raises(error, match=words):
         read_dicom(tmp_path)
 
 

@@ -25,6 +25,18 @@ name = "Nobody"
 targets = ["lps 1 2 3"]
 """
 
+DESCRIBED = (
+    "patient.toml",
+    "masks/airway/mask.nii.gz",
+    "masks/lung/mask.nii.gz",
+    "arteries.nii.gz",
+    "labels.nii.gz",
+    "labels.json",
+    "detached.mhd",
+    "voxels.raw",
+)
+"""Files of a described patient whose content matters."""
+
 
 def _write(folder: Path, **files: str) -> None:
     for name, text in files.items():
@@ -61,34 +73,13 @@ def _changes(path: Path, change: Callable[[], object]) -> bool:
 
 def test_files_of_a_description_are_hashed_by_their_place(described: Path) -> None:
     hashes = input_hashes(described)
-    assert set(hashes) == {
-        "patient.toml",
-        "masks/airway/mask.nii.gz",
-        "masks/lung/mask.nii.gz",
-        "arteries.nii.gz",
-        "labels.nii.gz",
-        "labels.json",
-        "detached.mhd",
-        "voxels.raw",
-    }
+    assert set(hashes) == set(DESCRIBED)
     assert hashes["arteries.nii.gz"] == hashlib.sha256(b"arteries").hexdigest()
     assert input_hashes(described / "patient.toml") == hashes
     assert input_hashes(str(described)) == hashes
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "patient.toml",
-        "masks/airway/mask.nii.gz",
-        "masks/lung/mask.nii.gz",
-        "arteries.nii.gz",
-        "labels.nii.gz",
-        "labels.json",
-        "detached.mhd",
-        "voxels.raw",
-    ],
-)
+@pytest.mark.parametrize("name", DESCRIBED)
 def test_any_content_that_matters_changes_the_key(described: Path, name: str) -> None:
     file = described / name
     assert _changes(described, lambda: file.write_text(file.read_text() + "\n"))

@@ -12,18 +12,13 @@ from scipy import ndimage
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.io import read_volume
-from anatomy.phantom import LABELS, Phantom, make_phantom
+from anatomy.phantom import LABELS, Phantom
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.lungs import CLOSING_MM, Lungs, lungs_given, segment_lungs
 from anatomy.typed import Array, Float, Mask
 
 LEAST_DICE = 0.98
-
-
-@pytest.fixture(scope="module")
-def patient() -> Phantom:
-    return make_phantom(seed=3, size="small")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from anatomy.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume
-from anatomy.phantom import LABELS, Phantom, make_phantom
+from anatomy.phantom import LABELS, Phantom
 from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, digest_of, onto_grid
 from anatomy.segmentation.labels import sides_of
 from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
@@ -24,11 +24,6 @@ from anatomy.segmentation.request import Given, SegmentationRequest
 
 ALL = ("lungs", "airway", "nodule", "vessels", "cost map")
 IMAGES = ("lungs", "central_airway", "airway", "airway_wall", "nodule", "vesselness", "vessels", "cost")
-
-
-@pytest.fixture(scope="module")
-def patient() -> Phantom:
-    return make_phantom(seed=3, size="small")
 
 
 @pytest.fixture(scope="module")

@@ -49,13 +49,13 @@ if TYPE_CHECKING:
     from lungaccess.reachability.reach_map import map_reach as map_reach
     from lungaccess.reachability.unreachable import UnreachableProof as UnreachableProof
     from lungaccess.report.html import plan_page as plan_page
-    from lungaccess.risk.assessment import assess as assess
-    from lungaccess.risk.errors import ErrorModel as ErrorModel
-    from lungaccess.risk.errors import load_errors as load_errors
-    from lungaccess.risk.tolerances import tolerances as tolerances
+    from lungaccess.risk import ErrorModel as ErrorModel
+    from lungaccess.risk import assess as assess
+    from lungaccess.risk import find_tolerances as find_tolerances
+    from lungaccess.risk import load_errors as load_errors
     from lungaccess.slicer import export_slicer as export_slicer
-    from lungaccess.study.driver import run_study as run_study
-    from lungaccess.study.settings import read_study as read_study
+    from lungaccess.study import run_study as run_study
+    from lungaccess.study import read_study as read_study
     from stages.needle import Objective as Objective
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,1 +1,1 @@
-"""Plans: what they hold, how they are stored, joined, priced and turned into curves."""
+"""Plans: what they hold, how they are stored, joined, evaluated and turned into curves."""

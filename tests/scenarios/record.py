@@ -29,7 +29,7 @@ from tests.scenarios.cases import (
     Anatomy,
     Case,
 )
-from tests.scenarios.runs import Answer, answer_for, dearer, lost, needle_answers
+from tests.scenarios.runs import Answer, answer_for, costlier, lost, needle_answers
 from tests.scenarios.scenes import Scenes
 from tests.scenarios.shared_queries import SharedQueries
 
@@ -102,7 +102,7 @@ def keep(stored: dict[str, Any], name: str, iterations: int, answers: list[Answe
     costs = [None if answer.cost is None else float(f"{answer.cost:.7g}") for answer in answers]
     before = stored.get(name, {}).get("costs", [])
     if len(before) == len(costs):
-        for said in (lost(before, costs), dearer(before, costs, 0.0)):
+        for said in (lost(before, costs), costlier(before, costs, 0.0)):
             if said:
                 sys.stdout.write(f"{name}: worse than before: {said}\n")
     planned = sum(cost is not None for cost in costs)

@@ -109,7 +109,7 @@ def lost(stored: Sequence[Cost], found: Sequence[Cost]) -> list[int]:
     return [number for number, (then, now) in pairs if then is not None and now is None]
 
 
-def dearer(stored: Sequence[Cost], found: Sequence[Cost], tolerance: float) -> list[str]:
+def costlier(stored: Sequence[Cost], found: Sequence[Cost], tolerance: float) -> list[str]:
     """Tell for which targets the cost exceeds the stored one by more than the tolerance, or is no number."""
     out = []
     for number, (then, now) in enumerate(zip(stored, found, strict=True)):

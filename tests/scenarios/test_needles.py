@@ -15,7 +15,7 @@ from tests.scenarios.cases import (
     SHARED_QUERIES,
     Anatomy,
 )
-from tests.scenarios.runs import Answer, dearer, lost, needle_answers
+from tests.scenarios.runs import Answer, costlier, lost, needle_answers
 from tests.scenarios.scenes import Scenes
 from tests.scenarios.shared_queries import SharedQueries
 
@@ -27,7 +27,7 @@ def require_no_regression(stored: dict[str, Any], answers: list[Answer]) -> None
     found = [answer.cost for answer in answers]
     assert stored["iterations"] == NEEDLE_ITERATIONS
     assert lost(stored["costs"], found) == []
-    assert dearer(stored["costs"], found, COST_TOLERANCE) == []
+    assert costlier(stored["costs"], found, COST_TOLERANCE) == []
     assert [answer.faults for answer in answers if answer.faults] == []
 
 

@@ -1,4 +1,4 @@
-"""Plans of all stages: no target lost, none dearer, every plan valid, every run repeatable."""
+"""Plans of all stages: no target lost, none costlier, every plan valid, every run repeatable."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from tests.scenarios.cases import COST_TOLERANCE, PLANNERS, Case
 from tests.scenarios.conftest import AnswersOf, marked
-from tests.scenarios.runs import answer_for, dearer, lost
+from tests.scenarios.runs import answer_for, costlier, lost
 from tests.scenarios.scenes import Scenes
 
 pytestmark = pytest.mark.parametrize("case", marked())
@@ -22,7 +22,7 @@ def test_no_target_is_lost(case: Case, answers_of: AnswersOf, expected: dict[str
 
 def test_no_plan_is_dearer(case: Case, answers_of: AnswersOf, expected: dict[str, Any]) -> None:
     found = [answer.cost for answer in answers_of(case)]
-    assert dearer(expected["plans"][case.name]["costs"], found, COST_TOLERANCE) == []
+    assert costlier(expected["plans"][case.name]["costs"], found, COST_TOLERANCE) == []
 
 
 def test_every_plan_is_valid_and_every_refusal_names_a_stage(case: Case, answers_of: AnswersOf) -> None:

@@ -1,4 +1,4 @@
-"""The scenarios fail where they should: dearer plans, lost targets, plans that are too near to something."""
+"""The scenarios fail where they should: costlier plans, lost targets, plans that are too near to something."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lungaccess.plans import evaluator
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from tests.scenarios import runs
 from tests.scenarios.cases import CASES, COST_TOLERANCE, NEEDLE_PLANNERS
-from tests.scenarios.runs import answer_for, dearer, lost
+from tests.scenarios.runs import answer_for, costlier, lost
 from tests.scenarios.scenes import Scenes
 
 (CASE,) = (case for case in CASES if case.name == "phantom-1/flexure-needle/atlas-shortest")
@@ -26,10 +26,10 @@ def test_5_percent_are_seen_and_rounding_is_not(expected: dict[str, Any]) -> Non
     def times(factor: float) -> list[float | None]:
         return [None if cost is None else factor * cost for cost in stored]
 
-    assert len(dearer(stored, times(1.05), COST_TOLERANCE)) == known > 0
-    assert len(dearer(stored, times(np.nan), COST_TOLERANCE)) == known
-    assert dearer(stored, times(1.0 + 1e-6), COST_TOLERANCE) == []
-    assert dearer(stored, times(0.5), COST_TOLERANCE) == []
+    assert len(costlier(stored, times(1.05), COST_TOLERANCE)) == known > 0
+    assert len(costlier(stored, times(np.nan), COST_TOLERANCE)) == known
+    assert costlier(stored, times(1.0 + 1e-6), COST_TOLERANCE) == []
+    assert costlier(stored, times(0.5), COST_TOLERANCE) == []
 
 
 def test_a_lost_target_is_seen_and_a_new_one_is_no_fault() -> None:

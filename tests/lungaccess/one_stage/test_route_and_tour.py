@@ -123,11 +123,11 @@ def test_tour_of_a_patient(small_lung: Lung) -> None:
 
 def test_a_price_on_tissue_brings_exits_nearer(small_lung: Lung) -> None:
     lesions = places(small_lung, 5)
-    free, dear = (plan_tour(small_lung, lesions, tissue_weight=w) for w in (0.0, 50.0))
-    near, far = (sum(e.distance_mm for e in a.shortest.visits) for a in (dear, free))
+    free, costly = (plan_tour(small_lung, lesions, tissue_weight=w) for w in (0.0, 50.0))
+    near, far = (sum(e.distance_mm for e in a.shortest.visits) for a in (costly, free))
     assert near < far
-    assert free.shortest.length_mm < dear.shortest.length_mm
-    assert dear.shortest.cost_mm == pytest.approx(dear.shortest.length_mm + 50.0 * near)
+    assert free.shortest.length_mm < costly.shortest.length_mm
+    assert costly.shortest.cost_mm == pytest.approx(costly.shortest.length_mm + 50.0 * near)
 
 
 def test_a_lesion_out_of_reach_is_left_out_and_named(small_lung: Lung) -> None:

@@ -1,4 +1,4 @@
-"""The scenarios fail where they should: costlier plans, lost targets, plans that are too near to something."""
+"""The scenarios fail where they should: costlier plans, lost targets, plans too near to something."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from anatomy.typed import Float, Int
 from stages.needle.kernels import cost as kernel
 from stages.needle.kernels.proof import Obstacles
 from stages.needle.objective import TERMS, Term
-from stages.needle.path import ArcPath, _kernel_arcs
+from stages.needle.path import ArcPath, kernel_arcs
 
 SAMPLE_MM = 0.1
 EXACT_BELOW_VOXELS = 8.0
@@ -63,6 +63,13 @@ def voxels_crossed(grid: Grid, path: ArcPath) -> Int:
 
     They are those that hold more than 1e-9 mm of an arc, or an end of one.  What lies beyond the grid is
     left out.
+
+    Examples
+    --------
+    >>> grid = Grid.from_spacing((4, 4, 4), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+    >>> path = ArcPath(lps_from_start=np.eye(4), arcs=np.array([[2.0, 0.0, 0.0]]))
+    >>> voxels_crossed(grid, path).tolist()
+    [[0, 0, 0], [0, 0, 1], [0, 0, 2]]
     """
     voxels, _lengths = _crossings(grid, path)
     inside = np.unique(voxels[voxels != kernel.OFF_GRID])
@@ -125,7 +132,7 @@ def _crossings(grid: Grid, path: ArcPath) -> tuple[Int, Float]:
     geometry = corner_geometry(grid)
     found = [
         kernel.voxels_on_arc(grid.shape, geometry, pose, bend, length)[:2]
-        for pose, bend, length in _kernel_arcs(path)
+        for pose, bend, length in kernel_arcs(path)
     ]
     return np.concatenate([voxels for voxels, _ in found]), np.concatenate([lengths for _, lengths in found])
 

@@ -16,7 +16,6 @@ from anatomy.typed import Float, Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import least_cosine
-from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.proof import blocker_on_arc
 
 LENGTH, ROLL, CURVATURE = 0, 1, 2
@@ -69,13 +68,19 @@ class ArcPath:
             lengths.append(lengths[-1][-1] + s)
         return np.concatenate(points), np.concatenate(lengths)
 
-    def max_angle_from_start_rad(self) -> float:
-        """Return the largest angle between the tip and its direction at the start, on all of the path."""
-        start = self.lps_from_start[:3, 2]
+    def max_angle_from_start_rad(self, reference: Float | None = None) -> float:
+        """Return the largest angle between the tip and a direction, on all of the path.
+
+        Parameters
+        ----------
+        reference : (3,) float64, optional
+            Unit vector; by default the direction at the start.
+        """
+        direction = self.lps_from_start[:3, 2] if reference is None else reference
         least = 1.0
         for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
-            forward = float(start @ frame[:3, 2])
-            aside = float(start @ bend_direction(frame, roll))
+            forward = float(direction @ frame[:3, 2])
+            aside = float(direction @ bend_direction(frame, roll))
             least = min(least, least_cosine(forward, aside, length * curvature))
         return math.acos(least)
 
@@ -137,7 +142,9 @@ def path_from_tree(lps_from_start: Float, nodes: Float, parents: Int, last: int)
     return ArcPath(lps_from_start=lps_from_start, arcs=np.array(arcs))
 
 
-def blocker_on_path(environment: NeedleEnvironment, path: ArcPath, branch: int) -> int:
+def blocker_on_path(
+    environment: NeedleEnvironment, path: ArcPath, branch: int, inserted_mm: float = 0.0
+) -> int:
     """Prove every arc of a path clear; return 0, or the label of the voxel that is too near.
 
     Parameters
@@ -146,28 +153,20 @@ def blocker_on_path(environment: NeedleEnvironment, path: ArcPath, branch: int) 
     path : ArcPath
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
+    inserted_mm : float
+        Length of the needle behind the start of the path.
     """
-    start = 0.0
-    for pose, bend, length in _kernel_arcs(path):
-        label = blocker_on_arc(environment.obstacles, environment.limits, pose, bend, length, start, branch)
+    for pose, bend, length in kernel_arcs(path):
+        label = blocker_on_arc(
+            environment.obstacles, environment.limits, pose, bend, length, inserted_mm, branch
+        )
         if label:
             return int(label)
-        start += length
+        inserted_mm += length
     return 0
 
 
-def estimated_inverse_clearance(environment: NeedleEnvironment, path: ArcPath) -> float:
-    """Return the integral of 1 / clearance along a path from the kernel's estimate of distances."""
-    step = environment.limits.cost_step_mm
-    return float(
-        sum(
-            inverse_clearance_on_arc(environment.obstacles, step, pose, bend, length)
-            for pose, bend, length in _kernel_arcs(path)
-        )
-    )
-
-
-def _kernel_arcs(path: ArcPath) -> Iterator[tuple[tuple[float, ...], tuple[float, ...], float]]:
+def kernel_arcs(path: ArcPath) -> Iterator[tuple[tuple[float, ...], tuple[float, ...], float]]:
     """Yield each arc as the kernels take it: `pose`, `bend` and length."""
     for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
         pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))

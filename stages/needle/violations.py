@@ -7,11 +7,8 @@ import math
 import numpy as np
 
 from anatomy.structures import BITS
-from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels.connections import least_cosine
-from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.path import ArcPath, bend_direction
+from stages.needle.path import ArcPath, blocker_on_path
 from stages.needle.query import Query
 
 SAME_MM = 1e-6
@@ -48,36 +45,12 @@ def violation(
             ((curvatures >= 0.0) & (curvatures <= needle.max_curvature_per_mm * (1.0 + SAME_MM))).all()
         ),
         "turns too far in all": turned <= math.radians(needle.max_accumulated_turn_deg) + SAME_RAD,
-        "points too far from its direction at the start": largest_angle_rad(path, reference)
+        "points too far from its direction at the start": path.max_angle_from_start_rad(reference)
         <= math.radians(needle.max_angle_from_start_deg) + SAME_RAD,
         "misses the target": np.linalg.norm(path.frames()[-1][:3, 3] - query.target) <= tolerance + SAME_MM,
     }
     for reason, passed in tests.items():
         if not passed:
             return reason
-    label = _blocker(environment, query, path)
+    label = blocker_on_path(environment, path, query.branch, query.inserted_mm)
     return "" if label == 0 else "too near: " + next(name for name, bit in BITS.items() if label & bit)
-
-
-def largest_angle_rad(path: ArcPath, reference: Float) -> float:
-    """Return the largest angle between the tip and a direction (3,) on all of a path."""
-    least = 1.0
-    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
-        forward, aside = float(reference @ frame[:3, 2]), float(reference @ bend_direction(frame, roll))
-        least = min(least, least_cosine(forward, aside, length * curvature))
-    return math.acos(least)
-
-
-def _blocker(environment: NeedleEnvironment, query: Query, path: ArcPath) -> int:
-    """Prove every arc clear as `blocker_on_path` does, behind what is inserted already."""
-    begin = query.inserted_mm
-    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs.tolist(), strict=False):
-        pose = (*frame[:3, 3].tolist(), *frame[:3, 2].tolist())
-        bend = (curvature, *bend_direction(frame, roll).tolist())
-        label = blocker_on_arc(
-            environment.obstacles, environment.limits, pose, bend, length, begin, query.branch
-        )
-        if label:
-            return int(label)
-        begin += length
-    return 0

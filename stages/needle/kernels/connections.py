@@ -138,25 +138,6 @@ def workspace_length(rho, h, limits):
 
 
 @numba.njit(cache=True)
-def in_spindle(a, q, b, kappa):
-    """Tell whether a point lies on a path from `a` to `b` that turns by less than 180 degrees.
-
-    The spindle is swept by the minor arcs of radius R through both points, a distance D apart.  From any
-    point of such an arc they are seen under the angle pi - asin(D / 2R); from points inside, under a larger
-    one.  Where D is 2R or more nothing is excluded.
-    """
-    dax, day, daz = a[0] - q[0], a[1] - q[1], a[2] - q[2]
-    dbx, dby, dbz = b[0] - q[0], b[1] - q[1], b[2] - q[2]
-    cx, cy, cz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    sine2 = 0.25 * kappa * kappa * (cx * cx + cy * cy + cz * cz)
-    if sine2 >= 1.0:
-        return True
-    dot = dax * dbx + day * dby + daz * dbz
-    norms2 = (dax * dax + day * day + daz * daz) * (dbx * dbx + dby * dby + dbz * dbz)
-    return dot <= -math.sqrt((1.0 - sine2) * norms2) + TINY
-
-
-@numba.njit(cache=True)
 def least_cosine(forward, aside, turn):
     """Return the least value of `forward cos a + aside sin a` for `a` from 0 to `turn`.
 

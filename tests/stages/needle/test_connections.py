@@ -104,39 +104,6 @@ def test_no_path_is_shorter_and_none_leads_out_of_the_trumpet() -> None:
             assert connections.shortest_path(rho, h, KAPPA, math.pi / 2 + 0.01, math.pi) < math.inf
 
 
-def test_points_of_paths_lie_in_the_spindle() -> None:
-    rng = np.random.default_rng(2)
-    inside = 0
-    for _ in range(300):
-        pose = START
-        points = [np.zeros(3)]
-        turn = 0.0
-        for _arc in range(3):
-            roll, length = rng.uniform(0, 2 * math.pi), rng.uniform(1, 40)
-            nx, ny, nz = connections.any_normal(*pose[3:])
-            normal = np.array([nx, ny, nz])
-            normal = math.cos(roll) * normal + math.sin(roll) * np.cross(pose[3:], normal)
-            bend = (KAPPA * rng.uniform(), *(float(v) for v in normal))
-            turn += bend[0] * length
-            points += [np.array(pose_on_arc(pose, bend, s)[:3]) for s in np.linspace(0, length, 15)[1:]]
-            pose = pose_on_arc(pose, bend, length)
-        if turn >= math.pi:
-            continue
-        for q in points[1:-1]:
-            assert connections.in_spindle(tuple(points[0]), tuple(q), tuple(points[-1]), KAPPA)
-        inside += 1
-    assert inside > 100
-
-
-def test_the_edge_of_the_spindle() -> None:
-    """The arc of the tightest curvature is its edge; a point a little farther out is not in it."""
-    a, b = (0.0, 0.0, -30.0), (0.0, 0.0, 30.0)
-    sagitta = RADIUS - math.sqrt(RADIUS**2 - 900)
-    assert connections.in_spindle(a, (sagitta - 1e-6, 0.0, 0.0), b, KAPPA)
-    assert not connections.in_spindle(a, (0.0, sagitta + 1e-6, 0.0), b, KAPPA)
-    assert not connections.in_spindle(a, (0.0, 0.0, 30.1), b, KAPPA)
-
-
 def test_a_goal_just_out_of_reach_is_reached_within_the_tolerance() -> None:
     def workspace_length(goal_tolerance_mm: float) -> float:
         values = dict.fromkeys(Limits._fields, 0.0) | {"kappa": KAPPA, "max_length_mm": 150.0}

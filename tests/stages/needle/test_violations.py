@@ -14,7 +14,7 @@ from stages.needle.device import Needle
 from stages.needle.environment import needle_environment
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
-from stages.needle.violations import largest_angle_rad, violation
+from stages.needle.violations import violation
 from tests.stages.scenes import Canvas
 
 AROUND = np.array([[20.0, math.pi / 2, 1 / 60], [35.0, math.pi, 1 / 60]])
@@ -96,11 +96,11 @@ def test_numbers_that_are_no_arcs_are_refused(value: float) -> None:
 
 def test_the_largest_angle_to_a_direction() -> None:
     path = around()
-    assert largest_angle_rad(path, start()[:3, 2]) == pytest.approx(path.max_angle_from_start_rad())
+    assert path.max_angle_from_start_rad(start()[:3, 2]) == path.max_angle_from_start_rad()
     frames = np.concatenate([ArcPath(lps_from_start=f, arcs=[[s, r, k]]).frames()[-1:, :3, 2]
                              for f, (length, r, k) in zip(path.frames(), path.arcs, strict=False)
                              for s in np.linspace(0.0, length, 50)])  # fmt: skip
     direction = np.array([0.6, 0.0, 0.8])
-    assert largest_angle_rad(path, direction) == pytest.approx(
+    assert path.max_angle_from_start_rad(direction) == pytest.approx(
         math.acos((frames @ direction).min()), abs=1e-3
     )

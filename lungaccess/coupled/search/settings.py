@@ -30,7 +30,7 @@ class SearchSettings:
     perturbations : int
         Perturbed copies of the best candidate that join the successive halving of each round.
     samplings : int
-        Iterations of local sampling in each round.
+        Iterations of local sampling in each round; with one or more, every round has an iteration.
     needle_searches : int
         Runs of the needle's optimal search in each round.
     needle_iterations : int
@@ -48,7 +48,7 @@ class SearchSettings:
     rungs: Annotated[int, quantity("rungs of a halving", at_least=1, at_most=30)] = 5
     rung_iterations: Annotated[int, quantity("iterations on the first rung", at_least=1, at_most=10_000)] = 3
     perturbations: Annotated[int, quantity("perturbed copies a round", at_least=0, at_most=1000)] = 2
-    samplings: Annotated[int, quantity("local samplings a round", at_least=0, at_most=1000)] = 6
+    samplings: Annotated[int, quantity("local samplings a round", at_least=1, at_most=1000)] = 6
     needle_searches: Annotated[int, quantity("needle searches a round", at_least=0, at_most=1000)] = 4
     needle_iterations: Annotated[
         int, quantity("iterations of a needle search", at_least=1, at_most=1_000_000)

@@ -335,14 +335,15 @@ class TestSearchSettings:
     def test_other_settings_give_other_plans(
         self, small_lung: Lung, target: Target, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        few = SearchSettings(starts=1, rungs=2, samplings=0, needle_searches=0)
+        few = SearchSettings(starts=1, rungs=2, samplings=1, needle_searches=0)
         monkeypatch.setitem(METHODS, "few", partial(AtlasSearch, settings=few))
         plans = plans_of(small_lung, target, atlas, method="few")
         assert plans[-1].digest != plans_of(small_lung, target, atlas)[-1].digest
 
     def test_absurd_ones_are_refused(self) -> None:
-        with pytest.raises(SettingsError, match="rungs"):
-            SearchSettings(rungs=0)
+        for name in ("rungs", "samplings", "starts"):
+            with pytest.raises(SettingsError, match=name):
+                SearchSettings(**{name: 0})
 
 
 class TestBadInput:

@@ -38,6 +38,10 @@ if TYPE_CHECKING:
     from anatomy.segmentation import read_ct as read_ct
     from anatomy.segmentation import segment as segment
     from anatomy.store import open_lung as open_lung
+    from anatomy.structures import AIRWAY as AIRWAY
+    from anatomy.structures import FISSURE as FISSURE
+    from anatomy.structures import OUTSIDE as OUTSIDE
+    from anatomy.structures import VESSEL as VESSEL
     from anatomy.tree import tree_from_graph as tree_from_graph
     from anatomy.tree import tree_from_mask as tree_from_mask
     from anatomy.tree_report import TreeReport as TreeReport

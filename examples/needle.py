@@ -7,10 +7,8 @@ with two objectives: the shortest path, and the least integral of 1 / clearance.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from anatomy.grid import Grid
-from anatomy.structures import VESSEL
-from stages.needle import PLANNERS, Needle, Objective, Query
-from stages.needle.environment import environment_of_labels
+from anatomy import VESSEL, Grid
+from stages.needle import PLANNERS, Needle, Objective, Query, environment_of_labels
 
 grid = Grid.from_spacing((64, 64, 64), (1.0, 1.0, 1.0), (-31.5, -31.5, -31.5))
 i, j, k = np.meshgrid(*[np.arange(64) - 31.5] * 3, indexing="ij")

@@ -15,6 +15,7 @@ HERE = Path(__file__).parent
 NAMES = (
     "patient",
     "sites",
+    "advisor",
     "tubes",
     "needle",
     "coupled_plan",

@@ -33,7 +33,16 @@ NODULE_NEIGHBOUR_MM = 1.4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedTree:
-    """A tree with radii `(N,)` mm by point of lumen and outside, and `freedom` `(B,)` of `paint_tree`."""
+    """A tree of B branches and N points, ready to be drawn.
+
+    Parameters
+    ----------
+    sprouts : Sprouts
+    inner_mm, outer_mm : (N,) float64
+        Radius of the lumen and of the outside at each point; the same for a vessel.
+    freedom : (B,) uint8
+        Where a branch may be drawn, see `paint_tree`.
+    """
 
     sprouts: Sprouts
     inner_mm: Float

@@ -49,7 +49,15 @@ SQUEEZE = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Obstacles:
-    """Balls `(N, 3)` LPS mm with radii `(N,)` mm that vessels keep away from."""
+    """Balls that vessels keep away from.
+
+    Parameters
+    ----------
+    centres : (N, 3) float64
+        LPS mm.
+    radii : (N,) float64
+        In mm.
+    """
 
     centres: Float
     radii: Float

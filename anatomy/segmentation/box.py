@@ -17,7 +17,15 @@ BOX_PAD_MM = 10.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Box:
-    """A box of voxels `low <= ijk < high` of a grid."""
+    """A box of voxels of a grid.
+
+    Parameters
+    ----------
+    grid : Grid
+        The whole grid.
+    low, high : (3,) int64
+        The voxels of the box are `low <= ijk < high`.
+    """
 
     grid: Grid
     low: Int

@@ -17,20 +17,27 @@ MAX_TURN_COS = 0.5
 NEAR_MM = 5.0
 """The side of a gap that faces it is judged from the voxels within this distance."""
 
-COURSE_MM = 15.0
+STRETCH_MM = 15.0
 ELONGATION = 1.5
-"""A piece runs along an axis if, within `COURSE_MM`, its variance along it is this many times the next."""
+"""A piece runs along an axis if, within `STRETCH_MM`, its variance along it is this many times the next."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Piece:
-    """A separate piece of the mask, `(M, 3)` voxel indices."""
+    """A separate piece of the mask.
+
+    Parameters
+    ----------
+    voxels : (M, 3) int64
+        Its voxels, ijk.
+    """
 
     voxels: Int
 
     MIN_VOXELS: ClassVar[int] = 10
     """Fewer voxels are noise and have no direction."""
     MIN_EXTENT_MM: ClassVar[float] = 3.0
+    """A shorter piece may point anywhere."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,10 +135,10 @@ def _in_direction(near: Int, far: Int, begin: Int, end: Int, spacing_mm: Float) 
         return False
     offset = (far - end) * spacing_mm
     reach = np.linalg.norm(offset, axis=1)
-    variance, axes = np.linalg.eigh(np.cov(offset[reach <= COURSE_MM], rowvar=False))
+    variance, axes = np.linalg.eigh(np.cov(offset[reach <= STRETCH_MM], rowvar=False))
     if variance[2] >= ELONGATION * variance[1]:
         return bool(abs(axes[:, 2] @ across) >= MAX_TURN_COS)
-    return bool(reach.max() > COURSE_MM)
+    return bool(reach.max() > STRETCH_MM)
 
 
 def _towards(voxels: Int, contact: Int, spacing_mm: Float) -> Float:

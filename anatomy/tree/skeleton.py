@@ -30,7 +30,19 @@ SPUR_MAX_MM = 3.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SkeletonTree:
-    """An unrooted tree; `neighbours[n]` lists the nodes next to n, empty for nodes taken off."""
+    """An unrooted tree of N nodes.
+
+    Parameters
+    ----------
+    ijk : (N, 3) int64
+        Voxels of the nodes.
+    mm : (N, 3) float64
+        The same times the spacing.
+    depth_mm : (N,) float64
+        Distance of each node to the border of the lumen.
+    neighbours : list of list of int
+        The nodes next to each node; none for nodes that were taken off.
+    """
 
     ijk: Int
     mm: Float

@@ -40,7 +40,17 @@ MAX_TILT_COS = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trunk:
-    """An end of the tree followed inwards over thin side branches to where it divides."""
+    """An end of the tree followed inwards over thin side branches to where it divides.
+
+    Parameters
+    ----------
+    nodes : list of int
+        From the end to the division.
+    radius_mm, length_mm : float
+        Its median radius, and its length along the nodes.
+    divides : bool
+        Whether it ends at a division, not at another end.
+    """
 
     nodes: list[int]
     radius_mm: float

@@ -35,7 +35,16 @@ LEAST_COST = 1.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scenario:
-    """A start pose and a goal, and the share of short searches that solve it."""
+    """A start pose and a goal.
+
+    Parameters
+    ----------
+    name : str
+        Of `SCENARIOS`.
+    query : Query
+    solved_share : float
+        Share of `TRIES` short searches that find a path.
+    """
 
     name: str
     query: Query

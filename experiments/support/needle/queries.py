@@ -38,12 +38,30 @@ GENERATED_RADII_MM = (50.0, 121.0)
 GENERATED_MM = (20.0, 50.0)
 GENERATED_CONE_RAD = 0.5
 AROUND_VOXELS = 3
+"""No obstacle lies within so many voxels of a drawn target: a tip can stop there."""
 EXEMPT_MM = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Query:
-    """A start pose, a target and a needle's radius of curvature, with what is known of them."""
+    """A start pose, a target and a needle, with what is known of them.
+
+    Parameters
+    ----------
+    name : str
+    patient : int
+    radius_mm : float
+        The needle's least radius of curvature.
+    lps_from_start : (4, 4) float64
+    target_lps : (3,) float64
+        LPS mm.
+    exempt_mm : float
+        Obstacles so near to the start do not count.
+    known : dict
+        What was recorded with the query.
+    runs : tuple of dict
+        Recorded runs of another planner.
+    """
 
     name: str
     patient: int

@@ -100,7 +100,7 @@ def sampled_route(
         centreline.nodes_mm, goal, centreline.cones, *centreline.cells, np.array(numbers),
         chosen.neighbours if star else 0, points, parent, cost, counts, state,
     ):  # fmt: skip
-        found = interpolate(_way_to_root(points, parent, int(counts[2]), goal))
+        found = interpolate(_path_to_root(points, parent, int(counts[2]), goal))
         proved = prove(
             found,
             centreline,
@@ -116,7 +116,7 @@ def sampled_route(
     return found, proved
 
 
-def _way_to_root(points: Float, parent: Int, vertex: int, goal: Float) -> Float:
+def _path_to_root(points: Float, parent: Int, vertex: int, goal: Float) -> Float:
     """Return the vertices from the root to the goal, `(V, 3)`."""
     path = [goal]
     while vertex >= 0:

@@ -34,7 +34,17 @@ NEAREST_ENDS_MM = 20.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tubes:
-    """Tubes to plan in, with what is known of them beforehand."""
+    """Tubes to plan in, with what is known of them beforehand.
+
+    Parameters
+    ----------
+    name : str
+    centreline : Centreline
+    links : Links
+        Which points of the centreline are neighbours.
+    root : int
+        The point of the centreline at which trials begin.
+    """
 
     name: str
     centreline: Centreline

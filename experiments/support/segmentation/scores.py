@@ -25,7 +25,15 @@ AUC_SAMPLES = 200_000
 
 @dataclass(frozen=True, kw_only=True)
 class F1:
-    """Mean F1 of several draws of points: at the best threshold of each, and at the fixed one."""
+    """Mean F1 of several draws of points.
+
+    Parameters
+    ----------
+    best, best_threshold : float
+        At the best threshold of each draw, and the mean of these thresholds.
+    fixed, fixed_deviation : float
+        At the fixed threshold, and its standard deviation over the draws.
+    """
 
     best: float
     best_threshold: float

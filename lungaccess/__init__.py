@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     from lungaccess.risk import find_tolerances as find_tolerances
     from lungaccess.risk import load_errors as load_errors
     from lungaccess.slicer import export_slicer as export_slicer
-    from lungaccess.study import run_study as run_study
     from lungaccess.study import read_study as read_study
+    from lungaccess.study import run_study as run_study
     from stages.needle import Objective as Objective
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,7 +1,7 @@
 """Lead a bronchoscope to a lesion.
 
-The advisor computes the motions of a real scope, advance, twist and bend, with its true radius inside the lumen.
-It prints instructions for each bifurcation. The picture shows the path of the tip from the front.
+The advisor computes motions of a real scope (advance, twist and bend), with its true radius inside the lumen.
+The script prints instructions for each bifurcation. The picture shows the path of the tip from the front.
 """
 
 import matplotlib.pyplot as plt

@@ -26,6 +26,8 @@ FACADES = (
     "lungaccess",
     "lungaccess.coupled",
     "lungaccess.problem",
+    "lungaccess.risk",
+    "lungaccess.study",
     "stages.needle",
     "stages.needle.kernels",
     "stages.scope",

@@ -14,6 +14,7 @@ import pytest
 import lungaccess as la
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.phantom import make_phantom, write_phantom
+from lungaccess.cli.app import _with_nodule_number, app
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/tutorial.md")
@@ -66,6 +67,17 @@ def test_the_pages_have_code() -> None:
         found = BLOCK.findall((ROOT / page).read_text())
         assert sum(len(commands(text)) for kind, text in found if kind == "console") >= 5
         assert any(kind == "python" for kind, _text in found)
+
+
+@pytest.mark.parametrize(
+    "page", sorted((ROOT / "docs").glob("*.md")) + [ROOT / "README.md"], ids=lambda p: p.name
+)
+def test_every_command_has_the_options_of_the_command_line(page: Path) -> None:
+    """Commands in a console block of any page, with names in capitals for what the reader knows."""
+    for kind, text in BLOCK.findall(page.read_text(encoding="utf-8")):
+        for words in commands(text) if kind == "console" else ():
+            if words[0] == "lungaccess":
+                app.parse_args(_with_nodule_number(words[1:]), print_error=False, exit_on_error=False)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume
 from benchmarks.fresh import FreshProcess
 from stages.scope.advisor.advisor import Advisor, start_state
-from stages.scope.advisor.best_motion import Weights, best_motion
+from stages.scope.advisor.best_motion import Weights, evaluate_motions
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
@@ -76,11 +76,11 @@ class Stage:
 
     def time_best_motion(self) -> None:
         """121 candidates with the true radius."""
-        best_motion(self.advisor.environment, self.start, 5.0, Weights())
+        evaluate_motions(self.advisor.environment, self.start, 5.0, Weights())
 
     def time_best_motion_printed_rules(self) -> None:
         """121 candidates with eq. 1."""
-        best_motion(self.printed.environment, self.start, 5.0, Weights())
+        evaluate_motions(self.printed.environment, self.start, 5.0, Weights())
 
     def time_path(self) -> None:
         """A path with retreats, if it needs any."""

@@ -18,7 +18,7 @@ from stages.tube import (
     DEFAULT_STOP_MM,
     Deployments,
     enumerate_deployments,
-    joined,
+    join_deployments,
     tracking_length_mm,
 )
 
@@ -118,7 +118,7 @@ def build_atlas(
     if straight < places.count:
         # Tips turned aside look in so many directions that each of them needs fewer rotations and stops.
         coarse = max(1, rotations // TURNED_COARSER), stop_spacing_mm * TURNED_COARSER
-        found = joined(found, enumerated(places.poses[straight:], *coarse, share, 1.0), straight)
+        found = join_deployments(found, enumerated(places.poses[straight:], *coarse, share, 1.0), straight)
     return Atlas(
         lung=lung,
         system=system,

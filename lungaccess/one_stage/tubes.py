@@ -27,7 +27,7 @@ from stages.tube import (
     TubeMechanics,
     check_nesting,
     deploy,
-    judge_design,
+    evaluate_design,
     kuntz2015,
     least_sweep_sequence,
     propose_designs,
@@ -176,9 +176,7 @@ def compare_sequences(answer: TubeAnswer) -> SequenceComparison:
     """Compare the sequences that lead to the same deployment."""
     final = answer.final
     angles = np.array([answer.rotation_rad, answer.rotation_rad + answer.relative_rad]) + BEND_RAD
-    return least_sweep_sequence(
-        final.mechanics.tubes, angles, (answer.inner_mm, answer.outer_mm), mechanics=final.mechanics
-    )
+    return least_sweep_sequence(final.mechanics.tubes, angles, (answer.inner_mm, answer.outer_mm))
 
 
 def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProposal, ...]]:
@@ -200,7 +198,7 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
             remedy="Give a system, not just two tubes",
         )
     limits = MakerLimits(channel_diameter_mm=system.scope.channel_diameter_mm)
-    present = judge_design(system.tubes, answer.outer_mm, answer.inner_mm)
+    present = evaluate_design(system.tubes, answer.outer_mm, answer.inner_mm)
     found = propose_designs(
         system.tubes, answer.outer_mm, answer.inner_mm, system.tubes.max_lateral_sweep_mm, limits
     )

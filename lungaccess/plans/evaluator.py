@@ -31,7 +31,7 @@ from stages.needle import (
     workspace_lengths,
 )
 from stages.scope import ScopeTip
-from stages.tube import Deployment, TubeJudge
+from stages.tube import Deployment, DeploymentValidator
 
 
 class NeedleArrays(NamedTuple):
@@ -70,7 +70,7 @@ class CandidateEvaluator:
     ----------
     environment : NeedleEnvironment
         What the needle collides with, and its limits.
-    tubes : TubeJudge
+    tubes : DeploymentValidator
         Validates deployments of the tubes.
     blocked : Counter of str
         How many direct arcs were stopped, by what stopped them.
@@ -82,7 +82,7 @@ class CandidateEvaluator:
         self.environment: NeedleEnvironment = needle_environment(
             task.lung, system.needle, system.margins, with_fissures=fissures
         )
-        self.tubes = TubeJudge(task.lung, system.tubes, system.margins, with_fissures=fissures)
+        self.tubes = DeploymentValidator(task.lung, system.tubes, system.margins, with_fissures=fissures)
         self.blocked: Counter[str] = Counter()
 
     def cost(self, path: ArcPath) -> float:
@@ -110,7 +110,7 @@ class CandidateEvaluator:
         self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float
     ) -> Candidate | None:
         """Return a deployment with a direct arc to the target, None if the deployment is refused."""
-        deployment = self.tubes.judge(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
+        deployment = self.tubes.validate(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
         if isinstance(deployment, str):
             return None
         path = direct_path(deployment.lps_from_tip, self.task.target.lps_mm)

@@ -97,4 +97,4 @@ class Reconstruction:
         bend = poses.bending_directions(smooth, x[at["rotation"]])[0]
         inner = min(max(float(x[at["inner"]]), 0.0), self._problem.longest_mm)
         outer = min(max(float(x[at["outer"]]), 0.0), inner)
-        return self._evaluator.tubes.judge(frame, poses.roll_towards(frame, bend), outer, inner)
+        return self._evaluator.tubes.validate(frame, poses.roll_towards(frame, bend), outer, inner)

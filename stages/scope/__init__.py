@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from stages.scope.tips import leaving_point as leaving_point
     from stages.scope.tips import looks_ahead as looks_ahead
     from stages.scope.tips import tip_at as tip_at
+    from stages.scope.tips import turned_aside as turned_aside
     from stages.scope.tips import walk as walk
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

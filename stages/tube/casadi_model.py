@@ -28,18 +28,26 @@ from numpy.typing import ArrayLike
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.typed import Float
+from stages.tube.casadi_rates import (
+    FIRST_ANGLE,
+    POSITION,
+    ROTATION,
+    about_z,
+    determinant_function,
+    landmarks_mm,
+    pose_derivative,
+    rest_curvature_per_mm,
+    rotation_of,
+    state_rates,
+)
 from stages.tube.device import Tube
 from stages.tube.errors import ConvergenceError
 
 DEFAULT_STEPS = 40
 """Runge-Kutta steps in each piece of constant stiffness and precurvature."""
 
-SAME_MM = 1e-9
-"""Rounding of the lengths of a tube's pieces."""
-
 LARGEST_RESIDUAL_RAD = 1e-9
 _NEWTON = {"abstol": 1e-12, "abstolStep": 1e-13, "max_iter": 60, "error_on_fail": False}
-_POSITION, _ROTATION, _FIRST_ANGLE = slice(0, 3), slice(3, 7), 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +104,7 @@ class OrderedTubes:
         self._tubes = tuple(tubes)
         self._order = order
         self._steps = steps_per_piece
-        self._marks = [_landmarks_mm(tube) for tube in tubes]
+        self._marks = [landmarks_mm(tube) for tube in tubes]
         self._ahead = [sum(tube == i for tube, _ in order.landmarks) for i in range(len(tubes))]
 
     @cached_property
@@ -123,7 +131,7 @@ class OrderedTubes:
         """
         tip, beta = self._symbols("tip_angles_rad")
         base, position, rotation = self._integrate(tip, beta)
-        determinant = _determinant(len(self._tubes))(casadi.jacobian(base, tip))
+        determinant = determinant_function(len(self._tubes))(casadi.jacobian(base, tip))
         return casadi.Function(
             "forward",
             [tip, beta],
@@ -165,7 +173,7 @@ class OrderedTubes:
         """
         tip, beta = self._symbols("tip_angles_rad")
         base, position, rotation = self._integrate(tip, beta)
-        by_tip, by_beta = (_twist(position, rotation, by) for by in (tip, beta))
+        by_tip, by_beta = (pose_derivative(position, rotation, by) for by in (tip, beta))
         tip_by_base = casadi.inv(casadi.jacobian(base, tip))
         fixed_base = by_beta - by_tip @ tip_by_base @ casadi.jacobian(base, beta)
         return casadi.Function(
@@ -193,27 +201,27 @@ class OrderedTubes:
         for (tube, _), (far, near) in zip(self._order.landmarks, gaps, strict=True):
             passed[tube] += 1
             if tube > 0 and passed[tube] == 1:
-                state[_FIRST_ANGLE + tube] = tip[tube] - state[_FIRST_ANGLE]
+                state[FIRST_ANGLE + tube] = tip[tube] - state[FIRST_ANGLE]
             state = self._step(passed).fold(self._steps)(state, (near - far) / self._steps)
-        first = state[_FIRST_ANGLE]
-        others = [first + state[_FIRST_ANGLE + i] if passed[i] else tip[i] for i in range(1, n)]
+        first = state[FIRST_ANGLE]
+        others = [first + state[FIRST_ANGLE + i] if passed[i] else tip[i] for i in range(1, n)]
         angles = casadi.vertcat(first, *others)
         rates = state[-n:] / casadi.DM([tube.torsional_stiffness_n_mm2 for tube in self._tubes])
-        rotation = _about_z(angles[0]) @ _rotation(state[_ROTATION]).T
-        return angles + beta * rates, -rotation @ state[_POSITION], rotation
+        rotation = about_z(angles[0]) @ rotation_of(state[ROTATION]).T
+        return angles + beta * rates, -rotation @ state[POSITION], rotation
 
     def _step(self, passed: Sequence[int]) -> Any:
         """Return the Runge-Kutta step in a piece: state, step in mm -> state.
 
         `passed` counts the landmarks of each tube between the piece and the tip.
         """
-        state, length = casadi.SX.sym("state", _FIRST_ANGLE + 2 * len(self._tubes)), casadi.SX.sym("step_mm")
+        state, length = casadi.SX.sym("state", FIRST_ANGLE + 2 * len(self._tubes)), casadi.SX.sym("step_mm")
         bending, rest = [], []
         for tube, marks, count in zip(self._tubes, self._marks, passed, strict=True):
             bending.append(tube.bending_stiffness_n_mm2 if count else 0.0)
-            rest.append(_precurvature_per_mm(tube, marks, len(marks) - count))
+            rest.append(rest_curvature_per_mm(tube, marks, len(marks) - count))
         twisting = [tube.torsional_stiffness_n_mm2 for tube in self._tubes]
-        rate = casadi.Function("rate", [state], [_rates(state, bending, twisting, rest)])
+        rate = casadi.Function("rate", [state], [state_rates(state, bending, twisting, rest)])
         first = rate(state)
         second = rate(state + 0.5 * length * first)
         third = rate(state + 0.5 * length * second)
@@ -271,7 +279,7 @@ class CasadiTubes:
         ahead = [
             (-(beta[i] + mark), i, index)
             for i, tube in enumerate(self._tubes)
-            for index, mark in enumerate(_landmarks_mm(tube))
+            for index, mark in enumerate(landmarks_mm(tube))
             if beta[i] + mark > 0.0
         ]
         return Order(landmarks=tuple((i, index) for _, i, index in sorted(ahead)))
@@ -354,69 +362,3 @@ class CasadiTubes:
                 f"The {name} are {found.tolist()}", expected=f"{len(self._tubes)} finite numbers, one a tube"
             )
         return found
-
-
-def _landmarks_mm(tube: Tube) -> list[float]:
-    """Return the ascending arc lengths from the base at which the precurvature changes, and the end."""
-    ends = {end for bend in tube.bends for end in (bend.from_mm, bend.to_mm)}
-    return [*sorted(end for end in ends if 0.0 < end < tube.length_mm - SAME_MM), tube.length_mm]
-
-
-def _precurvature_per_mm(tube: Tube, marks: Sequence[float], index: int) -> Any:
-    """Return the precurvature vector (2,) of the part of a tube that ends at a landmark."""
-    before = marks[index - 1] if index > 0 else 0.0
-    for start, end, curvature, direction in tube.bends:
-        if index < len(marks) and start <= 0.5 * (before + marks[index]) < end:
-            return curvature * np.array([np.cos(direction), np.sin(direction)])
-    return np.zeros(2)
-
-
-def _rates(state: Any, bending: Sequence[float], twisting: Sequence[float], rest: Sequence[Float]) -> Any:
-    """Return the derivative of the state by the arc length [Rucker2010]_.
-
-    The state is position, quaternion of the innermost tube's frame, its angle, the angles of the others
-    relative to it, and the torsional moments in N mm.
-    """
-    n = len(bending)
-    w, x, y, z = casadi.vertsplit(state[_ROTATION])
-    relative = [casadi.SX(0), *casadi.vertsplit(state[_FIRST_ANGLE + 1 : _FIRST_ANGLE + n])][:n]
-    rates = [state[_FIRST_ANGLE + n + i] / twisting[i] for i in range(n)]
-    turns = [_about_z(angle)[:2, :2] for angle in relative]
-    shared = sum(bending[i] * turns[i] @ rest[i] for i in range(n)) / sum(bending)
-    moments = []
-    for i in range(n):
-        own = turns[i].T @ shared
-        moments.append(bending[i] * (own[0] * rest[i][1] - own[1] * rest[i][0]))
-    forward = casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
-    a, b, c = shared[0], shared[1], rates[0]
-    spin = casadi.vertcat(
-        -x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
-    )
-    others = [rates[i] - rates[0] for i in range(1, n)]
-    return casadi.vertcat(forward, 0.5 * spin, rates[0], *others, *moments)
-
-
-def _about_z(angle: Any) -> Any:
-    """Return the rotation about z by an angle."""
-    c, s = casadi.cos(angle), casadi.sin(angle)
-    return casadi.vertcat(casadi.horzcat(c, -s, 0), casadi.horzcat(s, c, 0), casadi.horzcat(0, 0, 1))
-
-
-def _rotation(quaternion: Any) -> Any:
-    """Return the rotation of a quaternion (w, x, y, z) of any length."""
-    unit = quaternion / casadi.norm_2(quaternion)
-    cross = casadi.skew(unit[1:])
-    return casadi.MX.eye(3) + 2 * unit[0] * cross + 2 * cross @ cross
-
-
-def _twist(position: Any, rotation: Any, by: Any) -> Any:
-    """Return the (6, m) derivative of a pose: its position, then its rotation vector."""
-    columns = casadi.horzsplit(rotation)
-    turn = sum(casadi.skew(column) @ casadi.jacobian(column, by) for column in columns)
-    return casadi.vertcat(casadi.jacobian(position, by), 0.5 * turn)
-
-
-def _determinant(n: int) -> Any:
-    """Return the function: matrix (n, n) -> determinant, in plain arithmetic."""
-    matrix = casadi.SX.sym("matrix", n, n)
-    return casadi.Function("determinant", [matrix], [casadi.det(matrix)])

@@ -1,4 +1,4 @@
-"""What the tubes can do from a scope tip: shape, tip pose, exit through the wall, why not."""
+"""The enumeration of all deployments from many scope poses."""
 
 from __future__ import annotations
 
@@ -12,36 +12,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
-from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
-from anatomy.structures import obstacle_bits
-from anatomy.typed import Bool, Float, Int, UInt16
+from anatomy.typed import Float, Int
+from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
-from stages.tube.kernels import deployment as kernels
-
-Scene = tuple[UInt16, UInt16, Float, int, UInt16, Float, Bool]
-
-REASONS: dict[int, str] = {
-    kernels.NO_EXIT: "the tube does not leave the airway",
-    kernels.NEAR_VESSEL: "the tube comes too near a vessel",
-    kernels.NEAR_PLEURA: "the tube comes too near the pleura or leaves the lung",
-    kernels.NEAR_FISSURE: "the tube comes too near a fissure",
-    kernels.NEAR_OTHER_BRANCH: "the tube comes too near another airway",
-    kernels.REENTERS_LUMEN: "the tube enters an airway again",
-    kernels.FLAT_EXIT: "the tube meets the airway wall at too flat an angle",
-    kernels.SWEEPS: "the tube would sweep tissue sideways",
-    kernels.TOO_LONG: "the tube would extend too far",
-    kernels.PROTRUDES: "the inner tube is too short to protrude so far",
-    kernels.LEAVES_MEDIASTINAL: "the tube would leave the trachea or a main bronchus, in the mediastinum",
-}
-"""Why a deployment is refused."""
-
+from stages.tube.environment import tracking_length_mm, tube_constants, tube_environment
+from stages.tube.validation import REASONS
 
 DEFAULT_ROTATIONS = 24
+"""Rotations 15 degrees apart: at 30 mm of curve, tips are about 3 mm apart, as far as the stops."""
 DEFAULT_STOP_MM = 2.0
+"""Spacing of insertions: small against the reach of needles, which start at the tips."""
 THREADS = 2
+"""The kernels run without the interpreter's lock; more threads would wait for memory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,78 +69,6 @@ class Deployments:
         return len(self.site)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Deployment:
-    """One accepted deployment in full.
-
-    Parameters
-    ----------
-    rotation_rad, outer_mm, inner_mm : float
-    lps_from_tip : (4, 4) float64
-        +z forward, +x towards the bend.
-    branch : int
-    exit_mm, wall_angle_rad : float
-    lateral_sweep_mm : float
-    """
-
-    rotation_rad: float
-    outer_mm: float
-    inner_mm: float
-    lps_from_tip: Float
-    branch: int
-    exit_mm: float
-    wall_angle_rad: float
-    lateral_sweep_mm: float
-
-    @property
-    def length_in_tissue_mm(self) -> float:
-        """Length of tube beyond the lumen that it leaves."""
-        return self.inner_mm - self.exit_mm
-
-
-def scene_of(lung: Lung, *, with_fissures: bool) -> Scene:
-    """Gather the arrays that the tube kernels look at."""
-    field = lung.obstacle_field(with_fissures=with_fissures)
-    bits = obstacle_bits(with_fissures)
-    depth = lung.lumen_depth
-    return (
-        field.corners,
-        lung.labels,
-        field.geometry,
-        bits,
-        depth.corners,
-        depth.geometry,
-        lung.tree.mediastinal,
-    )
-
-
-def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
-    """Return the `(10,)` array of `stages.tube.kernels.deployment`, lengths in mm, angles in rad."""
-    constants = np.zeros(kernels.N_TUBES)
-    inner, outer = tubes.inner, tubes.outer
-    constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
-    constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
-    constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
-    constants[kernels.OUTER_RADIUS] = outer.radius_mm
-    constants[kernels.INNER_RADIUS] = inner.radius_mm
-    constants[kernels.MARGIN] = margins.total_mm
-    constants[kernels.MIN_WALL_ANGLE] = math.radians(tubes.min_wall_angle_deg)
-    constants[kernels.MAX_SWEEP] = tubes.max_lateral_sweep_mm
-    constants[kernels.MAX_EXTENSION] = tubes.max_extension_mm
-    constants[kernels.MAX_PROTRUSION] = tubes.max_inner_protrusion_mm
-    return constants
-
-
-def tracking_length_mm(tubes: ConcentricTubes) -> float:
-    """Return the greatest insertion in which the tubes follow their own track exactly.
-
-    Curved tubes do so as long as the straight part of the inner one stays in the scope.
-    """
-    if tubes.inner.precurvature_per_mm == 0.0:
-        return tubes.max_extension_mm
-    return min(tubes.inner.curved_length_mm, tubes.max_extension_mm)
-
-
 def insertion_stops(tubes: ConcentricTubes, spacing_mm: float = DEFAULT_STOP_MM) -> Float:
     """Return insertions from 0 to `tracking_length_mm`, about `spacing_mm` apart."""
     longest = tracking_length_mm(tubes)
@@ -196,7 +109,7 @@ def enumerate_deployments(
     coarse: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
     angles = np.concatenate([coarse, coarse + math.pi / rotations])
     stops = insertion_stops(tubes, stop_spacing_mm)
-    scene = scene_of(lung, with_fissures=with_fissures)
+    environment = tube_environment(lung, with_fissures=with_fissures)
     constants = tube_constants(tubes, margins)
     most = len(stops) * (len(stops) + 1) // 2
     done = 0
@@ -211,7 +124,7 @@ def enumerate_deployments(
             normals = frames.bending_directions(frame, angles[turns])
             rows = np.zeros((most * len(turns), kernels.ENTRY_COLUMNS))
             count = kernels.enumerate_site(
-                scene, constants, tips[site], normals, site, stops, rows, refused, work
+                environment, constants, tips[site], normals, site, stops, rows, refused, work
             )
             found = rows[:count].copy()
             found[:, 1] = turns[found[:, 1].astype(np.int64)]
@@ -244,7 +157,7 @@ def _between_unlike(rows: Float, rotations: int, stops: Float) -> Int:
     return np.flatnonzero(unlike)
 
 
-def joined(one: Deployments, other: Deployments, first_site: int) -> Deployments:
+def join_deployments(one: Deployments, other: Deployments, first_site: int) -> Deployments:
     """Return the deployments of two enumerations; the other's sites are counted from `first_site`."""
     arrays: dict[str, Any] = {
         f.name: read_only(np.concatenate([getattr(one, f.name), getattr(other, f.name)]))
@@ -273,55 +186,3 @@ def _as_deployments(rows: Float, angles: Float, refused: Int, candidates: int) -
         candidates=candidates,
         refused={REASONS[code]: int(refused[code]) for code in REASONS if refused[code]},
     )
-
-
-class TubeJudge:
-    """Judges single deployments of one pair of tubes in one lung."""
-
-    def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
-        self._scene = scene_of(lung, with_fissures=with_fissures)
-        self._constants = tube_constants(tubes, margins)
-        self._trace = np.zeros(kernels.N_TRACE)
-        self._tip = np.zeros(9)
-
-    def judge(
-        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
-    ) -> Deployment | str:
-        """Return the deployment, or the reason why it is refused.
-
-        Parameters
-        ----------
-        lps_from_scope_tip : (4, 4) float64
-        rotation_rad : float
-            Direction of the bend about +z of the scope tip, counted from its +x.
-        outer_mm, inner_mm : float
-            Insertions beyond the scope tip.
-
-        Raises
-        ------
-        SettingsError
-            If the outer tube would be ahead of the inner one.
-        """
-        if not 0.0 <= outer_mm <= inner_mm:
-            raise SettingsError(
-                f"The insertions of outer and inner tube are {outer_mm:g} and {inner_mm:g} mm",
-                expected="0 <= outer <= inner",
-            )
-        base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
-        normal = frames.bending_directions(lps_from_scope_tip, rotation_rad)[0]
-        trace, tip = self._trace, self._tip
-        reason = kernels.deploy(
-            self._scene, self._constants, base, normal, float(outer_mm), float(inner_mm), trace, tip
-        )
-        if reason != kernels.ACCEPTED:
-            return REASONS[reason]
-        return Deployment(
-            rotation_rad=float(rotation_rad),
-            outer_mm=float(outer_mm),
-            inner_mm=float(inner_mm),
-            lps_from_tip=frames.pose(tip[:3], tip[3:6], tip[6:9]),
-            branch=int(trace[kernels.BRANCH]),
-            exit_mm=float(trace[kernels.LEFT_AT]),
-            wall_angle_rad=float(trace[kernels.WALL_ANGLE]),
-            lateral_sweep_mm=float(kernels.lateral_sweep(self._constants, float(outer_mm), float(inner_mm))),
-        )

@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 from anatomy.errors import LungaccessError
 from anatomy.grid import read_only
 from anatomy.typed import Float, Int
+from stages.tube.equilibrium import Equilibrium
 from stages.tube.errors import ConvergenceError
-from stages.tube.mechanics import Equilibrium, TubeMechanics
+from stages.tube.mechanics import TubeMechanics
 from stages.tube.sequences import Sequence, joint_steps
 
 DEFAULT_STEP_MM = 1.0

@@ -14,7 +14,8 @@ from scipy.stats import qmc
 from anatomy.errors import FrameError, SettingsError
 from anatomy.grid import read_only
 from anatomy.typed import Float
-from stages.tube.mechanics import Equilibrium, TubeMechanics
+from stages.tube.equilibrium import Equilibrium
+from stages.tube.mechanics import TubeMechanics
 
 Match = Literal["position", "direction", "pose"]
 
@@ -91,6 +92,19 @@ def inverse_kinematics(
     SettingsError
         If a number is not above 0, the extension is longer than the innermost tube, or no configuration
         that is stable was met.
+
+    Examples
+    --------
+    >>> from stages.tube import Tube, TubeMechanics, inverse_kinematics
+    >>> tube = Tube(
+    ...     outer_diameter_mm=1.5, inner_diameter_mm=1.3, length_mm=680.0, curved_length_mm=40.0,
+    ...     precurvature_per_mm=0.025,
+    ... )
+    >>> mechanics = TubeMechanics([tube])
+    >>> wanted = mechanics.given_base_angles([0.3], [-640.0]).base_from_tip
+    >>> found = inverse_kinematics(mechanics, wanted)
+    >>> found.reached, found.beta_mm.round(2).tolist()
+    (True, [-640.0])
     """
     wanted = _checked_pose(base_from_tip)
     reach = _checked_extension(mechanics, max_extension_mm)

@@ -17,10 +17,10 @@ from anatomy.errors import SettingsError
 from anatomy.margins import Margins
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float, Int
-from stages.tube.deployments import tube_constants
+from stages.tube import kernels
 from stages.tube.device import ConcentricTubes, Tube
+from stages.tube.environment import tube_constants
 from stages.tube.following import DEFAULT_STEP_MM, DEFAULT_STEP_RAD, DeployedSequence, SnapError, deploy
-from stages.tube.kernels import deployment as kernels
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.sequences import Sequence, alternating, inner_first, together
 
@@ -232,7 +232,7 @@ def propose_designs(
         np.linspace(shortest, longest, LENGTHS).tolist(),
         np.linspace(steepest / CURVATURES, steepest, CURVATURES).tolist(),
     )
-    found = [judge_design(_design(tubes, bore, *variant), outer_mm, inner_mm) for variant in variants]
+    found = [evaluate_design(_design(tubes, bore, *variant), outer_mm, inner_mm) for variant in variants]
     kept = _worth_a_look([each for each in found if each.lateral_sweep_mm <= max_sweep_mm])
     return tuple(sorted(kept, key=lambda each: (each.lateral_sweep_mm, -each.tip_offset_mm)))
 
@@ -249,7 +249,7 @@ def _design(
     )
 
 
-def judge_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:
+def evaluate_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:
     """Return sweep and reach of a design in closed form.
 
     Parameters

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike
 from anatomy.margins import Margins
 from anatomy.poses import bending_directions
 from anatomy.typed import Float
-from stages.tube.deployments import tube_constants
+from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
-from stages.tube.kernels import deployment as kernels
+from stages.tube.environment import tube_constants
 
 
 def centreline(

@@ -12,7 +12,7 @@ from experiments.support.machine import median_cpu_s
 from experiments.support.results import Result
 from experiments.support.scope.goals import PAPER_VOXELS, end_goals, ends, goal_with_clearance, paper_sized
 from stages.scope.advisor.advisor import Advisor, start_state
-from stages.scope.advisor.best_motion import best_motion
+from stages.scope.advisor.best_motion import evaluate_motions
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import Goal, goal_at, navigation_field
@@ -49,7 +49,9 @@ def _measure_rules(
     paths = _path_times(advisors, state, result.seeds[0], repeats)
     motions = [
         median_cpu_s(
-            partial(best_motion, advisors[n].environment, path.state(number), LOOK_AHEAD_MM, options.weights),
+            partial(
+                evaluate_motions, advisors[n].environment, path.state(number), LOOK_AHEAD_MM, options.weights
+            ),
             3,
         )
         for n, path in enumerate(found)

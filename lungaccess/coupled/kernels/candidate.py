@@ -1,6 +1,6 @@
 """Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
-`tube` is the tuple (scene, constants) of `stages.tube.kernels.deployment`, `needle` a
+`tube` is the tuple (environment, constants) of `stages.tube.kernels`, `needle` a
 `lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x` holds a row of `scope_poses`, the
 rotation in rad, and the insertions of outer and inner tube in mm.  `vias` are points (LPS mm) through which
 single arcs lead from the tube to the target.  A row of `scope_poses` (9,) is a scope tip: point, unit
@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from anatomy.kernels.arcs import arc_to_point, normal_on_arc, pose_on_arc
+from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels import (
     blocker_on_arc,
@@ -24,12 +24,10 @@ from stages.needle.kernels import (
 from stages.tube.kernels import (
     ACCEPTED,
     BRANCH,
-    CURVED_LENGTH,
-    INNER_CURVATURE,
     MAX_EXTENSION,
     MAX_PROTRUSION,
-    OVERLAP_CURVATURE,
-    deploy,
+    tip_pose,
+    validate_deployment,
 )
 
 SCOPE_POSE = 0
@@ -43,29 +41,6 @@ ROUNDING = 1e-9
 """Share of each limit that stays unused, so that rounding does not carry a plan beyond the limit."""
 SHORTEST_ARC_MM = 0.5
 """Shorter arcs are refused.  The value is a free choice, well below the length of any useful arc."""
-
-
-@inner_kernel
-def _tube_tip(constants, base, normal, outer, inner):
-    """Return the pose at the tip of the inner tube, as `deploy` does but without testing anything."""
-    straight = max(inner - constants[CURVED_LENGTH], 0.0)
-    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
-    towards = (normal[0], normal[1], normal[2])
-    at = 0.0
-    for piece in range(4):
-        stop, kappa = min(straight, outer), 0.0
-        if piece == 1:
-            stop, kappa = outer, constants[OVERLAP_CURVATURE]
-        elif piece == 2:
-            stop, kappa = max(straight, outer), 0.0
-        elif piece == 3:
-            stop, kappa = inner, constants[INNER_CURVATURE]
-        if stop > at:
-            bend = (kappa, towards[0], towards[1], towards[2])
-            towards = normal_on_arc(pose, bend, stop - at)
-            pose = pose_on_arc(pose, bend, stop - at)
-            at = stop
-    return pose
 
 
 @inner_kernel
@@ -129,7 +104,7 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
 
     The fast tests come first: limits and cost of the needle, the deployment, the needle's clearance.
     """
-    scene, constants = tube
+    environment, constants = tube
     row = int(x[SCOPE_POSE])
     outer, inner = x[OUTER], x[INNER]
     if row < 0 or row >= scope_poses.shape[0] or not allowed[row]:
@@ -145,11 +120,12 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
         c * base[7] + s * (base[5] * base[6] - base[3] * base[8]),
         c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
     )
-    pose = _tube_tip(constants, base, normal, outer, inner)
+    pose = tip_pose(constants, base, normal, outer, inner)
     cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
     if cost == math.inf:
         return math.inf
-    if deploy(scene, constants, base[:6], np.array(normal), outer, inner, trace, tip) != ACCEPTED:
+    towards = np.array(normal)
+    if validate_deployment(environment, constants, base[:6], towards, outer, inner, trace, tip) != ACCEPTED:
         return math.inf
     branch = int(trace[BRANCH])
     if not _needle_clear(needle, pose, vias, count, target, branch):

@@ -90,7 +90,7 @@ def _vary(x, vias, count, start, target, state):
 def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, state):
     """Improve a choice by a stochastic local search: vary it at random and keep what is cheaper.
 
-    A choice is kept only if it is proved: the tubes by `deploy`, the needle by `blocker_on_arc`.
+    A choice is kept only if it is proved: the tubes by `validate_deployment`, the needle by `blocker_on_arc`.
 
     Parameters
     ----------

@@ -152,7 +152,7 @@ class ReferenceSearch:
     def _proved(self, found: Candidate) -> Candidate | None:
         """Return what was found with the tubes and the needle as the planner proves them."""
         began, own = time.thread_time(), found.deployment
-        deployment = self._evaluator.tubes.judge(
+        deployment = self._evaluator.tubes.validate(
             found.tip.lps_from_scope_tip, own.rotation_rad, own.outer_mm, own.inner_mm
         )
         stage = "tubes" if isinstance(deployment, str) else ""

@@ -52,7 +52,7 @@ class KuntzSearch:
     def _attempt(self, placement: Placement) -> Candidate | None:
         """Carry out lines 8 and 9 for a placement."""
         evaluator, tip = self._evaluator, placement.tip
-        deployment = evaluator.tubes.judge(
+        deployment = evaluator.tubes.validate(
             tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
         )
         if isinstance(deployment, str) or (self._rejects and not evaluator.reaches(deployment.lps_from_tip)):

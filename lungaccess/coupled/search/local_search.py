@@ -15,7 +15,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from stages.needle import ArcPath, direct_path
 from stages.scope import Sites
-from stages.tube import Deployment, scene_of, tube_constants
+from stages.tube import Deployment, tube_constants, tube_environment
 
 PERTURBATION = np.array([4.0, math.radians(15.0), 2.0, 2.0])
 """Standard deviations of a perturbation: scope pose (rows), rotation, and insertions in mm.  They are a few
@@ -70,8 +70,8 @@ class LocalSearch:
     def __init__(self, evaluator: CandidateEvaluator, sites: Sites, rng: np.random.Generator) -> None:
         task = evaluator.task
         self._evaluator, self._sites, self._rng = evaluator, sites, rng
-        scene = scene_of(task.lung, with_fissures=task.with_fissures)
-        self.tube = (scene, tube_constants(task.system.tubes, task.system.margins))
+        environment = tube_environment(task.lung, with_fissures=task.with_fissures)
+        self.tube = (environment, tube_constants(task.system.tubes, task.system.margins))
         self.needle = evaluator.needle_arrays
         x, y, z = task.target.lps_mm.tolist()
         self.target = (x, y, z)
@@ -122,7 +122,7 @@ class LocalSearch:
         index = int(run.x[SCOPE_POSE])
         tip, (rotation, outer, inner) = run.poses.tips[index], run.x[1:].tolist()
         rotation = run.poses.rotation_rad(index, rotation)
-        deployment = self._evaluator.tubes.judge(tip.lps_from_scope_tip, rotation, outer, inner)
+        deployment = self._evaluator.tubes.validate(tip.lps_from_scope_tip, rotation, outer, inner)
         if isinstance(deployment, str):
             return None
         path = path_through(deployment, run.vias[: run.count], self._evaluator.task.target.lps_mm)

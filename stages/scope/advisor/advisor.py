@@ -11,7 +11,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
 from anatomy.typed import Float
-from stages.scope.advisor.best_motion import Candidates, Judgement, Motion, best_motion
+from stages.scope.advisor.best_motion import Candidates, Motion, MotionEvaluation, evaluate_motions
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, straight_state, tip_frames
 from stages.scope.advisor.lumen import Lumen
@@ -40,8 +40,8 @@ class Advice:
         Eq. 9 of the best motion; 0 if there is none.
     candidates : Candidates
         All that were weighed.
-    own : Judgement or None
-        What the motion of one's own is worth.
+    own : MotionEvaluation or None
+        The evaluation of the user's own motion.
     distance_mm : float
         From the tip to the centre of the goal voxel, straight.
     """
@@ -50,7 +50,7 @@ class Advice:
     motion: Motion | None
     cost: float
     candidates: Candidates
-    own: Judgement | None
+    own: MotionEvaluation | None
     distance_mm: float
 
 
@@ -107,7 +107,7 @@ class Advisor:
     def advise(
         self, state: ScopeState, *, own: Motion | None = None, rng: np.random.Generator | None = None
     ) -> Advice:
-        """Return the best motion from any state whose tip is in the lumen, and the worth of one's own motion.
+        """Return the best motion from any state whose tip is in the lumen, and evaluate the user's own one.
 
         Where no candidate is valid the look-ahead is halved, down to the smallest voxel side (not in
         reproduction); where none is valid even then, the advice is to pull back as the scope came.
@@ -116,7 +116,7 @@ class Advisor:
         ----------
         state : ScopeState
         own : Motion, optional
-            A motion that somebody is about to make; weighed at its own advance, as far as the look-ahead.
+            A motion that the user is about to make, evaluated at its own advance, at most the look-ahead.
         rng : numpy Generator, optional
             Moves the candidates at random within their spacing.
 
@@ -141,7 +141,7 @@ class Advisor:
             motion=motion,
             cost=cost,
             candidates=found,
-            own=None if own is None else self._judge(state, own, rng),
+            own=None if own is None else self._evaluate(state, own, rng),
             distance_mm=float(np.linalg.norm(tip - self.goal.centre_lps)),
         )
 
@@ -154,7 +154,7 @@ class Advisor:
             else float(self.environment.lumen.grid.spacing_mm.min())
         )
         while True:
-            found, _ = best_motion(self.environment, state, look_ahead, self.options.weights, rng=rng)
+            found, _ = evaluate_motions(self.environment, state, look_ahead, self.options.weights, rng=rng)
             if found.best >= 0 or look_ahead <= least:
                 return found
             look_ahead = max(0.5 * look_ahead, least)
@@ -167,10 +167,12 @@ class Advisor:
         )
         return "pull back", back, 0.0
 
-    def _judge(self, state: ScopeState, own: Motion, rng: np.random.Generator | None) -> Judgement | None:
+    def _evaluate(
+        self, state: ScopeState, own: Motion, rng: np.random.Generator | None
+    ) -> MotionEvaluation | None:
         most = self.options.look_ahead_mm
         ahead = min(own.advance_mm, most) if own.advance_mm > 0.0 else most
-        return best_motion(self.environment, state, ahead, self.options.weights, rng=rng, own=own)[1]
+        return evaluate_motions(self.environment, state, ahead, self.options.weights, rng=rng, own=own)[1]
 
     def path(self, start: ScopeState, *, seed: int = 0) -> ScopePath:
         """Return the path from a state to the goal, or to the nearest point that was reached.

@@ -115,7 +115,7 @@ class Candidates:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judgement:
+class MotionEvaluation:
     """The evaluation of the user's own motion beside the candidates.
 
     Parameters
@@ -137,7 +137,7 @@ def offsets(rng: np.random.Generator | None) -> Float:
     return np.asarray(rng.uniform(-0.5, 0.5, (CANDIDATES, 2)))
 
 
-def best_motion(
+def evaluate_motions(
     environment: ScopeEnvironment,
     state: ScopeState,
     advance_mm: float,
@@ -145,7 +145,7 @@ def best_motion(
     *,
     rng: np.random.Generator | None = None,
     own: Motion | None = None,
-) -> tuple[Candidates, Judgement | None]:
+) -> tuple[Candidates, MotionEvaluation | None]:
     """Evaluate all candidates from a state (eqs. 3 to 9), and the user's own motion if there is one.
 
     Parameters
@@ -177,9 +177,9 @@ def best_motion(
     mine = None
     if own is not None:
         row = table[CANDIDATES]
-        mine = Judgement(verdict=VERDICTS[int(row[kernel.VERDICT])], cost=float(row[kernel.COST]))
+        mine = MotionEvaluation(verdict=VERDICTS[int(row[kernel.VERDICT])], cost=float(row[kernel.COST]))
         if _beyond_range(environment, own):
-            mine = Judgement(verdict=VERDICTS[0], cost=math.inf)
+            mine = MotionEvaluation(verdict=VERDICTS[0], cost=math.inf)
     return _candidates(table[:CANDIDATES], float(advance_mm), int(best)), mine
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -121,11 +120,6 @@ def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, 
         )
         twist_before = twist
     return tuple(instructions)
-
-
-def instructions_json(instructions: tuple[Instruction, ...]) -> str:
-    """Return instructions as JSON: a list of objects, each with its sentence under "text"."""
-    return json.dumps([{**asdict(one), "text": one.text()} for one in instructions], indent=1)
 
 
 def _places_on_route(tree: AirwayTree, tips: Float) -> Int:

@@ -142,21 +142,10 @@ def straight_state(base_lps: Float, forward: Float) -> ScopeState:
     return ScopeState(lps_from_base=base)
 
 
-def base_from_tool(model: ScopeModel, twist_rad: float, bend_rad: float) -> Float:
-    """Return the tool frame (4, 4) in the base frame: the chain of Table I.
-
-    Table I prints no angle between the axes of twist and bend; they are perpendicular here, as fig. 3 draws
-    them.  A link is a step along the axis, then the turn of its joint: only in this order do all joints
-    lie on the circle of Algorithm 1.
-    """
-    state = ScopeState(lps_from_base=np.eye(4), twist_rad=twist_rad, bend_rad=bend_rad)
-    return np.asarray(tool_frames(model, state.array)[0])
-
-
 def advanced(
     model: ScopeModel, state: ScopeState, distance_mm: float, twist_rad: float, bend_rad: float
 ) -> ScopeState:
-    """Return the state after Algorithm 1: a new twist and bend, then the base moved along its circle.
+    """Algorithm 1 of [Rosell2012]: return the state with a new twist and bend, advanced along its circle.
 
     A negative distance with the present twist and bend takes an advance back exactly.
 
@@ -181,7 +170,12 @@ def joints(model: ScopeModel, states: Float) -> Float:
 
 
 def tool_frames(model: ScopeModel, states: Float) -> Float:
-    """Return the tool frames `(M, 4, 4)` of states (M, 14); the camera looks along -z [Rosell2012]."""
+    """Return the tool frames `(M, 4, 4)` of states (M, 14): the chain of Table I [Rosell2012].
+
+    The camera looks along -z.  Table I prints no angle between the axes of twist and bend; they are
+    perpendicular here, as fig. 3 draws them.  A link is a step along the axis, then the turn of its joint:
+    only in this order do all joints lie on the circle of Algorithm 1.
+    """
     return _bodies(model, states)[1]
 
 

@@ -34,6 +34,23 @@ class Session:
     start : ScopeState
         Where the scope is.
     seed : int
+
+    Examples
+    --------
+    >>> from anatomy.build import build_lung
+    >>> from anatomy.phantom import make_phantom
+    >>> from stages.scope.advisor import Advisor, Session, goal_at, lumen_of_lung, model_of, start_state
+    >>> from stages.scope import Bronchoscope
+    >>> lung = build_lung(make_phantom(seed=1, size="small").images)
+    >>> scope = Bronchoscope(
+    ...     name="thin", outer_diameter_mm=3.0, channel_diameter_mm=1.2,
+    ...     bend_up_deg=180.0, bend_down_deg=130.0,
+    ... )
+    >>> lumen, model = lumen_of_lung(lung), model_of(scope)
+    >>> start = start_state(lumen, lung.tree, model)
+    >>> session = Session(Advisor(lumen, model, goal_at(lumen, lung.tree.carina_lps)), start)
+    >>> session.advise(start).action
+    'advance'
     """
 
     def __init__(self, advisor: Advisor, start: ScopeState, *, seed: int = 0) -> None:

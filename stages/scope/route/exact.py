@@ -13,6 +13,7 @@ from anatomy.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
 from stages.scope.route.guide_path import GuidePath
+from stages.scope.route.kernels.lagrangian import Program
 from stages.scope.route.kernels.repair import repair
 from stages.scope.route.kernels.spline import take_samples
 from stages.scope.route.proof import Proof, prove
@@ -152,16 +153,16 @@ def repaired(
     along, with_radius = guide.along_mm, np.column_stack((guide.points_mm, guide.radius_mm))
     control = np.array(curve.control_mm)
     take_samples(control, curve.knots, begin, end, level.per_span, along, with_radius, first, rows, samples)
-    limit, worst = limits.max_curvature_per_mm, np.inf
+    limit, worst, ends = limits.max_curvature_per_mm, np.inf, guide.points_mm[[0, -1]]
     for bending, times, rounds, steps in (*start, FINAL_STAGE):
         weights = np.array((
             CENTRING, bending / limit**2, times * limit, limits.needed_mm, level.spare_curvature,
             level.spare_mm, limits.end_tolerance_mm,
         ))  # fmt: skip
-        worst, _taken = repair(
-            control, low, high, first, rows, samples, lumen.cones, *lumen.cells, guide.cones, weights,
-            guide.points_mm[[0, -1]], rounds, steps, SOLVED,
-        )  # fmt: skip
+        program = Program(
+            low, high, first, rows, samples, lumen.cones, *lumen.cells, guide.cones, weights, ends
+        )
+        worst, _taken = repair(control, program, rounds, steps, SOLVED)
     return Curve(control_mm=control, knots=curve.knots), float(worst)
 
 

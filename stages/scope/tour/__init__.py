@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.scope.tour.circuit import MOST_COMBINATIONS as MOST_COMBINATIONS
+    from stages.scope.tour.circuit import SAME_RESISTANCE as SAME_RESISTANCE
     from stages.scope.tour.circuit import Circuits as Circuits
     from stages.scope.tour.circuit import Reading as Reading
     from stages.scope.tour.circuit import circuits as circuits
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from stages.scope.tour.itinerary import one_by_one_mm as one_by_one_mm
     from stages.scope.tour.itinerary import plan_itinerary as plan_itinerary
     from stages.scope.tour.resistance import Resistances as Resistances
+    from stages.scope.tour.resistance import branch_resistances as branch_resistances
     from stages.scope.tour.shortest import shortest_tour as shortest_tour
     from stages.scope.tour.subtree import MOST_LESIONS as MOST_LESIONS
     from stages.scope.tour.subtree import Subtree as Subtree

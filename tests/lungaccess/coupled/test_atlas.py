@@ -11,8 +11,7 @@ import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.coupled import tip_clearances_mm, tube_stability
-from stages.tube.deployments import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, insertion_stops
-from stages.tube.kernels import deployment as kernels
+from stages.tube import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, insertion_stops, kernels
 from stages.tube.shape import centreline
 from tests.stages.scenes import brute_clearance
 

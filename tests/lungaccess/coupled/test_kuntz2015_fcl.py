@@ -31,7 +31,7 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle.device import Needle
 from stages.scope.tips import MedialAxis
-from stages.tube.deployments import Deployment, TubeJudge, tracking_length_mm
+from stages.tube import Deployment, DeploymentValidator, tracking_length_mm
 from tests.lungaccess.resample import problems
 
 SYSTEM = la.load_system("ultrathin")
@@ -158,7 +158,9 @@ class TestTubes:
 
     def test_they_agree(self, atlas: la.Atlas, small_lung: Lung, obstacles: Obstacles) -> None:
         validator = TubeValidator(SYSTEM, obstacles)
-        proof = TubeJudge(small_lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=atlas.with_fissures)
+        proof = DeploymentValidator(
+            small_lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=atlas.with_fissures
+        )
         axis = MedialAxis(small_lung.tree, atlas.sites.passable & atlas.sites.exits_ahead)
         rng = np.random.default_rng(0)
         both, only_meshes, only_proof = 0, 0, 0
@@ -166,7 +168,7 @@ class TestTubes:
             frame, rotation = axis.sample(rng).lps_from_scope_tip, float(rng.uniform(0.0, 2.0 * math.pi))
             outer, inner = np.sort(rng.uniform(0.0, tracking_length_mm(SYSTEM.tubes), 2))
             ours = validator.validate(validator.shape(frame, rotation, float(outer), float(inner)))
-            theirs = proof.judge(frame, rotation, float(outer), float(inner))
+            theirs = proof.validate(frame, rotation, float(outer), float(inner))
             if isinstance(ours, Deployment) and isinstance(theirs, Deployment):
                 both += 1
                 np.testing.assert_allclose(ours.lps_from_tip, theirs.lps_from_tip, atol=1e-9)

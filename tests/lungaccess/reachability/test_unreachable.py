@@ -28,16 +28,16 @@ from lungaccess.reachability.kernels import blocked
 from lungaccess.reachability.kernels import deployment_boxes as boxes
 from lungaccess.reachability.kernels import unreachable as kernel
 from lungaccess.reachability.unreachable import UnreachableProof
-from stages.tube.deployments import scene_of, tube_constants
-from stages.tube.kernels.deployment import (
+from stages.tube import tube_constants, tube_environment
+from stages.tube.kernels import (
     ACCEPTED,
     CURVED_LENGTH,
     MAX_SWEEP,
     N_TRACE,
     NEAR_VESSEL,
-    deploy,
     lateral_sweep,
     planar_point,
+    validate_deployment,
 )
 
 KAPPA = 1.0 / 50.0
@@ -252,7 +252,7 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
 ) -> None:
     """Deployments as near to a limit as it gets, between one that can be and one that cannot."""
     rng = np.random.default_rng(6)
-    deploying = scene_of(small_lung, with_fissures=False)
+    deploying = tube_environment(small_lung, with_fissures=False)
     environment = proof._environment(plans[0].target_lps)
     trace, tip = np.zeros(N_TRACE), np.zeros(9)
     at_limits: Counter[int] = Counter()
@@ -262,7 +262,7 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
         turned = Rotation.from_rotvec(values[0] * frame[0] + values[1] * frame[1]).as_matrix()
         normal = turned @ (math.cos(values[2]) * frame[0] + math.sin(values[2]) * frame[1])
         base = np.concatenate([place, turned @ frame[2]])
-        return int(deploy(deploying, tubes, base, normal, values[3], values[4], trace, tip))
+        return int(validate_deployment(deploying, tubes, base, normal, values[3], values[4], trace, tip))
 
     def box_around(values: Float, m: int) -> Float:
         scale = 10.0 ** rng.uniform(-5.0, -1.0)

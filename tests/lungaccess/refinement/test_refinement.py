@@ -31,7 +31,7 @@ from stages.needle.environment import direct_arcs, needle_environment
 from stages.needle.path import ArcPath, direct_path
 from stages.scope.sites import Sites, find_sites
 from stages.scope.tips import looks_ahead, tip_at
-from stages.tube.deployments import Deployment, TubeJudge, enumerate_deployments, tracking_length_mm
+from stages.tube import Deployment, DeploymentValidator, enumerate_deployments, tracking_length_mm
 from tests.lungaccess.cli.ahead import turned_candidates
 from tests.lungaccess.resample import problems
 
@@ -64,12 +64,12 @@ def case(small_lung: Lung) -> Case:
     inside = ~places.turned[found.site] & (found.outer_mm > 0.0)
     clear = np.flatnonzero((blockers == 0) & inside)
     ranked = clear[np.argsort(-costs[clear], kind="stable")]
-    judge = TubeJudge(lung, system.tubes, system.margins, **fissures)
+    validator = DeploymentValidator(lung, system.tubes, system.margins, **fissures)
     candidates = []
     for entry in ranked[np.linspace(0, len(ranked) - 1, 6).astype(int)]:
         tip = tip_at(lung.tree, int(places.tree_point[found.site[entry]]))
         numbers = (found.rotation_rad[entry], found.outer_mm[entry], found.inner_mm[entry])
-        deployment = judge.judge(tip.lps_from_scope_tip, *(float(n) for n in numbers))
+        deployment = validator.validate(tip.lps_from_scope_tip, *(float(n) for n in numbers))
         assert isinstance(deployment, Deployment)
         path = direct_path(deployment.lps_from_tip, target.lps_mm)
         candidates.append(Candidate(tip=tip, deployment=deployment, path=path))
@@ -229,7 +229,9 @@ def pose_numbers(deployment: Deployment) -> Float:
 def planner_slope(case: Case, name: str, step: float) -> Float:
     """Differentiate what the planner says of the second candidate, by central differences."""
     old = case.candidates[1]
-    judge = TubeJudge(case.task.lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=case.task.with_fissures)
+    validator = DeploymentValidator(
+        case.task.lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=case.task.with_fissures
+    )
     ends = []
     for sign in (1.0, -1.0):
         numbers = {
@@ -238,7 +240,7 @@ def planner_slope(case: Case, name: str, step: float) -> Float:
             "inner": old.deployment.inner_mm,
         }
         numbers[name] += sign * step
-        moved = judge.judge(old.tip.lps_from_scope_tip, *numbers.values())
+        moved = validator.validate(old.tip.lps_from_scope_tip, *numbers.values())
         assert isinstance(moved, Deployment), moved
         ends.append(pose_numbers(moved))
     return np.asarray((ends[0] - ends[1]) / (2.0 * step))

@@ -12,17 +12,17 @@ from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import FISSURE, LUMEN, VESSEL
-from stages.tube.deployments import (
+from stages.tube import (
     REASONS,
     Deployment,
-    TubeJudge,
+    DeploymentValidator,
     enumerate_deployments,
     insertion_stops,
+    kernels,
     tracking_length_mm,
     tube_constants,
 )
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.kernels import deployment as kernels
 from tests.stages.scenes import Canvas
 
 OUTER = Tube(outer_diameter_mm=1.6, inner_diameter_mm=1.38, length_mm=640.0)
@@ -100,10 +100,12 @@ def test_every_candidate_is_accepted_or_counted(lung: Lung) -> None:
 
 def test_each_is_what_the_judge_says(lung: Lung) -> None:
     found = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
-    judge = TubeJudge(lung, TUBES, MARGINS, with_fissures=True)
+    validator = DeploymentValidator(lung, TUBES, MARGINS, with_fissures=True)
     for n in np.random.default_rng(0).choice(found.count, 60, replace=False):
         tip = TIPS[found.site[n]]
-        one = judge.judge(pose(tip[:3], tip[3:]), found.rotation_rad[n], found.outer_mm[n], found.inner_mm[n])
+        one = validator.validate(
+            pose(tip[:3], tip[3:]), found.rotation_rad[n], found.outer_mm[n], found.inner_mm[n]
+        )
         assert isinstance(one, Deployment)
         assert np.allclose(one.lps_from_tip[:3, 3], found.positions[n], atol=1e-9)
         assert np.allclose(one.lps_from_tip[:3, 2], found.tangents[n], atol=1e-9)
@@ -177,6 +179,6 @@ def test_straight_tubes_leave_along_the_axis_of_the_scope(lung: Lung) -> None:
 
 @pytest.mark.parametrize(("outer", "inner"), [(10.0, 9.9), (-0.1, 5.0), (math.nan, 5.0), (1.0, math.nan)])
 def test_impossible_insertions(lung: Lung, outer: float, inner: float) -> None:
-    judge = TubeJudge(lung, TUBES, MARGINS, with_fissures=False)
+    validator = DeploymentValidator(lung, TUBES, MARGINS, with_fissures=False)
     with pytest.raises(SettingsError, match="insertions"):
-        judge.judge(pose([-3, 0, -15], [0, 0, 1]), 0.0, outer, inner)
+        validator.validate(pose([-3, 0, -15], [0, 0, 1]), 0.0, outer, inner)

@@ -15,9 +15,8 @@ from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from anatomy.typed import Float
-from stages.tube.deployments import REASONS, Deployment, TubeJudge, scene_of, tube_constants
+from stages.tube import REASONS, Deployment, DeploymentValidator, kernels, tube_constants, tube_environment
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.kernels import deployment as kernels
 from tests.stages.scenes import Canvas, brute_clearance, forked_tree
 
 KAPPA = 0.025
@@ -124,9 +123,11 @@ def judged(
     rotation: float = 0.0, with_fissures: bool = False, forward: Any = (0.0, 0.0, 1.0),
 ) -> Deployment | str:  # fmt: skip
     """Judge a deployment that bends towards +x."""
-    judge = TubeJudge(lung, tubes, Margins(segmentation_margin_mm=MARGIN), with_fissures=with_fissures)
+    validator = DeploymentValidator(
+        lung, tubes, Margins(segmentation_margin_mm=MARGIN), with_fissures=with_fissures
+    )
     tip = pose(base, forward, (1.0, 0.0, 0.0))
-    return judge.judge(tip, rotation, outer, inner)
+    return validator.validate(tip, rotation, outer, inner)
 
 
 CHAIN = forked_tree(
@@ -391,7 +392,7 @@ class TestEnumeration:
             canvas.add(canvas.ball(rng.uniform([2, -8, -12], [12, 8, 16]), rng.uniform(0.6, 1.6)), VESSEL)
         canvas.labels[(canvas.labels & LUMEN) != 0] &= ~np.uint16(VESSEL)
         lung = canvas.lung()
-        scene, numbers = scene_of(lung, with_fissures=False), tube_constants(tubes, Margins())
+        environment, numbers = tube_environment(lung, with_fissures=False), tube_constants(tubes, Margins())
         base = np.array([*BASE, 0.0, 0.0, 1.0])
         angles = np.linspace(0.0, 2 * math.pi, 16, endpoint=False)
         normals = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(16)])
@@ -399,7 +400,7 @@ class TestEnumeration:
         rows = np.zeros((16 * 18 * 19 // 2, kernels.ENTRY_COLUMNS))
         reasons = np.zeros(kernels.N_REASONS, dtype=np.int64)
         count = kernels.enumerate_site(
-            scene, numbers, base, normals, 7, stops, rows, reasons, np.zeros((2, kernels.N_TRACE))
+            environment, numbers, base, normals, 7, stops, rows, reasons, np.zeros((2, kernels.N_TRACE))
         )
         found = {(int(row[1]), row[2], row[3]): row for row in rows[:count]}
         assert len(found) == count and (rows[:count, 0] == 7).all()
@@ -410,7 +411,9 @@ class TestEnumeration:
                 for e in range(m, 18):
                     if e == 0:
                         continue
-                    reason = kernels.deploy(scene, numbers, base, normals[t], stops[m], stops[e], trace, tip)
+                    reason = kernels.validate_deployment(
+                        environment, numbers, base, normals[t], stops[m], stops[e], trace, tip
+                    )
                     key = (t, stops[m], stops[e])
                     assert (reason == kernels.ACCEPTED) == (key in found), (key, reason)
                     alone[reason] += 1

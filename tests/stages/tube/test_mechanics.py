@@ -14,8 +14,8 @@ from scipy.special import ellipj
 
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.typed import Float
+from stages.tube import Equilibrium, TubeMechanics
 from stages.tube.device import BentPiece, ConcentricTubes, Tube
-from stages.tube.mechanics import Equilibrium, TubeMechanics
 from stages.tube.shape import centreline
 
 NU = 0.3

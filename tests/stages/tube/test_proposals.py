@@ -16,7 +16,7 @@ from stages.tube.mechanics import TubeMechanics
 from stages.tube.proposals import (
     MakerLimits,
     SequenceComparison,
-    judge_design,
+    evaluate_design,
     least_sweep_sequence,
     propose_designs,
 )
@@ -113,7 +113,7 @@ class TestDesigns:
 
     def test_there_is_a_design_that_reaches_as_far_without_sweep(self) -> None:
         """Its curve is as long as it is inserted."""
-        present = judge_design(TUBES, 30.0, 50.0)
+        present = evaluate_design(TUBES, 30.0, 50.0)
         assert present.lateral_sweep_mm > 2.0
         still = [each for each in self.FOUND if each.lateral_sweep_mm == 0.0]
         assert max(each.tip_offset_mm for each in still) > present.tip_offset_mm
@@ -159,7 +159,7 @@ class TestDesigns:
 
     def test_a_straight_inner_tube_has_no_sweep_and_no_reach(self) -> None:
         straight = replace(TUBES, inner=replace(INNER, curved_length_mm=0.0, precurvature_per_mm=0.0))
-        found = judge_design(straight, 30.0, 50.0)
+        found = evaluate_design(straight, 30.0, 50.0)
         assert (found.lateral_sweep_mm, found.tip_offset_mm, found.tip_angle_rad) == (0.0, 0.0, 0.0)
 
     def test_the_bore_keeps_its_clearance(self) -> None:

@@ -12,11 +12,9 @@ from hypothesis import strategies as st
 
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.margins import Margins
-from stages.tube.deployments import tube_constants
+from stages.tube import Equilibrium, TubeMechanics, kernels, tube_constants
 from stages.tube.device import BentPiece, ConcentricTubes, Tube
 from stages.tube.following import DeployedSequence, SnapError, deploy, motion_by_step
-from stages.tube.kernels import deployment as kernels
-from stages.tube.mechanics import Equilibrium, TubeMechanics
 from stages.tube.sequences import Sequence, alternating, inner_first, joint_steps, kuntz2015, together
 
 INNER = Tube(

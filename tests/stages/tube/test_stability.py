@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from stages.tube import Equilibrium, TubeMechanics
 from stages.tube.device import BentPiece, Tube
-from stages.tube.mechanics import Equilibrium, TubeMechanics
 from tests.stages.tube.energy import TubeEnergy
 
 CASES_EACH = 25

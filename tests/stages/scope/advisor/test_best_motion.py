@@ -11,7 +11,7 @@ import pytest
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, start_state
-from stages.scope.advisor.best_motion import CANDIDATES, VERDICTS, Motion, Weights, best_motion, offsets
+from stages.scope.advisor.best_motion import CANDIDATES, VERDICTS, Motion, Weights, evaluate_motions, offsets
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, advanced, tool_frames
 from stages.scope.advisor.lumen import Lumen
@@ -23,7 +23,7 @@ WEIGHTS = Weights(nf1=0.5, clearance=0.3, twist=0.2)
 OUT, AWAY, COLLIDES, VALID = range(4)
 
 
-def scene_of(lumen: Lumen, *, reproduction: bool, model: ScopeModel | None = None) -> ScopeEnvironment:
+def environment_of(lumen: Lumen, *, reproduction: bool, model: ScopeModel | None = None) -> ScopeEnvironment:
     goal = goal_at(lumen, LINES[3][1])
     metric = "voxels" if reproduction else "mm"
     field = navigation_field(lumen, goal.voxel, metric=metric)
@@ -107,12 +107,12 @@ def by_the_paper(
 def test_the_table_is_that_of_the_paper(
     forked: tuple[Lung, Lumen], states: list[ScopeState], seed: int | None
 ) -> None:
-    environment = scene_of(forked[1], reproduction=True)
+    environment = environment_of(forked[1], reproduction=True)
     counted = np.zeros(4, dtype=int)
     for state in states:
         rng = None if seed is None else np.random.default_rng(seed)
         moved = offsets(None if seed is None else np.random.default_rng(seed))
-        found, _ = best_motion(environment, state, 5.0, WEIGHTS, rng=rng)
+        found, _ = evaluate_motions(environment, state, 5.0, WEIGHTS, rng=rng)
         expected = by_the_paper(environment, state, 5.0, moved)
         counted += np.bincount(expected["verdict"], minlength=4)
         np.testing.assert_array_equal(found.verdict, expected["verdict"])
@@ -133,10 +133,10 @@ def test_the_true_radius_only_takes_candidates_away(
     forked: tuple[Lung, Lumen], states: list[ScopeState]
 ) -> None:
     """The twists cover their whole range; valid is what fits after the look-ahead, and whose shaft does."""
-    environment = scene_of(forked[1], reproduction=False, model=ScopeModel(radius_mm=2.0))
+    environment = environment_of(forked[1], reproduction=False, model=ScopeModel(radius_mm=2.0))
     valid = 0
     for state in states:
-        found, _ = best_motion(environment, state, 5.0, WEIGHTS)
+        found, _ = evaluate_motions(environment, state, 5.0, WEIGHTS)
         expected = by_the_paper(environment, state, 5.0, offsets(None))
         assert ((found.verdict == VALID) <= (expected["verdict"] == VALID)).all()
         np.testing.assert_array_equal(found.verdict == AWAY, expected["verdict"] == AWAY)
@@ -148,10 +148,10 @@ def test_the_true_radius_only_takes_candidates_away(
 def test_random_offsets_stay_within_their_spacing_and_their_range(
     forked: tuple[Lung, Lumen], states: list[ScopeState]
 ) -> None:
-    environment = scene_of(forked[1], reproduction=False)
-    plain, _ = best_motion(environment, states[1], 5.0, WEIGHTS)
-    moved, _ = best_motion(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
-    again, _ = best_motion(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
+    environment = environment_of(forked[1], reproduction=False)
+    plain, _ = evaluate_motions(environment, states[1], 5.0, WEIGHTS)
+    moved, _ = evaluate_motions(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
+    again, _ = evaluate_motions(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
     np.testing.assert_array_equal(moved.cost, again.cost)
     twist, bend = moved.twist_rad - plain.twist_rad, moved.bend_rad - plain.bend_rad
     assert np.abs(twist).max() <= math.radians(7.5) + 1e-12
@@ -165,8 +165,8 @@ def test_random_offsets_stay_within_their_spacing_and_their_range(
 
 def test_ties_and_ranges_of_nothing_are_defined(forked: tuple[Lung, Lumen], states: list[ScopeState]) -> None:
     stiff = ScopeModel(twist_low_deg=0.0, twist_high_deg=0.0, bend_low_deg=0.0, bend_high_deg=0.0)
-    environment = scene_of(forked[1], reproduction=False, model=stiff)
-    found, _ = best_motion(environment, replace(states[0], bend_rad=0.0, twist_rad=0.0), 5.0, WEIGHTS)
+    environment = environment_of(forked[1], reproduction=False, model=stiff)
+    found, _ = evaluate_motions(environment, replace(states[0], bend_rad=0.0, twist_rad=0.0), 5.0, WEIGHTS)
     valid = np.flatnonzero(found.verdict == VALID)
     assert len(valid) == 11, "bends other than 0 are out of range, the twists are all the same"
     assert (found.cost[valid] == 0.0).all(), "all equal in potential and clearance, no twist"
@@ -176,20 +176,20 @@ def test_ties_and_ranges_of_nothing_are_defined(forked: tuple[Lung, Lumen], stat
 def test_ones_own_motion_costs_what_the_candidate_costs(
     forked: tuple[Lung, Lumen], states: list[ScopeState]
 ) -> None:
-    environment = scene_of(forked[1], reproduction=False)
-    table, _ = best_motion(environment, states[2], 5.0, WEIGHTS)
+    environment = environment_of(forked[1], reproduction=False)
+    table, _ = evaluate_motions(environment, states[2], 5.0, WEIGHTS)
     verdicts = set()
     for row in range(CANDIDATES):
         if table.verdict[row] == OUT:
             continue
-        again, own = best_motion(environment, states[2], 5.0, WEIGHTS, own=table.motion(row))
+        again, own = evaluate_motions(environment, states[2], 5.0, WEIGHTS, own=table.motion(row))
         assert own is not None
         assert own.verdict == VERDICTS[table.verdict[row]]
         assert own.cost == table.cost[row]
         assert again.best == table.best
         verdicts.add(own.verdict)
     assert "valid" in verdicts
-    _, beyond = best_motion(
+    _, beyond = evaluate_motions(
         environment, states[2], 5.0, WEIGHTS, own=Motion(advance_mm=5.0, twist_rad=2.0, bend_rad=0.0)
     )
     assert beyond is not None

@@ -1,0 +1,94 @@
+"""The differential equations of concentric tubes [Rucker2010]_ in the symbols of CasADi.
+
+The state is the position and the quaternion of the innermost tube's frame, its angle, the angles of the
+others relative to it, and the torsional moments in N mm.
+
+References
+----------
+.. [Rucker2010] docs/bibliography.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+import numpy as np
+
+from anatomy.typed import Float
+from stages.tube.device import Tube
+
+POSITION, ROTATION, FIRST_ANGLE = slice(0, 3), slice(3, 7), 7
+"""Places in the state."""
+
+SAME_MM = 1e-9
+"""Rounding of the lengths of a tube's pieces."""
+
+
+def landmarks_mm(tube: Tube) -> list[float]:
+    """Return the ascending arc lengths from the base at which the precurvature changes, and the end."""
+    ends = {end for bend in tube.bends for end in (bend.from_mm, bend.to_mm)}
+    return [*sorted(end for end in ends if 0.0 < end < tube.length_mm - SAME_MM), tube.length_mm]
+
+
+def rest_curvature_per_mm(tube: Tube, marks: Sequence[float], index: int) -> Any:
+    """Return the precurvature vector (2,) of the part of a tube that ends at a landmark."""
+    before = marks[index - 1] if index > 0 else 0.0
+    for start, end, curvature, direction in tube.bends:
+        if index < len(marks) and start <= 0.5 * (before + marks[index]) < end:
+            return curvature * np.array([np.cos(direction), np.sin(direction)])
+    return np.zeros(2)
+
+
+def state_rates(
+    state: Any, bending: Sequence[float], twisting: Sequence[float], rest: Sequence[Float]
+) -> Any:
+    """Return the derivative of the state by the arc length [Rucker2010]_.
+
+    The state is position, quaternion of the innermost tube's frame, its angle, the angles of the others
+    relative to it, and the torsional moments in N mm.
+    """
+    n = len(bending)
+    w, x, y, z = casadi.vertsplit(state[ROTATION])
+    relative = [casadi.SX(0), *casadi.vertsplit(state[FIRST_ANGLE + 1 : FIRST_ANGLE + n])][:n]
+    rates = [state[FIRST_ANGLE + n + i] / twisting[i] for i in range(n)]
+    turns = [about_z(angle)[:2, :2] for angle in relative]
+    shared = sum(bending[i] * turns[i] @ rest[i] for i in range(n)) / sum(bending)
+    moments = []
+    for i in range(n):
+        own = turns[i].T @ shared
+        moments.append(bending[i] * (own[0] * rest[i][1] - own[1] * rest[i][0]))
+    forward = casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
+    a, b, c = shared[0], shared[1], rates[0]
+    spin = casadi.vertcat(
+        -x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
+    )
+    others = [rates[i] - rates[0] for i in range(1, n)]
+    return casadi.vertcat(forward, 0.5 * spin, rates[0], *others, *moments)
+
+
+def about_z(angle: Any) -> Any:
+    """Return the rotation about z by an angle."""
+    c, s = casadi.cos(angle), casadi.sin(angle)
+    return casadi.vertcat(casadi.horzcat(c, -s, 0), casadi.horzcat(s, c, 0), casadi.horzcat(0, 0, 1))
+
+
+def rotation_of(quaternion: Any) -> Any:
+    """Return the rotation of a quaternion (w, x, y, z) of any length."""
+    unit = quaternion / casadi.norm_2(quaternion)
+    cross = casadi.skew(unit[1:])
+    return casadi.MX.eye(3) + 2 * unit[0] * cross + 2 * cross @ cross
+
+
+def pose_derivative(position: Any, rotation: Any, by: Any) -> Any:
+    """Return the (6, m) derivative of a pose: its position, then its rotation vector."""
+    columns = casadi.horzsplit(rotation)
+    turn = sum(casadi.skew(column) @ casadi.jacobian(column, by) for column in columns)
+    return casadi.vertcat(casadi.jacobian(position, by), 0.5 * turn)
+
+
+def determinant_function(n: int) -> Any:
+    """Return the function: matrix (n, n) -> determinant, in plain arithmetic."""
+    matrix = casadi.SX.sym("matrix", n, n)
+    return casadi.Function("determinant", [matrix], [casadi.det(matrix)])

@@ -1,0 +1,65 @@
+"""What the tubes collide with, and the numbers of a pair of tubes, as the kernels take them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.lung import Lung
+from anatomy.margins import Margins
+from anatomy.structures import obstacle_bits
+from anatomy.typed import Float
+from stages.tube import kernels
+from stages.tube.device import ConcentricTubes
+from stages.tube.kernels import TubeEnvironment
+
+
+def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
+    """Return what the tubes collide with in a lung.
+
+    Parameters
+    ----------
+    lung : Lung
+    with_fissures : bool
+        Whether fissures are obstacles.
+    """
+    field = lung.obstacle_field(with_fissures=with_fissures)
+    bits = obstacle_bits(with_fissures)
+    depth = lung.lumen_depth
+    return TubeEnvironment(
+        field=field.corners,
+        labels=lung.labels,
+        geometry=field.geometry,
+        bits=bits,
+        lumen=depth.corners,
+        lumen_geometry=depth.geometry,
+        mediastinal=lung.tree.mediastinal,
+    )
+
+
+def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
+    """Return the `(10,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad."""
+    constants = np.zeros(kernels.N_TUBES)
+    inner, outer = tubes.inner, tubes.outer
+    constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
+    constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
+    constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
+    constants[kernels.OUTER_RADIUS] = outer.radius_mm
+    constants[kernels.INNER_RADIUS] = inner.radius_mm
+    constants[kernels.MARGIN] = margins.total_mm
+    constants[kernels.MIN_WALL_ANGLE] = math.radians(tubes.min_wall_angle_deg)
+    constants[kernels.MAX_SWEEP] = tubes.max_lateral_sweep_mm
+    constants[kernels.MAX_EXTENSION] = tubes.max_extension_mm
+    constants[kernels.MAX_PROTRUSION] = tubes.max_inner_protrusion_mm
+    return constants
+
+
+def tracking_length_mm(tubes: ConcentricTubes) -> float:
+    """Return the greatest insertion in which the tubes follow their own track exactly.
+
+    Curved tubes do so as long as the straight part of the inner one stays in the scope.
+    """
+    if tubes.inner.precurvature_per_mm == 0.0:
+        return tubes.max_extension_mm
+    return min(tubes.inner.curved_length_mm, tubes.max_extension_mm)

@@ -1,0 +1,110 @@
+"""The planar shape of deployed tubes, in closed form, and how they sweep sideways.
+
+A straight outer tube and an inner tube with a precurved distal part, rotated together, need no torsion: the
+centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `(10,)` float64 array of the
+numbers below: curvatures in 1/mm, lengths in mm, the angle in rad.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+
+from anatomy.kernels.arcs import normal_on_arc, pose_on_arc, sine_length, versine_length
+
+OVERLAP_CURVATURE = 0
+INNER_CURVATURE = 1
+CURVED_LENGTH = 2
+OUTER_RADIUS = 3
+INNER_RADIUS = 4
+MARGIN = 5
+MIN_WALL_ANGLE = 6
+MAX_SWEEP = 7
+MAX_EXTENSION = 8
+MAX_PROTRUSION = 9
+N_TUBES = 10
+
+SWEEP_SAMPLES = 100
+"""Samples of the sweep between its two sharp peaks; it is smooth there, and they are computed exactly."""
+
+
+@numba.njit(cache=True)
+def planar_point(tubes, outer, inner, s):
+    """Return (aside, ahead) of the centreline at arc length `s` for given insertions, in mm.
+
+    The inner tube is curved over its last CURVED_LENGTH mm.  Inside the outer tube the two share the
+    curvature `kappa E_i I_i / (E_i I_i + E_o I_o)`; beyond it the inner has its own.
+    """
+    straight = min(max(inner - tubes[CURVED_LENGTH], 0.0), s)
+    shared = min(max(outer - straight, 0.0), s - straight)
+    free = s - straight - shared
+    angle = tubes[OVERLAP_CURVATURE] * shared
+    aside = versine_length(tubes[OVERLAP_CURVATURE], shared)
+    ahead = straight + sine_length(tubes[OVERLAP_CURVATURE], shared)
+    out = versine_length(tubes[INNER_CURVATURE], free)
+    along = sine_length(tubes[INNER_CURVATURE], free)
+    aside += math.sin(angle) * along + math.cos(angle) * out
+    ahead += math.cos(angle) * along - math.sin(angle) * out
+    return aside, ahead
+
+
+@numba.njit(cache=True)
+def planar_points(tubes, outer, inner, arc_lengths, out):
+    """Fill `out` (N, 2) with `planar_point` at `arc_lengths` (N,)."""
+    for n in range(arc_lengths.shape[0]):
+        out[n, 0], out[n, 1] = planar_point(tubes, outer, inner, arc_lengths[n])
+
+
+@numba.njit(cache=True)
+def tube_pieces(tubes, outer, inner):
+    """Return the four arcs of the centreline, some empty: begin and end in mm, curvature, radius."""
+    straight = max(inner - tubes[CURVED_LENGTH], 0.0)
+    return (
+        (0.0, min(straight, outer), 0.0, tubes[OUTER_RADIUS]),
+        (min(straight, outer), outer, tubes[OVERLAP_CURVATURE], tubes[OUTER_RADIUS]),
+        (outer, max(straight, outer), 0.0, tubes[INNER_RADIUS]),
+        (max(straight, outer), inner, tubes[INNER_CURVATURE], tubes[INNER_RADIUS]),
+    )
+
+
+@numba.njit(cache=True)
+def tip_pose(tubes, base, normal, outer, inner):
+    """Return the pose at the tip of the inner tube, from the scope tip `base`, bending towards `normal`."""
+    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
+    towards = (normal[0], normal[1], normal[2])
+    for begin, end, kappa, _radius in tube_pieces(tubes, outer, inner):
+        if end > begin:
+            bend = (kappa, towards[0], towards[1], towards[2])
+            towards = normal_on_arc(pose, bend, end - begin)
+            pose = pose_on_arc(pose, bend, end - begin)
+    return pose
+
+
+@numba.njit(cache=True)
+def _off_track(tubes, outer, inner, tip):
+    """Return how far the point at arc length `tip` ends up from where the tip first got there, in mm."""
+    x0, z0 = planar_point(tubes, min(tip, outer), tip, tip)
+    x1, z1 = planar_point(tubes, outer, inner, tip)
+    return math.hypot(x1 - x0, z1 - z0)
+
+
+@numba.njit(cache=True)
+def lateral_sweep(tubes, outer, inner):
+    """Return the largest distance of a point of the body, at any step, from its final place, in mm.
+
+    Steps as in [Kuntz2015]: both tubes to `outer` with flush tips, then the inner to `inner`.  While the
+    straight part of the inner tube moves out, the bend behind it opens steadily, so each point is
+    farthest from its final place when the tip first gets there: the sweep is also the error with which
+    the tubes follow their leader.  While the tip is within the curved length of the scope it is 0.
+    """
+    curved = tubes[CURVED_LENGTH]
+    if inner <= curved:
+        return 0.0
+    # It peaks sharply where the straight part leaves the scope or the outer tube; elsewhere it is smooth.
+    worst = max(
+        _off_track(tubes, outer, inner, curved), _off_track(tubes, outer, inner, min(outer + curved, inner))
+    )
+    for m in range(1, SWEEP_SAMPLES + 1):
+        worst = max(worst, _off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
+    return worst

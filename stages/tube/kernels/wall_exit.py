@@ -1,0 +1,255 @@
+"""A tube followed from the lumen through the wall into the tissue, and whether each point of it is allowed.
+
+`tubes` is the array of `planar`.  `trace` is a `(5,)` float64 array that keeps where the tube is and how it
+left the lumen.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+
+from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
+from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
+from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
+from anatomy.typed import Bool, Float, Labels, UInt16
+from stages.tube.kernels.planar import MIN_WALL_ANGLE
+
+# trace
+PHASE = 0
+LEFT_AT = 1
+BRANCH = 2
+WALL_ANGLE = 3
+HAZARD = 4
+N_TRACE = 5
+
+IN_LUMEN = 0.0
+IN_WALL = 1.0
+IN_TISSUE = 2.0
+
+# reasons why a deployment is refused
+ACCEPTED = 0
+NO_EXIT = 1
+NEAR_VESSEL = 2
+NEAR_PLEURA = 3
+NEAR_FISSURE = 4
+NEAR_OTHER_BRANCH = 5
+REENTERS_LUMEN = 6
+FLAT_EXIT = 7
+SWEEPS = 8
+TOO_LONG = 9
+PROTRUDES = 10
+LEAVES_MEDIASTINAL = 11
+N_REASONS = 12
+
+FINE_STEP_MM = 0.05
+"""Least step in the lumen, where the axis may cut corners of voxels: a tenth of a voxel."""
+WALL_ZONE_MM = 1.0
+"""Within this length the tube pierces the wall; airways that tubes leave have thinner walls."""
+OUT_OF_LUMEN_MM = 0.02
+"""Least distance from the axis to any lumen, once it is in the tissue."""
+NORMAL_RADIUS_MM = 2.5
+"""The wall's normal is that of the lumen within this radius: larger than voxels, smaller than branches."""
+BISECTIONS = 12
+"""Halvings of a step to find where the axis leaves the lumen: to less than 0.001 mm."""
+
+
+class TubeEnvironment(NamedTuple):
+    """What the tubes collide with, for kernels.
+
+    field, geometry : corner field of the distance to the obstacles, and its geometry; labels : the labels of
+    the voxels; bits : those of the obstacles; lumen, lumen_geometry : corner field of the depth in the
+    lumen; mediastinal : (B,) bool, which branches lie in the mediastinum and must not be left.
+    """
+
+    field: UInt16
+    labels: Labels
+    geometry: Float
+    bits: int
+    lumen: UInt16
+    lumen_geometry: Float
+    mediastinal: Bool
+
+
+@numba.njit(cache=True)
+def _reason(label):
+    """Translate the label of a voxel that is too near into a reason."""
+    if label & VESSEL:
+        return NEAR_VESSEL
+    if label & OUTSIDE:
+        return NEAR_PLEURA
+    if label & FISSURE:
+        return NEAR_FISSURE
+    return NEAR_OTHER_BRANCH
+
+
+@numba.njit(cache=True)
+def _wall_normal(labels, geometry, x, y, z):
+    """Return the outward unit normal of the lumen at a border point, in corner axes scaled to mm.
+
+    It points away from the centroid of the lumen within NORMAL_RADIUS_MM.
+    """
+    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
+    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
+    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    su = math.sqrt(geometry[0, 4])
+    sv = math.sqrt(geometry[1, 4])
+    sw = math.sqrt(geometry[2, 4])
+    r = NORMAL_RADIUS_MM
+    mu = mv = mw = 0.0
+    for k in range(max(int(w - r / sw), 0), min(int(w + r / sw) + 1, labels.shape[2])):
+        dw = (k + 0.5 - w) * sw
+        for j in range(max(int(v - r / sv), 0), min(int(v + r / sv) + 1, labels.shape[1])):
+            dv = (j + 0.5 - v) * sv
+            for i in range(max(int(u - r / su), 0), min(int(u + r / su) + 1, labels.shape[0])):
+                du = (i + 0.5 - u) * su
+                if labels[i, j, k] & LUMEN and du * du + dv * dv + dw * dw <= r * r:
+                    mu += du
+                    mv += dv
+                    mw += dw
+    norm = math.sqrt(mu * mu + mv * mv + mw * mw)
+    if norm < 1e-9:
+        return 0.0, 0.0, 0.0
+    return -mu / norm, -mv / norm, -mw / norm
+
+
+@numba.njit(cache=True)
+def wall_angle(labels, geometry, pose):
+    """Return the angle in rad between a tangent and the lumen's border at its point; pi/2 is square on."""
+    nu, nv, nw = _wall_normal(labels, geometry, pose[0], pose[1], pose[2])
+    tx, ty, tz = pose[3], pose[4], pose[5]
+    sine = 0.0
+    for axis in range(3):
+        along = geometry[axis, 0] * tx + geometry[axis, 1] * ty + geometry[axis, 2] * tz
+        normal = nu if axis == 0 else (nv if axis == 1 else nw)
+        sine += along * math.sqrt(geometry[axis, 4]) * normal
+    return math.asin(min(max(sine, -1.0), 1.0))
+
+
+@numba.njit(cache=True)
+def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
+    """Find where the axis leaves the lumen between two arc lengths of a piece, and validate the exit."""
+    labels, geometry, mediastinal = environment.labels, environment.geometry, environment.mediastinal
+    branch = int(trace[BRANCH])
+    if branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
+        return LEAVES_MEDIASTINAL
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (inside + outside)
+        x, y, z = point_on_arc(pose, bend, middle)
+        if label_at(labels, geometry, x, y, z) & LUMEN:
+            inside = middle
+        else:
+            outside = middle
+    trace[PHASE] = IN_WALL
+    trace[LEFT_AT] = s0 + inside
+    trace[WALL_ANGLE] = wall_angle(labels, geometry, pose_on_arc(pose, bend, inside))
+    if trace[WALL_ANGLE] < tubes[MIN_WALL_ANGLE]:
+        return FLAT_EXIT
+    return int(trace[HAZARD])
+
+
+@numba.njit(cache=True)
+def _tissue_gap(environment, trace, x, y, z, required):
+    """Return the clearance beyond `required` outside the lumen and the label that limits it.
+
+    Exempt is the wall of the pierced branch; its lumen must stay out of reach of the axis.
+    """
+    labels, geometry = environment.labels, environment.geometry
+    gap = distance_bound(environment.field, geometry, x, y, z) - required
+    if gap >= MIN_GAP_MM:
+        return gap, 0
+    reach = required + EXACT_REACH_MM
+    branch = int(trace[BRANCH])
+    distance, label = exact_distance(labels, geometry, x, y, z, environment.bits, branch, reach)
+    gap = distance - required
+    if trace[PHASE] == IN_TISSUE:
+        lumen, _label = exact_distance(labels, geometry, x, y, z, LUMEN, -1, reach)
+        if lumen - OUT_OF_LUMEN_MM < gap:
+            return lumen - OUT_OF_LUMEN_MM, LUMEN
+    return gap, label
+
+
+@numba.njit(cache=True)
+def _lumen_step(environment, trace, x, y, z, radius, required):
+    """Note branch and hazards of a point in the lumen; return the step to the next one.
+
+    Where the tube touches the wall, what lies behind it must be as clear as in the tissue, unless the
+    tube comes free again before it leaves.
+    """
+    labels, geometry = environment.labels, environment.geometry
+    trace[BRANCH] = (label_at(labels, geometry, x, y, z) >> BRANCH_SHIFT) - 1
+    depth = distance_bound(environment.lumen, environment.lumen_geometry, x, y, z)
+    if depth >= radius:
+        trace[HAZARD] = ACCEPTED
+        return max(depth - radius, FINE_STEP_MM)
+    reach = required + EXACT_REACH_MM
+    bits = environment.bits & ~AIRWAY
+    distance, label = exact_distance(labels, geometry, x, y, z, bits, -1, reach)
+    if distance - required < FINE_STEP_MM:
+        trace[HAZARD] = _reason(label)
+        return max(0.5 * depth, FINE_STEP_MM)
+    return max(min(0.5 * depth, distance - required), FINE_STEP_MM)
+
+
+@numba.njit(cache=True)
+def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
+    """Follow one arc of the tube, from `s0` mm beyond the scope tip, and validate every point of it.
+
+    In the lumen the axis moves freely, and corners of voxels that it cuts for less than FINE_STEP_MM may
+    go unnoticed.  Where it leaves, the wall is pierced within WALL_ZONE_MM; from
+    there on the axis is out of every lumen, and the tube keeps `clearance` from its surface to
+    vessels, pleura, fissures and other branches.  Returns a reason, ACCEPTED if there is none.
+    """
+    labels, geometry = environment.labels, environment.geometry
+    required = radius + clearance
+    s = 0.0
+    last = 0.0
+    while True:
+        x, y, z = point_on_arc(pose, bend, s)
+        if trace[PHASE] == IN_LUMEN:
+            if label_at(labels, geometry, x, y, z) & LUMEN:
+                step = _lumen_step(environment, trace, x, y, z, radius, required)
+            elif s0 + s == 0.0:
+                return NO_EXIT
+            else:
+                reason = _leave_lumen(environment, tubes, trace, pose, bend, last, s, s0)
+                if reason != ACCEPTED:
+                    return reason
+                s = max(trace[LEFT_AT] - s0, 0.0)
+                continue
+        else:
+            gap, label = _tissue_gap(environment, trace, x, y, z, required)
+            if gap < MIN_GAP_MM:
+                return REENTERS_LUMEN if label == LUMEN else _reason(label)
+            step = gap
+            if trace[PHASE] == IN_WALL:
+                here = label_at(labels, geometry, x, y, z)
+                if here & LUMEN and (here >> BRANCH_SHIFT) - 1 != int(trace[BRANCH]):
+                    return REENTERS_LUMEN
+                zone = trace[LEFT_AT] + WALL_ZONE_MM - s0
+                if s >= zone:
+                    trace[PHASE] = IN_TISSUE
+                    continue
+                step = min(step, max(zone - s, 1e-6))
+        if s >= length:
+            return ACCEPTED
+        last = s
+        s = min(s + step, length)
+
+
+@numba.njit(cache=True)
+def reset(trace):
+    """Put a trace at the scope tip, in the lumen."""
+    for m in range(trace.shape[0]):
+        trace[m] = 0.0
+    trace[BRANCH] = -1.0
+
+
+@numba.njit(cache=True)
+def advance(environment, tubes, trace, pose, normal, kappa, s0, s1, radius, clearance):
+    """March along one arc; return the reason, and pose and bending direction at its end."""
+    bend = (kappa, normal[0], normal[1], normal[2])
+    reason = march(environment, tubes, trace, pose, bend, s0, s1 - s0, radius, clearance)
+    return reason, pose_on_arc(pose, bend, s1 - s0), normal_on_arc(pose, bend, s1 - s0)

@@ -1,0 +1,84 @@
+"""Nested tubes: whether they fit into each other, and their numbers as the kernels take them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.grid import read_only
+from anatomy.typed import Float
+from stages.tube.device import Tube
+from stages.tube.kernels import assembly
+
+STEP_RAD = 0.075
+"""Angle of the fastest torsional oscillation that one step spans; tips are then right to about 1e-6 mm."""
+SAME_MM = 1e-9
+"""Lengths that differ by less are equal: rounding."""
+
+
+class NestedTubes:
+    """Nested tubes, the innermost first, cut into pieces of constant stiffness and precurvature.
+
+    Parameters and errors are those of `TubeMechanics`.
+    """
+
+    def __init__(
+        self, tubes: Sequence[Tube], *, step_rad: float = STEP_RAD, least_clearance_mm: float | None = 0.0
+    ) -> None:
+        check_nesting(tubes, least_clearance_mm)
+        if not 0.0 < step_rad <= 1.0:
+            raise SettingsError(f"The step is {step_rad:g} rad", expected="above 0, at most 1")
+        self.tubes = tuple(tubes)
+        self.step_rad = float(step_rad)
+        self.lengths_mm = read_only(np.array([tube.length_mm for tube in self.tubes]))
+        stiffness = [[t.bending_stiffness_n_mm2, t.torsional_stiffness_n_mm2] for t in self.tubes]
+        bends = [(float(i), *bend) for i, tube in enumerate(self.tubes) for bend in tube.bends]
+        self.design = (np.array(stiffness), np.array(self.lengths_mm), np.array(bends).reshape(-1, 5))
+
+    @property
+    def count(self) -> int:
+        """Number of tubes, n."""
+        return len(self.tubes)
+
+    def cut(self, beta: Float) -> tuple[tuple[Any, ...], int]:
+        """Return the pieces of constant stiffness and precurvature, and their steps; rear ends `(n,)` mm."""
+        most = 1 + self.count + 2 * len(self.design[2])
+        pieces = np.zeros((most, assembly.PIECE_COLUMNS))
+        moments, directions = np.zeros((most, self.count)), np.zeros((most, self.count))
+        count, n_steps = assembly.cut(self.design, beta, self.step_rad, pieces, moments, directions)
+        return (pieces, moments, directions, count), int(n_steps)
+
+
+def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0) -> None:
+    """Check that tubes, the innermost first, fit into each other and that none is longer than one inside.
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+    least_clearance_mm : float, optional
+        Least difference of diameters, which must be more than 0 in any case; None: any will do.
+
+    Raises
+    ------
+    SettingsError
+        If there is none, or they do not nest.
+    """
+    if not tubes:
+        raise SettingsError("There is no tube", expected="one tube or more, the innermost first")
+    for m in range(len(tubes) - 1):
+        inner, outer = tubes[m], tubes[m + 1]
+        clearance = outer.inner_diameter_mm - inner.outer_diameter_mm
+        if least_clearance_mm is not None and not clearance > max(least_clearance_mm - SAME_MM, 0.0):
+            raise SettingsError(
+                f"Tube {m + 1} has an outer diameter of {inner.outer_diameter_mm:g} mm",
+                expected=f"less than the inner diameter of tube {m + 2}, {outer.inner_diameter_mm:g} mm, by "
+                f"{least_clearance_mm:g} mm or more",
+            )
+        if inner.length_mm < outer.length_mm:
+            raise SettingsError(
+                f"Tube {m + 1} is {inner.length_mm:g} mm long",
+                expected=f"at least the length of tube {m + 2}, {outer.length_mm:g} mm",
+            )

@@ -1,0 +1,121 @@
+"""Validation of single deployments: shape, tip pose and exit through the wall, or why one is refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from anatomy import poses as frames
+from anatomy.errors import SettingsError
+from anatomy.lung import Lung
+from anatomy.margins import Margins
+from anatomy.typed import Float
+from stages.tube import kernels
+from stages.tube.device import ConcentricTubes
+from stages.tube.environment import tube_constants, tube_environment
+
+REASONS: dict[int, str] = {
+    kernels.NO_EXIT: "the tube does not leave the airway",
+    kernels.NEAR_VESSEL: "the tube comes too near a vessel",
+    kernels.NEAR_PLEURA: "the tube comes too near the pleura or leaves the lung",
+    kernels.NEAR_FISSURE: "the tube comes too near a fissure",
+    kernels.NEAR_OTHER_BRANCH: "the tube comes too near another airway",
+    kernels.REENTERS_LUMEN: "the tube enters an airway again",
+    kernels.FLAT_EXIT: "the tube meets the airway wall at too flat an angle",
+    kernels.SWEEPS: "the tube would sweep tissue sideways",
+    kernels.TOO_LONG: "the tube would extend too far",
+    kernels.PROTRUDES: "the inner tube is too short to protrude so far",
+    kernels.LEAVES_MEDIASTINAL: "the tube would leave the trachea or a main bronchus, in the mediastinum",
+}
+"""Why a deployment is refused, by the code of the kernels."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Deployment:
+    """One accepted deployment in full.
+
+    Parameters
+    ----------
+    rotation_rad, outer_mm, inner_mm : float
+    lps_from_tip : (4, 4) float64
+        +z forward, +x towards the bend.
+    branch : int
+    exit_mm, wall_angle_rad : float
+    lateral_sweep_mm : float
+    """
+
+    rotation_rad: float
+    outer_mm: float
+    inner_mm: float
+    lps_from_tip: Float
+    branch: int
+    exit_mm: float
+    wall_angle_rad: float
+    lateral_sweep_mm: float
+
+    @property
+    def length_in_tissue_mm(self) -> float:
+        """Length of tube beyond the lumen that it leaves."""
+        return self.inner_mm - self.exit_mm
+
+
+class DeploymentValidator:
+    """Accepts or refuses single deployments of one pair of tubes in one lung.
+
+    Parameters
+    ----------
+    lung : Lung
+    tubes : ConcentricTubes
+    margins : Margins
+    with_fissures : bool
+        Whether fissures are obstacles.
+    """
+
+    def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
+        self._environment = tube_environment(lung, with_fissures=with_fissures)
+        self._constants = tube_constants(tubes, margins)
+        self._trace = np.zeros(kernels.N_TRACE)
+        self._tip = np.zeros(9)
+
+    def validate(
+        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
+    ) -> Deployment | str:
+        """Return the deployment, or the reason why it is refused.
+
+        Parameters
+        ----------
+        lps_from_scope_tip : (4, 4) float64
+        rotation_rad : float
+            Direction of the bend about +z of the scope tip, counted from its +x.
+        outer_mm, inner_mm : float
+            Insertions beyond the scope tip.
+
+        Raises
+        ------
+        SettingsError
+            If the outer tube would be ahead of the inner one.
+        """
+        if not 0.0 <= outer_mm <= inner_mm:
+            raise SettingsError(
+                f"The insertions of outer and inner tube are {outer_mm:g} and {inner_mm:g} mm",
+                expected="0 <= outer <= inner",
+            )
+        base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
+        normal = frames.bending_directions(lps_from_scope_tip, rotation_rad)[0]
+        trace, tip = self._trace, self._tip
+        reason = kernels.validate_deployment(
+            self._environment, self._constants, base, normal, float(outer_mm), float(inner_mm), trace, tip
+        )
+        if reason != kernels.ACCEPTED:
+            return REASONS[reason]
+        return Deployment(
+            rotation_rad=float(rotation_rad),
+            outer_mm=float(outer_mm),
+            inner_mm=float(inner_mm),
+            lps_from_tip=frames.pose(tip[:3], tip[3:6], tip[6:9]),
+            branch=int(trace[kernels.BRANCH]),
+            exit_mm=float(trace[kernels.LEFT_AT]),
+            wall_angle_rad=float(trace[kernels.WALL_ANGLE]),
+            lateral_sweep_mm=float(kernels.lateral_sweep(self._constants, float(outer_mm), float(inner_mm))),
+        )

@@ -39,7 +39,7 @@ PAPER_SUCCESS = {
     "rrt": {"G1": 0.980, "G2": 0.760, "G3": 0.890, "G4": 0.910},
     "rrt*": {"G1": 0.988, "G2": 0.740, "G3": 0.890, "G4": 0.950},
 }
-"""[Li2021, table 2]; BFS-GA stands beside both repairs."""
+"""[Li2021, table 2]; BFS-GA is compared with both repairs."""
 PAPER_SAVED_G4 = 0.41
 OWN_TEST = {
     "exact": "tested at path points",

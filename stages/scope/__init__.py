@@ -1,4 +1,4 @@
-"""The bronchoscope: where its tip can stand, how it gets there, routes and tours."""
+"""The bronchoscope: the device, its sites and its tip poses; see also `advisor`, `route` and `tour`."""
 
 from __future__ import annotations
 

@@ -250,13 +250,13 @@ def _labels_at(lung: Lung, points: Float) -> Labels:
 
 
 def _distance_to_exit(tree: AirwayTree, in_tissue: Bool) -> Float:
-    """Return the way from each point down the tree to the next point in lung tissue."""
-    way = np.where(in_tissue, 0.0, np.inf)
+    """Return the distance from each point down the tree to the next point in lung tissue."""
+    distance_mm = np.where(in_tissue, 0.0, np.inf)
     for point in range(tree.n_points - 1, 0, -1):
         parent = tree.parent_point[point]
         step = tree.distance_from_root_mm[point] - tree.distance_from_root_mm[parent]
-        way[parent] = min(way[parent], way[point] + step)
-    return way
+        distance_mm[parent] = min(distance_mm[parent], distance_mm[point] + step)
+    return distance_mm
 
 
 def _every(tree: AirwayTree, spacing_mm: float) -> Bool:

@@ -73,7 +73,7 @@ class DeployedSequence:
     steps : tuple of Equilibrium
     lateral_sweep_by_step_mm : (K,) float64
         Largest distance of a point of the body from its final place: the point of the final centreline at
-        the same arc length from the scope tip, or the final tip if the body is longer now.
+        the same arc length from the scope tip, or the final tip if the body is longer by then.
     follow_the_leader_by_step_mm : (K,) float64
         Largest distance of a point of the body from the nearest point of the final centreline.
     """

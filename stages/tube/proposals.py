@@ -192,7 +192,7 @@ def propose_designs(
     """Vary what a maker can vary, and return the designs worth a look, least sweep first.
 
     Varied are the wall of the outer tube, and length and curvature of the inner tube's curved part, within
-    the strain limit of `tubes`; the curved part is at least half as long as now.  A design is left out if
+    the strain limit of `tubes`; the curved part is at least half as long as theirs.  A design is left out if
     another one sweeps no more, reaches no less to the side, turns the tip no more and has no longer curved
     part.
 
@@ -221,7 +221,7 @@ def propose_designs(
     if thickest < limits.thinnest_wall_mm:
         raise SettingsError(
             f"The outer tube's wall could be {thickest:g} mm thick at most",
-            expected=f"room for {limits.thinnest_wall_mm:g} mm between inner tube and channel",
+            expected=f"space for {limits.thinnest_wall_mm:g} mm between inner tube and channel",
             remedy="Allow less clearance, or take a thinner inner tube or a larger channel",
         )
     longest = limits.longest_curve_mm or max(inner_mm, tubes.inner.curved_length_mm)

@@ -168,12 +168,12 @@ def alternating(
         raise SettingsError(f"The increment is {increment_mm:g} mm", expected="a finite length above 0")
     insertions = _insertions(tubes, insertions_mm)
     numbers = np.arange(len(insertions))
-    now = np.zeros_like(insertions)
+    inserted = np.zeros_like(insertions)
     moves: list[tuple[str, Float]] = []
-    while (now < insertions).any():
-        for tube in numbers[now < insertions]:
-            now = np.where(numbers == tube, np.minimum(now + increment_mm, insertions), now)
-            moves.append((_insert(tubes, numbers == tube), now))
+    while (inserted < insertions).any():
+        for tube in numbers[inserted < insertions]:
+            inserted = np.where(numbers == tube, np.minimum(inserted + increment_mm, insertions), inserted)
+            moves.append((_insert(tubes, numbers == tube), inserted))
     return _from_insertions("alternating", tubes, base_angles_rad, moves)
 
 

@@ -95,7 +95,7 @@ def grow(
     reach : int
         Neighbours that RRT* looks at; 0 for RRT.
     points (V, 3), parent (V,), cost (V,)
-        The tree so far; as many samples are taken as it has room for.
+        The tree so far; as many samples are taken as its arrays hold.
     counts : (3,) int64
         Vertices, samples taken, vertex that was last connected to the goal; continued from there.
     state : (1,) uint64

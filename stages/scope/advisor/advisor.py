@@ -28,7 +28,7 @@ THINNEST_MM = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Advice:
-    """What to do now.
+    """What the user is advised to do.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class Advice:
     cost : float
         Eq. 9 of the best motion; 0 if there is none.
     candidates : Candidates
-        All that were weighed.
+        All that were evaluated.
     own : MotionEvaluation or None
         The evaluation of the user's own motion.
     distance_mm : float

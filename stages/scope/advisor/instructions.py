@@ -19,7 +19,7 @@ DIRECTIONS = (
     ("upwards", (0.0, 0.0, 1.0)),
     ("downwards", (0.0, 0.0, -1.0)),
 )
-"""Words for the LPS axes, as the patient stands."""
+"""Words for the LPS axes, for an upright patient."""
 LOOK_MM = 10.0
 """The direction of a branch is that of its first millimetres; forks nearer to each other count as one."""
 
@@ -101,15 +101,15 @@ def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, 
     instructions: list[Instruction] = []
     twist_before = math.degrees(path.states[0, 12])
     for number, (begin, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
-        now = int(branch[begin])
+        here = int(branch[begin])
         twist, bend = np.degrees(path.states[begin, 12:14]).tolist()
         bends = np.degrees(path.states[begin:end, 13])
         instructions.append(
             Instruction(
-                branch=now,
-                generation=int(tree.generation[now]),
-                from_carina_mm=float(tree.distance_from_root_mm[_first_point(tree, now)]) - carina,
-                heading=_heading(tree, now) if number else "",
+                branch=here,
+                generation=int(tree.generation[here]),
+                from_carina_mm=float(tree.distance_from_root_mm[_first_point(tree, here)]) - carina,
+                heading=_heading(tree, here) if number else "",
                 rotate_deg=twist - twist_before,
                 twist_deg=twist,
                 bend_deg=bend,

@@ -40,7 +40,7 @@ class PathSettings:
     look_ahead_mm : float
         Advance of the candidates (dz).
     sub_step_mm : float
-        Advance until the candidates are weighed anew.
+        Advance until the candidates are evaluated again.
     weights : Weights
         Of eq. 9.
     random_offsets : bool

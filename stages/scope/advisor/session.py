@@ -62,14 +62,14 @@ class Session:
         self._return_mm = np.zeros(0)
 
     def advise(self, state: ScopeState, *, own: Motion | None = None) -> Advice:
-        """Return what to do now: the next motion of the plan, or how far to pull back.
+        """Return the advice for a state: the next motion of the plan, or how far to pull back.
 
         "arrived" is where the plan ends, be it the goal or the nearest point found.
 
         Parameters
         ----------
         state : ScopeState
-            Where the scope is now, in the lumen.
+            Where the scope is, in the lumen.
         own : Motion, optional
             A motion that the user is about to make, to be evaluated.
 

@@ -1,4 +1,4 @@
-"""Centrelines with radii: what a route runs along, and the lumen that they stand for."""
+"""Centrelines with radii: what a route follows, and the lumen as a union of cones."""
 
 from __future__ import annotations
 

@@ -27,22 +27,22 @@ ROUNDS, STEPS = 12, 30
 SOLVED = 2e-3
 """Violation that counts as none; the spares are larger, so that the limits themselves hold."""
 HOPELESS = 0.02
-"""With a larger violation, finer samples do not help; more room may."""
+"""With a larger violation, finer samples do not help; a wider segment may."""
 LEAST_SPANS = 8
-"""A segment is widened by at least so many spans on both sides: a bend needs room."""
+"""A segment is widened by at least so many spans on both sides: a bend needs length."""
 MARGIN_SHARE = 0.05
 """Share of all spans by which a segment is widened on both sides, as in [Li2021]."""
 ANY_CURVATURE = 1e9
 
 Stage = tuple[float, float, int, int]
-"""Price of bending, times the limit of curvature, rounds and steps."""
+"""Weight of bending, times the limit of curvature, rounds and steps."""
 FINAL_STAGE: Stage = (BENDING, 1.0, ROUNDS, STEPS)
 
 SMOOTH: tuple[Stage, ...] = ((2.0, ANY_CURVATURE, 2, 10),)
 SMOOTH_WITHIN: tuple[Stage, ...] = ((2.0, ANY_CURVATURE, 1, 8), (2.0, 1.0, 2, 10))
 FALLING: tuple[Stage, ...] = (
     (30.0, ANY_CURVATURE, 1, 8),
-    *((price, 1.0, 1, 10) for price in (30.0, 3.0, 0.3)),
+    *((weight, 1.0, 1, 10) for weight in (30.0, 3.0, 0.3)),
 )
 STIFF: tuple[Stage, ...] = ((30.0, ANY_CURVATURE, 4, STEPS), (30.0, 1.0, 4, STEPS))
 AS_IT_IS: tuple[Stage, ...] = ()

@@ -179,9 +179,9 @@ def search_segment(
     from scipy.spatial import KDTree
 
     rng = np.random.default_rng((seed, segment.begin))
-    judge = _Judge(segment, limits, KDTree(segment.nodes_mm))
+    evaluator = _Evaluator(segment, limits, KDTree(segment.nodes_mm))
     genes = rng.uniform(size=(settings.population, 2))
-    costs = np.array([judge.cost(gene) for gene in genes])
+    costs = np.array([evaluator.cost(gene) for gene in genes])
     for generation in range(settings.most_generations):
         if generation >= settings.generations and costs.min() < FEASIBLE:
             break
@@ -189,9 +189,9 @@ def search_segment(
         genes, costs = genes[best], costs[best]
         children = _children(genes, settings.population - len(genes), settings.mutation_share, rng)
         genes = np.vstack((genes, children))
-        costs = np.concatenate((costs, [judge.cost(gene) for gene in children]))
+        costs = np.concatenate((costs, [evaluator.cost(gene) for gene in children]))
     winner = int(np.argmin(costs))
-    return judge.fitted(genes[winner])[0], float(costs[winner])
+    return evaluator.fitted(genes[winner])[0], float(costs[winner])
 
 
 def _children(parents: Float, count: int, mutation_share: float, rng: np.random.Generator) -> Float:
@@ -202,7 +202,7 @@ def _children(parents: Float, count: int, mutation_share: float, rng: np.random.
     return np.asarray(np.clip(crossed + rng.normal(0.0, mutation_share, size=crossed.shape), 0.0, 1.0))
 
 
-class _Judge:
+class _Evaluator:
     """Fits a chromosome, whose genes lie in [0, 1], and finds its cost."""
 
     def __init__(self, segment: Segment, limits: RouteLimits, near: KDTree) -> None:

@@ -261,7 +261,7 @@ class Replanner:
         radius_mm : (N,) float64, optional
             New radii; the old ones if None.
         start_mm, goal_mm : (3,) float64, optional
-            Where the tip is now, and the goal; the old ones, moved along with the nearest node, if None.
+            Where the tip is, and the goal; the old ones, moved along with the nearest node, if None.
 
         Raises
         ------

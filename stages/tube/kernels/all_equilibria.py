@@ -71,7 +71,7 @@ def all_of_two(design, cutting, beta, wanted, nodes, steps, found):
     Parameters
     ----------
     design, cutting, beta, nodes, steps
-        See `torsion.twist`; `nodes` has room for one derivative.
+        See `torsion.twist`; `nodes` holds one derivative.
     wanted : float
         rad, not wrapped.
     found : (F,) float64

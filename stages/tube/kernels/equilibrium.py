@@ -289,7 +289,7 @@ def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stab
 
 
 @inner_kernel
-def room_for(n_steps, n, columns):
+def workspace_for(n_steps, n, columns):
     """Return `nodes` and `steps` as `torsion.twist` fills them."""
     angles = np.zeros((2, n_steps + 1, n))
     derivatives = np.zeros((2, n_steps + 1, columns, n))
@@ -319,21 +319,21 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
     most = 1 + n + 2 * design[2].shape[0]
     pieces, moments, directions = np.zeros((most, PIECE_COLUMNS)), np.zeros((most, n)), np.zeros((most, n))
     owners = -1 - np.arange(n - 1)
-    room = 0
-    nodes, steps = room_for(room, n, n - 1)
-    poses = np.zeros((room + 1, 12))
+    allocated = 0
+    nodes, steps = workspace_for(allocated, n, n - 1)
+    poses = np.zeros((allocated + 1, 12))
     for m in range(beta.shape[0]):
         count, n_steps = cut(design, beta[m], step, pieces, moments, directions)
-        if n_steps != room:
-            room = n_steps
-            nodes, steps = room_for(room, n, n - 1)
-            poses = np.zeros((room + 1, 12))
+        if n_steps != allocated:
+            allocated = n_steps
+            nodes, steps = workspace_for(allocated, n, n - 1)
+            poses = np.zeros((allocated + 1, 12))
         cutting = (pieces, moments, directions, count)
         worst, least = settle(
             design, cutting, base_angles[m], beta[m], owners, nodes, steps, prefer_stable, tip_angles[m]
         )
         lay(cutting, nodes, steps, poses)
-        turned(poses[room], tip_angles[m, 0], results[m, TIP:])
+        turned(poses[allocated], tip_angles[m, 0], results[m, TIP:])
         results[m, CONVERGED] = 1.0 if worst < TOLERANCE else 0.0
         results[m, STABLE] = 1.0 if least > 0.0 else 0.0
         results[m, LEAST_DETERMINANT] = least

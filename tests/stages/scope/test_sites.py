@@ -1,4 +1,4 @@
-"""Where the scope can stand, on a forked airway of known radii."""
+"""Sites, candidate scope poses, on a forked airway of known radii."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_the_lumen_margin_counts_on_both_sides(lung: Lung) -> None:
 
 
 def test_behind_a_narrow_place_nothing_is_passable(lung: Lung) -> None:
-    """The way counts: a wide branch behind a ring of wall cannot be reached."""
+    """The route counts: a wide branch behind a ring of wall cannot be reached."""
     labels = lung.labels.copy(order="F")
     centres = lung.grid.lps(np.argwhere(labels >= 0)).reshape(*labels.shape, 3)
     along = (centres - CARINA) @ ((FORK - CARINA) / np.linalg.norm(FORK - CARINA))
@@ -83,7 +83,7 @@ def test_behind_a_narrow_place_nothing_is_passable(lung: Lung) -> None:
 
 
 def test_radius_of_the_way_is_proved(lung: Lung) -> None:
-    """Never more than the distance to the nearest voxel that is not lumen, anywhere on the way."""
+    """Never more than the distance to the nearest voxel that is not lumen, anywhere on the route."""
     found = find_sites(lung, scope(3.0), reach_mm=30.0)
     tree = lung.tree
     lumen = (lung.labels & LUMEN) != 0
@@ -131,9 +131,9 @@ def test_tips_look_along_the_airway(lung: Lung) -> None:
 @pytest.mark.parametrize("spacing", [0.5, 1.0, 3.0])
 def test_spacing(lung: Lung, spacing: float) -> None:
     found = find_sites(lung, scope(2.0), reach_mm=100.0, spacing_mm=spacing, turning=False)
-    way = lung.tree.distance_from_root_mm[found.tree_point]
+    depth_mm = lung.tree.distance_from_root_mm[found.tree_point]
     for branch in range(5):
-        on_branch = np.sort(way[lung.tree.branch_of_point[found.tree_point] == branch])
+        on_branch = np.sort(depth_mm[lung.tree.branch_of_point[found.tree_point] == branch])
         assert np.diff(on_branch).mean() == pytest.approx(max(spacing, 0.5), rel=0.3)
 
 

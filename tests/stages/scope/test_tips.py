@@ -36,7 +36,7 @@ TREE = forked_tree(
 )
 
 
-def way(tree: AirwayTree, point: int, back_mm: float) -> float:
+def depth_mm(tree: AirwayTree, point: int, back_mm: float) -> float:
     return float(tree.distance_from_root_mm[point]) - back_mm
 
 
@@ -91,8 +91,8 @@ def _chord(point: int) -> np.ndarray:
 def test_walking_back_follows_the_route(point: int, back: float, distance: float) -> None:
     tip = tip_at(TREE, point, back)
     moved = walk(TREE, tip, distance, np.random.default_rng(0))
-    assert way(TREE, moved.tree_point, moved.back_mm) == pytest.approx(
-        max(way(TREE, point, tip.back_mm) + distance, 0.0), abs=1e-9
+    assert depth_mm(TREE, moved.tree_point, moved.back_mm) == pytest.approx(
+        max(depth_mm(TREE, point, tip.back_mm) + distance, 0.0), abs=1e-9
     )
     assert moved.tree_point in TREE.route(point)
 
@@ -100,7 +100,7 @@ def test_walking_back_follows_the_route(point: int, back: float, distance: float
 @given(point=st.integers(0, TREE.n_points - 1), distance=st.floats(0.0, 120.0), seed=st.integers(0, 99))
 def test_walking_on_stays_on_the_way_down(point: int, distance: float, seed: int) -> None:
     moved = walk(TREE, tip_at(TREE, point), distance, np.random.default_rng(seed))
-    gone = way(TREE, moved.tree_point, moved.back_mm) - way(TREE, point, 0.0)
+    gone = depth_mm(TREE, moved.tree_point, moved.back_mm) - depth_mm(TREE, point, 0.0)
     assert point in TREE.route(moved.tree_point)
     at_an_end = not (TREE.parent_point == moved.tree_point).any() and moved.back_mm == 0.0
     assert gone == pytest.approx(distance, abs=1e-9) or (at_an_end and gone <= distance)
@@ -132,7 +132,7 @@ def test_the_medial_axis_is_drawn_uniformly_by_length() -> None:
     for b, bins in ((0, 24), (1, 30), (3, 20)):
         begin = TREE.distance_from_root_mm[TREE.branch_points(b)[-1]] - lengths[b]
         at = [
-            way(TREE, t.tree_point, t.back_mm) - begin
+            depth_mm(TREE, t.tree_point, t.back_mm) - begin
             for t, at_b in zip(tips, branch == b, strict=True)
             if at_b
         ]

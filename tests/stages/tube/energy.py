@@ -1,4 +1,4 @@
-"""The elastic energy of nested tubes in small cells: what an equilibrium and its stability are judged by."""
+"""The elastic energy of nested tubes in small cells: the reference for equilibria and their stability."""
 
 from __future__ import annotations
 

@@ -153,7 +153,7 @@ def test_no_sites_no_deployments(lung: Lung) -> None:
 
 
 def test_progress_is_told(lung: Lung) -> None:
-    told: list[float] = []
+    shares: list[float] = []
     tips = np.repeat(TIPS[:1], 100, axis=0)
     enumerate_deployments(
         lung,
@@ -163,9 +163,9 @@ def test_progress_is_told(lung: Lung) -> None:
         with_fissures=False,
         rotations=1,
         stop_spacing_mm=15.0,
-        progress=told.append,
+        progress=shares.append,
     )
-    assert told and all(0.0 < share <= 1.0 for share in told)
+    assert shares and all(0.0 < share <= 1.0 for share in shares)
 
 
 def test_straight_tubes_leave_along_the_axis_of_the_scope(lung: Lung) -> None:

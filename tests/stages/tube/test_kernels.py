@@ -118,11 +118,11 @@ def plane_canvas(wall_mm: float = 1.0, spacing: Any = SPACING) -> Canvas:
     return canvas
 
 
-def judged(
+def validated(
     lung: Lung, outer: float = 0.0, inner: float = 30.0, *, base: Any = BASE, tubes: ConcentricTubes = TUBES,
     rotation: float = 0.0, with_fissures: bool = False, forward: Any = (0.0, 0.0, 1.0),
 ) -> Deployment | str:  # fmt: skip
-    """Judge a deployment that bends towards +x."""
+    """Validate a deployment that bends towards +x."""
     validator = DeploymentValidator(
         lung, tubes, Margins(segmentation_margin_mm=MARGIN), with_fissures=with_fissures
     )
@@ -151,7 +151,7 @@ class TestExit:
 
     @pytest.mark.parametrize("depth", [1.0, 3.0, 5.3])
     def test_through_a_plane(self, depth: float) -> None:
-        found = accepted(judged(plane_canvas().lung(), base=(-depth, 0.1, -15.0)))
+        found = accepted(validated(plane_canvas().lung(), base=(-depth, 0.1, -15.0)))
         s = arc_to_wall(depth)
         assert found.exit_mm == pytest.approx(s, abs=2e-3)
         assert found.branch == 0
@@ -169,7 +169,7 @@ class TestExit:
         forward = np.array([math.sin(angle), 0.0, math.cos(angle)])
         for shift in (0.0, 0.13, 0.31):
             base = np.array([border, shift, shift]) - 4.0 * forward
-            found = accepted(judged(lung, 8.0, 8.0, base=base, forward=forward, tubes=straight))
+            found = accepted(validated(lung, 8.0, 8.0, base=base, forward=forward, tubes=straight))
             assert found.exit_mm == pytest.approx(4.0, abs=2e-3)
             assert math.degrees(found.wall_angle_rad) == pytest.approx(angle_deg, abs=5.0)
 
@@ -178,7 +178,7 @@ class TestExit:
         canvas = Canvas.empty(LOW, HIGH, 0.5)
         x = canvas.points[..., 0]
         canvas.airway(x < 0, x < 1, branch)
-        verdict = judged(canvas.lung(CHAIN))
+        verdict = validated(canvas.lung(CHAIN))
         if branch == 2:
             assert accepted(verdict).branch == 2
         else:
@@ -191,7 +191,7 @@ class TestExit:
         radial = np.linalg.norm(canvas.points[..., :2], axis=-1)
         canvas.airway(radial < 3.0, radial < 4.0, 2)
         lung = canvas.lung(CHAIN)
-        found = accepted(judged(lung, base=(0.0, 0.0, -15.0), rotation=rotation))
+        found = accepted(validated(lung, base=(0.0, 0.0, -15.0), rotation=rotation))
         s = np.arange(0.0, 30.0, 0.001)
         aside, ahead = (1 - np.cos(KAPPA * s)) / KAPPA, np.sin(KAPPA * s) / KAPPA
         points = np.column_stack([aside * math.cos(rotation), aside * math.sin(rotation), ahead - 15.0])
@@ -203,7 +203,7 @@ class TestExit:
         assert math.degrees(found.wall_angle_rad) == pytest.approx(math.degrees(exact), abs=6.0)
 
     def test_tip_pose_of_both_tubes(self) -> None:
-        found = accepted(judged(plane_canvas().lung(), 12.0, 32.0, rotation=0.2))
+        found = accepted(validated(plane_canvas().lung(), 12.0, 32.0, rotation=0.2))
         tip = found.lps_from_tip
         assert np.allclose(tip[:3, 3], tip_of(12.0, 32.0, BASE, 0.2), atol=1e-9)
         angle = 12 * OVERLAP + 20 * KAPPA
@@ -261,11 +261,11 @@ class TestRefusals:
         ],
     )
     def test_near_a_structure(self, bits: int, why: str) -> None:
-        assert judged(self.near(bits, self.REQUIRED - 0.2), with_fissures=True) == REFUSALS[why]
-        accepted(judged(self.near(bits, self.REQUIRED + 0.4), with_fissures=True))
+        assert validated(self.near(bits, self.REQUIRED - 0.2), with_fissures=True) == REFUSALS[why]
+        accepted(validated(self.near(bits, self.REQUIRED + 0.4), with_fissures=True))
 
     def test_fissures_may_be_allowed(self) -> None:
-        accepted(judged(self.near(FISSURE, -2.0), with_fissures=False))
+        accepted(validated(self.near(FISSURE, -2.0), with_fissures=False))
 
     def test_the_outer_tube_needs_more_room(self) -> None:
         """The inner tube's 1.1 mm are there, the outer tube's 1.3 mm are not."""
@@ -274,8 +274,8 @@ class TestRefusals:
         canvas.add((canvas.points[..., 1] > 1.2) & (canvas.points[..., 0] > 1.5), VESSEL)
         lung, any_angle = canvas.lung(), tubes_of(min_wall_angle_deg=1.0)
         assert point[0] > 1.5
-        accepted(judged(lung, 10.0, 30.0, base=(-1.0, 0.0, -15.0), tubes=any_angle))
-        assert judged(lung, 30.0, 30.0, base=(-1.0, 0.0, -15.0), tubes=any_angle) == REFUSALS["vessel"]
+        accepted(validated(lung, 10.0, 30.0, base=(-1.0, 0.0, -15.0), tubes=any_angle))
+        assert validated(lung, 30.0, 30.0, base=(-1.0, 0.0, -15.0), tubes=any_angle) == REFUSALS["vessel"]
 
     def test_behind_the_wall_where_the_tube_rubs_it(self) -> None:
         """A vessel on the wall, passed in touch with the wall before the exit."""
@@ -286,12 +286,12 @@ class TestRefusals:
         canvas.labels[
             where & (canvas.points[..., 2] < touch[2]) & (canvas.points[..., 2] > touch[2] - 1)
         ] |= VESSEL
-        assert judged(canvas.lung()) == REFUSALS["vessel"]
+        assert validated(canvas.lung()) == REFUSALS["vessel"]
 
     def test_vessels_that_only_lie_beside_the_free_tube_do_not_matter(self) -> None:
         canvas = plane_canvas(spacing=0.25)
         canvas.add((np.abs(canvas.points[..., 0] - 0.5) < 0.5) & (canvas.points[..., 2] < -11), VESSEL)
-        accepted(judged(canvas.lung()))
+        accepted(validated(canvas.lung()))
 
     @pytest.mark.parametrize("branch", [0, 3])
     def test_a_second_lumen(self, branch: int) -> None:
@@ -299,48 +299,50 @@ class TestRefusals:
         canvas = plane_canvas()
         x = canvas.points[..., 0]
         canvas.airway((x > 4) & (x < 6), (x > 3) & (x < 7), branch)
-        assert judged(canvas.lung()) == REFUSALS["again" if branch == 0 else "branch"]
+        assert validated(canvas.lung()) == REFUSALS["again" if branch == 0 else "branch"]
 
     def test_flat_exit(self) -> None:
         lung = plane_canvas().lung()
         angle = math.degrees(KAPPA * arc_to_wall(3.0))
-        accepted(judged(lung, tubes=tubes_of(min_wall_angle_deg=angle - 4)))
-        assert judged(lung, tubes=tubes_of(min_wall_angle_deg=angle + 4)) == REFUSALS["flat"]
+        accepted(validated(lung, tubes=tubes_of(min_wall_angle_deg=angle - 4)))
+        assert validated(lung, tubes=tubes_of(min_wall_angle_deg=angle + 4)) == REFUSALS["flat"]
 
     def test_no_exit(self) -> None:
         lung = plane_canvas().lung()
         s = arc_to_wall(3.0)
-        assert judged(lung, 0.0, 0.0) == REFUSALS["none"]
-        assert judged(lung, 0.0, s - 0.1) == REFUSALS["none"]
-        assert judged(lung, 0.0, s + 0.9) == REFUSALS["none"], "still in the wall zone"
-        accepted(judged(lung, 0.0, s + 1.1))
-        assert judged(lung, 0.0, 30.0, base=(2.0, 0.0, -15.0)) == REFUSALS["none"], "starts beside the airway"
-        assert judged(lung, 0.0, 20.0, rotation=math.pi, base=(-0.9, 0, -15)) == REFUSALS["none"]
+        assert validated(lung, 0.0, 0.0) == REFUSALS["none"]
+        assert validated(lung, 0.0, s - 0.1) == REFUSALS["none"]
+        assert validated(lung, 0.0, s + 0.9) == REFUSALS["none"], "still in the wall zone"
+        accepted(validated(lung, 0.0, s + 1.1))
+        assert validated(lung, 0.0, 30.0, base=(2.0, 0.0, -15.0)) == REFUSALS["none"], (
+            "starts beside the airway"
+        )
+        assert validated(lung, 0.0, 20.0, rotation=math.pi, base=(-0.9, 0, -15)) == REFUSALS["none"]
 
     def test_too_long(self) -> None:
         lung = plane_canvas().lung()
-        assert judged(lung, tubes=tubes_of(max_extension_mm=29.9)) == REFUSALS["long"]
-        accepted(judged(lung, tubes=tubes_of(max_extension_mm=30.0)))
+        assert validated(lung, tubes=tubes_of(max_extension_mm=29.9)) == REFUSALS["long"]
+        accepted(validated(lung, tubes=tubes_of(max_extension_mm=30.0)))
 
     def test_protrusion(self) -> None:
         lung, short = plane_canvas().lung(), tubes_of(inner_length_mm=665.0)
-        assert judged(lung, 4.9, 30.0, tubes=short) == REFUSALS["short"]
-        accepted(judged(lung, 5.0, 30.0, tubes=short))
+        assert validated(lung, 4.9, 30.0, tubes=short) == REFUSALS["short"]
+        accepted(validated(lung, 5.0, 30.0, tubes=short))
 
     def test_sweep_is_limited_and_widens_the_clearance(self) -> None:
         lung = plane_canvas().lung()
         some = tubes_of(curved_length_mm=27.0, max_lateral_sweep_mm=5.0)
-        sweep = accepted(judged(lung, 0.0, 30.0, tubes=some)).lateral_sweep_mm
+        sweep = accepted(validated(lung, 0.0, 30.0, tubes=some)).lateral_sweep_mm
         assert 0.2 < sweep < 5.0
         strict = tubes_of(curved_length_mm=27.0, max_lateral_sweep_mm=0.99 * sweep)
-        assert judged(lung, 0.0, 30.0, tubes=strict) == REFUSALS["sweep"]
+        assert validated(lung, 0.0, 30.0, tubes=strict) == REFUSALS["sweep"]
         beside = plane_canvas(spacing=0.25)
         beside.add((beside.points[..., 1] > 1.25) & (beside.points[..., 0] > 1.5), VESSEL)
-        accepted(judged(beside.lung(), 0.0, 30.0))
-        assert judged(beside.lung(), 0.0, 30.0, tubes=some) == REFUSALS["vessel"]
+        accepted(validated(beside.lung(), 0.0, 30.0))
+        assert validated(beside.lung(), 0.0, 30.0, tubes=some) == REFUSALS["vessel"]
 
     def test_out_of_the_grid(self) -> None:
-        assert judged(plane_canvas().lung(), 0.0, 40.0, base=(-1.0, 0.0, -5.0)) == REFUSALS["pleura"]
+        assert validated(plane_canvas().lung(), 0.0, 40.0, base=(-1.0, 0.0, -5.0)) == REFUSALS["pleura"]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -356,7 +358,7 @@ def test_what_is_accepted_is_clear_and_what_is_clear_is_accepted(seed: int) -> N
     for _ in range(60):
         rotation, inner = rng.uniform(-0.9, 0.9), rng.uniform(20.0, 32.0)
         outer = rng.uniform(0.0, inner)
-        verdict = judged(lung, outer, inner, rotation=rotation)
+        verdict = validated(lung, outer, inner, rotation=rotation)
         spare = spare_behind_exit(lung, outer, inner, rotation)
         if isinstance(verdict, Deployment):
             assert spare >= -1e-9

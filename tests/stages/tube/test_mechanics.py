@@ -241,7 +241,7 @@ def test_turning_all_bases_turns_the_shape(turn: float, seed: int) -> None:
 
 @given(seed=st.integers(0, 1000))
 def test_mirrored_angles_give_the_mirrored_shape(seed: int) -> None:
-    """Tubes not turned bend in the plane of y and z: turned the other way, x changes sign."""
+    """Tubes not turned bend in the plane of y and z: turned by half a turn, x changes sign."""
     (base,), (beta,) = random_joints(TRIPLE, np.random.default_rng(seed), 1)
     one, two = TRIPLE.given_base_angles(base, beta), TRIPLE.given_base_angles(-base, beta)
     s = np.linspace(0.0, one.length_mm, 7)

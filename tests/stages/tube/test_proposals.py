@@ -149,8 +149,8 @@ class TestDesigns:
         with pytest.raises(SettingsError, match=message):
             propose_designs(TUBES, *arguments, LIMITS)
 
-    def test_no_room_for_an_outer_tube(self) -> None:
-        with pytest.raises(SettingsError, match="room for"):
+    def test_an_outer_tube_that_does_not_fit(self) -> None:
+        with pytest.raises(SettingsError, match="space for"):
             propose_designs(TUBES, 30.0, 50.0, 1.0, MakerLimits(channel_diameter_mm=1.8))
 
     def test_limits_are_checked(self) -> None:

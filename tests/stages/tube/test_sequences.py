@@ -1,4 +1,4 @@
-"""Sequences of joint motions, what they sweep, and where tubes snap on the way."""
+"""Sequences of joint motions, what they sweep, and where tubes snap."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ class TestSnapping:
         assert all(step.stable for step in found.steps)
         assert found.final.tip_angles_rad == pytest.approx([0.0, 2.0 * math.pi], abs=1e-9)
         between = [float(np.diff(step.tip_angles_rad)[0]) for step in found.steps]
-        assert (np.diff(between) > -1e-9).all(), "the tips turn one way"
+        assert (np.diff(between) > -1e-9).all(), "the tips turn in one direction"
 
     def test_there_and_back_again(self) -> None:
         mechanics = TubeMechanics(pair(0.0052))
@@ -269,7 +269,7 @@ class TestSnapping:
         assert found.tip_angles_rad == pytest.approx(there.tip_angles_rad.tolist(), abs=1e-8)
 
     def test_a_snap_while_inserting(self) -> None:
-        """A tube bent one way and then the other turns over as its rear part comes out."""
+        """A tube bent to one side and then to the other turns over as its rear part comes out."""
         inner = Tube(
             outer_diameter_mm=1.5, inner_diameter_mm=1.3, length_mm=680.0,
             bent_pieces=(

@@ -31,17 +31,17 @@ def scope_tip(seed: int) -> np.ndarray:
 
 def by_steps(frame: np.ndarray, rotation: float, outer: float, inner: float, steps: int) -> np.ndarray:
     """Roll the frame along the tube in small steps of its curvature."""
-    now = frame.copy()
-    now[:3, :3] = frame[:3, :3] @ Rotation.from_rotvec([0, 0, rotation]).as_matrix()
-    points = [now[:3, 3]]
+    pose = frame.copy()
+    pose[:3, :3] = frame[:3, :3] @ Rotation.from_rotvec([0, 0, rotation]).as_matrix()
+    points = [pose[:3, 3]]
     for n in range(steps):
         s = (n + 0.5) * inner / steps
         kappa = 0.0 if s < inner - 40.0 else OVERLAP if s < outer else 0.025
         half = Rotation.from_rotvec([0, 0.5 * kappa * inner / steps, 0]).as_matrix()
         small = np.eye(4)
         small[:3, :3], small[:3, 3] = half @ half, half @ [0, 0, inner / steps]
-        now = now @ small
-        points.append(now[:3, 3])
+        pose = pose @ small
+        points.append(pose[:3, 3])
     return np.array(points)
 
 

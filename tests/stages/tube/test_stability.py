@@ -186,13 +186,13 @@ def test_energy_agrees_with_its_derivatives() -> None:
     energy = case.energy
     rng = np.random.default_rng(8)
     angles = case.angles + rng.normal(scale=0.3, size=case.angles.shape)
-    way = rng.normal(size=angles.shape)
-    after, before = angles + 1e-4 * way, angles - 1e-4 * way
+    direction = rng.normal(size=angles.shape)
+    after, before = angles + 1e-4 * direction, angles - 1e-4 * direction
     slope = (energy.value(after) - energy.value(before)) / 2e-4
-    assert slope == pytest.approx(energy.gradient(angles) @ energy.free(way), rel=1e-6)
+    assert slope == pytest.approx(energy.gradient(angles) @ energy.free(direction), rel=1e-6)
     bands = energy.hessian(angles)
     count = bands.shape[1]
     hessian = sum(np.diag(band[: count - k], -k) for k, band in enumerate(bands))
     hessian += np.tril(hessian, -1).T
     change = (energy.gradient(after) - energy.gradient(before)) / 2e-4
-    assert change == pytest.approx(hessian @ energy.free(way), abs=1e-6 * np.abs(change).max())
+    assert change == pytest.approx(hessian @ energy.free(direction), abs=1e-6 * np.abs(change).max())

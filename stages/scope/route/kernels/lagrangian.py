@@ -26,7 +26,7 @@ class Program(NamedTuple):
     """The program of a repair; S samples.
 
     lo, hi : the control points `lo` to `hi - 1` are free; first (S,), rows (S, 3, 4) : first control point
-    and basis rows of each sample; samples (S, 7), weights (7,) : see `repair`; cones, index, cell_start,
+    and basis rows of each sample; samples (S, 7), weights (7,) : see `repair`; cones, cells, cell_start,
     cell_cones : the lumen, see `lumen`; guide_cones (P, 8) : cones along the guide path; ends (2, 3) : the
     wanted first and last points.
     """

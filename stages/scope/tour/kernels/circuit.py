@@ -12,7 +12,7 @@ from anatomy.kernels.compiling import inner_kernel
 
 @inner_kernel
 def parallel(a, b):
-    """Return the resistance of two resistors side by side; infinity stands for none."""
+    """Return the resistance of two resistors side by side; infinity is an open circuit."""
     if math.isinf(a):
         return b
     if math.isinf(b):

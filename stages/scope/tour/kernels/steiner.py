@@ -162,7 +162,7 @@ def solve(left, right, lift, cost, below, open_sets, offset, closed_tour, best, 
 
 @inner_kernel
 def _choose(left, right, open_sets, offset, split, ends_below, chosen):
-    """Walk back from the root and mark the exits that the best values stand for."""
+    """Walk back from the root and mark the exits of the best values."""
     nodes = left.shape[0]
     want = np.zeros(nodes, dtype=np.int64)
     flag = np.zeros(nodes, dtype=np.int64)

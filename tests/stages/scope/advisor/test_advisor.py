@@ -1,4 +1,4 @@
-"""Paths to goals in a forked airway, advice on the way, and what is said about it."""
+"""Paths to goals in a forked airway, advice during a procedure, and instructions."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_a_scope_that_does_not_fit_is_refused(forked: tuple[Lung, Lumen]) -> Non
 
 
 def follow(session: Session, state: ScopeState, came: list[ScopeState]) -> tuple[str, list[ScopeState], int]:
-    """Do what a session says, with a hand that shakes; pulling back goes the way it came."""
+    """Do what a session says, with a hand that shakes; pulling back follows the path in reverse."""
     rng, pulls = np.random.default_rng(0), 0
     for _ in range(400):
         advice = session.advise(state)
@@ -155,14 +155,14 @@ def test_a_session_leads_to_the_goal(forked: tuple[Lung, Lumen], target: np.ndar
     advisor, _path = path_to(forked, target)
     start = start_state(lumen, lung.tree, MODEL)
     session = Session(advisor, start, seed=3)
-    action, way, _pulls = follow(session, start, [])
+    action, states, _pulls = follow(session, start, [])
     assert action == "arrived"
     assert session.plan.reached
-    tip = tip_frames(MODEL, way[-1].array)[0][:3, 3]
+    tip = tip_frames(MODEL, states[-1].array)[0][:3, 3]
     assert np.linalg.norm(tip - session.plan.lps_from_tip[:3, 3]) <= SAME_STATE_MM
     thinner = replace(MODEL, radius_mm=MODEL.radius_mm - SAME_STATE_MM)
     strayed = ScopeEnvironment(model=thinner, field=advisor.field)
-    assert strayed.fits(np.array([state.array for state in way])).all()
+    assert strayed.fits(np.array([state.array for state in states])).all()
 
 
 def test_a_session_leads_back_out_of_the_wrong_airway(forked: tuple[Lung, Lumen]) -> None:
@@ -173,11 +173,11 @@ def test_a_session_leads_back_out_of_the_wrong_airway(forked: tuple[Lung, Lumen]
     came = [wrong.state(number) for number in range(wrong.count)]
     for state in came:
         session.advise(state)
-    action, way, pulls = follow(session, came.pop(), came)
+    action, states, pulls = follow(session, came.pop(), came)
     assert pulls > 10
     assert action == "arrived"
     assert session.plan.reached
-    tip = tip_frames(MODEL, way[-1].array)[0][:3, 3]
+    tip = tip_frames(MODEL, states[-1].array)[0][:3, 3]
     assert np.linalg.norm(tip - advisor.goal.centre_lps) <= SAME_STATE_MM + 1.0
 
 
@@ -197,7 +197,7 @@ def test_best_motions_lead_on_or_end_with_a_word(forked: tuple[Lung, Lumen]) -> 
     assert (done.action, done.motion) == ("arrived", None)
 
 
-def test_ones_own_motion_is_judged(forked: tuple[Lung, Lumen]) -> None:
+def test_the_users_own_motion_is_evaluated(forked: tuple[Lung, Lumen]) -> None:
     advisor, path = path_to(forked, GOALS[1])
     state = path.state(10)
     advice = advisor.advise(state)

@@ -52,16 +52,16 @@ def by_the_paper(
     low, high = np.radians([model.twist_low_deg, model.twist_high_deg])
     least, most = np.radians([model.bend_low_deg, model.bend_high_deg])
     middle = 0.0 if environment.reproduction else 0.5 * (low + high)
-    now = lumen.voxel_at(tool_frames(model, state.array)[0][:3, 3])
+    here = lumen.voxel_at(tool_frames(model, state.array)[0][:3, 3])
     gradient = np.zeros(3)
     for di in (-1, 0, 1):
         for dj in (-1, 0, 1):
             for dk in (-1, 0, 1):
-                ijk = lumen.voxels[now] + (di, dj, dk)
+                ijk = lumen.voxels[here] + (di, dj, dk)
                 number = lumen.index[tuple(ijk)]
                 clearance = field.clearance[number] if number >= 0 else 0.0
-                way = lumen.grid.lps(ijk) - lumen.centres(now)
-                gradient += way * (clearance - field.clearance[now])
+                offset = lumen.grid.lps(ijk) - lumen.centres(here)
+                gradient += offset * (clearance - field.clearance[here])
     out = {name: np.zeros(CANDIDATES) for name in ("twist", "bend", "k_nf1", "k_clearance", "k_twist")}
     verdict, nf1, cg = np.zeros(CANDIDATES, dtype=int), np.full(CANDIDATES, np.inf), np.zeros(CANDIDATES)
     n = -1
@@ -85,12 +85,12 @@ def by_the_paper(
                 verdict[n] = COLLIDES
                 continue
             nf1[n] = field.potential[voxel]
-            if nf1[n] >= field.potential[now]:
+            if nf1[n] >= field.potential[here]:
                 verdict[n] = AWAY
             else:
                 verdict[n] = VALID if environment.fits(there.array)[0] else COLLIDES
-            if voxel != now:
-                q = lumen.centres(voxel) - lumen.centres(now)
+            if voxel != here:
+                q = lumen.centres(voxel) - lumen.centres(here)
                 cg[n] = max(float(q @ gradient) / np.linalg.norm(q), 0.0)
     valid = verdict == VALID
     if valid.any():

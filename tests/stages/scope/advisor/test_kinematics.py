@@ -27,7 +27,7 @@ from stages.scope.device import Bronchoscope
 MODELS = st.builds(ScopeModel, links=st.integers(2, 40), link_mm=st.floats(0.2, 5.0), radius_mm=st.just(1.0))
 TWISTS = st.floats(-math.pi, math.pi)
 BENDS = st.floats(-2.2, 2.2)
-WAYS = st.floats(-10.0, 10.0)
+DISTANCES = st.floats(-10.0, 10.0)
 
 
 def some_base(seed: int) -> np.ndarray:
@@ -49,11 +49,13 @@ def exponential(
     return expm(generator * angle)
 
 
-def algorithm_1(model: ScopeModel, base: np.ndarray, way: float, alpha: float, beta: float) -> np.ndarray:
+def algorithm_1(
+    model: ScopeModel, base: np.ndarray, distance: float, alpha: float, beta: float
+) -> np.ndarray:
     """Lines 1 to 7 as printed, matrix by matrix."""
     xi = beta / model.links
     d = model.link_mm * math.cos(xi / 2) / (2 * math.sin(xi / 2))
-    delta = way / d
+    delta = distance / d
 
     def about_x(angle: float) -> np.ndarray:
         out = np.eye(4)
@@ -80,74 +82,82 @@ def test_the_chain_is_a_product_of_exponentials(model: ScopeModel, alpha: float,
 
 
 @given(
-    model=MODELS, seed=st.integers(0, 999), way=WAYS, alpha=TWISTS, beta=BENDS.filter(lambda b: abs(b) > 1e-3)
+    model=MODELS,
+    seed=st.integers(0, 999),
+    distance=DISTANCES,
+    alpha=TWISTS,
+    beta=BENDS.filter(lambda b: abs(b) > 1e-3),
 )
 def test_the_base_moves_by_algorithm_1_as_printed(
-    model: ScopeModel, seed: int, way: float, alpha: float, beta: float
+    model: ScopeModel, seed: int, distance: float, alpha: float, beta: float
 ) -> None:
     base = some_base(seed)
-    moved = advanced(model, ScopeState(lps_from_base=base), way, alpha, beta)
-    np.testing.assert_allclose(moved.lps_from_base, algorithm_1(model, base, way, alpha, beta), atol=1e-8)
+    moved = advanced(model, ScopeState(lps_from_base=base), distance, alpha, beta)
+    np.testing.assert_allclose(
+        moved.lps_from_base, algorithm_1(model, base, distance, alpha, beta), atol=1e-8
+    )
     assert (moved.twist_rad, moved.bend_rad) == (alpha, beta)
 
 
-@given(model=MODELS, way=WAYS, alpha=TWISTS, beta=BENDS.filter(lambda b: abs(b) > 1e-3))
+@given(model=MODELS, distance=DISTANCES, alpha=TWISTS, beta=BENDS.filter(lambda b: abs(b) > 1e-3))
 def test_middle_and_base_of_the_base_link_move_on_circles_of_their_own(
-    model: ScopeModel, way: float, alpha: float, beta: float
+    model: ScopeModel, distance: float, alpha: float, beta: float
 ) -> None:
-    """The middle on that of radius d, by the way; the base on (l / 2) / sin(xi / 2)."""
+    """The middle on that of radius d, by the distance; the base on (l / 2) / sin(xi / 2)."""
     xi = beta / model.links
     d = 0.5 * model.link_mm / math.tan(abs(xi) / 2)
-    moved = advanced(model, ScopeState(lps_from_base=np.eye(4)), way, alpha, beta).lps_from_base
+    moved = advanced(model, ScopeState(lps_from_base=np.eye(4)), distance, alpha, beta).lps_from_base
     towards = math.copysign(1.0, beta) * np.array([-math.sin(alpha), math.cos(alpha), 0.0])
     middle = np.array([0.0, 0.0, -0.5 * model.link_mm])
     centre = middle + d * towards
     after = moved[:3, :3] @ middle + moved[:3, 3]
     assert np.linalg.norm(after - centre) == pytest.approx(d, rel=1e-9)
-    assert np.linalg.norm(after - middle) == pytest.approx(2 * d * abs(math.sin(way / (2 * d))), abs=1e-9)
+    assert np.linalg.norm(after - middle) == pytest.approx(
+        2 * d * abs(math.sin(distance / (2 * d))), abs=1e-9
+    )
     radius = 0.5 * model.link_mm / math.sin(abs(xi) / 2)
     assert np.linalg.norm(moved[:3, 3] - centre) == pytest.approx(radius, rel=1e-9)
 
 
-@given(model=MODELS, seed=st.integers(0, 999), way=WAYS, alpha=TWISTS)
+@given(model=MODELS, seed=st.integers(0, 999), distance=DISTANCES, alpha=TWISTS)
 def test_small_bends_tend_to_the_straight_motion(
-    model: ScopeModel, seed: int, way: float, alpha: float
+    model: ScopeModel, seed: int, distance: float, alpha: float
 ) -> None:
     state = ScopeState(lps_from_base=some_base(seed))
-    straight = advanced(model, state, way, alpha, 0.0).lps_from_base
+    straight = advanced(model, state, distance, alpha, 0.0).lps_from_base
     expected = state.lps_from_base.copy()
-    expected[:3, 3] -= way * expected[:3, 2]
+    expected[:3, 3] -= distance * expected[:3, 2]
     np.testing.assert_allclose(straight, expected, atol=1e-12)
     for beta in (1e-2, -1e-4, 1e-6, 1e-9, -1e-13):
-        bent = advanced(model, state, way, alpha, beta).lps_from_base
+        bent = advanced(model, state, distance, alpha, beta).lps_from_base
         kappa = abs(beta) / model.length_mm
-        allowed = kappa * (way * way + abs(way) * (2.0 + model.link_mm)) + 1e-12
+        allowed = kappa * (distance * distance + abs(distance) * (2.0 + model.link_mm)) + 1e-12
         assert np.abs(bent - straight).max() <= allowed
 
 
 @given(model=MODELS, seed=st.integers(0, 999), alpha=TWISTS, beta=BENDS.filter(lambda b: abs(b) > 1e-2))
 def test_the_links_follow_each_other(model: ScopeModel, seed: int, alpha: float, beta: float) -> None:
-    """Advanced by the length of a link on its circle, every joint stands where the next one stood."""
+    """Advanced by the length of a link on its circle, every joint is where the next one was."""
     xi = abs(beta) / model.links
-    way = xi * 0.5 * model.link_mm / math.tan(xi / 2)
+    distance = xi * 0.5 * model.link_mm / math.tan(xi / 2)
     start = ScopeState(lps_from_base=some_base(seed), twist_rad=alpha, bend_rad=beta)
     before = joints(model, start.array)[0]
-    after = joints(model, advanced(model, start, way, alpha, beta).array)[0]
+    after = joints(model, advanced(model, start, distance, alpha, beta).array)[0]
     np.testing.assert_allclose(after[:-1], before[1:], atol=1e-8)
 
 
-@given(model=MODELS, seed=st.integers(0, 999), way=WAYS, alpha=TWISTS, beta=BENDS)
+@given(model=MODELS, seed=st.integers(0, 999), distance=DISTANCES, alpha=TWISTS, beta=BENDS)
 def test_pulling_back_undoes_an_advance(
-    model: ScopeModel, seed: int, way: float, alpha: float, beta: float
+    model: ScopeModel, seed: int, distance: float, alpha: float, beta: float
 ) -> None:
     start = ScopeState(lps_from_base=some_base(seed), twist_rad=alpha, bend_rad=beta)
-    there = advanced(model, start, way, alpha, beta)
-    np.testing.assert_allclose(advanced(model, there, -way, alpha, beta).array, start.array, atol=1e-9)
+    there = advanced(model, start, distance, alpha, beta)
+    np.testing.assert_allclose(advanced(model, there, -distance, alpha, beta).array, start.array, atol=1e-9)
 
 
 def symbolic_tool(model: ScopeModel) -> casadi.Function:
-    """Return the tool after Algorithm 1, its rotation and position, as expressions of (way, alpha, beta)."""
-    way, alpha, beta = casadi.SX.sym("way"), casadi.SX.sym("alpha"), casadi.SX.sym("beta")
+    """Return the tool after Algorithm 1, its rotation and position, of (distance, alpha, beta)."""
+    distance, alpha, beta = casadi.SX.sym("distance"), casadi.SX.sym("alpha"), casadi.SX.sym("beta")
 
     def turn(axis: str, angle: casadi.SX) -> casadi.SX:
         c, s = casadi.cos(angle), casadi.sin(angle)
@@ -164,11 +174,13 @@ def symbolic_tool(model: ScopeModel) -> casadi.Function:
     xi = beta / model.links
     d = 0.5 * model.link_mm / casadi.tan(0.5 * xi)
     middle = -0.5 * model.link_mm
-    frame = turn("z", alpha) @ shift(d, middle) @ turn("x", way / d) @ shift(-d, 0.0) @ shift(0.0, -middle)
+    frame = (
+        turn("z", alpha) @ shift(d, middle) @ turn("x", distance / d) @ shift(-d, 0.0) @ shift(0.0, -middle)
+    )
     for _ in range(model.links):
         frame = frame @ shift(0.0, -model.link_mm) @ turn("x", xi)
     flat = casadi.vertcat(casadi.vec(frame[:3, :3]), frame[:3, 3])
-    inputs = casadi.vertcat(way, alpha, beta)
+    inputs = casadi.vertcat(distance, alpha, beta)
     return casadi.Function("tool", [inputs], [flat, casadi.jacobian(flat, inputs)])
 
 
@@ -232,6 +244,6 @@ def test_impossible_chains_are_refused(wrong: dict[str, float]) -> None:
 
 def test_impossible_motions_are_refused() -> None:
     state = ScopeState(lps_from_base=np.eye(4))
-    for way, twist, bend in ((math.nan, 0.0, 0.0), (1.0, math.inf, 0.0), (1.0, 0.0, 31.5)):
+    for distance, twist, bend in ((math.nan, 0.0, 0.0), (1.0, math.inf, 0.0), (1.0, 0.0, 31.5)):
         with pytest.raises(SettingsError, match="cannot move"):
-            advanced(ScopeModel(), state, way, twist, bend)
+            advanced(ScopeModel(), state, distance, twist, bend)

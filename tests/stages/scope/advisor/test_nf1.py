@@ -135,8 +135,8 @@ def test_clearance_leads_away_from_the_wall_where_nf1_grazes_it() -> None:
     away: dict[Kind, list[int]] = {"plain": [], "clearance": []}
     for kind, list_of in away.items():
         field = navigation_field(lumen, goal, kind=kind, metric="voxels")
-        way = lumen.grid.ijk(field.route(start)).round().astype(int)
-        list_of += [int(to_wall[i, j]) for i, j, _ in way]
+        route = lumen.grid.ijk(field.route(start)).round().astype(int)
+        list_of += [int(to_wall[i, j]) for i, j, _ in route]
     assert min(away["clearance"][5:-5]) > min(away["plain"][5:-5])
     assert np.mean(away["clearance"]) > np.mean(away["plain"]) + 1.0
 

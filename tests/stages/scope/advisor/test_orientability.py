@@ -38,7 +38,7 @@ def test_a_wide_tube_leaves_every_bend_a_narrow_one_none() -> None:
 
 
 def test_the_chord_of_the_bend_must_fit_across_the_tube() -> None:
-    """A bend of b over 10 mm goes (1 - cos b) 10 mm / b sideways; leaning aside, it needs less room."""
+    """A bend of b over 10 mm goes (1 - cos b) 10 mm / b sideways; leaning aside, it needs less width."""
     found = in_tube(5.0, 1.5)
     largest = found.largest_bend_rad
     lean = math.radians(15.0)
@@ -103,7 +103,7 @@ def test_the_tip_can_look_along_most_sites(small_lung: Lung) -> None:
 
 
 def test_the_papers_twists_leave_a_sector_out() -> None:
-    """Alpha in [-60, 90] with bends both ways leaves a gap of 30 degrees, on either side."""
+    """Alpha in [-60, 90] with bends to both sides leaves a gap of 30 degrees, on either side."""
     found = in_tube(14.0, 1.0, twist_low_deg=-60.0)
     angles = [
         found.angle_rad([math.cos(a), math.sin(a), 0.0]) for a in np.radians(np.arange(0.0, 360.0, 5.0))

@@ -42,9 +42,9 @@ def test_a_straight_tube_needs_no_repair() -> None:
 @pytest.mark.parametrize("angle", [30.0, 60.0, 90.0])
 @pytest.mark.parametrize("curvature", [0.08, 0.2])
 def test_a_corner_is_rounded_where_there_is_room(angle: float, curvature: float) -> None:
-    """The arc tangent to both legs needs (1 / cos(angle / 2) - 1) / curvature of room."""
-    room = least_clearance_of_corner(angle, curvature)
-    tube = corner(angle, 1.15 * room + 0.3)
+    """The arc tangent to both legs needs (1 / cos(angle / 2) - 1) / curvature of clearance to the corner."""
+    clearance = least_clearance_of_corner(angle, curvature)
+    tube = corner(angle, 1.15 * clearance + 0.3)
     limits = RouteLimits(max_curvature_per_mm=curvature, device_radius_mm=0.2)
     route = plan_route(tube, tube.nodes_mm[0], tube.nodes_mm[-1], limits)
     assert_kept(route, tube, limits)

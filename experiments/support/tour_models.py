@@ -116,7 +116,7 @@ def _strand(
 def random_lesions(tree: AirwayTree, count: int, seed: int, *, rule: ExitRule | None = None) -> Float:
     """Return lesions `(count, 3)`, LPS mm, evenly distributed in the hull of the bronchi.
 
-    The hull of all points below the carina takes the place of the lungs; a place farther from the airway than the
+    The hull of all points below the carina replaces the lungs; a place farther from the airway than the
     needle reaches is drawn again.
 
     Raises

@@ -17,6 +17,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.risk.deviations import TUBE_PIECES, Deviations, Draws, deviated_pieces, deviated_starts
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.statistics import Share, share_of
+from stages.needle import Obstacles
 
 STRUCTURES: dict[str, int] = {
     "vessel": VESSEL,
@@ -88,7 +89,7 @@ class RiskAssessor:
         )
         bits = obstacle_bits(lung.has_fissures)
         field = lung.obstacle_field(with_fissures=True)
-        self._environment = (field.corners, lung.labels, field.geometry, bits)
+        self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
         self._depth = (lung.lumen_depth.corners, lung.lumen_depth.geometry)
         self._mediastinal = lung.tree.mediastinal
         self.structures = {
@@ -107,7 +108,7 @@ class RiskAssessor:
 
         def follow(part: slice) -> None:
             kernel.follow(
-                self._environment, self._depth, self._mediastinal, starts[part], pieces[part], TUBE_PIECES,
+                self._obstacles, self._depth, self._mediastinal, starts[part], pieces[part], TUBE_PIECES,
                 exempt_mm, touched[part], ends[part],
             )  # fmt: skip
 

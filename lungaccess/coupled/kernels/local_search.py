@@ -1,5 +1,10 @@
 """Compiled kernels of the coupled search: local search from one choice, and local sampling around many.
 
+The needle stage has a local search of its own (`stages.needle.search.kernels.optimal.refine`).  There the
+start is fixed, a via point may be reached by an arc and a straight line, and points are drawn from balls.
+Here scope pose, tubes and via points change together, by normal distributions of one common spread, and all
+legs are single arcs.
+
 The arguments are those of `lungaccess.coupled.kernels.candidate`.
 """
 

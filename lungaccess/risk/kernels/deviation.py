@@ -42,18 +42,17 @@ _LUMEN = np.int64(LUMEN)
 
 
 @inner_kernel
-def _touch(environment, touched, x, y, z, radius, spared, lumen_mm):
+def _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm):
     """Add what a ball touches, and return how far no structure that is not yet touched can be met.
 
     The airway of the branch `spared` counts for nothing (-1: none is spared), but the lumen of any airway
     nearer than `lumen_mm` does (negative: it does not).
     """
-    _field, labels, geometry, bits = environment
     reach = radius + EXACT_REACH_MM
     gap = EXACT_REACH_MM
-    left = bits & ~touched
+    left = obstacles.bits & ~touched
     while left != 0:
-        distance, label = exact_distance(labels, geometry, x, y, z, left, spared, reach)
+        distance, label = exact_distance(obstacles.labels, obstacles.geometry, x, y, z, left, spared, reach)
         if distance >= radius - TOUCHES_MM:
             gap = distance - radius
             break
@@ -64,7 +63,7 @@ def _touch(environment, touched, x, y, z, radius, spared, lumen_mm):
         left &= ~hit
     if lumen_mm >= 0.0 and not touched & AIRWAY:
         distance, _label = exact_distance(
-            labels, geometry, x, y, z, _LUMEN, _NOBODY, lumen_mm + EXACT_REACH_MM
+            obstacles.labels, obstacles.geometry, x, y, z, _LUMEN, _NOBODY, lumen_mm + EXACT_REACH_MM
         )
         if distance < lumen_mm - TOUCHES_MM or distance == 0.0:
             touched |= AIRWAY
@@ -73,10 +72,9 @@ def _touch(environment, touched, x, y, z, radius, spared, lumen_mm):
 
 
 @inner_kernel
-def _in_lumen(environment, depth, x, y, z):
+def _in_lumen(obstacles, depth, x, y, z):
     """Return the step to the next point in a lumen, and the branch; NOT_IN_LUMEN outside of all."""
-    _field, labels, geometry, _bits = environment
-    label = label_at(labels, geometry, x, y, z)
+    label = label_at(obstacles.labels, obstacles.geometry, x, y, z)
     if not label & LUMEN:
         return 0.0, NOT_IN_LUMEN
     corners, depth_geometry = depth
@@ -84,9 +82,8 @@ def _in_lumen(environment, depth, x, y, z):
 
 
 @inner_kernel
-def _follow(environment, depth, mediastinal, start, pieces, n_tube, exempt_mm):
+def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm):
     """Follow one chain; return what it touches and the point where it ends."""
-    field, _labels, geometry, bits = environment
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
     nx, ny, nz = start[6], start[7], start[8]
     touched = 0
@@ -105,21 +102,21 @@ def _follow(environment, depth, mediastinal, start, pieces, n_tube, exempt_mm):
         if p == n_tube and pierced == IN_LUMEN:
             touched |= STAYS_INSIDE
         at = 0.0
-        while not touched & STAYS_INSIDE and touched & bits != bits:
+        while not touched & STAYS_INSIDE and touched & obstacles.bits != obstacles.bits:
             x, y, z = point_on_arc(pose, bend, at)
             if pierced == IN_LUMEN:
-                step, here = _in_lumen(environment, depth, x, y, z)
+                step, here = _in_lumen(obstacles, depth, x, y, z)
                 if here == NOT_IN_LUMEN:
                     if branch == IN_LUMEN:
                         touched |= STAYS_INSIDE
                     elif branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
-                        touched |= bits & OUTSIDE
+                        touched |= obstacles.bits & OUTSIDE
                     pierced = branch
                     left_at = done + at
                     continue
                 branch = here
             else:
-                step = distance_bound(field, geometry, x, y, z) - radius
+                step = distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) - radius
                 if step < MIN_GAP_MM:
                     spared = pierced if p < n_tube or done + at < tube_mm + exempt_mm else -1
                     lumen_mm = -1.0
@@ -127,7 +124,7 @@ def _follow(environment, depth, mediastinal, start, pieces, n_tube, exempt_mm):
                         lumen_mm = radius
                     elif done + at > left_at + WALL_ZONE_MM:
                         lumen_mm = 0.0
-                    touched, step = _touch(environment, touched, x, y, z, radius, spared, lumen_mm)
+                    touched, step = _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm)
             if at >= length:
                 break
             at = min(at + step, length)
@@ -138,7 +135,7 @@ def _follow(environment, depth, mediastinal, start, pieces, n_tube, exempt_mm):
 
 
 @numba.njit(cache=True, nogil=True)
-def follow(environment, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched, ends):
+def follow(obstacles, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched, ends):
     """Follow N deviated plans, and note what each touches and where it ends.
 
     A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
@@ -149,8 +146,8 @@ def follow(environment, depth, mediastinal, starts, pieces, n_tube, exempt_mm, t
 
     Parameters
     ----------
-    environment : tuple
-        Clearance field of all structures in `bits`, labels, geometry, bits.
+    obstacles : Obstacles
+        All structures that count.
     depth : tuple
         Lumen depth and its geometry.
     mediastinal : (B,) bool
@@ -165,7 +162,7 @@ def follow(environment, depth, mediastinal, starts, pieces, n_tube, exempt_mm, t
         Receives the last points.
     """
     for n in range(starts.shape[0]):
-        found, x, y, z = _follow(environment, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm)
+        found, x, y, z = _follow(obstacles, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm)
         touched[n] = found
         ends[n, 0] = x
         ends[n, 1] = y

@@ -35,6 +35,14 @@ CHEAPEST_SHARE = 0.5
 ARC, LEGS = 0, 1
 VIA_COLUMNS = 4
 SPREADS_MM = (6.0, 2.0, 0.6, 0.2, 0.05, 0.01)
+"""Radii of the balls in which a via point is drawn anew, from the size of vessels down."""
+LEAST_NEW_SPREAD_MM = 2.0
+"""A new first via point is drawn from a ball of this radius at least: its centre lies between the next one
+and the goal, not near the start."""
+DROP_SHARE, ADD_SHARE, OTHER_LEG_SHARE, ALL_SHARE = 0.12, 0.27, 0.37, 0.9
+"""Below the first share of all variations a via point is dropped, below the second one is added, below the
+third one is reached by the other kind of leg; above the fourth all points are moved, and else a single one.
+The values are a free choice: most variations move points, and each kind is frequent."""
 
 
 @numba.njit(cache=True)
@@ -187,13 +195,13 @@ def _mutate(vias, trial, count, goal, limits, state):
     kind = uniform(state)
     spread = SPREADS_MM[int(uniform(state) * len(SPREADS_MM))]
     m = int(uniform(state) * count)
-    if kind < 0.12 and count > 1:
+    if kind < DROP_SHARE and count > 1:
         m = min(m, count - 2)
         for k in range(m, count - 1):
             for n in range(VIA_COLUMNS):
                 trial[k, n] = trial[k + 1, n]
         return count - 1
-    if kind < 0.27 and count + 1 < trial.shape[0]:
+    if kind < ADD_SHARE and count + 1 < trial.shape[0]:
         for k in range(count, m, -1):
             for n in range(VIA_COLUMNS):
                 trial[k, n] = trial[k - 1, n]
@@ -204,11 +212,11 @@ def _mutate(vias, trial, count, goal, limits, state):
         trial[m, 3] = ARC if uniform(state) < 0.5 else LEGS
         count += 1
         if m == 0:
-            spread = max(spread, 2.0)
-    elif kind < 0.37:
+            spread = max(spread, LEAST_NEW_SPREAD_MM)
+    elif kind < OTHER_LEG_SHARE:
         trial[m, 3] = LEGS if trial[m, 3] == ARC else ARC
         return count
-    every = kind > 0.9
+    every = kind > ALL_SHARE
     for k in range(count):
         if k != m and not every:
             continue
@@ -230,6 +238,9 @@ def _mutate(vias, trial, count, goal, limits, state):
 @numba.njit(cache=True, nogil=True)
 def refine(obstacles, limits, objective, branch, goal, nodes, parents, vias, count, tries, state, best):
     """Vary the via points of a path at random and keep what is cheaper; return count, cost, improvements.
+
+    Here the start is fixed, a leg may be an arc and a straight line, and the end may be anywhere within the
+    goal tolerance.  A planner that varies the start too needs a local search of another kind.
 
     `vias` (N, 4) holds the path and gets the best one; rows of `nodes` but the root are scratch.
     """

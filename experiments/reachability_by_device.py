@@ -21,7 +21,7 @@ from anatomy.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.system import System
-from lungaccess.reachability.reach_map import map_reach
+from lungaccess.reachability import map_reach
 from lungaccess.report import style
 
 

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from lungaccess.coupled import build_atlas as build_atlas
     from lungaccess.coupled import open_atlas as open_atlas
     from lungaccess.coupled import plan as plan
-    from lungaccess.one_stage.needle import plan_needle as plan_needle
-    from lungaccess.one_stage.scope import advise_scope as advise_scope
-    from lungaccess.one_stage.tour import plan_tour as plan_tour
-    from lungaccess.one_stage.tubes import deploy_tubes as deploy_tubes
+    from lungaccess.one_stage import advise_scope as advise_scope
+    from lungaccess.one_stage import deploy_tubes as deploy_tubes
+    from lungaccess.one_stage import plan_needle as plan_needle
+    from lungaccess.one_stage import plan_tour as plan_tour
     from lungaccess.plans.no_plan import NoPlan as NoPlan
     from lungaccess.plans.plan import Plan as Plan
     from lungaccess.problem import System as System
@@ -45,9 +45,9 @@ if TYPE_CHECKING:
     from lungaccess.problem import point_target as point_target
     from lungaccess.problem import preset_names as preset_names
     from lungaccess.problem import resolve_target as resolve_target
-    from lungaccess.reachability.reach_map import compare_reach as compare_reach
-    from lungaccess.reachability.reach_map import map_reach as map_reach
-    from lungaccess.reachability.unreachable import UnreachableProof as UnreachableProof
+    from lungaccess.reachability import UnreachableProof as UnreachableProof
+    from lungaccess.reachability import compare_reach as compare_reach
+    from lungaccess.reachability import map_reach as map_reach
     from lungaccess.report.html import plan_page as plan_page
     from lungaccess.risk import ErrorModel as ErrorModel
     from lungaccess.risk import assess as assess

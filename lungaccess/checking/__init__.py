@@ -1,6 +1,15 @@
 """The independent check of a plan: it shares no arithmetic with the planners."""
 
-from lungaccess.checking.checker import Checker, check
-from lungaccess.checking.findings import CheckReport, Finding
+from __future__ import annotations
 
-__all__ = ["CheckReport", "Checker", "Finding", "check"]
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.checking.checker import Checker as Checker
+    from lungaccess.checking.checker import check as check
+    from lungaccess.checking.findings import CheckReport as CheckReport
+    from lungaccess.checking.findings import Finding as Finding
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -112,7 +112,7 @@ def widest_end(centreline: Centreline) -> Float:
     return np.asarray(centreline.nodes_mm[ends[int(np.argmax(centreline.radius_mm[ends]))]])
 
 
-def record(source: RouteSource, route: Route) -> dict[str, Any]:
+def route_record(source: RouteSource, route: Route) -> dict[str, Any]:
     """Return a route as plain JSON types, in LPS mm."""
     from anatomy.settings import to_mapping
     from stages.scope.route import measure

@@ -233,7 +233,7 @@ def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
     return frozenset(good)
 
 
-def record(answer: TourAnswer) -> dict[str, Any]:
+def tour_record(answer: TourAnswer) -> dict[str, Any]:
     """Return a tour as plain JSON types: points in LPS mm, lengths in mm, lesions counted from 1."""
     least = answer.least_resistance
     return {

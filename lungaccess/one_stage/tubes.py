@@ -216,7 +216,7 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
     return present, tuple(sorted(chosen, key=lambda each: each.lateral_sweep_mm))
 
 
-def record(answer: TubeAnswer) -> dict[str, Any]:
+def tubes_record(answer: TubeAnswer) -> dict[str, Any]:
     """Return a deployment as plain JSON types: mm, rad, frame of the scope tip."""
     deployed, snap = answer.deployed, answer.snap
     return {

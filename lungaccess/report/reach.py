@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from anatomy.grid import Volume
     from anatomy.lung import Lung
-    from lungaccess.reachability.reach_map import ReachMap
+    from lungaccess.reachability import ReachMap
 
 
 WIDTH_IN, HEIGHT_IN = 18.0, 11.0
@@ -128,7 +128,7 @@ def _values(volume: Volume, lps: Float) -> Float:
 
 
 def _kind_colours(reach: ReachMap, lps: Float) -> Float:
-    from lungaccess.reachability.reach_map import KINDS
+    from lungaccess.reachability import KINDS
 
     kinds = _values(reach.kinds, lps)
     image = np.zeros((*kinds.shape, 4))
@@ -138,7 +138,7 @@ def _kind_colours(reach: ReachMap, lps: Float) -> Float:
 
 
 def _clearance_colours(reach: ReachMap, lps: Float) -> Float:
-    from lungaccess.reachability.reach_map import KINDS
+    from lungaccess.reachability import KINDS
 
     kinds = _values(reach.kinds, lps)
     reached = (kinds == KINDS["direct arc"]) | (kinds == KINDS["search"])
@@ -172,7 +172,7 @@ def _bar(figure: Figure) -> None:
 
 
 def _text(figure: Figure, reach: ReachMap) -> None:
-    from lungaccess.reachability.reach_map import KINDS
+    from lungaccess.reachability import KINDS
 
     system = reach.system
     heading = f"What {system.name} reaches of {reach.patient_name}"

@@ -121,7 +121,7 @@ class PlannerChoice:
     @property
     def is_of_ompl(self) -> bool:
         """Whether it is a planner of OMPL, whose random numbers can be seeded once in a process."""
-        from lungaccess.one_stage.needle import OMPL_PLANNERS
+        from lungaccess.one_stage import OMPL_PLANNERS
 
         return self.kind == "needle" and self.method in OMPL_PLANNERS
 
@@ -194,7 +194,7 @@ class Study:
 def methods(kind: str) -> tuple[str, ...]:
     """Return the names of the planners of a kind, "plan" or "needle"."""
     if kind == "needle":
-        from lungaccess.one_stage.needle import OMPL_PLANNERS
+        from lungaccess.one_stage import OMPL_PLANNERS
         from stages.needle import PLANNERS
 
         return (*PLANNERS, *OMPL_PLANNERS)

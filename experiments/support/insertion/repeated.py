@@ -17,7 +17,7 @@ from experiments.support.insertion.closed_loop import (
     simulate,
 )
 from experiments.support.insertion.truth import Errors
-from lungaccess.risk.statistics import Share
+from lungaccess.risk import Share
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath

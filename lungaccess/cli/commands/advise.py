@@ -12,7 +12,7 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions, TargetOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from lungaccess.one_stage.scope import ScopeAdvice
+    from lungaccess.one_stage import ScopeAdvice
 
 
 def advise(
@@ -43,7 +43,7 @@ def advise(
     out : Path
         Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer.
     """
-    from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
+    from lungaccess.one_stage import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
     from lungaccess.problem.system import load_system
 
     stated = target.stated()

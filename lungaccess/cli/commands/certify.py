@@ -31,7 +31,7 @@ def certify(
         Ranges of deployments to look at for every 8 mm of airway before the proof is given up; 3 million if
         not given.
     """
-    from lungaccess.reachability.unreachable import MOST_BOXES, UnreachableProof
+    from lungaccess.reachability import MOST_BOXES, UnreachableProof
 
     stated = target.stated()
     if most_boxes is not None and most_boxes < 1:

@@ -19,7 +19,7 @@ from stages.needle import Objective
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.typed import Float
-    from lungaccess.one_stage.needle import NeedleAnswer
+    from lungaccess.one_stage import NeedleAnswer
 
 NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 
@@ -54,7 +54,7 @@ def needle(
         What to make small: length, integral of 1/clearance, integral of the cost map, its sum over voxels, or
         a weighted sum such as length=1,cost-map=0.5.
     """
-    from lungaccess.one_stage.needle import plan_needle
+    from lungaccess.one_stage import plan_needle
 
     stated, weighed = target.stated(), Objective.of(objective)
     device = system.load()

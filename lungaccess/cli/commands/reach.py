@@ -14,7 +14,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.reachability.reach_map import ReachMap, RegionReach
+    from lungaccess.reachability import ReachMap, RegionReach
 
 
 def reach(
@@ -116,7 +116,7 @@ def record(reach: ReachMap) -> dict[str, object]:
 
 
 def _plain(row: RegionReach) -> dict[str, object]:
-    from lungaccess.reachability.reach_map import KINDS
+    from lungaccess.reachability import KINDS
 
     return {
         "name": row.name,
@@ -128,7 +128,7 @@ def _plain(row: RegionReach) -> dict[str, object]:
 
 
 def _region_table(reach: ReachMap) -> Table:
-    from lungaccess.reachability.reach_map import KINDS
+    from lungaccess.reachability import KINDS
 
     rows = [
         (

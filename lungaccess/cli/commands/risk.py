@@ -13,9 +13,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.risk.assessment import RiskReport
-    from lungaccess.risk.statistics import Share
-    from lungaccess.risk.tolerances import Tolerance
+    from lungaccess.risk import RiskReport, Share, Tolerance
 
 
 def risk(
@@ -49,9 +47,7 @@ def risk(
         Seed of the random numbers.
     """
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk.assessment import assess
-    from lungaccess.risk.errors import ErrorModel, load_errors
-    from lungaccess.risk.tolerances import find_tolerances
+    from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors
 
     model = ErrorModel() if errors is None else load_errors(errors)
     stored = Plan.load(plan)
@@ -142,7 +138,7 @@ def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:
 
 
 def _largest(tolerance: Tolerance) -> str:
-    from lungaccess.risk.tolerances import LARGEST
+    from lungaccess.risk import LARGEST
 
     size = tolerance.largest
     more = "at least " if size >= LARGEST[tolerance.unit] else ""

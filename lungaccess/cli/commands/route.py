@@ -62,7 +62,7 @@ def route(
     out : Path
         Folder for route.json and route.png.
     """
-    from lungaccess.one_stage.route import open_source, record, widest_end
+    from lungaccess.one_stage import open_source, route_record, widest_end
     from lungaccess.report.route import route_png
     from stages.scope.route import RouteLimits, try_route
 
@@ -83,7 +83,7 @@ def route(
         shown.step("planning")
         first = widest_end(opened.centreline) if begin is None else begin
         found = try_route(opened.centreline, first, end, limits, repair=repair, seed=seed)
-    written = record(opened, found)
+    written = route_record(opened, found)
     write_json(out / "route.json", written)
     route_png(opened.name, opened.centreline, found, out / "route.png")
     if output.json:

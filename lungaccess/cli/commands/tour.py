@@ -13,7 +13,7 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from lungaccess.one_stage.tour import TourAnswer
+    from lungaccess.one_stage import TourAnswer
     from stages.scope.tour import Itinerary
 
 
@@ -59,7 +59,7 @@ def tour(
     out : Path
         Folder for tour.json and tour.png.
     """
-    from lungaccess.one_stage.tour import plan_tour, read_lesions, record
+    from lungaccess.one_stage import plan_tour, read_lesions, tour_record
     from lungaccess.problem.system import load_system
     from lungaccess.report.tour import tour_png
     from stages.scope.tour import Resistances
@@ -86,10 +86,10 @@ def tour(
             tissue_weight=tissue_weight,
             atlas=atlas,
         )
-    write_json(out / "tour.json", record(answer))
+    write_json(out / "tour.json", tour_record(answer))
     tour_png(answer, lung, out / "tour.png")
     if output.json:
-        terminal.show_json(record(answer))
+        terminal.show_json(tour_record(answer))
         return ExitCode.of(not answer.left_out)
     _show(answer, speed, per_lesion)
     terminal.say(f"Written to {out}: tour.json, tour.png")

@@ -15,7 +15,7 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.one_stage.tubes import TubeAnswer
+    from lungaccess.one_stage import TubeAnswer
     from stages.tube import DesignProposal, SequenceComparison
 
 
@@ -49,7 +49,7 @@ def tubes(
     out : Path
         PNG file for the picture.
     """
-    from lungaccess.one_stage.tubes import deploy_tubes, load_tubes
+    from lungaccess.one_stage import deploy_tubes, load_tubes
 
     if out.suffix.lower() != ".png":
         raise SettingsError(f"--out is {out}", expected="a file name that ends in .png")
@@ -72,7 +72,7 @@ def _show_tables(answer: TubeAnswer, propose: bool) -> None:
     terminal.show([terminal.table(f"Tubes of {answer.name}", ("", "", "limit"), _rows(answer))])
     if not propose:
         return
-    from lungaccess.one_stage.tubes import compare_sequences, design_choices
+    from lungaccess.one_stage import compare_sequences, design_choices
 
     comparison = compare_sequences(answer)
     terminal.show([_sequence_table(comparison)])
@@ -151,9 +151,9 @@ def _design_table(present: DesignProposal, choices: tuple[DesignProposal, ...]) 
 
 
 def _show_json(answer: TubeAnswer, propose: bool) -> None:
-    from lungaccess.one_stage.tubes import compare_sequences, design_choices, record
+    from lungaccess.one_stage import compare_sequences, design_choices, tubes_record
 
-    written = record(answer)
+    written = tubes_record(answer)
     if propose:
         comparison = compare_sequences(answer)
         written["sequences"] = [

@@ -84,7 +84,7 @@ def plan_page(
         If the CT does not hold the plan.
     """
     from lungaccess.checking import Checker
-    from lungaccess.risk.assessment import assess
+    from lungaccess.risk import assess
 
     chosen = options or PageOptions()
     plans = (plan, *chosen.alternatives)

@@ -19,7 +19,7 @@ from lungaccess.report.reach import CLEARANCE_MM, COLOURS, fullest_point
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.reachability.reach_map import ReachMap
+    from lungaccess.reachability import ReachMap
 
 MODULES = ("reach.js",)
 STEPS_PER_MM = 25.0
@@ -72,7 +72,7 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
 
 def packed_map(reach: ReachMap) -> Packed:
     """Return a map for the scripts: its kinds and clearances, and the surfaces of what is reached and not."""
-    from lungaccess.reachability.reach_map import KINDS
+    from lungaccess.reachability import KINDS
 
     clearance = np.clip(np.rint(reach.clearance_mm.array * STEPS_PER_MM), 0, 255).astype(np.uint8)
     return {
@@ -88,7 +88,7 @@ def packed_map(reach: ReachMap) -> Packed:
 
 
 def _surfaces(reach: ReachMap) -> list[Packed]:
-    from lungaccess.reachability.reach_map import NOT_COUNTED
+    from lungaccess.reachability import NOT_COUNTED
 
     counted = reach.kinds.array != NOT_COUNTED
     masks = {"reached": reach.reached, "not reached": counted & ~reach.reached}
@@ -108,7 +108,7 @@ def _surfaces(reach: ReachMap) -> list[Packed]:
 
 def volumes_section(maps: Sequence[ReachMap]) -> str:
     """Return a table of volumes by side for each system, in mL and as a share."""
-    from lungaccess.reachability.reach_map import KINDS
+    from lungaccess.reachability import KINDS
 
     headings = (
         "", "tissue, mL", *(f"{name}, mL (%)" for name in KINDS), "median 1/clearance integral",

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from lungaccess.checking import CheckReport
     from lungaccess.checking.findings import Finding
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk.assessment import RiskReport
-    from lungaccess.risk.statistics import Share
+    from lungaccess.risk import RiskReport, Share
 
 GOAL_RADIUS_MM = 2.0
 AXES_AGREE = "largest angle between the axes"
@@ -134,7 +133,7 @@ def key_section(plan: Plan) -> str:
 
 def instructions_section(plan: Plan, lung: Lung) -> str:
     """Return turn by turn how the scope gets to where the plan has its tip, or why that is not known."""
-    from lungaccess.one_stage.scope import advise_scope
+    from lungaccess.one_stage import advise_scope
 
     tip = np.array(plan.scope.lps_from_scope_tip[:3, 3])
     try:

@@ -16,7 +16,7 @@ from anatomy.phantom import Phantom, write_phantom
 from experiments.support.tour_models import random_airway
 from lungaccess.cli.app import main
 from lungaccess.one_stage.route import open_source, read_drawing, widest_end
-from lungaccess.one_stage.tour import coupled_plan_test, plan_tour, read_lesions, record
+from lungaccess.one_stage.tour import coupled_plan_test, plan_tour, read_lesions, tour_record
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_tour_of_a_patient(small_lung: Lung) -> None:
     assert not answer.left_out
     assert answer.least_resistance is not None
     assert answer.shortest.length_mm <= answer.least_resistance.length_mm <= answer.one_by_one_mm * 2
-    written = json.loads(json.dumps(record(answer)))
+    written = json.loads(json.dumps(tour_record(answer)))
     total = sum(s["length_mm"] * s["passes"] for s in written["shortest"]["stretches"])
     assert total == pytest.approx(written["shortest"]["length_mm"])
     assert sorted(written["shortest"]["order"]) == [1, 2, 3, 4, 5]

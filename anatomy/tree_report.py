@@ -8,54 +8,49 @@ from anatomy.typed import Float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GapBridged:
-    """A break of the lumen across which the tree was continued.
+class Repair:
+    """A place where the tree differs from the mask.
 
     Parameters
     ----------
     position_lps : (3,) float64
-        Middle of the gap, LPS mm.
+        LPS mm.
     length_mm : float
-        Distance between the two facing voxels, as solid boxes; 0 where they touch by an edge or corner alone.
+        How large the difference is; the kinds of repairs say what is measured.
+    """
+
+    position_lps: Float
+    length_mm: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GapBridged(Repair):
+    """A break of the lumen across which the tree was continued; its position is the middle of the gap.
+
+    The length is the distance between the two facing voxels, as solid boxes; 0 where they touch by an edge
+    or corner alone.
+
+    Parameters
+    ----------
     voxels_joined : int
         Voxels of the piece that was joined (0 where the pieces touch).
     """
 
-    position_lps: Float
-    length_mm: float
     voxels_joined: int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SpurPruned:
-    """A twig that was taken off because it barely leaves the branch it grows from.
+class SpurPruned(Repair):
+    """A twig that was taken off because it barely leaves the branch it grows from; its position is its tip.
 
-    Parameters
-    ----------
-    position_lps : (3,) float64
-        Its tip, LPS mm.
-    length_mm : float
-        Length from the centreline of the parent to the tip.
+    The length is that from the centreline of the parent to the tip.
     """
 
-    position_lps: Float
-    length_mm: float
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LoopOpened:
+class LoopOpened(Repair):
     """A ring of the lumen (two airways that touch, a hole in a wall) that was cut where it is thinnest.
 
-    Parameters
-    ----------
-    position_lps : (3,) float64
-        The cut, LPS mm.
-    length_mm : float
-        Length once around.
+    Its position is that of the cut, and the length is that once around.
     """
-
-    position_lps: Float
-    length_mm: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,11 +22,17 @@ from stages.needle.query import Query
 from stages.needle.search.base import RestartingRRT
 
 EXIT_MM = (5.0, 9.0)
+"""Needles start this far outside of the airway's wall."""
 MAX_EXIT_ANGLE_DEG = 60.0
+"""A goal farther to the side needs more curvature than the needle has."""
 TARGET_MM = (50.0, 90.0)
+"""Distances of goals: through most of a lobe."""
 PLEURA_MM = 5.0
+"""Goals keep this far from the pleura."""
 TRIES, TRY_ITERATIONS = 40, 300
+"""Enough short searches to tell easy problems from hard ones."""
 MOST_CANDIDATES = 3000
+"""Of so many problems some are hard in every CT."""
 SCENARIOS = {"easy": (0.9, 1.0), "medium": (0.4, 0.6), "hard": (0.02, 0.12)}
 """Share of `TRIES` short searches that find a path: what makes a scenario easy or hard."""
 LEAST_COST = 1.0

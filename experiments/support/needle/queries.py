@@ -30,16 +30,25 @@ from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.path import ArcPath
 
 NEEDLE_DIAMETER_MM = 2.0
+"""Of the recorded queries."""
 GOAL_TOLERANCE_MM = 1.0
+"""Of the recorded queries."""
 MAX_LENGTH_MM = 150.0
+"""Of the recorded queries."""
 RECHECK_MM = 0.02
+"""A tenth of a voxel or less: no obstacle is stepped over."""
 BORDER_MM = 30.0
+"""Obstacles are cut out so far around a query; a path that leaves this box is too long."""
 GENERATED_RADII_MM = (50.0, 121.0)
+"""The two radii of curvature of the recorded queries."""
 GENERATED_MM = (20.0, 50.0)
+"""Distances of drawn targets, as those of the recorded queries."""
 GENERATED_CONE_RAD = 0.5
+"""Drawn targets lie within this angle of straight ahead, where the needle bends to."""
 AROUND_VOXELS = 3
 """No obstacle lies within so many voxels of a drawn target: a tip can stop there."""
 EXEMPT_MM = 4.0
+"""The airway's wall around the start, which the needle pierces."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

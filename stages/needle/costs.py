@@ -17,6 +17,7 @@ from stages.needle.objective import TERMS, Term
 from stages.needle.path import ArcPath, kernel_arcs
 
 SAMPLE_MM = 0.1
+"""Greatest step of the trapezoid rule, as long as the least clearance that counts."""
 EXACT_BELOW_VOXELS = 8.0
 """Nearer than so many of the longest voxel sides, distances are exact; farther, the clearance field's lower
 bound is less than 0.6 % off."""

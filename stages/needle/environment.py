@@ -1,4 +1,4 @@
-"""What the needle kernels look at: obstacles as arrays, and the needle's limits as numbers."""
+"""The environment of a needle: obstacles as arrays, and the needle's limits, as the kernels take them."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ from stages.needle.kernels.proof import Obstacles
 from stages.needle.objective import Objective
 
 RRT_STEP_MM = 20.0
+"""Longest arc of a tree.  The value is a free choice: a path across a lobe takes several arcs."""
 COST_STEP_MM = 0.5
+"""Step of estimated integrals: about a voxel, since clearance changes by no more than one moves."""
 ROUNDING_MM = 1e-6
-"""By so much less than the goal tolerance searches miss, so that rounding leads no path out of it."""
+"""The searches keep a goal tolerance that is smaller by this, so that rounding leads no path out of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -24,6 +24,7 @@ DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
 
 DEFAULT_ARCS = 4
 RRT_ITERATIONS = 200
+"""Iterations of a tree: those that succeed do so early, see `RESTART_ITERATIONS`."""
 ORDER_SEED = 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from experiments.support.needle.queries import Obstacles, Validator, hard_queries, load_obstacles
-from stages.needle.search import base as searches
+from stages.needle import query as needle_query
 from stages.needle.search.planners import PLANNERS
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES
 from tests.scenarios.runs import Answer
@@ -27,7 +27,7 @@ class SharedQueries:
         out = []
         for query in self._queries:
             environment = self._obstacles[query.patient].environment(query)
-            asked = searches.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
+            asked = needle_query.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
             search = PLANNERS[planner](environment, asked, 0)
             search.advance(NEEDLE_ITERATIONS)
             path = search.path

@@ -8,8 +8,8 @@ from collections import Counter
 from typing import Any
 
 from experiments.support.needle.queries import Query, Validator
+from stages.needle import query as needle_query
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.search import base as searches
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.decision import Decision
 from stages.needle.search.planners import MakeSearch
@@ -22,9 +22,9 @@ UNIT = Resolution(fine_mm=1.0, fine_rolls=16)
 Problem = tuple[Query, NeedleEnvironment, Validator]
 
 
-def asked(query: Query) -> searches.Query:
+def asked(query: Query) -> needle_query.Query:
     """Return a recorded query as the needle stage takes it."""
-    return searches.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
+    return needle_query.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
 
 
 def run(

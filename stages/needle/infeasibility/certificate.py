@@ -45,12 +45,15 @@ SLACK_RATIO = 1.08
 """Of the amounts of missing clearance that are told apart."""
 SLACKS = 48
 LARGEST_DEPTH_MM = 12.5
+"""Greatest distance of the planes, however little the needle bends."""
 LEAST_KAPPA = 1e-5
 """In 1/mm; what bends less is taken to bend so much, for the sake of rounding."""
 LEAST_DISTANCE_MM = 1e-3
+"""Nearer targets are left undecided; targets outside the workspace by less are not ruled out at once."""
 STEEPEST = 0.995
 """Largest sine of the angle between paths and the planes' normal for which planes are tried."""
 MAX_BYTES = 1 << 30
+"""A gigabyte, which any computer that segments a CT has."""
 
 
 class _TooMuchError(Exception):

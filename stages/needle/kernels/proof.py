@@ -19,6 +19,7 @@ from anatomy.typed import Float, Labels, UInt16
 from stages.needle.kernels.limits import TINY
 
 PROBE_SPACING_MM = 1.5
+"""Before the proof, arcs are looked at in points at most so far apart: most obstacles are met there."""
 
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)

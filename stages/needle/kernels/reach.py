@@ -32,6 +32,7 @@ COST = 0
 CLEARANCE = 1
 
 CLEARANCE_STEP_MM = 0.5
+"""Step of the clearance that is stated; half of it is what the bound may be too low."""
 LONGEST_JUMP = 256
 JUMP_GROWTH = 4
 """Neighbours of the best start pose are tried 1, 4, 16, ... places away in the list, up to the longest."""

@@ -22,6 +22,7 @@ from stages.needle.kernels.tree import (
 )
 
 SAMPLE_TRIES = 50
+"""So many points are drawn in search of one in the workspace; then the iteration draws none."""
 
 
 @inner_kernel

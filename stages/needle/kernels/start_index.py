@@ -26,6 +26,7 @@ ANGLE = 7
 N_BOUNDS = 8
 
 ROUNDING_MM = 1e-6
+"""Added to bounds, so that rounding excludes no pose."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -25,6 +25,7 @@ from stages.needle.violations import SAME_MM
 ROUNDING_MM = 1e-6
 """What every goal tolerance is larger for OMPL, whose states are rounded."""
 SLICE_ITERATIONS = 200
+"""Iterations between two looks at OMPL's termination condition, a few milliseconds."""
 NO_LIMIT = 2**62
 
 

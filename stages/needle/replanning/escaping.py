@@ -18,6 +18,7 @@ from stages.needle.replanning.reaiming import Attempts, Bend, Root, Source, as_p
 
 ROLLS = 8
 STEP_MM = 0.25
+"""Lengths of the arcs that are tried differ by this: half a voxel."""
 SLACK_MM = 0.1
 """By so much an arc that leads away from an obstacle may come nearer to it first: bending takes a while."""
 

@@ -16,7 +16,9 @@ from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.query import Query
 
 MAX_NODES = 20_000
+"""Rows of a tree, 2 MB; a tree that has more begins anew."""
 RANDOM_SHARE = 0.5
+"""Share of the iterations that extend a random node by a random arc; a free choice."""
 RESTART_ITERATIONS = 200
 """Unit of the restart schedule: trees that are lucky are so early."""
 

@@ -15,6 +15,7 @@ from stages.needle.search.base import RestartingRRT
 from stages.needle.search.kernels import optimal
 
 MAX_VIAS = 64
+"""A path of more arcs is not varied: none that is worth it has so many."""
 REFINE_SHARE = 0.7
 """Share of the iterations, once there is a path, that vary it instead of growing trees."""
 IMPROVEMENT = 1e-6

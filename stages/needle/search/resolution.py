@@ -33,8 +33,11 @@ Queue = tuple[Float, Int32, Float, Int32, Int32]
 
 FIRST_NODES = 1024
 FIRST_ENTRIES = 4096
+"""Sizes of the arrays at first; they are doubled when they are full."""
 MOST_STEPS = 128
+"""The greatest power of two of which the kernel's bytes can hold the number of steps."""
 MOST_ROLLS = 64
+"""More directions would differ by less than 6 degrees."""
 EQUAL_CELL_MM = 1e-3
 """Where only equal poses are duplicates, poses are looked for in cells of this size."""
 
@@ -168,7 +171,7 @@ class Counts:
 class ResolutionSearch:
     """The search over words of arcs and straight pieces, from coarse to fine [Fu2021, Fu2022].
 
-    See docs/resolution_search.md; it is a `searches.Search`.  Nothing in it is random.
+    See docs/resolution_search.md; it is a `stages.needle.search.base.Search`.  Nothing in it is random.
 
     Parameters
     ----------
@@ -190,7 +193,7 @@ class ResolutionSearch:
     Attributes
     ----------
     path, cost, finished
-        See `searches.Search`.
+        See `Search`.
     outcome : Outcome
     """
 
@@ -267,7 +270,7 @@ class ResolutionSearch:
         return _megabytes((*self._store, *self._queue))
 
     def advance(self, iterations: int) -> bool:
-        """Take up to `iterations` entries off the queue; see `searches.Search`."""
+        """Take up to `iterations` entries off the queue; see `Search`."""
         stop = int(self._counts[kernel.POPS]) + iterations
         while not self.finished and self._counts[kernel.POPS] < stop:
             reason, self.cost = kernel.search_words(
@@ -362,7 +365,7 @@ def _doubled(array: NDArray[T]) -> NDArray[T]:
 
 
 def _words(resolution: Resolution, kappa: float) -> Words:
-    """Return what the kernel has to know of a resolution, see `kernels.resolution.search_words`."""
+    """Return what the kernel has to know of a resolution, see `search_words`."""
     lengths = resolution.fine_mm * np.arange(resolution.steps + 1)
     arcs = [
         (

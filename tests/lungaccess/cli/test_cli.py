@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+import lungaccess as la
 from anatomy.errors import AnatomyError, FrameError
 from lungaccess.checking import CheckReport, Finding
 from lungaccess.cli import app as cli
@@ -233,6 +234,13 @@ def test_an_iteration_budget_leaves_the_time_open(
 ) -> None:
     cli.main(["plan", "toy", "--nodule", *words, "--out", str(tmp_path)])
     assert (toy_commands["time_s"], toy_commands["iterations"]) == (time_s, iterations)
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.parametrize("words", ["length=1,inverse-clearance=2", "inverse_clearance=2, length_mm"])
+def test_an_objective_may_be_a_weighted_sum(words: str, toy_commands: dict[str, Any], tmp_path: Path) -> None:
+    cli.main(["plan", "toy", "--nodule", "--objective", words, "--out", str(tmp_path)])
+    assert la.Objective.of(toy_commands["objective"]) == la.Objective(inverse_clearance=2.0, length=1.0)
 
 
 @pytest.mark.usefixtures("no_pictures")

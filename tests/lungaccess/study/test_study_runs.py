@@ -139,6 +139,26 @@ def test_a_process_of_its_own_gives_the_same_plan(runs: list[Run], cache: Path) 
     assert found.findings == here.findings
 
 
+def test_a_run_under_a_weighted_sum(cache: Path) -> None:
+    """Whatever the spelling, the key is that of the sum; planner and needle alone are judged by it."""
+    text = "inverse_clearance=2,length_mm=0.1"
+    spelled = ("inverse-clearance=2,length=0.1", "length_mm=0.1, inverse_clearance=2.0")
+    first, second = (
+        next(runs_of(study_of(content(case={"objective": words})), cache=cache)) for words in spelled
+    )
+    assert first.problem.objective == text and first.key == second.key
+    found = answer(first, cache)
+    assert found.accepted
+    expected = 2.0 * found.costs["inverse_clearance"] + 0.1 * found.costs["length_mm"]
+    assert found.costs[text] == found.improvements[-1].cost == expected
+    lung = open_patient(first.problem.patient, cache)
+    tip = Plan.from_json(found.plan).tube.lps_from_tip
+    choice = PlannerChoice(name="needle", kind="needle", method="optimal")
+    alone = Run(problem=replace(first.problem, start=1, iterations=500), planner=choice, seed=3)
+    path = needle_answer(alone, replace(lung, starts=(tip,)))
+    assert path.accepted and path.improvements[0].cost == path.costs[text]
+
+
 def test_a_run_of_the_needle_alone(runs: list[Run], cache: Path) -> None:
     """From where the tube of a plan ends, to the plan's target."""
     lung = open_patient(runs[0].problem.patient, cache)

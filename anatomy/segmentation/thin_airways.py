@@ -12,7 +12,7 @@ from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.typed import Float, Int, Int16, Mask, UInt8
 
 N_DIRECTIONS = 260
-"""Over the sphere: 13 degrees apart, 1.1 mm at the end of a stretch."""
+"""Over the sphere: one every 13 degrees, 1.1 mm at the end of a stretch."""
 RING_VOXELS = (1.4, 2.0)
 """Radii of the ring about a line.  A wall thinner than a voxel appears so far from its middle."""
 N_PLACES = 400
@@ -102,10 +102,10 @@ def _false_contrast(
     radii_mm: Float,
 ) -> float:
     """Return the contrast that hardly any place beside something so bright has; 0 if there are none."""
-    apart = np.ceil(FAR_MM / spacing_mm).astype(np.int64)
+    distance = np.ceil(FAR_MM / spacing_mm).astype(np.int64)
     stride = max(int(np.count_nonzero(lung)) // (LOOKED_AT * N_PLACES), 1)
     places = np.zeros((LOOKED_AT * N_PLACES, 3), dtype=np.int64)
-    count = tube_stretch.places_beside_bright(smooth, state, lung, stride, apart, bright_hu, places)
+    count = tube_stretch.places_beside_bright(smooth, state, lung, stride, distance, bright_hu, places)
     if count < LEAST_PLACES:
         return 0.0
     places = places[np.linspace(0, count - 1, min(count, N_PLACES)).astype(np.int64)]

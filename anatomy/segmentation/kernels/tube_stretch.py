@@ -24,7 +24,7 @@ STATION_MM = 0.65
 LENGTH_MM = STATIONS * STATION_MM
 HALF = STATIONS // 2
 ANGLES = 8
-"""On a ring of two voxels' radius they are as far apart as voxels are."""
+"""On a ring of two voxels' radius their spacing is that of the voxels."""
 ACROSS = np.stack([f(2.0 * np.pi * np.arange(ANGLES) / ANGLES) for f in (np.cos, np.sin)])
 OFFSETS_MM = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 """Where a stretch may begin beside the point it is sought from: the end of a lumen is known to a voxel."""
@@ -129,7 +129,7 @@ def allowed(heading, about, least_cos, other):
 
 @inner_kernel
 def is_free(state, lung, per_mm, begin, heading):
-    """Tell whether a stretch lies in the lung, and after `CLEAR_MM` apart from lumen and what is banned."""
+    """Tell whether a stretch lies in the lung, and after `CLEAR_MM` clear of lumen and what is banned."""
     along = 0.0
     while along <= LENGTH_MM:
         k = int(np.rint((begin[0] + along * heading[0]) * per_mm[0]))
@@ -221,18 +221,18 @@ def best_contrasts(hu, state, lung, per_mm, points, headings, directions, radii_
 
 
 @numba.njit(cache=True)
-def places_beside_bright(smooth, state, lung, stride, apart, bright_hu, out):
+def places_beside_bright(smooth, state, lung, stride, distance, bright_hu, out):
     """List voxels of the lung that lie beside something bright, far from the lumen, `(N, 3)` int64.
 
-    Every `stride`-th voxel of the lung is looked at.  No voxel within `apart` voxels, `(3,)` int64, is lumen.
+    Every `stride`-th voxel of the lung is looked at.  No voxel within `distance` voxels, `(3,)` int64, is lumen.
     Returns how many were listed, at most as many as `out` has room for.
     """
     nk, nj, ni = smooth.shape
     count = 0
     wait = 0
-    for k in range(apart[0], nk - apart[0]):
-        for j in range(apart[1], nj - apart[1]):
-            for i in range(apart[2], ni - apart[2]):
+    for k in range(distance[0], nk - distance[0]):
+        for j in range(distance[1], nj - distance[1]):
+            for i in range(distance[2], ni - distance[2]):
                 if not lung[k, j, i]:
                     continue
                 wait += 1
@@ -241,9 +241,9 @@ def places_beside_bright(smooth, state, lung, stride, apart, bright_hu, out):
                 if smooth[k - 1 : k + 2, j - 1 : j + 2, i - 1 : i + 2].max() < bright_hu:
                     continue
                 free = True
-                for c in range(k - apart[0], k + apart[0] + 1):
-                    for b in range(j - apart[1], j + apart[1] + 1):
-                        for a in range(i - apart[2], i + apart[2] + 1):
+                for c in range(k - distance[0], k + distance[0] + 1):
+                    for b in range(j - distance[1], j + distance[1] + 1):
+                        for a in range(i - distance[2], i + distance[2] + 1):
                             free = free and state[c, b, a] != LUMEN
                 if free:
                     out[count, 0], out[count, 1], out[count, 2] = k, j, i

@@ -15,7 +15,7 @@ STANDARD = {
     "polish, polished": "intensification",
     "race, races, racing, heat, heats, led": "successive halving, rung, guided",
     "dear, dearer, dearest, price, prices, priced, pricing": "cost, costly, evaluate",
-    "desk, court": "evaluator, validator",
+    "desk, court, judge, judges, judged, judgement": "evaluator, validator, the check",
     "stand, stands": "scope pose",
     "menu, menus, apart": "diverse plan set, separation",
     "hope, hopes, hopeful, hopeless": "reachability pruning, futile",

@@ -224,7 +224,7 @@ def best_contrasts(hu, state, lung, per_mm, points, headings, directions, radii_
 def places_beside_bright(smooth, state, lung, stride, distance, bright_hu, out):
     """List voxels of the lung that lie beside something bright, far from the lumen, `(N, 3)` int64.
 
-    Every `stride`-th voxel of the lung is looked at.  No voxel within `distance` voxels, `(3,)` int64, is lumen.
+    Every `stride`-th voxel of the lung is tested.  No voxel within `distance` voxels, `(3,)` int64, is lumen.
     Returns how many were listed, at most as many as `out` has room for.
     """
     nk, nj, ni = smooth.shape

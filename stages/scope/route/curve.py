@@ -85,7 +85,7 @@ class Curve:
         return np.asarray(self.at(self.parameters(per_span))[0])
 
     def curvature_per_mm(self, parameters: ArrayLike) -> Float:
-        """Return the curvature in 1/mm at rising parameters, `(S,)`: |c' x c''| / |c'|^3."""
+        """Return the curvature in 1/mm at rising parameters, `(S,)`: `|c' x c''| / |c'|^3`."""
         _point, first, second = self.at(parameters)
         speed = np.linalg.norm(first, axis=1)
         return np.asarray(np.linalg.norm(np.cross(first, second), axis=1) / speed**3)

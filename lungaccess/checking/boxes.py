@@ -11,6 +11,7 @@ from lungaccess.checking.space import Select, labels_at
 from lungaccess.checking.tiles import Cluster, Tiles
 
 FIRST_NEIGHBOURS = 16
+"""Nearest centres asked for at first: mostly enough to be sure of the nearest box."""
 STRIDE = 16
 """Along a path every so manieth point is measured first; the others are skipped where it tells enough."""
 

@@ -9,6 +9,7 @@ from lungaccess.checking.shapes import STEP_MM
 from lungaccess.plans.plan import Plan
 
 CLEARANCE_TOLERANCE_MM = 1e-3
+"""A planner may keep exactly the required clearance, so that the check may find a micrometre less."""
 BEYOND_MM = 1.0
 """Distances up to this much beyond what is required are measured with FCL, larger ones at samples alone."""
 

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
 
 NUMBER_TOLERANCE = 1e-9
+"""Stated and recomputed sums of radii and margins agree up to rounding."""
 STRUCTURES = {"airway", "vessel", "outside", "fissure"}
+"""The structures from which a plan may state clearances."""
 MAX_NUMBER = 1e5
 MAX_TOTAL_MM = 2000.0
 MAX_CURVATURE_PER_MM = 1.0

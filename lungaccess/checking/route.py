@@ -19,12 +19,16 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
 
 SAMPLE_MM = 0.1
+"""Spacing of the points of the route that are looked up, well below a voxel."""
 AXIS_TOLERANCE_MM = 0.01
+"""Routes are copied from the airway tree, so that only rounding lies between them."""
 SAME_MM = 1e-6
 """Points of a route that are nearer than this are the same."""
 
 MAX_STEP_MM = 5.0
+"""Points of the airway tree lie closer; a longer step would jump from branch to branch."""
 REACH_MM = 15.0
+"""Lumen radii are recomputed up to this, more than that of any trachea."""
 RADIUS_TOLERANCE_MM = 0.05
 """Radii are stated at points; between two points the lumen may be this much narrower."""
 
@@ -32,6 +36,7 @@ MAX_CHORD_ANGLE_RAD = np.deg2rad(45.0) + 1e-6
 """Between the tip and the last `CHORD_MM` of the route: a tip must look where the scope is going."""
 
 CHORD_MM = 2.0
+"""Length of the last chord of the route: a few of its points, so that one of them does not decide."""
 
 MAX_OFF_AXIS_MM = 20.0
 """Only so near to its tip may a scope with a turned tip be beside the medial axis."""

@@ -11,6 +11,7 @@ from anatomy.typed import Float
 from stages.tube.device import ConcentricTubes
 
 TINY_MM = 1e-9
+"""A piece shorter than this is rounding, and is not cut off."""
 TERMS = 14
 """Of the exponential series for a matrix of norm 1/4: the next term is less than 1e-20."""
 

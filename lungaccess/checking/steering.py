@@ -27,15 +27,23 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
 
 TURN_TOLERANCE_RAD = 1e-3
+"""The turn is summed over thousands of small steps, whose rounding adds up to less than this."""
 LENGTH_TOLERANCE_MM = 1e-6
+"""Lengths are sums of a few numbers and agree up to rounding."""
 LIMIT_TOLERANCE = 1e-9
+"""A planner may use all of a limit, so that rounding alone may exceed it, by this share."""
 COST_TOLERANCE = 0.02
+"""Share by which a planner's sampled integral may differ from the finer one of the check."""
 COST_STEP_MM = 0.1
+"""Step of the integral: small against the distances over which a clearance changes."""
 COST_REACH_MM = 100.0
+"""No point of a lung is farther than this from the pleura, so that every clearance is found."""
 CLEARANCE_FLOOR_MM = 0.1
+"""1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1]."""
 GREATEST_VOXEL_COST = 1.0
 """Of one voxel: so much may two sums differ because one grazes a voxel that the other does not."""
 GRAZED_MM = 1e-9
+"""A voxel that is crossed for less than this is met at an edge only, by rounding."""
 COSTS = ("inverse_clearance", "cost_map", "voxel_sum", "length_mm")
 ROUNDING = 1e-12
 """Sums of four numbers agree to this share of them, whatever the order."""

@@ -25,6 +25,7 @@ RUN = 32
 """Points of a path whose common bounding box is compared with those of tiles."""
 
 BITS = tuple(structures.BITS.values())
+"""One bit of the labels for each structure."""
 NOT_LUMEN = -1
 """Stands for everything that is not lumen, beside the bits of structures."""
 

@@ -27,9 +27,11 @@ from stages.needle import (
 )
 
 SLICE = 500
+"""Iterations between two looks at the clock: some milliseconds."""
 OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
 """Planners of OMPL itself.  They steer by chance, and end within OMPL_TOLERANCE_MM of the target."""
 OMPL_TOLERANCE_MM = 1.0
+"""Distance to the target that counts as reached; random steering hardly ever comes nearer."""
 WALL_MM = 3.0
 """A start so near to an airway is taken to have pierced its wall."""
 

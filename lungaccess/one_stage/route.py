@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 CENTRELINE_SUFFIXES = (".vtp", ".vtu")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 CURVE_SPACING_MM = 0.5
+"""Spacing of the points in the record: about a voxel; the spline itself is exact."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

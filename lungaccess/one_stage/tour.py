@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas
 
 FARTHEST_MM = 200.0
+"""No exit farther from a lesion is of use: a lung is not wider."""
 PROOFS_PER_SITE = 3
 """How many deployments of a site are tried in full before the site counts as refused."""
 

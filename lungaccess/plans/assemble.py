@@ -24,7 +24,9 @@ from stages.scope import ScopeTip, Sites, approach, approach_depth_mm, leaving_p
 from stages.tube import centreline
 
 CLEARANCE_CAP_MM = 5.0
+"""Clearances below this are stated exactly: larger ones never limit a plan."""
 SAMPLE_MM = 0.05
+"""Spacing of the samples of a clearance, which is lowered by half of it to hold between them."""
 
 
 def assemble(

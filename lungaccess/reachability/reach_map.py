@@ -32,6 +32,7 @@ from stages.needle import (
 )
 
 DEFAULT_SPACING_MM = 3.0
+"""Half the diameter of a small nodule, so that none falls between the points."""
 FORMAT = b"lungaccess-reach-1"
 
 NOT_COUNTED = 0

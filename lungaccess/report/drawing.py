@@ -15,6 +15,7 @@ from lungaccess.report.layers import Footprint, Layers
 from lungaccess.report.views import View
 
 BAR_LENGTHS_MM = (1, 2, 5, 10, 20, 50, 100)
+"""Round lengths of a scale bar; the longest that fits is taken."""
 
 
 def title(axes: Axes, text: str) -> None:

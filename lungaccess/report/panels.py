@@ -24,6 +24,7 @@ CURVES = {
 }
 STRUCTURES = {"airway": "airway wall", "outside": "outside of the lung"}
 LEAST_TOP_MM, MOST_TOP_MM = 4.0, 15.0
+"""Least and greatest upper end of the clearance axis, so that what is near and required fills it."""
 
 
 def clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:

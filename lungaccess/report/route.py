@@ -25,7 +25,9 @@ VIEWS_IN = ((0.5, 3.6, 6.9, 4.7), (7.9, 3.6, 6.6, 4.7))
 GRAPHS_IN = ((0.9, 0.95, 6.2, 2.1), (8.3, 0.95, 6.2, 2.1))
 FLAT = View(name="The drawing", right=np.array([1.0, 0, 0]), up=np.array([0, -1.0, 0]))
 PER_SPAN = 16
+"""Points drawn for each span of the spline."""
 AROUND_MM = 6.0
+"""Border around the route in a picture."""
 
 
 def route_png(name: str, centreline: Centreline, route: Route, path: str | os.PathLike[str]) -> Path:

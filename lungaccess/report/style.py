@@ -29,6 +29,7 @@ INK = "#222222"
 FAINT_INK = "#6B6B6B"
 
 DPI = 130
+"""Pixels per inch at which the smallest letters stay sharp on a screen."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 PIXELS = 520
+"""Columns of a cut: as many as the panel has on paper."""
 SLAB_MM = (-2.0, -1.0, 1.0, 2.0)
 # Painted in this order; a later layer covers an earlier one.
 PAINT = (

@@ -14,6 +14,7 @@ from anatomy.typed import Float
 from lungaccess.plans.curves import DeviceCurve
 
 MOST_TRIANGLES = 150_000
+"""Enough for the shape of the vessels; models are for display alone."""
 SIDES = 16
 """Corners of a ring around a device."""
 

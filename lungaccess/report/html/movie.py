@@ -25,10 +25,14 @@ MARCHES, FARTHEST_MM, LEAST_STEP_MM = 120, 160.0, 0.2
 NEAR_WALL_MM = 2.5
 """The smooth wall is looked for only where the voxels' wall is so near."""
 AROUND_MM = 45.0
+"""Border of the box around the route in which the lumen is drawn."""
 BLUR_VOXELS = 0.9
+"""Smoothing of the mask: its voxels do not show as steps on the wall."""
 HALF = 0.5
 NORMAL_MM = 0.7
+"""Step of the differences from which the direction of the wall is taken: about a voxel."""
 FALL_OFF_MM2 = 520.0
+"""Square of the distance at which the light is half as bright: 23 mm."""
 DARK, BRIGHT = np.array([0.50, 0.16, 0.13]), np.array([0.98, 0.72, 0.64])
 """Colours of the wall with little and with much light."""
 

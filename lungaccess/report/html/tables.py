@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from lungaccess.risk import RiskReport, Share
 
 GOAL_RADIUS_MM = 2.0
+"""Radius about the place of the plan's tip that counts as that place for the instructions."""
 AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {
     "scope": "Bronchoscope",

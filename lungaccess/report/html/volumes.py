@@ -20,11 +20,15 @@ if TYPE_CHECKING:
 
 CODES = {"outside": 0, "lung": 1, "airway wall": 2, "lumen": 3, "vessel": 4, "fissure": 5, "nodule": 6}
 COARSE_VOXELS, FINE_VOXELS = 3_000_000, 3_000_000
+"""Voxels at most of the coarse and the fine volume, so that the page stays small."""
 LEAST_COARSE_MM = 1.5
+"""Finest voxels of the whole lung on a page, so that the page stays small."""
 AROUND_MM = 28.0
+"""Border around the devices that is shown in fine voxels."""
 LOWEST_HU, HU_PER_STEP = -1350.0, 6.25
 """A CT byte b stands for LOWEST_HU + HU_PER_STEP b: from -1350 to 244 HU."""
 MOST_CT_CHARACTERS = 8_500_000
+"""Text of a stored CT at most: a page of 10 MB still opens at once and can be sent."""
 STORED_CT = ("ct.nii.gz", "ct.nii", "ct.nrrd", "ct.mha")
 
 

@@ -57,18 +57,13 @@ def overview_png(plan: Plan, lung: Lung, path: str | os.PathLike[str]) -> Path:
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)
     for box, view in zip(PROJECTIONS_IN, STANDARD, strict=True):
-        projection(_panel(figure, box), plan, layers, view)
-    zoom.exit_zoom(_panel(figure, EXIT_IN), plan, layers)
-    zoom.needle_zoom(_panel(figure, NEEDLE_IN), plan, layers)
-    panels.clearance_panel(_panel(figure, CLEARANCE_IN), plan, lung)
-    panels.text_panel(_panel(figure, TEXT_IN), plan)
+        projection(style.panel(figure, box), plan, layers, view)
+    zoom.exit_zoom(style.panel(figure, EXIT_IN), plan, layers)
+    zoom.needle_zoom(style.panel(figure, NEEDLE_IN), plan, layers)
+    panels.clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
+    panels.text_panel(style.panel(figure, TEXT_IN), plan)
     _heading_and_legend(figure, plan, layers)
     return style.save_png(figure, path)
-
-
-def _panel(figure: Figure, box_in: tuple[float, float, float, float]) -> Axes:
-    left, bottom, width, height = box_in
-    return figure.add_axes((left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN))
 
 
 def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
@@ -104,10 +99,7 @@ def _nodule(axes: Axes, layers: Layers, view: View) -> None:
 
 
 def _heading_and_legend(figure: Figure, plan: Plan, layers: Layers) -> None:
-    figure.text(
-        0.3 / WIDTH_IN, 1 - 0.14 / HEIGHT_IN, f"Three-stage plan for {plan.patient_name}", va="top",
-        fontsize=15, fontweight="bold", color=style.INK,
-    )  # fmt: skip
+    style.heading(figure, f"Three-stage plan for {plan.patient_name}", size=15)
     figure.legend(
         handles=_legend_entries(layers), loc="lower left", bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN),
         ncols=12, fontsize=9, frameon=False, handlelength=1.8, columnspacing=1.3,

@@ -73,8 +73,7 @@ def reach_png(reach: ReachMap, lung: Lung, path: str | os.PathLike[str]) -> Path
         points = reach.kinds.grid.lps(np.array([[0, 0, 0], reach.kinds.grid.shape]))
     for left, width, view in zip(LEFTS_IN, WIDTHS_IN, STANDARD, strict=True):
         for bottom, paint in zip(BOTTOMS_IN, (_kind_colours, _clearance_colours), strict=True):
-            box = (left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, PANEL_IN / HEIGHT_IN)
-            axes = figure.add_axes(box)
+            axes = style.panel(figure, (left, bottom, width, PANEL_IN))
             uv = view.project(points)
             drawing.fit(axes, uv.min(axis=0) - 6.0, uv.max(axis=0) + 6.0)
             lps, extent = _plane(axes, view, centre)
@@ -162,8 +161,7 @@ def _anatomy(axes: Axes, layers: Layers, lps: Float, extent: tuple[float, float,
 
 
 def _bar(figure: Figure) -> None:
-    left, bottom, width, height = BAR_IN
-    axes = figure.add_axes((left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN))
+    axes = style.panel(figure, BAR_IN)
     bar = figure.colorbar(
         ScalarMappable(norm=Normalize(*CLEARANCE_MM), cmap="viridis"), cax=axes, extend="max"
     )
@@ -176,10 +174,7 @@ def _text(figure: Figure, reach: ReachMap) -> None:
 
     system = reach.system
     heading = f"What {system.name} reaches of {reach.patient_name}"
-    figure.text(
-        0.3 / WIDTH_IN, 1 - 0.14 / HEIGHT_IN, heading, va="top", fontsize=15, fontweight="bold",
-        color=style.INK,
-    )  # fmt: skip
+    style.heading(figure, heading, size=15)
     total = reach.total
     figure.legend(
         handles=[

@@ -42,23 +42,16 @@ def route_png(name: str, centreline: Centreline, route: Route, path: str | os.Pa
     flat = bool(np.ptp(centreline.nodes_mm[:, 2]) == 0.0)
     boxes = ((0.5, 3.6, 14.0, 4.7),) if flat else VIEWS_IN
     for box, view in zip(boxes, (FLAT,) if flat else (CORONAL, SAGITTAL), strict=True):
-        _view(_axes(figure, box), centreline, route, view)
-    _curvature_graph(_axes(figure, GRAPHS_IN[0]), route)
-    _wall_graph(_axes(figure, GRAPHS_IN[1]), centreline, route)
+        _view(style.panel(figure, box), centreline, route, view)
+    _curvature_graph(style.panel(figure, GRAPHS_IN[0]), route)
+    _wall_graph(style.panel(figure, GRAPHS_IN[1]), centreline, route)
     verdict = "proved on the whole curve" if route.proved else "NOT PROVED"
-    figure.text(
-        0.3 / WIDTH_IN, 1 - 0.15 / HEIGHT_IN, va="top", fontsize=14, fontweight="bold", color=style.INK,
-        s=f"{name}: route of {route.curve.length_mm():.0f} mm, repair {route.repair!r}, {verdict}",
-    )  # fmt: skip
+    style.heading(
+        figure,
+        f"{name}: route of {route.curve.length_mm():.0f} mm, repair {route.repair!r}, {verdict}",
+    )
     figure.legend(handles=_legend(), loc="lower center", ncol=4, frameon=False, fontsize=10)
     return style.save_png(figure, path)
-
-
-def _axes(figure: object, box: tuple[float, float, float, float]) -> Axes:
-    left, bottom, width, height = box
-    place = (left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN)
-    axes: Axes = figure.add_axes(place)  # type: ignore[attr-defined]
-    return axes
 
 
 def _view(axes: Axes, centreline: Centreline, route: Route, view: View) -> None:

@@ -9,6 +9,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from anatomy.io.files import atomic_write
@@ -35,6 +36,19 @@ DPI = 130
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Return an empty white figure that belongs to no window."""
     return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
+
+
+def panel(figure: Figure, box_in: tuple[float, float, float, float]) -> Axes:
+    """Add axes to a figure at left, bottom, width and height in inches."""
+    width, height = figure.get_size_inches()
+    left, bottom, across, up = box_in
+    return figure.add_axes((left / width, bottom / height, across / width, up / height))
+
+
+def heading(figure: Figure, text: str, *, size: float = 14.0) -> None:
+    """Write the heading of a figure at its upper left."""
+    width, height = figure.get_size_inches()
+    figure.text(0.3 / width, 1 - 0.15 / height, text, va="top", fontsize=size, fontweight="bold", color=INK)
 
 
 def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:

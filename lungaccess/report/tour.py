@@ -39,15 +39,15 @@ def tour_png(answer: TourAnswer, lung: Lung, path: str | os.PathLike[str]) -> Pa
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)
-    for (left, bottom, width, height), view in zip(PANELS_IN, (CORONAL, SAGITTAL), strict=True):
-        axes = figure.add_axes((left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN))
+    for box, view in zip(PANELS_IN, (CORONAL, SAGITTAL), strict=True):
+        axes = style.panel(figure, box)
         _panel(axes, answer, lung.tree, layers, view)
     tour = answer.shortest
-    figure.text(
-        0.3 / WIDTH_IN, 1 - 0.15 / HEIGHT_IN, va="top", fontsize=14, fontweight="bold", color=style.INK,
-        s=f"{lung.name}: tour to {len(tour.order)} lesions, {tour.length_mm:.0f} mm "
+    style.heading(
+        figure,
+        f"{lung.name}: tour to {len(tour.order)} lesions, {tour.length_mm:.0f} mm "
         f"({answer.one_by_one_mm:.0f} mm one by one)",
-    )  # fmt: skip
+    )
     figure.legend(handles=_legend(), loc="lower center", ncol=5, frameon=False, fontsize=10)
     return style.save_png(figure, path)
 

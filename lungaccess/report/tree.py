@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 WIDTH_IN, HEIGHT_IN = 17.0, 6.6
 PANELS_IN = ((0.55, 0.6, 5.4, 5.3), (6.5, 0.6, 5.4, 5.3), (12.4, 0.6, 3.6, 5.3))
+BAR_IN = (16.2, 0.8, 0.16, 4.9)
+"""Left, bottom, width and height of panels and colour bar."""
 
 
 def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
@@ -41,18 +43,18 @@ def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)
     colours, norm = _generation_colours(int(np.max(lung.tree.generation)))
-    for (left, bottom, width, height), view in zip(PANELS_IN, STANDARD, strict=True):
-        axes = figure.add_axes((left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN))
+    for box, view in zip(PANELS_IN, STANDARD, strict=True):
+        axes = style.panel(figure, box)
         _tree_panel(axes, lung.tree, layers, view, colours, norm)
-    bar_axes = figure.add_axes((16.2 / WIDTH_IN, 0.8 / HEIGHT_IN, 0.16 / WIDTH_IN, 4.9 / HEIGHT_IN))
+    bar_axes = style.panel(figure, BAR_IN)
     bar = figure.colorbar(ScalarMappable(norm=norm, cmap=colours), cax=bar_axes)
     generations = np.arange(int(np.max(lung.tree.generation)) + 1)
     bar.set_ticks(generations.tolist(), labels=[str(g) for g in generations], fontsize=8)
     bar.set_label("generation (trachea 0)", fontsize=9)
-    figure.text(
-        0.3 / WIDTH_IN, 1 - 0.15 / HEIGHT_IN, va="top", fontsize=14, fontweight="bold", color=style.INK,
-        s=f"Airway tree of {lung.name}: {lung.tree.n_branches} branches, up to generation {generations[-1]}",
-    )  # fmt: skip
+    style.heading(
+        figure,
+        f"Airway tree of {lung.name}: {lung.tree.n_branches} branches, up to generation {generations[-1]}",
+    )
     return style.save_png(figure, path)
 
 

@@ -74,20 +74,12 @@ def tubes_png(
     lines = [_body(equilibrium)]
     if deployed is not None:
         lines += _ghosts(deployed)
-    _side_view(_panel(figure, SIDE_IN), equilibrium, lines, widest)
-    _front_view(_panel(figure, FRONT_IN), equilibrium, lines, widest)
-    _key(_panel(figure, KEY_IN), equilibrium, notes, with_ghosts=len(lines) > 1)
+    _side_view(style.panel(figure, SIDE_IN), equilibrium, lines, widest)
+    _front_view(style.panel(figure, FRONT_IN), equilibrium, lines, widest)
+    _key(style.panel(figure, KEY_IN), equilibrium, notes, with_ghosts=len(lines) > 1)
     _graphs(figure, equilibrium)
-    figure.text(
-        0.3 / WIDTH_IN, 1 - 0.15 / HEIGHT_IN, heading, va="top", fontsize=14, fontweight="bold",
-        color=style.INK,
-    )  # fmt: skip
+    style.heading(figure, heading)
     return style.save_png(figure, path)
-
-
-def _panel(figure: Figure, place_in: tuple[float, float, float, float]) -> Axes:
-    left, bottom, width, height = place_in
-    return figure.add_axes((left / WIDTH_IN, bottom / HEIGHT_IN, width / WIDTH_IN, height / HEIGHT_IN))
 
 
 def _body(equilibrium: Equilibrium) -> Float:
@@ -227,8 +219,8 @@ def _graphs(figure: Figure, equilibrium: Equilibrium) -> None:
         (STABILITY, "determinant", lambda s: np.asarray(equilibrium.determinant(s))[:, None], 1.2),
     )
     for bottom, (title, label, values, least) in zip(GRAPHS_IN, rows, strict=True):
-        left = _panel(figure, (BEHIND_IN[0], bottom, BEHIND_IN[1], GRAPH_HEIGHT_IN))
-        right = _panel(figure, (AHEAD_IN[0], bottom, AHEAD_IN[1], GRAPH_HEIGHT_IN))
+        left = style.panel(figure, (BEHIND_IN[0], bottom, BEHIND_IN[1], GRAPH_HEIGHT_IN))
+        right = style.panel(figure, (AHEAD_IN[0], bottom, AHEAD_IN[1], GRAPH_HEIGHT_IN))
         behind, before = values(in_scope), values(ahead)
         limits = _limits(np.concatenate([behind, before]), least, with_zero=title == STABILITY)
         for axes, s, curves in ((left, in_scope, behind), (right, ahead, before)):

@@ -47,6 +47,7 @@ DEFAULT_STEPS = 40
 """Runge-Kutta steps in each piece of constant stiffness and precurvature."""
 
 LARGEST_RESIDUAL_RAD = 1e-9
+"""A larger residual after Newton's method means that it did not converge."""
 _NEWTON = {"abstol": 1e-12, "abstolStep": 1e-13, "max_iter": 60, "error_on_fail": False}
 
 

@@ -18,6 +18,7 @@ from stages.tube.sequences import Sequence, joint_steps
 
 DEFAULT_STEP_MM = 1.0
 DEFAULT_STEP_RAD = 0.1
+"""Largest motion of a joint between two steps: small against the bends, so that branches are followed."""
 SAMPLE_MM = 0.25
 """Spacing of the points of the body that are looked at; the tip is always one of them."""
 TRACK_SPACING_MM = 0.1

@@ -20,6 +20,7 @@ from stages.tube.mechanics import TubeMechanics
 Match = Literal["position", "direction", "pose"]
 
 SAMPLES = 256
+"""Configurations sampled before the best of them are refined: enough to meet every kind of bend."""
 SHORTEST_MM = 1e-3
 """The innermost tube is ahead of the front plate by at least this."""
 

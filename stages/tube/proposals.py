@@ -32,6 +32,7 @@ WALLS, LENGTHS, CURVATURES = 4, 13, 36
 SAME_MM, SAME_RAD = 0.05, 0.02
 """What differs less is taken to be equal."""
 ROUNDING = 1e-12
+"""Share of the strain limit that stays unused, so that rounding does not exceed it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,6 +22,7 @@ NUDGE_MM = 1e-12
 
 TURN = "turn"
 DEFAULT_INCREMENT_MM = 5.0
+"""Increment of the alternating sequences: a compromise of sweep and the number of motions."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -23,6 +23,7 @@ from stages.scope.advisor.kinematics import ScopeState
 VERDICTS = ("out of range", "leads away", "collides", "valid")
 CANDIDATES = kernel.CANDIDATES
 SUM_TOLERANCE = 1e-9
+"""Weights may add up to 1 but for rounding."""
 
 
 @settings

@@ -19,6 +19,7 @@ from stages.scope.advisor.kernels.collision import FINE_DEPTH_MM
 from stages.scope.advisor.kernels.voxel_graph import WALL, clearance_l1, number_component, widest_paths
 
 DEPTH_UNITS_PER_MM = 256.0
+"""Depths are compared as integers of 1/256 mm, the unit of the distance fields."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

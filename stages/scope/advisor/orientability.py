@@ -21,6 +21,7 @@ from stages.scope.advisor.kinematics import ScopeState, straight_state, tool_fra
 
 TWIST_STEP_RAD = math.radians(15.0)
 BEND_STEP_RAD = math.radians(7.5)
+"""Steps of twist and bend that are tried: directions are then at most about 8 degrees from one tried."""
 LEAN_RAD = math.radians(15.0)
 """How far the base of the bending tip may lean from the axis of the airway behind it."""
 ASIDE = 6

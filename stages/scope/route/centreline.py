@@ -18,9 +18,13 @@ from anatomy.typed import Bool, Float, Int
 from stages.scope.route.kernels import lumen as kernel
 
 DEFAULT_SPACING_MM = 0.75
+"""Longest edge: about a voxel of a CT, so that radii follow the wall."""
 MIN_CELL_MM = 1.0
+"""Smallest cell of the grid of cones: smaller ones hold the same cones and only cost memory."""
 SAME_POINT_MM = 1e-3
+"""Points of a file that are nearer are one point, written twice with rounding."""
 MAX_CELLS = 2_000_000
+"""More cells than this would cost more memory than they save time."""
 THIN_VOXELS = 6.0
 """Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to half."""
 FINE_MM = 0.05

@@ -13,6 +13,7 @@ from anatomy.typed import Float
 from stages.scope.route.kernels import spline as kernel
 
 DEGREE = 3
+"""Cubic splines, as in [Li2021]: their curvature is continuous."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -27,11 +27,17 @@ if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
 BROKEN = 1e4
+"""Cost of a broken limit, the paper's 10000."""
 FEASIBLE = 1e3
+"""Costs below this break no limit: the other terms stay far below it."""
 NO_WEIGHT = 1e-6
+"""Weight of points that count for nothing in the fit; 0 would make its equations singular."""
 HELD = 1e3
+"""Weight of the ends of a segment that must stay where they are."""
 POINT_SPACING_MM = 1.0
+"""Spacing of the path points that are fitted and tested, about a voxel of a CT."""
 AROUND_MM = 10.0
+"""A segment keeps the nodes of the centreline this near: fits do not move farther."""
 
 
 @settings

@@ -10,6 +10,7 @@ from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 
 PER_SPAN = 16
+"""Samples a span: about 0.2 mm apart, where curvature hardly changes between two."""
 
 
 @dataclass(frozen=True, kw_only=True)

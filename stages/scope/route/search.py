@@ -13,6 +13,7 @@ from stages.scope.route.centreline import Centreline
 from stages.scope.route.kernels.search import breadth_first
 
 DEFAULT_NEIGHBOURS = 8
+"""Nearest nodes that are linked: two along a tube, and those of a fork, with some to spare."""
 
 
 class NoRouteError(LungaccessError):

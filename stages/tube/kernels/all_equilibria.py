@@ -17,7 +17,9 @@ from stages.tube.kernels.torsion import twist
 
 TURN = 2.0 * math.pi
 SAMPLES = 256
+"""Samples of a turn in which sign changes are looked for."""
 BISECTIONS = 60
+"""Halvings of a bracket: to the last bit of a float."""
 
 
 @inner_kernel

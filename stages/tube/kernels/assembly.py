@@ -16,6 +16,7 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel
 
 SHORTEST_PIECE_MM = 1e-9
+"""Shorter pieces are rounding and are left out."""
 
 # Columns of `pieces`: arc lengths of both ends; the tubes whose shift moves them (-1: none); 1 / the sum of
 # bending stiffnesses; how many tubes are bent here; the only one if it is one; number of steps.

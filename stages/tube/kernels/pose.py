@@ -21,6 +21,7 @@ from stages.tube.kernels.assembly import BENT, BENT_TUBE, SOFTNESS
 GAUSS = 0.5 - math.sqrt(3.0) / 6.0
 COMMUTATOR = math.sqrt(3.0) / 12.0
 SMALL_ANGLE2 = 1e-6
+"""Below this square of an angle, series take the place of quotients that lose digits."""
 
 
 @inner_kernel

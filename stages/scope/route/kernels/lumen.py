@@ -16,6 +16,7 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel
 
 NOWHERE = -1.0e30
+"""Depth of a point in no listed cone: below that of any point."""
 
 
 @inner_kernel
@@ -59,33 +60,12 @@ def cell_of(index, x, y, z):
 
 
 @inner_kernel
-def depth_at(cones, index, cell_start, cell_cones, x, y, z):
-    """Return the depth of a point in the lumen and the centre of its best ball.
-
-    Where the point lies in no cone that is listed for its cell, the depth may be `NOWHERE`: it is exact
-    where it is not negative, and never too large.
-    """
-    best = NOWHERE
-    bx = 0.0
-    by = 0.0
-    bz = 0.0
-    cell = cell_of(index, x, y, z)
-    if cell >= 0:
-        for at in range(cell_start[cell], cell_start[cell + 1]):
-            depth, cx, cy, cz = cone_depth(cones, cell_cones[at], x, y, z)
-            if depth > best:
-                best = depth
-                bx = cx
-                by = cy
-                bz = cz
-    return best, bx, by, bz
-
-
-@inner_kernel
 def deep_enough(cones, index, cell_start, cell_cones, hint, enough, x, y, z):
     """Return depth, centre of the ball and cone of the first cone found to hold a point `enough` deep.
 
-    If none does, they are those of the best cone, as in `depth_at`.  `hint` is looked at first, -1 for none.
+    If none does, they are those of the best cone.  Where the point lies in no cone that is listed for its
+    cell, the depth may be `NOWHERE`: it is exact where it is not negative, and never too large.  `hint` is a
+    cone that is looked at first, -1 for none.
     """
     best = NOWHERE
     bx = 0.0
@@ -110,6 +90,17 @@ def deep_enough(cones, index, cell_start, cell_cones, hint, enough, x, y, z):
                 if best >= enough:
                     break
     return best, bx, by, bz, cone
+
+
+@inner_kernel
+def depth_at(cones, index, cell_start, cell_cones, x, y, z):
+    """Return the depth of a point in the lumen and the centre of its best ball.
+
+    Where the point lies in no cone that is listed for its cell, the depth may be `NOWHERE`: it is exact
+    where it is not negative, and never too large.
+    """
+    depth, cx, cy, cz, _cone = deep_enough(cones, index, cell_start, cell_cones, -1, math.inf, x, y, z)
+    return depth, cx, cy, cz
 
 
 @inner_kernel

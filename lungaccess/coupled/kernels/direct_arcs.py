@@ -16,6 +16,7 @@ from stages.needle.kernels import (
     CLEARANCE_FLOOR_MM,
     blocker_on_arc,
     cost_of_arc,
+    single_arc_exceeds,
 )
 
 PRUNED_BY_BOUND = -2
@@ -93,11 +94,7 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
         pose = (x, y, z, tx, ty, tz)
         length, bend, turn = arc_to_point(pose, target)
         costs[n] = math.inf
-        if (
-            bend[0] > limits.kappa
-            or length > limits.max_length_mm
-            or turn > min(limits.max_angle_rad, limits.max_turn_rad)
-        ):
+        if single_arc_exceeds(limits, bend, length, turn):
             blockers[n] = -1
             continue
         if _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length) > slack * best:

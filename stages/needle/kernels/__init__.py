@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.needle.kernels.connections import least_cosine as least_cosine
+    from stages.needle.kernels.connections import single_arc_exceeds as single_arc_exceeds
     from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM as CLEARANCE_FLOOR_MM
     from stages.needle.kernels.cost import ObjectiveArrays as ObjectiveArrays
     from stages.needle.kernels.cost import cost_of_arc as cost_of_arc

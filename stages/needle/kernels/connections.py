@@ -138,6 +138,16 @@ def workspace_length(rho, h, limits):
 
 
 @numba.njit(cache=True)
+def single_arc_exceeds(limits, bend, length, turn):
+    """Tell whether an arc that is the whole path breaks a limit of curvature, length or turning."""
+    return (
+        bend[0] > limits.kappa
+        or length > limits.max_length_mm
+        or turn > min(limits.max_angle_rad, limits.max_turn_rad)
+    )
+
+
+@numba.njit(cache=True)
 def least_cosine(forward, aside, turn):
     """Return the least value of `forward cos a + aside sin a` for `a` from 0 to `turn`.
 

@@ -16,7 +16,7 @@ from anatomy.kernels.arcs import arc_to_point, point_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import UNITS_PER_MM, distance_bound, exact_distance, interpolate_squared
 from anatomy.kernels.labels import AIRWAY
-from stages.needle.kernels.connections import seen_from, workspace_length
+from stages.needle.kernels.connections import seen_from, single_arc_exceeds, workspace_length
 from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.proof import PROBE_SPACING_MM, blocker_on_arc
 from stages.needle.kernels.rrt import grow_rrt
@@ -102,11 +102,7 @@ def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
     """
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
     length, bend, turn = arc_to_point(pose, q)
-    if (
-        bend[0] > limits.kappa
-        or length > limits.max_length_mm
-        or turn > min(limits.max_angle_rad, limits.max_turn_rad)
-    ):
+    if single_arc_exceeds(limits, bend, length, turn):
         return math.inf
     share = _blocked_share(obstacles, limits, pose, bend, length, hints[entry])
     if share >= 0.0:

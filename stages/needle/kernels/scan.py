@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 
 from anatomy.kernels.arcs import arc_to_point
-from stages.needle.kernels.connections import seen_from, workspace_length
+from stages.needle.kernels.connections import seen_from, single_arc_exceeds, workspace_length
 from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.proof import blocker_on_arc
 
@@ -34,11 +34,7 @@ def direct_arcs(obstacles, limits, positions, tangents, branches, target, blocke
         pose = (x, y, z, tx, ty, tz)
         length, bend, turn = arc_to_point(pose, target)
         costs[n, 0] = length
-        if (
-            bend[0] > limits.kappa
-            or length > limits.max_length_mm
-            or turn > min(limits.max_angle_rad, limits.max_turn_rad)
-        ):
+        if single_arc_exceeds(limits, bend, length, turn):
             blockers[n] = -1
             continue
         blockers[n] = blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branches[n])

@@ -247,7 +247,7 @@ def why_stopped(path: ScopePath, field: NavigationField, tree: AirwayTree) -> st
     if width < path.model.radius_mm and len(narrow):
         return (
             f"too narrow {place_words(tree, route[narrow[0]])}: no ball thicker than {2.0 * width:.1f} mm "
-            f"gets from there to the goal, and the scope with its gap is {2.0 * path.model.radius_mm:.1f} mm "
+            f"gets from there to the goal, the scope with its gap is {2.0 * path.model.radius_mm:.1f} mm "
             "thick"
         )
     return f"no motion found that leads on {place_words(tree, tip)}, though the lumen is wide enough"

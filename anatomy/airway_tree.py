@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.tree_report import TreeReport
 from anatomy.typed import Bool, Float, Int
 
@@ -21,7 +22,7 @@ Real forks divide: main bronchi have 0.6 to 0.85 of the trachea's radius, lobar 
 """
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class AirwayTree:
     """Centreline tree of the airway; N points, B branches, parents before children.
 

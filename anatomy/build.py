@@ -229,9 +229,6 @@ def _lumen_depth(lumen: Volume, keep: Callable[[str, Array], Array]) -> Distance
 
 
 def _cut_volume(
-    volume: Volume | None,
-    box: WorkingBox,
-    name: str,
-    keep: Callable[[str, Array], Array],
+    volume: Volume | None, box: WorkingBox, name: str, keep: Callable[[str, Array], Array]
 ) -> Volume | None:
     return None if volume is None else Volume(grid=box.grid, array=keep(name, box.cut(volume.array)))

@@ -7,14 +7,13 @@ corners that touch the structure: exact, with voxels as solid boxes and any voxe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import GridMismatchError
 from anatomy.grid import Grid, read_only
 from anatomy.kernels import field as kernel
+from anatomy.records import frozen_record
 from anatomy.typed import Array, Float, Mask, UInt16
 
 MAX_STORED = np.iinfo(np.uint16).max
@@ -50,7 +49,7 @@ def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:
     return read_only(geometry)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class DistanceField:
     """The distance to a structure whose voxels are solid boxes, or count as their centres.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import FrameError, GridMismatchError
+from anatomy.records import frozen_record
 from anatomy.typed import Array, Bool, Float
 
 ORTHONORMAL_TOLERANCE = 1e-4
@@ -30,7 +30,7 @@ def transform_points(target_from_source: ArrayLike, points: ArrayLike) -> Float:
     return np.asarray(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Grid:
     """A rectilinear voxel grid; integer `ijk` are voxel CENTRES.
 
@@ -156,7 +156,7 @@ class Grid:
         return f"{'x'.join(map(str, self.shape))} voxels of {size} mm, first at LPS ({first})"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Volume:
     """An image on a grid; `array[i, j, k]` lies Fortran-contiguous (i fastest) in memory.
 

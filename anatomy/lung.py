@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -16,13 +15,14 @@ from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels import field as kernel
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Labels
 
 if TYPE_CHECKING:
     from anatomy.meshes import SurfaceMesh
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Lung:
     """The anatomy of one patient, in LPS mm, immutable.
 

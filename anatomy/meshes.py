@@ -18,7 +18,7 @@ A surface is hollow: what lies wholly inside touches nothing.  Test containment 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,13 @@ from numpy.typing import ArrayLike
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.morphology import bounds, window
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int, Mask
 
 _RING = ((0, 0), (1, 0), (1, 1), (0, 1))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class SurfaceMesh:
     """A triangle mesh, closed, its faces turned outwards.
 

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from types import MappingProxyType
 
 import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 
 MASKS = ("lumen", "wall", "vessels", "lung", "fissures", "nodules")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class PatientImages:
     """Masks, poses and points of one patient.
 

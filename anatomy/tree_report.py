@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Repair:
     """A place where the tree differs from the mask.
 
@@ -23,7 +22,7 @@ class Repair:
     length_mm: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class GapBridged(Repair):
     """A break of the lumen across which the tree was continued; its position is the middle of the gap.
 
@@ -53,7 +52,7 @@ class LoopOpened(Repair):
     """
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class TreeReport:
     """What was changed or left out while the tree was made.
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy.grid import Grid
+from anatomy.records import frozen_record
 from anatomy.typed import Array, Float, Int16, Mask
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def obstacles(edge: int) -> tuple[Grid, Mask]:
     return Grid.from_spacing(mask.shape, (0.6, 0.6, 0.7), (0.0, 0.0, 0.0)), mask
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Chest:
     """A CT and its masks, `(n, n, n)` and Fortran-contiguous."""
 

@@ -11,11 +11,11 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from anatomy.records import frozen_value
 from benchmarks import scenes
 
 Work = Callable[[], object]
@@ -25,7 +25,7 @@ MOST_REPEATS = 20
 """The least of so many times changes no more."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Workload:
     """A piece of work of several sizes.
 

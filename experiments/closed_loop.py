@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 import lungaccess as la
 from anatomy.errors import TargetError
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, anatomy, default_anatomies
 from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
@@ -66,7 +67,7 @@ LEVELS = {"no": 0.0, "half": 0.5, "full": 1.0, "double": 2.0}
 WEAK = Errors(curvature_bias=-0.15, curvature_sd=0.05, position_noise_mm=0.2, direction_noise_deg=0.3)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Case:
     """A start, a target, and the plan for each curvature reserve."""
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from anatomy.grid import Volume
 from anatomy.io import load_patient
 from anatomy.patient import PatientImages
 from anatomy.phantom import make_phantom
+from anatomy.records import frozen_record
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.lungs import segment_lungs
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
@@ -43,13 +43,13 @@ DRAWS = 20
 QUICK_SPACING_MM = 1.0
 NOT_REPRODUCED = [
     "The three scans of VESSEL12 with the points their readers marked cannot be had: points are drawn from "
-    "rendered CT instead, whose truth is exact, and which has neither disease nor breathing.",
+    "rendered CT instead, whose truth is exact, and which has neither disease nor breathing."
 ]
 
 Timed = tuple[Any, float, float]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Curve:
     """F1 over the threshold, of one patient."""
 

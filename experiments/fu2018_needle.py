@@ -42,7 +42,7 @@ QUICK = {"runs": 3, "limit_s": 0.5, "problems": 10}
 FULL = {"runs": 10, "limit_s": 10.0, "problems": 30}
 NOT_REPRODUCED = [
     "The CT of a pig's inflated lung cannot be had; the paper's runs took 500 s.  "
-    "The numbers compare objectives with each other.",
+    "The numbers compare objectives with each other."
 ]
 
 Results = dict[tuple[str, str], list[Run]]

@@ -14,11 +14,11 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from anatomy.records import frozen_value
 from benchmarks.workloads import WORKLOADS, Workload
 from experiments.support.results import Result, setting_of, study_parser, write_result
 
@@ -33,7 +33,7 @@ OVERHEAD_S = 1e-3
 """Sizes that take less are left out of the fit where two longer ones are left: calls and threads dominate."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Growth:
     """What was measured of one workload.
 

@@ -10,7 +10,7 @@ FILE and not repeated, so an interrupted study goes on where it was.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 import lungaccess as la
+from anatomy.records import frozen_value
 from anatomy.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.kuntz2015 import cost_over_time, workspace_rejection
@@ -33,11 +34,11 @@ from lungaccess.problem.task import Task
 from lungaccess.report import style
 
 NOT_REPRODUCED = [
-    "The goals and the costs of fig. 9: the paper prints no numbers for them, and its lung cannot be had.",
+    "The goals and the costs of fig. 9: the paper prints no numbers for them, and its lung cannot be had."
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Size:
     """How much is run: goals, seeds and seconds of fig. 9, goals and repeats of the ablations, RRTs timed."""
 

@@ -10,13 +10,13 @@ lungs.  Each search ends with its first plan, which the check then judges.  The 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from anatomy.records import frozen_value
 from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
@@ -36,7 +36,7 @@ FROM runs r JOIN plannerConfigs c ON c.id = r.plannerid JOIN problems p ON p.exp
 WHERE NOT o.failed ORDER BY p.case_name, c.name, p.target"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Size:
     """Targets a lung, seconds a target of our search and of Algorithm 1, and the systems."""
 
@@ -53,9 +53,7 @@ FULL = Size(
     ),
 )  # fmt: skip
 QUICK = Size(per_lung=5, ours_s=5.0, papers_s=5.0, systems=(("ultrathin", True),))
-NOT_REPRODUCED = [
-    "The lung of the paper and its nodules; it is a commercial model that cannot be had.",
-]
+NOT_REPRODUCED = ["The lung of the paper and its nodules; it is a commercial model that cannot be had."]
 
 
 def study(patients: list[str], size: Size, planner: str) -> dict[str, Any]:

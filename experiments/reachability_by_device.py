@@ -10,13 +10,14 @@ counted.  Fissures may be crossed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import lungaccess as la
 from anatomy.lung import Lung
+from anatomy.records import frozen_value
 from anatomy.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
@@ -25,7 +26,7 @@ from lungaccess.reachability import map_reach
 from lungaccess.report import style
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Size:
     """Diameters of the scope and radii of curvature, mm, and the spacing of the points, mm."""
 

@@ -96,10 +96,7 @@ def test_every_block_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPat
         for words in commands(text):
             assert words[0] == "lungaccess"
             done = subprocess.run(
-                [str(LUNGACCESS), *at_hand(words[1:], point)],
-                capture_output=True,
-                text=True,
-                check=False,
+                [str(LUNGACCESS), *at_hand(words[1:], point)], capture_output=True, text=True, check=False
             )
             answers = {0, 1} if words[1] in MAY_SAY_NO else {0}
             assert done.returncode in answers, f"{words}\n{done.stdout}\n{done.stderr}"

@@ -79,7 +79,5 @@ def require_intact(path: Path, offset: int) -> None:
 
 def _damaged(path: Path, why: str) -> FileError:
     return FileError(
-        f"{path} is damaged: {why}",
-        expected="a complete file",
-        remedy="Copy or download the file again",
+        f"{path} is damaged: {why}", expected="a complete file", remedy="Copy or download the file again"
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from anatomy.errors import FileError, FrameError
 from anatomy.grid import Grid, Volume
 from anatomy.io.nifti_header import named_grid
+from anatomy.records import frozen_value
 from anatomy.typed import Float
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEY
 _SERIES_KEYS = ("SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class SeriesInfo:
     """One series of a folder: what a person needs to choose it, and its files (unsorted)."""
 

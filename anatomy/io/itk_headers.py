@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from anatomy.errors import FileError, FrameError
 from anatomy.io.frames import Frame
+from anatomy.records import frozen_value
 
 _HEADER_LIMIT = 1 << 20
 _SPACES = {
@@ -16,7 +16,7 @@ _SPACES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class NrrdHeader:
     """The `field: value` and `key:=value` lines of a NRRD file, and where its data begin."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from os.path import commonpath
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from anatomy.io.frames import Frame
 from anatomy.io.images import read_mask, read_volume
 from anatomy.io.nifti import require_numbers
 from anatomy.patient import PatientImages
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Array, Mask
 
 _READERS = 2  # decompression releases the interpreter; more threads only raise the peak of memory
@@ -25,7 +25,7 @@ _REQUIRED = ("lumen", "vessels", "lung")
 _MAY_BE_EMPTY = ("fissures", "nodules")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class MaskSource:
     """A file, or some labels of it, that makes up (a part of) the mask `role`.
 
@@ -43,7 +43,7 @@ class MaskSource:
     labels: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class MaskSet:
     """The masks by role, the file names each came from, and the SHA-256 of every file.
 

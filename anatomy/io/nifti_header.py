@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from anatomy.errors import FileError, FrameError
 from anatomy.grid import Grid, transform_points
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 
 _VERSION_1: dict[str, tuple[int, str]] = {
@@ -39,7 +40,7 @@ _MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
 _TRANSFORM_TOLERANCE_MM = 1.0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class NiftiHeader:
     """What is needed to read the voxels of a file.
 

@@ -138,10 +138,7 @@ def fill_lung(masks: MaskSet) -> MaskSet:
     closed = ~grown_by_one(~grown_by_one(lung[box]))
     lung[box] |= closed & grown_by_one(tubes[box]) & grown_by_one(grown_by_one(lobes[box]))
     return MaskSet(
-        grid=masks.grid,
-        masks={**masks.masks, "lung": lung},
-        files=masks.files,
-        sources=masks.sources,
+        grid=masks.grid, masks={**masks.masks, "lung": lung}, files=masks.files, sources=masks.sources
     )
 
 

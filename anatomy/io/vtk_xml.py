@@ -7,7 +7,6 @@ import binascii
 import re
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -15,6 +14,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from anatomy.io.files import require_file, unreadable
+from anatomy.records import frozen_record
 from anatomy.typed import Array
 
 _TYPES = {
@@ -24,7 +24,7 @@ _TYPES = {
 _APPENDED = re.compile(rb"<AppendedData\s+encoding\s*=\s*[\"'](\w+)[\"']\s*>\s*_")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class VtkPiece:
     """The arrays of one piece: points, point data by name, cells as connectivity and offsets."""
 
@@ -35,7 +35,7 @@ class VtkPiece:
     cell_types: Array | None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class VtkFile:
     """The pieces of a file and its field data by name."""
 

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from anatomy.phantom.branching import Centerlines as Centerlines
-    from anatomy.phantom.chest import LOBES as LOBES
-    from anatomy.phantom.files import write_phantom as write_phantom
-    from anatomy.phantom.nodules import Nodule as Nodule
-    from anatomy.phantom.patient import Phantom as Phantom
-    from anatomy.phantom.patient import make_phantom as make_phantom
-    from anatomy.phantom.rasterize import LABELS as LABELS
+    from anatomy.phantom.branching import Centerlines
+    from anatomy.phantom.chest import LOBES
+    from anatomy.phantom.files import write_phantom
+    from anatomy.phantom.nodules import Nodule
+    from anatomy.phantom.patient import Phantom, make_phantom
+    from anatomy.phantom.rasterize import LABELS
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
 
 
@@ -93,7 +94,7 @@ class Sprouts:
         return unit(self.points[branch][-1] - self.points[branch][0])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Centerlines:
     """Ground-truth centrelines of one tree (N points, B branches).
 

@@ -10,7 +10,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.chest import LEFT_LOWER, LEFT_UPPER, LOBES, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.growth import STEP_MM, GrowthRule, grow, limit_turn
 from anatomy.phantom.territory import Territory
+from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
 
 TRACHEA_DIAMETER_MM = 18.0
@@ -36,7 +37,7 @@ LENGTH_JITTER = 0.08
 """Lengths of bronchi differ about this much between patients [Horsfield1971]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Bronchus:
     """One named bronchus of an adult; `direction` is LPS of any length, `segment` marks segmental ones."""
 

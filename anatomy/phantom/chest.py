@@ -6,10 +6,9 @@ All lengths in the code are those of an adult in mm, with the carina at the orig
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from anatomy.records import frozen_value
 from anatomy.typed import Array
 
 RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
@@ -48,7 +47,7 @@ def _power(u: Array) -> Array:
     return np.asarray(u * u * np.sqrt(u))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Side:
     """One half of the chest; `sign` is +1 for the patient's left, which is +x."""
 
@@ -98,7 +97,7 @@ class Side:
         return np.asarray(self.horizontal_z - 0.1 * lateral - 0.0022 * (y + 35) ** 2 + wave)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Chest:
     """A chest of `scale` times adult size.
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.territory import Territory
+from anatomy.records import frozen_value
 from anatomy.typed import Float
 
 Clearance = Callable[[Float], Float]
@@ -34,7 +34,7 @@ ASIDE_RAD = (0.25, 0.5, 0.75)
 """Turns that are tried in order around an obstacle, up to 43 degrees."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class GrowthRule:
     """How branches divide.
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import read_only
 from anatomy.phantom.territory import Territory
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 
 LEAST_PLEURA_MM, GREATEST_PLEURA_MM = 5.0, 30.0
@@ -23,7 +22,7 @@ TUBES_LOOKED_AT = 8
 """The tube with the nearest surface is among so many of the nearest centres, as radii differ little."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Nodule:
     """A ball of tissue in the lung.
 
@@ -45,11 +44,7 @@ class Nodule:
 
 
 def place_nodules(
-    territory: Territory,
-    tube_points: Float,
-    tube_radius_mm: Float,
-    scale: float,
-    rng: np.random.Generator,
+    territory: Territory, tube_points: Float, tube_radius_mm: Float, scale: float, rng: np.random.Generator
 ) -> tuple[Nodule, ...]:
     """Choose 3 to 6 nodules among the points of a territory.
 

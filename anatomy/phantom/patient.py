@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
@@ -20,6 +19,7 @@ from anatomy.phantom.nodules import Nodule
 from anatomy.phantom.plan import plan_patient
 from anatomy.phantom.rasterize import LABELS, Canvas, draw_ball, draw_body, draw_tree, phantom_grid
 from anatomy.phantom.territory import make_territory
+from anatomy.records import frozen_record
 from anatomy.typed import Mask
 
 Size = Literal["adult", "small"]
@@ -33,7 +33,7 @@ GREATEST_NOISE_HU = 200.0
 """Ten times the noise of a diagnostic CT."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Phantom:
     """A synthetic patient with the truth about it; all volumes lie on one grid, LPS mm.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from anatomy.phantom.bronchi import grow_airways
 from anatomy.phantom.nodules import Nodule, place_nodules
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way
+from anatomy.records import frozen_record
 from anatomy.typed import Float, UInt8
 
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
@@ -31,7 +32,7 @@ NODULE_NEIGHBOUR_MM = 1.4
 """Only tubes of a larger radius keep nodules away: thin ones run into them in patients, too."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class PlannedTree:
     """A tree of B branches and N points, ready to be drawn.
 
@@ -55,7 +56,7 @@ class PlannedTree:
         return np.vstack(self.sprouts.points)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class PatientPlan:
     """What a phantom holds besides the chest."""
 
@@ -122,12 +123,7 @@ def _vessel_part(sprouts: Sprouts, scale: float, spacing_mm: float) -> tuple[Spr
 
 
 def _vessels(
-    sprouts: Sprouts,
-    radius_mm: Float,
-    obstacles: Obstacles,
-    spacing_mm: float,
-    fixed: int,
-    freedom: UInt8,
+    sprouts: Sprouts, radius_mm: Float, obstacles: Obstacles, spacing_mm: float, fixed: int, freedom: UInt8
 ) -> PlannedTree:
     """Lead vessels around obstacles; they become thinner in narrow places, but never too thin to draw."""
     radius = make_way(sprouts, radius_mm, obstacles, VESSEL_GAP_MM, fixed)

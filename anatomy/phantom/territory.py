@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.phantom.chest import LOBES, Chest
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Float32, UInt8
 
 MAP_SPACING_MM = 3.0
@@ -16,7 +15,7 @@ TISSUE_PER_POINT_MM = 6.6
 """Side of the cube that a point stands for: about as large as what a terminal branch of the tree supplies."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Territory:
     """A coarse map of the lobes.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from anatomy.phantom.branching import Sprouts, smooth_line, unit
 from anatomy.phantom.chest import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.growth import STEP_MM, Clearance, GrowthRule, grow, overlap_mm
 from anatomy.phantom.territory import Territory
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
 
 SHEATH_MM = 0.5
@@ -47,7 +48,7 @@ SQUEEZE = 0.5
 """A vessel keeps at least half of its radius where it must pass between others."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Obstacles:
     """Balls that vessels keep away from.
 

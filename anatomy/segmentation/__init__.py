@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from anatomy.segmentation.pipeline import Segmentation as Segmentation
-    from anatomy.segmentation.pipeline import read_ct as read_ct
-    from anatomy.segmentation.pipeline import segment as segment
-    from anatomy.segmentation.request import Given as Given
-    from anatomy.segmentation.request import SegmentationRequest as SegmentationRequest
+    from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
+    from anatomy.segmentation.request import Given, SegmentationRequest
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Volume, read_only
 from anatomy.morphology import Window, bounds, window
+from anatomy.records import frozen_record
 from anatomy.segmentation.airway_warnings import airway_warnings
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.local_minima import local_minima_map
@@ -36,7 +36,7 @@ GREATEST_HU = 16_383
 """More, which metal may have, is cut off."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Airways:
     """The airways of both lungs on the grid of the CT.
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
+from anatomy.records import frozen_record
 from anatomy.segmentation.lungs import Lungs
 from anatomy.typed import Array, Int
 
@@ -15,7 +14,7 @@ BOX_PAD_MM = 10.0
 """More than any filter of the segmentation looks beyond a voxel of the lung."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Box:
     """A box of voxels of a grid.
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
 from anatomy.morphology import bounds, window
+from anatomy.records import frozen_record
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.typed import Float, Int, Mask
 
@@ -39,7 +40,7 @@ WIDE_SHARE = 0.35
 """Of the radius of the trachea: what is narrower is left to the segmentation of the airways."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class CentralAirway:
     """The large airways on coarse voxels.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds
+from anatomy.records import frozen_record
 from anatomy.typed import Array, Float, Float32, Int, Mask
 
 COARSE_MM = 1.5
@@ -17,7 +17,7 @@ LEAST_HU = -1024
 """Scanners write lower values where they measured nothing."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class CoarseCt:
     """Means over blocks of a CT's voxels; axis 0 runs most nearly to the left, 1 to the back, 2 up.
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.segmentation.kernels import growing as kernel
 from anatomy.segmentation.kernels import lumen_edge
 from anatomy.segmentation.kernels.neighbours import box_offsets, face_offsets
@@ -46,7 +45,7 @@ _MARGIN = 3
 """Border of the padded arrays: nothing grows into it, and no kernel looks farther than this from a voxel."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Ground:
     """What the airway grows in; arrays `(nk, nj, ni)`, C-contiguous.
 
@@ -77,7 +76,7 @@ class Ground:
     least_depth: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Grown:
     """Lumen and wall, bool `(nk, nj, ni)`, and the number of voxels that were grown and undone."""
 
@@ -140,11 +139,7 @@ def grow(ground: Ground, start: Mask) -> Grown:
     )
     flat[flat != LUMEN] = 0
     _join_and_wall(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, edged, tubes.count)
-    return Grown(
-        lumen=_inner(state == LUMEN),
-        wall=_inner(state == lumen_edge.WALL),
-        undone=int(undone),
-    )
+    return Grown(lumen=_inner(state == LUMEN), wall=_inner(state == lumen_edge.WALL), undone=int(undone))
 
 
 def _to_its_edge(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.morphology import bounds, grown_by_one, window
+from anatomy.records import frozen_record
 from anatomy.segmentation.central_airway import CentralAirway, find_central_airway
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
@@ -42,7 +42,7 @@ GAS_HU, GAS_PERCENTILE = -975.0, 25.0
 """A piece is gas in the bowel, not lung, if this share of it lies below."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Lungs:
     """Both lungs of a CT.
 
@@ -78,11 +78,7 @@ class Lungs:
 
 
 def segment_lungs(
-    ct: Volume,
-    *,
-    ex_vivo: bool = False,
-    seed_lps: ArrayLike | None = None,
-    progress: Progress | None = None,
+    ct: Volume, *, ex_vivo: bool = False, seed_lps: ArrayLike | None = None, progress: Progress | None = None
 ) -> Lungs:
     """Segment both lungs by region growing and closing.
 

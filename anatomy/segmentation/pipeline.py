@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION
+from anatomy.records import frozen_record
 from anatomy.segmentation.description import Description, description_text
 from anatomy.segmentation.folder import SegmentationFolder, digest_of, grid_digest, key_of
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
@@ -27,7 +27,7 @@ BYTES_PER_VOXEL = 40
 """Peak memory over the voxels of the CT."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Segmentation:
     """What a segmentation wrote.
 

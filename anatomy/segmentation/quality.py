@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
+from anatomy.records import frozen_record
 from anatomy.segmentation.steps import Parts
 
 WIDENING = 1.6
@@ -20,7 +20,7 @@ USUAL_LUNGS_L = (1.5, 9.0)
 """From a child to a large adult after breathing in."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Quality:
     """Figures and warnings about one segmentation.
 

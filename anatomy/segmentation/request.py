@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from anatomy.errors import FileError
@@ -12,6 +12,7 @@ from anatomy.io.files import sha256
 from anatomy.io.images import read_volume
 from anatomy.io.masks import read_masks
 from anatomy.io.totalsegmentator import mask_sources
+from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.folder import onto_grid
 from anatomy.typed import Float
 
@@ -19,7 +20,7 @@ _ROLES = {"lumen": "airway", "wall": "airway_wall", "vessels": "vessels", "lung"
 """Which image of the folder a role of TotalSegmentator's output stands for."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Given:
     """Files in place of steps, and the target; all optional.
 
@@ -94,7 +95,7 @@ def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
     }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class SegmentationRequest:
     """What to segment, and what is given.
 

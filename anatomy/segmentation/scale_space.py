@@ -52,14 +52,7 @@ class ScaleSpace:
     threads: int
 
     @classmethod
-    def of(
-        cls,
-        hu: Int16 | Float32,
-        lung: Mask,
-        spacing_mm: ArrayLike,
-        *,
-        threads: int = 0,
-    ) -> Self:
+    def of(cls, hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, threads: int = 0) -> Self:
         """Cut the box around the lung out of a CT.
 
         Parameters

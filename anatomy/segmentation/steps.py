@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from anatomy.grid import Volume
 from anatomy.io.files import sha256
+from anatomy.records import frozen_record
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.description import Description
 from anatomy.segmentation.folder import IMAGES, SegmentationFolder, digest_of, grid_digest, key_of
@@ -34,7 +34,7 @@ VERSION = 1
 _NOT_MASKS = ("lungs", "vesselness", "cost")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Parts:
     """The images of a segmentation on the grid of the CT, `(ni, nj, nk)`.
 
@@ -129,10 +129,7 @@ class Steps:
                 lungs = lungs_given(request.ct, left, right, seed_lps=seed)
             else:
                 lungs = segment_lungs(request.ct, ex_vivo=request.ex_vivo, seed_lps=seed, progress=self._tell)
-            images = {
-                "lungs": lung_labels(lungs.left, lungs.right),
-                "central_airway": lungs.central_airway,
-            }
+            images = {"lungs": lung_labels(lungs.left, lungs.right), "central_airway": lungs.central_airway}
             seed_ijk = [int(n) for n in lungs.trachea_seed_ijk]
             facts = {"seed": seed_ijk, "threshold_hu": lungs.threshold_hu, "warnings": list(lungs.warnings)}
             return images, facts

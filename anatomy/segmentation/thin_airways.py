@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from anatomy.records import frozen_value
 from anatomy.segmentation.kernels import lumen_ends, tube_stretch
 from anatomy.segmentation.kernels import thin_airways as kernel
 from anatomy.segmentation.kernels.neighbours import box_offsets
@@ -39,7 +38,7 @@ MOST_STARTS = 4096
 """An airway has some hundred ends, each with six places behind it."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Tubes:
     """What was followed: the number of voxels of the lumen now, and of tubes."""
 
@@ -48,14 +47,7 @@ class Tubes:
 
 
 def follow_thin_airways(
-    hu: Int16,
-    smooth: Int16,
-    state: UInt8,
-    lung: Mask,
-    spacing_mm: Float,
-    lumen: Int,
-    known: int,
-    count: int,
+    hu: Int16, smooth: Int16, state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known: int, count: int
 ) -> Tubes:
     """Add to the lumen the thin airways that go on from its ends.
 

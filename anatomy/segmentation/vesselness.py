@@ -59,12 +59,7 @@ def vesselness(
 
 
 def add_vesselness_of(
-    space: ScaleSpace,
-    scale: int,
-    sigma: float,
-    image: Float32,
-    settings: Float,
-    best: Float32,
+    space: ScaleSpace, scale: int, sigma: float, image: Float32, settings: Float, best: Float32
 ) -> None:
     """Raise `best` to the response at one scale; `settings` are alpha, beta, c."""
     from anatomy.segmentation.kernels.hessian import add_vesselness

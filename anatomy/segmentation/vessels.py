@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy.errors import GridMismatchError
 from anatomy.grid import Volume
+from anatomy.records import frozen_record
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
 from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, add_vesselness_of
 from anatomy.typed import Float, Float32, Int16, Mask, UInt8
@@ -39,7 +39,7 @@ EDGE_VOXELS = 2
 """How far the response of a vessel's core carries to its edge."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Vessels:
     """Vessels of both lungs on the grid of the CT, all `(ni, nj, nk)`.
 
@@ -169,12 +169,7 @@ def _add_large(
 
 
 def _large(
-    space: ScaleSpace,
-    solid: Mask,
-    airway: Mask,
-    response: Float32,
-    at_scale: UInt8,
-    radius_mm: float,
+    space: ScaleSpace, solid: Mask, airway: Mask, response: Float32, at_scale: UInt8, radius_mm: float
 ) -> Mask:
     """Return the large vessels in the box: the solid voxels within `radius_mm` of what tells their inside.
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from anatomy.tree.build import tree_from_graph as tree_from_graph
-    from anatomy.tree.build import tree_from_mask as tree_from_mask
+    from anatomy.tree.build import tree_from_graph, tree_from_mask
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.records import frozen_record
 from anatomy.tree_report import TreeReport
 from anatomy.typed import Float, Int
 
@@ -23,7 +24,7 @@ class NodeBranch:
     attach: int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Strand:
     """A branch as points.
 

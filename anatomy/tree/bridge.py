@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 
 MAX_TURN_COS = 0.5
@@ -22,7 +22,7 @@ ELONGATION = 1.5
 """A piece runs along an axis if, within `STRETCH_MM`, its variance along it is this many times the next."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Piece:
     """A separate piece of the mask.
 
@@ -40,7 +40,7 @@ class Piece:
     """A shorter piece may point anywhere."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Join:
     """A piece that belongs to the tree and the bridge to it, `(M, 3)` voxel indices."""
 
@@ -87,7 +87,7 @@ def join_pieces(main: Int, pieces: list[Piece], spacing_mm: Float, max_gap_mm: f
                 best[p] = other
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class _Gap:
     begin: Int
     end: Int

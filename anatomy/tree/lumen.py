@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
+from anatomy.records import frozen_record
 from anatomy.tree.bridge import Piece, join_pieces
 from anatomy.tree_report import GapBridged
 from anatomy.typed import Bool, Float, Float32, Int, Int32
@@ -15,7 +14,7 @@ from anatomy.typed import Bool, Float, Float32, Int, Int32
 CONNECT_26 = np.ones((3, 3, 3), dtype=bool)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class PreparedLumen:
     """The lumen in its bounding box with an empty layer all around.
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.records import frozen_record
 from anatomy.tree.bridge import face_paths
 from anatomy.typed import Bool, Float, Int
 
@@ -28,7 +29,7 @@ SPUR_MAX_MM = 3.0
 """Even the thinnest airways that a CT shows are longer than this."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class SkeletonTree:
     """An unrooted tree of N nodes.
 

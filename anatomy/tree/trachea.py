@@ -5,12 +5,12 @@ The rule is stated with its reasons in `docs/airway_tree.md`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
 
 from anatomy.errors import AnatomyError
+from anatomy.records import frozen_record
 from anatomy.tree.skeleton import SkeletonTree
 from anatomy.typed import Float
 
@@ -38,7 +38,7 @@ MAX_TILT_COS = 0.5
 """The trachea runs within 60 degrees of the body axis."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Trunk:
     """An end of the tree followed inwards over thin side branches to where it divides.
 

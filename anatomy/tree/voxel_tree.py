@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.tree.bridge import face_paths
 from anatomy.tree.depth import segments_inside
 from anatomy.tree.lumen import PreparedLumen
@@ -24,7 +25,7 @@ HALVINGS = 4
 """A step that leaves the lumen is halved so often before it is given up: a sixteenth of it is nothing."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class VoxelTree:
     """A rooted tree of positions, parents before children.
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from anatomy.errors import FileError
 from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.records import frozen_value
 from experiments.support.machine import cpu_seconds, machine
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ PNG_BYTES = 150_000
 PNG_DPI = (130, 110, 90, 70, 55)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Row:
     """One line of a table "paper | ours".
 

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.checking.checker import Checker as Checker
-    from lungaccess.checking.checker import check as check
-    from lungaccess.checking.findings import CheckReport as CheckReport
-    from lungaccess.checking.findings import Finding as Finding
+    from lungaccess.checking.checker import Checker, check
+    from lungaccess.checking.findings import CheckReport, Finding
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy import structures
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Labels
 from lungaccess.checking import shapes
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
@@ -53,7 +54,7 @@ SWEEP_TOLERANCE_MM = 0.02
 """So much less may a replay at steps find than a formula that takes the largest sweep."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Exit:
     """Where the re-integrated tube leaves the lumen: frame, arc length and pierced branch."""
 

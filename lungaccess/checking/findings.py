@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.records import frozen_value
+
 Side = Literal["at least", "at most"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Finding:
     """One thing that was checked.
 
@@ -82,7 +83,7 @@ class Finding:
         return {**words, **finite, "tolerance": self.tolerance, "unit": self.unit, "detail": self.detail}
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class CheckReport:
     """The verdict of the check: accepted only if every finding is ok.
 

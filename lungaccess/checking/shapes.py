@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.tube.device import ConcentricTubes
 
@@ -19,7 +20,7 @@ STEP_MM = 0.05
 """Largest integration step; the sagitta of one step at a curvature of 0.025 / mm is 8e-6 mm."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Piece:
     """A piece of constant curvature: turn about the tangent, then advance.
 
@@ -33,7 +34,7 @@ class Piece:
     curvature_per_mm: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Curve:
     """Frames along a curve, S + 1 of them, at most `STEP_MM` apart.
 
@@ -129,7 +130,7 @@ def cut_at(pieces: Sequence[Piece], at_mm: float) -> list[Piece]:
     return cut
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Bend:
     """Curvature of the deployed tubes along their length from the scope tip: `per_mm` between `edges_mm`."""
 

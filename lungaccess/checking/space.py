@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy import structures
 from anatomy.grid import Grid
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Bool, Float, Int, Labels
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Select:
     """Tells from labels which voxels belong to a structure.
 
@@ -84,7 +84,7 @@ def window_of(lung: Lung, low: Int, high: Int) -> Labels:
     return labels
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Region:
     """The part of a lung around some points, OUTSIDE beyond the lung's grid.
 

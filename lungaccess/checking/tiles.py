@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from anatomy import structures
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int, Labels
 from lungaccess.checking.space import Select, branch_of, window_of
 
@@ -30,7 +30,7 @@ NOT_LUMEN = -1
 """Stands for everything that is not lumen, beside the bits of structures."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Cluster:
     """Surface voxels of one structure in one tile, of one branch if it is an airway.
 

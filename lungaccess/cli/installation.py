@@ -7,19 +7,20 @@ import platform
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
 from anatomy.cache import default_cache
+from anatomy.records import frozen_value
 
 PACKAGES = ("anatomy", "stages", "lungaccess")
 _REQUIREMENT = re.compile(r"^\s*([A-Za-z0-9._-]+)\s*([^;]*)")
 _COMPILED = re.compile(r"^@(?:\w+\.)?njit\(.*cache=True|^@(?:\w+\.)?njit$|^from \S*compil", re.MULTILINE)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Library:
     """A library that is needed: its name, what is required, and the version found; None if it is missing."""
 
@@ -28,7 +29,7 @@ class Library:
     version: str | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class KernelCache:
     """Compiled kernels on disk.
 
@@ -54,7 +55,7 @@ class KernelCache:
         return "warm" if self.warm == self.modules else "partly warm"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Folder:
     """A folder: where it is, whether it can be written, and what it holds."""
 
@@ -65,7 +66,7 @@ class Folder:
     entries: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Health:
     """What `examine` found.
 

@@ -5,13 +5,13 @@ Every class is a group of options that cyclopts flattens into those of a command
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
+from anatomy.records import frozen_value
 from lungaccess.cli.progress import progress
 from stages.needle import TERMS, Objective
 
@@ -46,7 +46,7 @@ STEP_SHARES = {
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class OutputOptions:
     """How a command answers.
 
@@ -60,7 +60,7 @@ class OutputOptions:
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class PatientOptions(OutputOptions):
     """How a command answers, and where it keeps what it prepares.
 
@@ -85,7 +85,7 @@ class PatientOptions(OutputOptions):
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class TargetOptions:
     """Where to go.
 
@@ -116,7 +116,7 @@ class TargetOptions:
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class SystemOptions:
     """With which devices.
 
@@ -139,7 +139,7 @@ class SystemOptions:
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class BudgetOptions:
     """How long to search.
 
@@ -175,7 +175,7 @@ class BudgetOptions:
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class SearchOptions(BudgetOptions):
     """How to search for plans, and how long.
 

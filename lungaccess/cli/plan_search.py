@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from anatomy.records import frozen_value
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOptions, SearchOptions
@@ -67,7 +67,7 @@ class CostHistory:
         self.points.append(self._point(elapsed_s=elapsed_s, iteration=self._iteration, best_cost=self._best))
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class PlanRequest:
     """What to plan, and where to write it.
 

@@ -53,9 +53,7 @@ def plan_tables(plan: Plan) -> list[Table]:
     return [
         terminal.table("The three stages", ("stage", "what to do"), _stage_rows(plan)),
         terminal.table(
-            "Least distances (axis to structure)",
-            ("device", "structure", "mm", "at least"),
-            _distances(plan),
+            "Least distances (axis to structure)", ("device", "structure", "mm", "at least"), _distances(plan)
         ),
         terminal.table(
             f"Costs of the needle (made small: {Objective.of(plan.objective).words})",

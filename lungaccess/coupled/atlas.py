@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
@@ -28,7 +28,7 @@ TURNED_COARSER = 2
 """By this factor deployments from turned tips have fewer rotations and stops: their directions are many."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Atlas:
     """All accepted deployments of a system in a lung; independent of any target and of the needle.
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.separated_arcs import separated_candidates
@@ -39,7 +40,7 @@ _THIN: WeakKeyDictionary[Atlas, Atlas] = WeakKeyDictionary()
 """Atlases of the thinnest scopes by the atlases they belong to: they take seconds to make."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Counterfactual:
     """A change of one device parameter with which the target is reached.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.explanation import explain
 from lungaccess.coupled.search.direct_arcs import DirectArcs
@@ -29,7 +29,7 @@ LARGE_IS_GOOD = ("clearance_mm", "pleura_mm")
 """The criteria of the Pareto front."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Alternative:
     """One plan of a diverse plan set.
 

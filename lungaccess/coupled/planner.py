@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
+from anatomy.records import frozen_value
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
 from lungaccess.coupled.search.atlas_search import AtlasSearch
@@ -34,7 +34,7 @@ PROGRESS_EVERY_S = 0.1
 """Time between two progress reports: a display looks smooth, and the reports cost no time worth mention."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class ProgressEvent:
     """The progress of a search.
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
 from typing import Any
 
 from anatomy.errors import SettingsError, TargetError
 from anatomy.kernels.field import exact_distance
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT
 from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float
@@ -36,7 +36,7 @@ WALL_MM = 3.0
 """A start so near to an airway is taken to have pierced its wall."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class NeedleAnswer:
     """What a planner found.
 

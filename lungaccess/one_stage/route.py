@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from anatomy.errors import FileError, SettingsError
 from anatomy.io.frames import Frame
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ CURVE_SPACING_MM = 0.5
 """Spacing of the points in the record: about a voxel; the spline itself is exact."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class RouteSource:
     """Where a route runs.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.problem.system import System
 from stages.scope.advisor import (
@@ -30,7 +31,7 @@ CLEARANCE_AT_GOAL_MM = 0.25
 """A goal in the lesion is chosen, if there is one, where the scope has this clearance, about half a voxel."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ScopeAdvice:
     """The path of a scope to a lesion, with instructions.
 

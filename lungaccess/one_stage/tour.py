@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from anatomy.errors import FileError, TargetError
 from anatomy.io.files import read_text
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.scope.tour import (
     MOST_COMBINATIONS,
@@ -43,7 +43,7 @@ PROOFS_PER_SITE = 3
 """How many deployments of a site are tried in full before the site counts as refused."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class TourAnswer:
     """Tours to M lesions.
 

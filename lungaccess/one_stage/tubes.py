@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +13,7 @@ from pydantic import Field
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import read_text
+from anatomy.records import frozen_value
 from anatomy.settings import impossible, parse, settings, text, to_mapping
 from lungaccess.problem.system import System, load_system
 from stages.tube import (
@@ -67,7 +67,7 @@ class TubePair:
             raise impossible("tubes", error.found, error.expected) from None
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class TubeAnswer:
     """A deployment as in [Kuntz2015], and what it does.
 

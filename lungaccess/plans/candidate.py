@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from anatomy.records import frozen_record
 from stages.needle import ArcPath
 from stages.scope import ScopeTip
 from stages.tube import Deployment
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Candidate:
     """The choices that make a plan.
 

@@ -6,13 +6,13 @@ Reports and exports use these curves.  The independent check integrates the devi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from anatomy.grid import read_only
 from anatomy.poses import poses_on_arc
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.parts import NeedlePath, ScopeRoute, TubeDeployment
 from lungaccess.problem.system import System
@@ -28,7 +28,7 @@ SHORTEST_ARC_MM = 1e-9
 """A piece of tube that is shorter than this is only the rounding of its neighbours' lengths."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class DeviceCurve:
     """Where a device runs; N poses.
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from lungaccess.plans.record import Record, shaped
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ScopeRoute(Record):
     """Where the bronchoscope runs and the pose of its tip.
 
@@ -45,7 +46,7 @@ class ScopeRoute(Record):
     min_lumen_margin_mm: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class WallExit(Record):
     """Where the axis of the tube leaves the airway lumen.
 
@@ -66,7 +67,7 @@ class WallExit(Record):
     wall_angle_rad: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class TubeDeployment(Record):
     """How the concentric tubes are turned and inserted, and what that does.
 
@@ -94,7 +95,7 @@ class TubeDeployment(Record):
     follow_the_leader_error_mm: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class NeedleArc(Record):
     """One arc: turn by `roll_rad` about the axis, then insert `length_mm`, bending towards local +x.
 
@@ -106,7 +107,7 @@ class NeedleArc(Record):
     curvature_per_mm: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class NeedlePath(Record):
     """The arcs of the steerable needle, from the tip of the tube to the target.
 
@@ -131,7 +132,7 @@ class NeedlePath(Record):
     accumulated_turn_rad: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Exemption(Record):
     """The one obstacle that may be touched: the wall of the pierced branch.
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Self
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
@@ -17,7 +18,7 @@ from lungaccess.plans.record import Record, shaped
 from lungaccess.problem.system import System
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Plan(Record):
     """One plan: scope route, tube deployment and needle arcs, with costs, margins and provenance.
 

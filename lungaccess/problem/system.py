@@ -63,9 +63,7 @@ class System:
         outer, channel = self.tubes.outer.outer_diameter_mm, self.scope.channel_diameter_mm
         if outer >= channel:
             raise impossible(
-                "tubes.outer.outer_diameter_mm",
-                outer,
-                f"less than scope.channel_diameter_mm = {channel:g}",
+                "tubes.outer.outer_diameter_mm", outer, f"less than scope.channel_diameter_mm = {channel:g}"
             )
         bore = self.tubes.inner.inner_diameter_mm
         if self.needle.diameter_mm >= bore:

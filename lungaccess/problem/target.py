@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.errors import TargetError
 from anatomy.grid import Volume, read_only
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
 from anatomy.typed import Float, Int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Target:
     """Where the needle has to end.
 
@@ -28,7 +27,7 @@ class Target:
     origin: str
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class StatedTarget:
     """A target as a user states it, before any lung is looked at.
 

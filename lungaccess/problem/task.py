@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
 from stages.needle import Objective
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Task:
     """What a search for plans is asked.
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Mask
 from lungaccess.problem.system import System
 from stages.scope import LEAVING_MM, MAX_TURN_AT_TIP_RAD, find_sites
@@ -23,7 +23,7 @@ SPARE_RAD = 1e-6
 """More than the rounding of any angle here, so that no direction is lost by it."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class AxisPiece:
     """A piece of the medial axis where the scope tip may be.
 

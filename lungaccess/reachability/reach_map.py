@@ -6,7 +6,6 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.files import require_writable_folder
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Bool
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.problem.system import System, system_fingerprint
@@ -45,7 +45,7 @@ KINDS: dict[str, int] = {
 """What the voxels of a map say; `NOT_COUNTED` is outside the lung or in an obstacle."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class RegionReach:
     """How much of a region a system reaches.
 
@@ -72,7 +72,7 @@ class RegionReach:
         return self.shares[0] + self.shares[1]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ReachMap:
     """What a system reaches in a lung.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import OBSTACLES
 from anatomy.typed import Float, Mask
 
@@ -19,7 +19,7 @@ SMALLER_LUNG_SHARE = 0.1
 """The smaller of two lungs holds at least this share of the larger one."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Regions:
     """The region of each voxel of a grid.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from anatomy.errors import TargetError
 from anatomy.fields import distance_corners
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Float, Int32, Mask
 from lungaccess.problem.system import System
@@ -34,7 +34,7 @@ MOST_BOXES = 3_000_000
 """Boxes looked at for one piece of the airway before it is given up, after about a second."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ReachVerdict:
     """Whether a target is proved unreachable.
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.fields import corner_geometry, distance_corners
 from anatomy.grid import Grid, Volume
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN
 from anatomy.typed import Array, Float, Int
 
@@ -24,7 +23,7 @@ LUMEN_WIDTH_MM = 0.945
 """A ball of the radius within which that test looks has this spread along each axis."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class FieldBox:
     """Values on a lattice, the first index fastest.
 
@@ -136,14 +135,7 @@ def _cut_box(kind: int, values: Array, geometry: Float, low: Int, unit: float) -
     return _box(kind, values, moved, np.zeros(3, dtype=np.int64), np.array(values.shape), unit)
 
 
-def _box(
-    kind: int,
-    values: Array,
-    geometry: Float,
-    low: Int,
-    high: Int,
-    unit: float,
-) -> FieldBox:
+def _box(kind: int, values: Array, geometry: Float, low: Int, high: Int, unit: float) -> FieldBox:
     """Return the values between two indices, thinned out until they are few enough."""
     stride, spacing = np.ones(3, dtype=np.int64), np.sqrt(geometry[:, 4])
     while np.prod((high - low + stride - 1) // stride) > BOX_VALUES[kind]:

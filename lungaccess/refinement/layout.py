@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Float
 
 AXIS_DEGREE = 5
@@ -24,7 +24,7 @@ SLOPE_MM = 0.5
 """Step over which the share of lumen is compared at the exit."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Layout:
     """The shape of a program.
 
@@ -142,7 +142,7 @@ def _end(places: dict[str, slice]) -> int:
     return int(max(place.stop for place in places.values()))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Numbers:
     """The numbers of one call of a program.
 

@@ -83,11 +83,7 @@ class Problem:
     """
 
     def __init__(
-        self,
-        task: Task,
-        sites: Sites,
-        candidate: Candidate,
-        weights: tuple[float, float, float],
+        self, task: Task, sites: Sites, candidate: Candidate, weights: tuple[float, float, float]
     ) -> None:
         self.task = task
         self._candidate, self._weights = candidate, weights

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy import poses
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -22,7 +22,7 @@ MOVED_PLACEMENTS = 2
 """So many proved placements besides the candidate's own get a program for the needle alone, to save time."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Placement:
     """Proved scope and tubes, and the program's variables there.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Array, Bool, Float
 from lungaccess.report.views import View
 
@@ -20,7 +20,7 @@ LUNG_POINTS = 3_000_000
 """A mask of more voxels is thinned out evenly: the picture has fewer pixels."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Footprint:
     """A mask seen through: `thickness_mm[row, column]`, the first row at the bottom.
 

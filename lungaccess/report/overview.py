@@ -120,10 +120,7 @@ def _legend_entries(layers: Layers) -> list[Line2D | Patch]:
     entries.append(Patch(facecolor=style.LUMEN, edgecolor=style.AIRWAY, label="airway lumen"))
     if layers.count("airway") > layers.count("lumen"):
         entries.append(Patch(color=style.AIRWAY, label="airway wall"))
-    entries += [
-        Patch(color=style.VESSEL, label="vessel"),
-        Patch(color="#C9C9C9", label="outside the lung"),
-    ]
+    entries += [Patch(color=style.VESSEL, label="vessel"), Patch(color="#C9C9C9", label="outside the lung")]
     if layers.mask("fissure") is not None:
         entries.append(Patch(color=style.FISSURE, alpha=0.6, label="fissure"))
     return entries

@@ -47,8 +47,7 @@ def route_png(name: str, centreline: Centreline, route: Route, path: str | os.Pa
     _wall_graph(style.panel(figure, GRAPHS_IN[1]), centreline, route)
     verdict = "proved on the whole curve" if route.proved else "NOT PROVED"
     style.heading(
-        figure,
-        f"{name}: route of {route.curve.length_mm():.0f} mm, repair {route.repair!r}, {verdict}",
+        figure, f"{name}: route of {route.curve.length_mm():.0f} mm, repair {route.repair!r}, {verdict}"
     )
     figure.legend(handles=_legend(), loc="lower center", ncol=4, frameon=False, fontsize=10)
     return style.save_png(figure, path)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.axes import Axes
 
 from anatomy.io.files import atomic_write
+from anatomy.records import frozen_value
 from lungaccess.report import drawing, style
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class CostPoint:
     """The state of a search at one moment.
 

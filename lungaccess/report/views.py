@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 
 LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class View:
     """A parallel projection onto the plane of two directions.
 

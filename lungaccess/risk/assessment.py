@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
+from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.deviations import Draws
@@ -22,7 +22,7 @@ MISS_QUANTILES = (0.5, 0.9, 0.95)
 """The median, and the two quantiles by which accuracy is usually stated."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class RiskReport:
     """The risk of one plan under an error model.
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.errors import PlanFileError, SettingsError
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
@@ -34,7 +34,7 @@ THREADS = 2
 """The kernel holds no lock, and two cores are the least that a machine of today has."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Outcomes:
     """What became of N deviated plans.
 

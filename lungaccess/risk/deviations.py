@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.errors import UNITS
@@ -17,7 +17,7 @@ TUBE_PIECES = 4
 """Arcs of the tubes, see `stages.tube.device.TubeArcs`."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Deviations:
     """N sets of errors of a plan whose needle has A arcs.
 

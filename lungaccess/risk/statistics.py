@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.records import frozen_value
 from anatomy.typed import Bool
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Share:
     """How many of a number of samples, and what that says of the probability.
 

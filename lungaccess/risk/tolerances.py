@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
+from anatomy.records import frozen_value
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
@@ -32,7 +32,7 @@ AZIMUTHS = 16
 """Directions in which a tilt is tried: one every 22.5 degrees."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Tolerance:
     """How large errors of one kind may be, all others being 0.
 

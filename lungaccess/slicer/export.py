@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from anatomy.errors import PlanFileError
 from anatomy.io.centerlines import write_centerlines
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
+from anatomy.records import frozen_value
 from lungaccess.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurves
 from lungaccess.plans.plan import Plan
@@ -40,7 +40,7 @@ STEP_MM = 1.0
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Exported:
     """What was written.
 

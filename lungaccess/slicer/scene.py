@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal
 from xml.sax.saxutils import quoteattr
+
+from anatomy.records import frozen_value
 
 Kind = Literal["Model", "MarkupsCurve", "MarkupsFiducial", "Segmentation"]
 
@@ -23,7 +24,7 @@ _STORAGE: dict[Kind, str] = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Item:
     """One thing in a scene.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from anatomy.grid import Volume
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.morphology import bounds
+from anatomy.records import frozen_value
 from anatomy.typed import UInt8
 
 _LIST = "Segmentation category and type - 3D Slicer General Anatomy list"
@@ -20,7 +20,7 @@ _TISSUE = "SCT^85756007^Tissue"
 _ALTERED = "SCT^49755003^Morphologically Altered Structure"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Segment:
     """One segment: value in the label map, name, colour in [0, 1], category and type (SNOMED CT)."""
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
+
+from anatomy.records import frozen_value
 
 PLAN, PATH, NO_PLAN = "plan", "path", "no plan"
 """Outcomes of runs; another one is the class of the error that ended the run."""
@@ -18,7 +20,7 @@ UNKNOWN, INVALID_GOAL, TIMEOUT, EXACT, CRASH = 0, 2, 4, 6, 7
 """The numbers of those that runs end with."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Improvement:
     """A plan that is better than those before.
 
@@ -36,7 +38,7 @@ class Improvement:
     cost: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Answer:
     """What a run ended with.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from anatomy.records import frozen_value
 from lungaccess.study.answers import CRASH, UNKNOWN, Answer
 from lungaccess.study.cluster import Backlog, connect, interruptions_noted, require_dask
 from lungaccess.study.results import ResultsFile
@@ -23,7 +23,7 @@ RETRIES = 2
 Progress = Callable[[str, float | None], None]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class StudyDone:
     """What a start of a study did.
 
@@ -156,8 +156,7 @@ def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tu
         run = under_way.pop(future.key)
         if future.status in ("cancelled", "lost"):
             raise StudyError(
-                "The dask scheduler was lost",
-                remedy="Start the study again, it goes on from what is stored",
+                "The dask scheduler was lost", remedy="Start the study again, it goes on from what is stored"
             )
         yield run, result if future.status == "finished" else _failed(run, result)
         future.release()

@@ -28,16 +28,7 @@ from lungaccess.coupled.planner import plan
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
-from lungaccess.study.answers import (
-    EXACT,
-    INVALID_GOAL,
-    NO_PLAN,
-    PLAN,
-    TIMEOUT,
-    UNKNOWN,
-    Answer,
-    Improvement,
-)
+from lungaccess.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PLAN, TIMEOUT, UNKNOWN, Answer, Improvement
 from lungaccess.study.needle_run import needle_answer
 from lungaccess.study.patients import Patient, open_patient
 from lungaccess.study.runs import Problem, Run

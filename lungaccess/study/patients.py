@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,10 +9,11 @@ from anatomy.build import lung_key
 from anatomy.errors import FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
+from anatomy.records import frozen_value
 from lungaccess.study.settings import PHANTOM, Case, PhantomPatient
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Patient:
     """A patient by content, and where to read it where no cache holds it.
 

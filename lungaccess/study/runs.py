@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 from anatomy.errors import LungaccessError
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
+from anatomy.records import frozen_value
 from anatomy.settings import to_mapping
 from lungaccess.plans.assemble import software_version
 from lungaccess.problem.peripheral import peripheral_targets
@@ -26,7 +27,7 @@ RUN_FORMAT = 1
 """Raise it when what a run does changes: stored runs of another format are run anew."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Problem:
     """What is asked of the planners: everything but planner and seed.
 
@@ -96,7 +97,7 @@ class Problem:
         return _hash(self.to_mapping())
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Run:
     """One run: a problem, a planner and a seed.
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from anatomy.records import frozen_value
 from lungaccess.study.results import ResultsFile
 
 _QUERY = """
@@ -16,7 +16,7 @@ FROM runs r JOIN outcomes o ON o.runid = r.id JOIN plannerConfigs c ON c.id = r.
 ORDER BY p.case_name, p.objective, c.name, r.key"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Group:
     """The runs of one case with one planner.
 

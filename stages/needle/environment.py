@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from anatomy.fields import CENTRES, SOLID, DistanceField, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.records import frozen_record
 from anatomy.structures import OBSTACLES, obstacle_bits
 from anatomy.typed import Float, Int, Labels
 from stages.needle.device import Needle
@@ -30,7 +31,7 @@ ROUNDING_MM = 1e-6
 """The searches keep a goal tolerance that is smaller by this, so that rounding leads no path out of it."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class NeedleEnvironment:
     """One needle among obstacles.
 

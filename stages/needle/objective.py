@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_value
 from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float32
 
@@ -23,7 +24,7 @@ NO_MAP = read_only(np.zeros((2, 2, 2), dtype=np.float32, order="F"))
 """Stands for a map that is not looked at, of the type of all maps: the kernels are compiled once."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Term:
     """One cost of a needle path, which an objective can weigh.
 
@@ -69,7 +70,7 @@ TERMS = (
 _BY_NAME = {name: term for term in TERMS for name in (term.key, term.option, term.weight)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Objective:
     """A weighted sum of costs of a path.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike
 from anatomy import poses as frames
 from anatomy.grid import read_only
 from anatomy.kernels import arcs as arc_kernels
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
@@ -21,7 +21,7 @@ from stages.needle.kernels.proof import blocker_on_arc
 LENGTH, ROLL, CURVATURE = 0, 1, 2
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ArcPath:
     """A needle path of A arcs from a start pose.
 

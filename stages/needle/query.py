@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.errors import FrameError, SettingsError
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Query:
     """A start pose and a target.
 

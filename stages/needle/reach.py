@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int, UInt8, UInt64
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import reach as kernel
@@ -28,7 +27,7 @@ RRT_ITERATIONS = 200
 ORDER_SEED = 1
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Reached:
     """What became of N points.
 

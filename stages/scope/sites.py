@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE
 from anatomy.typed import Bool, Float, Int, Labels
 from stages.scope.device import Bronchoscope
-from stages.scope.tips import (
-    ScopeTip,
-    approach,
-    looks_ahead,
-    tip_at,
-    turned_aside,
-)
+from stages.scope.tips import ScopeTip, approach, looks_ahead, tip_at, turned_aside
 
 WALL_PROBE_MM = 2.5
 """Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes leave."""
@@ -39,7 +33,7 @@ TURN_DIRECTIONS = 8
 """Directions of a turn about the chord, 45 degrees apart: at most 30 degrees apart at the largest angle."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Sites:
     """Candidate poses of the scope tip: S tree points, about evenly spaced, and why others are no sites.
 

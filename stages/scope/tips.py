@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
 
 TURN_CHORD_MM = 2.0
@@ -32,7 +33,7 @@ TINY_RAD = 1e-6
 """Lengths and angles below these are 0 but for rounding."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ScopeTip:
     """The tip of the scope on the medial axis, looking along it or turned aside.
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -27,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Float
 from stages.tube.casadi_rates import (
     FIRST_ANGLE,
@@ -51,7 +51,7 @@ LARGEST_RESIDUAL_RAD = 1e-9
 _NEWTON = {"abstol": 1e-12, "abstolStep": 1e-13, "max_iter": 60, "error_on_fail": False}
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Order:
     """The order in which ends and bends of the tubes follow each other, seen from the tip.
 
@@ -65,7 +65,7 @@ class Order:
     landmarks: tuple[tuple[int, int], ...]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class CasadiEquilibrium:
     """One equilibrium of the tubes.
 

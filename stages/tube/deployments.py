@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from anatomy import poses as frames
 from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
@@ -29,7 +30,7 @@ THREADS = 2
 """The kernels run without the interpreter's lock; more threads would wait for memory."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Deployments:
     """Accepted deployments, E of them, and counts of the refused.
 

@@ -99,9 +99,7 @@ class Tube:
             )
         if self.curved_length_mm > self.length_mm:
             raise impossible(
-                "curved_length_mm",
-                self.curved_length_mm,
-                f"at most length_mm = {self.length_mm:g}",
+                "curved_length_mm", self.curved_length_mm, f"at most length_mm = {self.length_mm:g}"
             )
         pieces_mm = sum(piece.length_mm for piece in self.bent_pieces)
         if self.bent_pieces and self.curved_length_mm > 0.0:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as SequenceOf
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from anatomy.errors import LungaccessError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.tube.equilibrium import Equilibrium
 from stages.tube.errors import ConvergenceError
@@ -62,7 +62,7 @@ class SnapError(LungaccessError):
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class DeployedSequence:
     """All K steps of a deployment.
 

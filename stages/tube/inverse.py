@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from scipy.stats import qmc
 
 from anatomy.errors import FrameError, SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.tube.equilibrium import Equilibrium
 from stages.tube.mechanics import TubeMechanics
@@ -25,7 +25,7 @@ SHORTEST_MM = 1e-3
 """The innermost tube is ahead of the front plate by at least this."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class InverseSolution:
     """What the tubes can do towards a wanted tip pose.
 

@@ -7,13 +7,12 @@ and whose precurvature has direction 0, bends towards -y.  Behind the front plat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
 from stages.tube.equilibrium import Equilibrium, matrices, torsion_workspace
 from stages.tube.errors import ConvergenceError
@@ -24,7 +23,7 @@ LARGEST_COUNT = 64
 """Of equilibria that are looked for: two tubes have a few, and one more for each turn of wind-up."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Batch:
     """Equilibria of M configurations of n tubes.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as SequenceOf
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Annotated
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.margins import Margins
+from anatomy.records import frozen_record, frozen_value
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float, Int
 from stages.tube import kernels
@@ -35,7 +36,7 @@ ROUNDING = 1e-12
 """Share of the strain limit that stays unused, so that rounding does not exceed it."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class SequenceComparison:
     """Sequences to one final place, by their sweep.
 
@@ -166,7 +167,7 @@ class MakerLimits:
     ] = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class DesignProposal:
     """A pair of tubes, and what one deployment of it does, both tubes first, then the inner one alone.
 

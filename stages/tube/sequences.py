@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections.abc
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.tube.device import Tube
 
@@ -25,7 +25,7 @@ DEFAULT_INCREMENT_MM = 5.0
 """Increment of the alternating sequences: a compromise of sweep and the number of motions."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Sequence:
     """Waypoints of all joints; between two of them every joint moves at a steady rate.
 

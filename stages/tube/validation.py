@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy import poses as frames
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
@@ -31,7 +30,7 @@ REASONS: dict[int, str] = {
 """Why a deployment is refused, by the code of the kernels."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Deployment:
     """One accepted deployment in full.
 

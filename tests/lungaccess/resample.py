@@ -43,12 +43,7 @@ def arc(kappa: float, length: float) -> Float:
     a = kappa * length
     x, z = ((1 - math.cos(a)) / kappa, math.sin(a) / kappa) if kappa > 1e-9 else (0.0, length)
     return np.array(
-        [
-            [math.cos(a), 0, math.sin(a), x],
-            [0, 1, 0, 0],
-            [-math.sin(a), 0, math.cos(a), z],
-            [0, 0, 0, 1.0],
-        ]
+        [[math.cos(a), 0, math.sin(a), x], [0, 1, 0, 0], [-math.sin(a), 0, math.cos(a), z], [0, 0, 0, 1.0]]
     )
 
 

@@ -6,13 +6,13 @@ in expected.json, so that they stay the same when the code that drew them change
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from anatomy.records import frozen_value
 
 COST_TOLERANCE = 0.02
 """Share by which a cost may exceed the stored one: rounding that differs between processors, no more."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Anatomy:
     """A synthetic patient by seed, or a real one by name.
 
@@ -42,7 +42,7 @@ class Anatomy:
         return self.seed is None
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Planner:
     """A method of `lungaccess.plan` with its objective, and how long it searches."""
 
@@ -51,7 +51,7 @@ class Planner:
     iterations: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Case:
     """One planner for one device in one anatomy, to all targets of the anatomy."""
 

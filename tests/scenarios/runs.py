@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import lungaccess as la
 from anatomy.poses import pose
+from anatomy.records import frozen_value
 from lungaccess.one_stage.needle import plan_needle
 from lungaccess.problem.target import point_target
 from stages.needle.query import Query
 from stages.needle.violations import violation
-from tests.scenarios.cases import (
-    NEEDLE_DEVICE,
-    NEEDLE_ITERATIONS,
-    NEEDLE_OBJECTIVE,
-    PLANNERS,
-    Anatomy,
-    Case,
-)
+from tests.scenarios.cases import NEEDLE_DEVICE, NEEDLE_ITERATIONS, NEEDLE_OBJECTIVE, PLANNERS, Anatomy, Case
 from tests.scenarios.scenes import Scenes
 
 STAGES = ("scope: ", "tube: ", "needle: ")
 Cost = float | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Answer:
     """What a search gave for one target.
 
@@ -66,9 +59,7 @@ def answer_for(scenes: Scenes, case: Case, target_lps: Sequence[float]) -> Answe
     if not report.accepted and not faults:
         faults = ("the check refuses the plan",)
     return Answer(
-        cost=best.costs[planner.objective],
-        digest=" ".join(plan.digest for plan in plans),
-        faults=faults,
+        cost=best.costs[planner.objective], digest=" ".join(plan.digest for plan in plans), faults=faults
     )
 
 

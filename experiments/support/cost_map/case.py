@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from anatomy.grid import Volume
 from anatomy.phantom import make_phantom
+from anatomy.records import frozen_record
 from anatomy.segmentation.pipeline import read_ct, segment
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
@@ -29,7 +29,7 @@ GENERATIONS = (4, 9)
 CONTOURS = "nodule_contours.json"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Case:
     """Both lungs of a CT.
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 
 import edt
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.structures import OUTSIDE
 from anatomy.typed import Float
 from experiments.support.cost_map.case import Case
@@ -39,7 +39,7 @@ LEAST_COST = 1.0
 """Where the shortest path costs less there is nothing to be saved."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Scenario:
     """A start pose and a goal.
 

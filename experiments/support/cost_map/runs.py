@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from anatomy.grid import Volume
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Float
 from experiments.support.cost_map.case import Case
 from experiments.support.cost_map.inflation import inflated_environment, refuting_labels
@@ -28,7 +29,7 @@ PAPER_MODE_ITERATIONS = 30_000
 COST_MAP, SHORTEST_PATH, INTENSITY = "cost map", "shortest path", "voxel intensity"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Run:
     """The paths of one search, each better than the last by its own objective, and what they cost.
 
@@ -125,7 +126,7 @@ def success_and_means(runs: list[Run], seconds: Float) -> tuple[Float, Float, Fl
         return found / len(runs), np.nansum(sums, axis=0) / found, np.nansum(integrals, axis=0) / found
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Proofs:
     """How many paths of some searches the proof refutes, and the least distance of all from obstacles, mm."""
 

@@ -7,7 +7,6 @@ then makes a new path from there; in open loop the first plan is carried out bli
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.kernels.field import bounds_at, exact_at
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from experiments.support.insertion.truth import Errors, Truth, tilt
 from stages.needle.environment import NeedleEnvironment
@@ -53,7 +53,7 @@ class Outcome(StrEnum):
     OUT_OF_LENGTH = "out of length"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Insertion:
     """What happened to one needle.
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.errors import SettingsError
+from anatomy.records import frozen_record
 from experiments.support.insertion.closed_loop import (
     GAIN,
     STEP_MM,
@@ -25,7 +25,7 @@ from stages.needle.query import Query
 from stages.needle.replanning.replanner import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Summary:
     """What became of many insertions.
 
@@ -52,7 +52,7 @@ class Summary:
     clearance_mm: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Study:
     """The same needles in open and in closed loop."""
 

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.lung import Lung
+from anatomy.records import frozen_value
 from anatomy.typed import Float
 from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
@@ -30,7 +30,7 @@ RRT_TIME_S = 0.05
 PAPER_PATHS, PAPER_S = 15, (5.63, 42.62)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Run:
     """One search: paths found, placements, and processor time by part."""
 

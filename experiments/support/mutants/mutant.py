@@ -8,12 +8,13 @@ says is refused; its digest fits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.checking import CheckReport
 from lungaccess.plans.plan import Plan
@@ -22,7 +23,7 @@ from lungaccess.problem.system import System, system_fingerprint
 Rng = np.random.Generator
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Case:
     """An accepted plan, what the check said of it, and another plan of the same lung."""
 
@@ -36,7 +37,7 @@ class Case:
         return next((each.limit for each in self.report.findings if each.name == finding), None)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Mutant:
     """A plan that must be refused, perhaps because of one voxel.
 

@@ -114,14 +114,7 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
     )
     if kind > 0.75:
         yield from bent_plans(
-            Task(
-                lung=lung,
-                system=system,
-                target=target,
-                objective=objective,
-                method="bent",
-                seed=seed,
-            ),
+            Task(lung=lung, system=system, target=target, objective=objective, method="bent", seed=seed),
             atlas,
             rng,
         )

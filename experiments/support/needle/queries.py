@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from anatomy.grid import Grid
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.io.med_rad import load_med_rad
 from anatomy.patient import PatientImages
+from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
 from anatomy.typed import Float, Labels
 from stages.needle.device import Needle
@@ -51,7 +52,7 @@ EXEMPT_MM = 4.0
 """The airway's wall around the start, which the needle pierces."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Query:
     """A start pose, a target and a needle, with what is known of them.
 
@@ -92,7 +93,7 @@ class Query:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Obstacles:
     """The label volume of one patient, and the distance that a needle's axis keeps from voxel centres."""
 

@@ -102,10 +102,7 @@ def sampled_route(
     ):  # fmt: skip
         found = interpolate(_path_to_root(points, parent, int(counts[2]), goal))
         proved = prove(
-            found,
-            centreline,
-            max_curvature_per_mm=limits.max_curvature_per_mm,
-            needed_mm=limits.needed_mm,
+            found, centreline, max_curvature_per_mm=limits.max_curvature_per_mm, needed_mm=limits.needed_mm
         ).holds
         if any_curve:
             break

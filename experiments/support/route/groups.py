@@ -12,13 +12,13 @@ The paper's images cannot be had; the groups keep its limits and number of dimen
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.io import read_mask
 from anatomy.io.centerlines import read_centerlines
 from anatomy.phantom import make_phantom
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, anatomy, data_folder, require_data
 from stages.scope.route.centreline import Centreline, from_image, from_lung, from_mask, from_tree
@@ -36,7 +36,7 @@ NEAREST_ENDS_MM = 20.0
 """Nearer ends need no route."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Tubes:
     """Tubes to plan in, with what is known of them beforehand.
 
@@ -56,7 +56,7 @@ class Tubes:
     root: int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Trial:
     """Start and goal."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import edt
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid
+from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.airway import Airways
 from anatomy.typed import Float32, Int, Mask
 from experiments.support.segmentation.synthetic_ct import SyntheticCt
@@ -26,7 +26,7 @@ AUC_SAMPLES = 200_000
 """Voxels of each class: the area is then known to a thousandth."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class F1:
     """Mean F1 of several draws of points.
 
@@ -44,7 +44,7 @@ class F1:
     fixed_deviation: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class PointGroups:
     """Where points are drawn, as flat indices of the images' memory order.
 
@@ -150,7 +150,7 @@ def share_of(mask: Mask, at: Int) -> float:
     return float(mask.ravel(order="K")[at].mean())
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class AirwayScores:
     """Shares of the tree's length and branches found, and of the lumen found that is none."""
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Float, Float32, Mask
 
 AIR_HU, LUMEN_HU, FAT_HU, TISSUE_HU, WALL_HU, NODULE_HU, FISSURE_HU = (
@@ -29,7 +28,7 @@ LEAST_HU, GREATEST_HU = -1024, 3071
 HALF = np.float32(0.5)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class CtLook:
     """How a rendered CT looks.
 
@@ -88,7 +87,7 @@ class CtLook:
                 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class SyntheticCt:
     """A rendered CT (int16 HU) and its truth on the same grid, bool `(ni, nj, nk)`.
 

@@ -10,11 +10,7 @@ from lungaccess.cli.options import PatientOptions
 
 
 def check(
-    plan: Path,
-    patient: Path,
-    *,
-    system: str | None = None,
-    output: PatientOptions = PatientOptions(),
+    plan: Path, patient: Path, *, system: str | None = None, output: PatientOptions = PatientOptions()
 ) -> ExitCode:
     """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
 

@@ -10,13 +10,7 @@ from lungaccess.cli.options import PatientOptions
 from lungaccess.cli.progress import progress
 
 
-def export(
-    plan: Path,
-    patient: Path,
-    *,
-    slicer: Path,
-    output: PatientOptions = PatientOptions(),
-) -> ExitCode:
+def export(plan: Path, patient: Path, *, slicer: Path, output: PatientOptions = PatientOptions()) -> ExitCode:
     """Write a stored plan and its patient for 3D Slicer; exit code 1 if the check refuses the plan.
 
     Parameters

@@ -7,13 +7,7 @@ from pathlib import Path
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import (
-    PatientOptions,
-    SearchOptions,
-    SystemOptions,
-    TargetOptions,
-    require_map,
-)
+from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions, TargetOptions, require_map
 from lungaccess.cli.plan_search import PlanRequest, plan_and_report
 from stages.needle import Objective
 

@@ -59,12 +59,7 @@ def reach(
     lung = output.load(patient)
     with progress("scanning") as shown:
         maps = compare_reach(
-            lung,
-            systems,
-            spacing_mm=spacing,
-            trees=search,
-            work=folder,
-            progress=shown.step,
+            lung, systems, spacing_mm=spacing, trees=search, work=folder, progress=shown.step
         )
     stems = _stems(maps)
     for stem, each in zip(stems, maps, strict=True):

@@ -104,10 +104,7 @@ def _outcome_table(report: RiskReport) -> Table:
         low, high = share.interval
         return name, f"{100.0 * share.value:.2f}", f"{100.0 * low:.2f} to {100.0 * high:.2f}"
 
-    rows = [
-        row("succeeds", report.succeeds),
-        row(f"ends within {report.radius_mm:.2f} mm", report.reaches),
-    ]
+    rows = [row("succeeds", report.succeeds), row(f"ends within {report.radius_mm:.2f} mm", report.reaches)]
     for name, share in report.touches.items():
         words = name if name.startswith("stays") else f"touches {name}"
         rows.append(row(words if name in report.forbidden else f"{words} (allowed)", share))

@@ -15,20 +15,8 @@ import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
-from stages.needle.kernels import (
-    blocker_on_arc,
-    cost_of_arc,
-    least_cosine,
-    map_costs_on_arc,
-)
-from stages.tube.kernels import (
-    ACCEPTED,
-    BRANCH,
-    MAX_EXTENSION,
-    MAX_PROTRUSION,
-    tip_pose,
-    validate_deployment,
-)
+from stages.needle.kernels import blocker_on_arc, cost_of_arc, least_cosine, map_costs_on_arc
+from stages.tube.kernels import ACCEPTED, BRANCH, MAX_EXTENSION, MAX_PROTRUSION, tip_pose, validate_deployment
 
 SCOPE_POSE = 0
 ROTATION = 1

@@ -12,12 +12,7 @@ import numba
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_estimate
-from stages.needle.kernels import (
-    CLEARANCE_FLOOR_MM,
-    blocker_on_arc,
-    cost_of_arc,
-    single_arc_exceeds,
-)
+from stages.needle.kernels import CLEARANCE_FLOOR_MM, blocker_on_arc, cost_of_arc, single_arc_exceeds
 
 PRUNED_BY_BOUND = -2
 """The label of an arc that was not tested for obstacles, because its cost or its lower bound is too high."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.poses import roll_towards
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, chord_mm
 from stages.needle import RRT_STEP_MM, ArcPath, Needle, arc_transform
@@ -20,7 +20,7 @@ SHORTEST_ARC_MM = 1e-6
 """A shorter arc leads to the state itself."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Controls:
     """The controls [Kuntz2015, `steer`] that lead from N states to one point: length, bend and its direction.
 

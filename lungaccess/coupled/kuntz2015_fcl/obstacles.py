@@ -38,11 +38,7 @@ class Solid:
     """
 
     def __init__(
-        self,
-        lung: Lung,
-        holds: Callable[[Labels], Bool],
-        low: Int | None = None,
-        high: Int | None = None,
+        self, lung: Lung, holds: Callable[[Labels], Bool], low: Int | None = None, high: Int | None = None
     ) -> None:
         self._lung = lung
         self._holds = holds
@@ -126,10 +122,7 @@ class Obstacles:
             low = np.maximum(np.array([along.start for along in box]) - reach, 0)
             high = np.minimum(np.array([along.stop for along in box]) + reach, self.lung.labels.shape)
             self._other_airways[branch] = Solid(
-                self.lung,
-                lambda labels: ((labels & AIRWAY) != 0) & (branch_of(labels) != branch),
-                low,
-                high,
+                self.lung, lambda labels: ((labels & AIRWAY) != 0) & (branch_of(labels) != branch), low, high
             )
         return self._other_airways[branch]
 

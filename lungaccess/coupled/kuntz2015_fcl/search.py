@@ -6,11 +6,12 @@ import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from anatomy.errors import SettingsError
+from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
@@ -33,7 +34,7 @@ RRT_ITERATIONS = 50
 """About what 0.05 s of [Kuntz2015] hold here."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Refusal:
     """A plan of the reference that the planner's proof refuses: whether its tubes or its needle."""
 

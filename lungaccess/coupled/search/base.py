@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from anatomy.records import frozen_value
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Step:
     """One step of a search.
 

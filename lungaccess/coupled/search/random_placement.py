@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.problem.task import Task
 from stages.scope import MedialAxis, ScopeTip, looks_ahead
 from stages.tube import tracking_length_mm
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Placement:
     """Where scope and tubes are placed.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy.grid import Volume
+from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
 from lungaccess.report.html.pack import Packed, pack
 
@@ -21,7 +21,7 @@ SHRINK, GROW = 0.5, -0.53
 """Factors of one smoothing there and back [Taubin1995], which keeps the volume."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Look:
     """How a structure is shown.
 

@@ -38,12 +38,7 @@ DARK, BRIGHT = np.array([0.50, 0.16, 0.13]), np.array([0.98, 0.72, 0.64])
 
 
 def bronchoscopy_webp(
-    plan: Plan,
-    lung: Lung,
-    path: str | os.PathLike[str],
-    *,
-    frames: int = FRAMES,
-    pixels: int = PIXELS,
+    plan: Plan, lung: Lung, path: str | os.PathLike[str], *, frames: int = FRAMES, pixels: int = PIXELS
 ) -> Path:
     """Write what the scope's camera sees on its route to the plan's site as an animated WebP.
 

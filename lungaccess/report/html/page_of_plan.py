@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from lungaccess.report.html import tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
 from lungaccess.report.html.document import scene_figure, write_page
@@ -29,7 +29,7 @@ THICKER = "; seen from afar, devices are drawn thicker than they are"
 RISK_SAMPLES, RISK_SEED = 2000, 0
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class PageOptions:
     """What a plan's page shows besides the plan.
 

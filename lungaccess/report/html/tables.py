@@ -21,12 +21,7 @@ if TYPE_CHECKING:
 GOAL_RADIUS_MM = 2.0
 """Radius about the place of the plan's tip that counts as that place for the instructions."""
 AXES_AGREE = "largest angle between the axes"
-STAGE_NAMES = {
-    "scope": "Bronchoscope",
-    "tube": "Tubes",
-    "needle": "Needle",
-    "exemption": "The pierced wall",
-}
+STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
 
 
 def check_section(report: CheckReport) -> str:

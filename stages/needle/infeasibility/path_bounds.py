@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.needle.infeasibility.kernels import bounds
 
@@ -14,7 +14,7 @@ ROUNDING = 1e-8
 """Share by which curvature and angles are taken too large, so that rounding rules out no path."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class PathBounds:
     """Bounds of the places and directions of all paths.
 

@@ -23,10 +23,7 @@ from stages.needle.kernels.connections import (
     shortest_legs,
 )
 from stages.needle.kernels.cost import cost_of_arc
-from stages.needle.kernels.limits import (
-    MIN_ARC_MM,
-    TINY,
-)
+from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 from stages.needle.kernels.proof import blocker_on_arc
 
 # Columns: pose (6), arc from the parent: length, bend (4); path length, accumulated turn, path cost.

@@ -104,11 +104,7 @@ class NeedlePlanner(base.Planner):
     """
 
     def __init__(
-        self,
-        si: Any,
-        make_search: Callable[[Query, int], Search],
-        question: Question,
-        name: str = "rrt",
+        self, si: Any, make_search: Callable[[Query, int], Search], question: Question, name: str = "rrt"
     ) -> None:
         super().__init__(si, name)
         self._si = si

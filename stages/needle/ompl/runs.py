@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
+from anatomy.records import frozen_value
 from stages.needle.path import ArcPath
 
 PROPERTIES = ("proved BOOLEAN", "path length mm REAL")
 _HEADING = "properties for each run"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Outcome:
     """What one run ended with.
 
@@ -33,7 +33,7 @@ class Outcome:
         return None if self.path is None or self.violation else self.path.length_mm
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class PlannerRuns:
     """What one planner did.
 

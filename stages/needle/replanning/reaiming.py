@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import StrEnum
 
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
@@ -49,7 +50,7 @@ Waypoints = tuple[list[Float], Source]
 """Points to pass, and where they come from."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Root:
     """A pose to plan from, and the arcs `(A, 3)` that led to it from the tip, see `ArcPath`."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
 from typing import Annotated
 
@@ -12,6 +12,7 @@ import numpy as np
 from anatomy.errors import SettingsError
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.field import MIN_GAP_MM
+from anatomy.records import frozen_record
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
@@ -90,7 +91,7 @@ class ReplanSettings:
 DEFAULT_SETTINGS = ReplanSettings()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Replan:
     """What came of replanning from one pose.
 
@@ -219,12 +220,7 @@ class Replanner:
             self._variants.append(environment)
 
     def replan(
-        self,
-        lps_from_tip: Float,
-        target: Float,
-        inserted_mm: float,
-        *,
-        turned_rad: float | None = None,
+        self, lps_from_tip: Float, target: Float, inserted_mm: float, *, turned_rad: float | None = None
     ) -> Replan:
         """Plan from the pose that the tip is in; a path that is found becomes the plan.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeVar
 
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from anatomy.errors import SettingsError
 from anatomy.kernels import arcs as arc_kernels
 from anatomy.kernels.field import UNITS_PER_MM
+from anatomy.records import frozen_value
 from anatomy.typed import Array, Float, Int, Int32, UInt8
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
@@ -51,7 +51,7 @@ class Outcome(StrEnum):
     OUT_OF_MEMORY = "out of memory"
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Resolution:
     """The words of a search: pieces of whole steps, in equally spaced directions of bending.
 
@@ -115,7 +115,7 @@ def _halvings(whole: int, part: int) -> int:
     return (whole // (part & -part)).bit_length() - 1
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Cells:
     """Cells of poses: of all that fall into one cell, only the cheapest so far is followed.
 
@@ -143,7 +143,7 @@ class Cells:
             raise SettingsError(f"{self} has no size", expected="finite sizes of more than 0")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Counts:
     """What a search has done.
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment, workspace_lengths
 from stages.needle.kernels import limits as index
@@ -32,7 +32,7 @@ SAMPLE_MM = 0.05
 """Distance of the points of a path between which its controls are interpolated."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class GuidePath:
     """The cheapest path through a state lattice of L layers, if there is one.
 

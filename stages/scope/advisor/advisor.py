@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Float
 from stages.scope.advisor.best_motion import Candidates, Motion, MotionEvaluation, evaluate_motions
 from stages.scope.advisor.environment import ScopeEnvironment
@@ -26,7 +27,7 @@ THINNEST_MM = 0.5
 """Radii of thinner scopes that are tried."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Advice:
     """What the user is advised to do.
 
@@ -54,7 +55,7 @@ class Advice:
     distance_mm: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class ThinnerScope:
     """What a thinner scope of the same bends would reach.
 

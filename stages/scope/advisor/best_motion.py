@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
 from anatomy.grid import read_only
+from anatomy.records import frozen_record, frozen_value
 from anatomy.settings import impossible, quantity, settings
 from anatomy.typed import Float, Int
 from stages.scope.advisor.environment import ScopeEnvironment
@@ -55,7 +55,7 @@ class Weights:
         return np.array([self.nf1, self.clearance, self.twist])
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Motion:
     """Advance with a twist and a bend.
 
@@ -72,7 +72,7 @@ class Motion:
     bend_rad: float
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Candidates:
     """The candidates of a motion and what they cost; C = 121 rows, twist by twist.
 
@@ -115,7 +115,7 @@ class Candidates:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class MotionEvaluation:
     """The evaluation of the user's own motion beside the candidates.
 

@@ -7,11 +7,11 @@ side, and looks at the joints alone: it lets a scope touch the wall.  It is ther
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
 from stages.scope.advisor.kernels import collision as kernel
 from stages.scope.advisor.kinematics import ScopeModel
@@ -19,7 +19,7 @@ from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import NavigationField
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ScopeEnvironment:
     """A scope in a lumen with a goal: what the scope collides with, and where it is to go.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.scope.advisor.kinematics import tip_frames
 from stages.scope.advisor.path import ScopePath
@@ -20,7 +20,7 @@ MARKUPS_SCHEMA = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class FlyThrough:
     """Camera poses along a path; F poses.
 
@@ -49,12 +49,7 @@ class FlyThrough:
                 zip(self.lps_from_camera, self.inserted_mm, strict=True), start=1
             )
         ]
-        curve = {
-            "type": "Curve",
-            "coordinateSystem": "LPS",
-            "coordinateUnits": "mm",
-            "controlPoints": points,
-        }
+        curve = {"type": "Curve", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
         return {"@schema": MARKUPS_SCHEMA, "markups": [curve]}
 
 

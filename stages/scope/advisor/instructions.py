@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
 from stages.scope.advisor.path import ScopePath
 
@@ -24,7 +24,7 @@ LOOK_MM = 10.0
 """The direction of a branch is that of its first millimetres; forks nearer to each other count as one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Instruction:
     """One stretch of a path: into a branch and along it.
 

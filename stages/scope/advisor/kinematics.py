@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -12,6 +11,7 @@ from pydantic import Field
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.poses import pose
+from anatomy.records import frozen_record
 from anatomy.settings import impossible, quantity, settings
 from anatomy.typed import Float
 from stages.scope.advisor.kernels import chain
@@ -93,7 +93,7 @@ def model_of(scope: Bronchoscope, *, links: int = 10, link_mm: float = 1.0) -> S
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ScopeState:
     """Where the scope is: the base of its bending tip, and how the tip is turned.
 

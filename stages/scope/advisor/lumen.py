@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from anatomy.fields import DistanceField, corner_geometry, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.structures import OUTSIDE
 from anatomy.typed import Float, Int32, Labels
 from stages.scope.advisor.kernels.collision import FINE_DEPTH_MM
@@ -22,7 +23,7 @@ DEPTH_UNITS_PER_MM = 256.0
 """Depths are compared as integers of 1/256 mm, the unit of the distance fields."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Lumen:
     """The piece of the lumen that hangs together by voxel faces; N interior voxels.
 

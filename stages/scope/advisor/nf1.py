@@ -7,7 +7,6 @@ without a lower neighbour can only be the goal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import TargetError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
 from stages.scope.advisor.kernels.voxel_graph import shortest_paths
 from stages.scope.advisor.lumen import Lumen
@@ -27,7 +27,7 @@ LEAST = 0.1
 """Eq. 2: from this share of C_max on, entering a voxel costs the least."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Goal:
     """The voxel where the tip has to end.
 
@@ -55,11 +55,7 @@ class Goal:
 
 
 def goal_at(
-    lumen: Lumen,
-    lesion_lps: ArrayLike,
-    lesion_radius_mm: float = 0.0,
-    *,
-    preferred: Bool | None = None,
+    lumen: Lumen, lesion_lps: ArrayLike, lesion_radius_mm: float = 0.0, *, preferred: Bool | None = None
 ) -> Goal:
     """Return the goal for a lesion, a sphere: the interior voxel nearest to its centre [Rosell2012, IV-B].
 
@@ -98,7 +94,7 @@ def goal_at(
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class NavigationField:
     """Potential of every interior voxel, 0 at the goal and without any other local minimum.
 

@@ -7,13 +7,13 @@ of tunnelling through the airway wall; hence this question is asked for every si
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels.orientation import pointable
@@ -28,7 +28,7 @@ ASIDE = 6
 """Directions in which tip and base are moved and tilted."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Orientability:
     """The directions in which a scope's tip can point at a site; D directions tried.
 

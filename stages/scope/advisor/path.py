@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.scope.advisor import kinematics
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState
 from stages.scope.advisor.nf1 import Goal
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class ScopePath:
     """A path of Algorithm 2 [Rosell2012]; M states.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +13,7 @@ from anatomy.fields import CENTRES, ROUNDING_MM, SOLID, DistanceField, corner_ge
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
 from stages.scope.route.kernels import lumen as kernel
 
@@ -34,7 +34,7 @@ KEPT_DEPTH = 0.9
 """Smoothing never takes a point of a skeleton to less than this share of the depth it had."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Centreline:
     """A graph of centred points with radii; N nodes, E edges.
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.scope.route.kernels import spline as kernel
 
@@ -16,7 +15,7 @@ DEGREE = 3
 """Cubic splines, as in [Li2021]: their curvature is continuous."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Curve:
     """A clamped cubic B-spline; n control points, M = n - 3 spans, twice continuously differentiable.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
@@ -68,7 +68,7 @@ FURTHER_STARTS: tuple[tuple[float, tuple[Stage, ...]], ...] = (
 work: the quick ones first."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Level:
     """At how many samples the program holds, and how much stricter it is than the limits.
 
@@ -94,7 +94,7 @@ LEVELS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Problem:
     """What a route has to keep to.
 
@@ -121,11 +121,7 @@ class Problem:
 
 
 def repaired(
-    curve: Curve,
-    problem: Problem,
-    free: tuple[int, int],
-    level: Level,
-    start: Sequence[Stage],
+    curve: Curve, problem: Problem, free: tuple[int, int], level: Level, start: Sequence[Stage]
 ) -> tuple[Curve, float]:
     """Move the control points `free[0]` to `free[1] - 1` of a curve until it keeps to its limits.
 

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.settings import quantity, settings
 from anatomy.typed import Bool, Float
 from stages.scope.route.centreline import Centreline
@@ -71,7 +71,7 @@ class GeneticSettings:
     mutation_share: Annotated[float, quantity("noise on the genes", above=0.0, at_most=1.0)] = 0.15
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Segment:
     """A part of the path that bends too much; n points.
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
@@ -19,7 +18,7 @@ WAYPOINT_SPACING_MM = 3.0
 """Denser points give the spline the kinks of a voxel skeleton; sparser ones cut the bends of airways."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class GuidePath:
     """Points from start to goal with the radius of the lumen; P points.
 

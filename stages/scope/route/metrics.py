@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from anatomy.records import frozen_value
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 
@@ -13,7 +12,7 @@ PER_SPAN = 16
 """Samples a span: about 0.2 mm apart, where curvature hardly changes between two."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class RouteMetrics:
     """Numbers of a curve, from dense samples.
 

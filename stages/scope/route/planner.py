@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
@@ -28,7 +28,7 @@ CORRIDOR_MM = 3.0
 """A tube counts for replanning if it comes so near to one that the route runs through."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Route:
     """A route from start to goal.
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
@@ -19,7 +18,7 @@ REASONS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Proof:
     """What was proved of a curve with M spans.
 

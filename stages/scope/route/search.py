@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.kernels.search import breadth_first
@@ -20,7 +19,7 @@ class NoRouteError(LungaccessError):
     """There is no route, or none was found; the message says where and why."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Links:
     """Which nodes the search may go to from a node, as a compressed list.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.scope.tour.kernels.circuit import all_resistances
 from stages.scope.tour.subtree import Subtree
@@ -23,7 +23,7 @@ SAME_RESISTANCE = 1e-9
 """Relative difference up to which two resistances count as equal; sums in another order differ by less."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Circuits:
     """The circuits of all combinations of exits; C combinations, M lesions.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import TargetError
+from anatomy.records import frozen_value
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float, Int
 
@@ -51,7 +51,7 @@ class ExitRule:
         return ratio / (1.0 + ratio)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Exit:
     """A point of the airway from where a lesion is taken.
 
@@ -78,11 +78,7 @@ class Exit:
 
 
 def find_exits(
-    tree: AirwayTree,
-    lesions_lps: ArrayLike,
-    *,
-    rule: ExitRule | None = None,
-    accepts: ExitTest | None = None,
+    tree: AirwayTree, lesions_lps: ArrayLike, *, rule: ExitRule | None = None, accepts: ExitTest | None = None
 ) -> tuple[tuple[Exit, ...], ...]:
     """Return up to three exits for each lesion: the target positions P1, P2 and P3 of [Pan2025].
 
@@ -159,13 +155,7 @@ def exits_of(
 
 
 def _exit(
-    lesion: int,
-    points: Int,
-    distance: Float,
-    angle: Float,
-    weighted: Float,
-    at: int,
-    roles: tuple[str, ...],
+    lesion: int, points: Int, distance: Float, angle: Float, weighted: Float, at: int, roles: tuple[str, ...]
 ) -> Exit:
     return Exit(
         lesion=lesion,

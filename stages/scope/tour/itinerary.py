@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Int
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.subtree import Subtree
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Itinerary:
     """A tour through the airway that takes every lesion at one exit; K stretches of its `Subtree`.
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
 from stages.scope.tour.itinerary import Itinerary, plan_itinerary
 from stages.scope.tour.kernels.steiner import solve
@@ -41,7 +40,7 @@ def shortest_tour(subtree: Subtree, *, closed: bool = False) -> Itinerary:
     return plan_itinerary(subtree, chosen, closed=closed)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class _Nodes:
     """The binary tree of the dynamic program, see `kernels.steiner`; T nodes."""
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
+from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.resistance import Resistances, branch_resistances
@@ -21,7 +21,7 @@ MOST_LESIONS = 62
 """A set of lesions is an int64 with one bit a lesion, and the next larger power of two must fit as well."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@frozen_record
 class Subtree:
     """The stretches from the root to all exits; K vertices, parents first, and X exits of M lesions.
 

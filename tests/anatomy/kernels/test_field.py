@@ -73,12 +73,7 @@ def _expected(scene: Labelled, bits: int, exempt: int, cap: float) -> Float:
     return np.minimum(distance, cap)
 
 
-@given(
-    scene=labelled(),
-    bits=st.sampled_from(BITS),
-    exempt=st.integers(-1, 2),
-    cap=st.floats(0.05, 8.0),
-)
+@given(scene=labelled(), bits=st.sampled_from(BITS), exempt=st.integers(-1, 2), cap=st.floats(0.05, 8.0))
 def test_exact_distance_is_that_of_trying_every_voxel(
     scene: Labelled, bits: int, exempt: int, cap: float
 ) -> None:

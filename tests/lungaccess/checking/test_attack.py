@@ -68,10 +68,7 @@ def cases(made: list[tuple[Any, Any, Plan]], checks: Any, small_lung: Lung) -> l
             system,
             target,
             Case(
-                lung=small_lung,
-                plan=plan,
-                report=checks.of_plan(plan, system, target),
-                other=made[n - 1][2],
+                lung=small_lung, plan=plan, report=checks.of_plan(plan, system, target), other=made[n - 1][2]
             ),
         )
         for n, (system, target, plan) in enumerate(made)

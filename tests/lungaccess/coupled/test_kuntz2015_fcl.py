@@ -129,11 +129,7 @@ class TestSearch:
         assert counts[0][OUT_OF_WORKSPACE] > ITERATIONS / 2 and counts[1][OUT_OF_WORKSPACE] == 0
 
     def test_what_the_proof_refuses_is_kept_and_not_yielded(
-        self,
-        atlas: la.Atlas,
-        target: Target,
-        obstacles: Obstacles,
-        monkeypatch: pytest.MonkeyPatch,
+        self, atlas: la.Atlas, target: Target, obstacles: Obstacles, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         search = ReferenceSearch(task_for(atlas, target), atlas, obstacles=obstacles)
         monkeypatch.setattr(CandidateEvaluator, "proves", lambda *_: False)

@@ -58,9 +58,7 @@ def moved(plan: la.Plan, lps_from_lps: Any) -> la.Plan:
             exit=replace(plan.tube.exit, point_lps=point(plan.tube.exit.point_lps)),
         ),
         needle=replace(
-            plan.needle,
-            lps_from_start=pose(plan.needle.lps_from_start),
-            end_lps=point(plan.needle.end_lps),
+            plan.needle, lps_from_start=pose(plan.needle.lps_from_start), end_lps=point(plan.needle.end_lps)
         ),
         exemption=replace(plan.exemption, exit_point_lps=point(plan.exemption.exit_point_lps)),
     )

@@ -171,11 +171,7 @@ def test_a_hole_without_a_part_is_refused() -> None:
 # Numbers as text ---------------------------------------------------------------------------------
 
 
-@given(
-    st.sampled_from(["u1", "u2", "i4"]),
-    st.lists(st.integers(0, 255), max_size=60),
-    st.booleans(),
-)
+@given(st.sampled_from(["u1", "u2", "i4"]), st.lists(st.integers(0, 255), max_size=60), st.booleans())
 def test_whole_numbers_survive_packing(kind: str, values: list[int], wide: bool) -> None:
     scale = 257 if wide and kind != "u1" else 1
     array = np.array(values, dtype=np.int64).reshape(1, -1) * scale

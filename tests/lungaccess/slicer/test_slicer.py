@@ -323,8 +323,7 @@ def test_the_command_says_what_it_wrote(
     report = CheckReport(accepted=accepted, findings=())
     monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_lung)
     monkeypatch.setattr(
-        "lungaccess.slicer.export_slicer",
-        lambda *_, **__: Exported(files=("scene.mrml",), report=report),
+        "lungaccess.slicer.export_slicer", lambda *_, **__: Exported(files=("scene.mrml",), report=report)
     )
     plan.save(tmp_path / "plan.json")
     words = ["export", str(tmp_path / "plan.json"), "toy", "--slicer", str(tmp_path / "out")]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from anatomy.records import frozen_value
 from anatomy.structures import VESSEL
 from anatomy.typed import Float
 from stages.needle.device import Needle
@@ -25,7 +26,7 @@ SURE_MM = 0.5 * SAMPLE_MM + 0.01
 """Clearance to spare at samples that rules out a refusal: half their distance, and what a proof gives up."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Maze:
     """Blocks in a box of free space, a start and a target.
 
@@ -172,7 +173,7 @@ class Enumeration:
     words: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen_value
 class Curves:
     """N curves, sampled at S points each, as they lie one after the other on N paths.
 
@@ -315,12 +316,7 @@ class Paths:
 
 
 def enumerate_words(
-    maze: Maze,
-    fine_mm: float,
-    rolls: int,
-    most_steps: int,
-    cost_at: CostAt | None = None,
-    least: float = 1.0,
+    maze: Maze, fine_mm: float, rolls: int, most_steps: int, cost_at: CostAt | None = None, least: float = 1.0
 ) -> Enumeration:
     """Try the goal from the end of every word of up to `most_steps` single steps.
 

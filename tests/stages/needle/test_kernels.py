@@ -170,10 +170,7 @@ def points_of_arc(pose: Any, bend: Any, length: float, step: float) -> tuple[Flo
     kappa = bend[0]
     ahead = np.sin(kappa * s) / kappa if kappa else s
     aside = (1 - np.cos(kappa * s)) / kappa if kappa else 0.0 * s
-    return (
-        np.array(pose[:3]) + ahead[:, None] * np.array(pose[3:]) + aside[:, None] * np.array(bend[1:]),
-        s,
-    )
+    return (np.array(pose[:3]) + ahead[:, None] * np.array(pose[3:]) + aside[:, None] * np.array(bend[1:]), s)
 
 
 def spare_clearance(lung: Lung, limits: Limits, points: Float, s: Float, branch: int) -> float:

@@ -68,9 +68,7 @@ def test_ends() -> None:
     assert centreline(TUBES, frame, 0.4, 0.0, 20.0, 7.0).shape == (1, 3)
 
 
-@given(
-    insertions=st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 1.0)), min_size=1, max_size=4),
-)
+@given(insertions=st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 1.0)), min_size=1, max_size=4))
 def test_arcs_lead_along_the_centreline(insertions: list[tuple[float, float]]) -> None:
     inner = np.array([each for each, _share in insertions])
     outer = inner * [share for _each, share in insertions]

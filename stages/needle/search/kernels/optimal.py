@@ -10,10 +10,7 @@ from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import length_ahead, seen_from
-from stages.needle.kernels.limits import (
-    MIN_ARC_MM,
-    TINY,
-)
+from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 from stages.needle.kernels.rrt import random_arc, sample_between
 from stages.needle.kernels.tree import (
     PATH_COST,

@@ -17,9 +17,7 @@ from anatomy.kernels.arcs import pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.cost import cost_of_arc
-from stages.needle.kernels.limits import (
-    TINY,
-)
+from stages.needle.kernels.limits import TINY
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.kernels.tree import angle_kept
 from stages.needle.search.kernels.goal_ball import least_length, shortest_into_ball, single_into_ball

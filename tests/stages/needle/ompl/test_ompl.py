@@ -623,11 +623,7 @@ def test_a_problem_is_freed_when_it_is_dropped(environment: NeedleEnvironment) -
     problem.setup.solve(LONG_S)
     problem.setup.setPlanner(problem.planner)
     benchmark(problem, query(), time_s=LONG_S, runs=1, planners=["rrt"])
-    alive = [
-        weakref.ref(problem),
-        weakref.ref(problem.own().search),
-        weakref.ref(problem._question),
-    ]
+    alive = [weakref.ref(problem), weakref.ref(problem.own().search), weakref.ref(problem._question)]
     assert all(reference() is not None for reference in alive)
     del problem
     gc.collect()

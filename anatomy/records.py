@@ -1,0 +1,20 @@
+"""Frozen classes of keyword-only fields: what functions return, and what they are given as one thing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar, dataclass_transform
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False)
+def frozen_record(cls: type[T]) -> type[T]:
+    """Make a class of annotated fields a frozen dataclass that may hold arrays; it equals itself alone."""
+    return dataclass(frozen=True, kw_only=True, eq=False)(cls)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def frozen_value(cls: type[T]) -> type[T]:
+    """Make a class of annotated fields a frozen dataclass of plain values, compared by its fields."""
+    return dataclass(frozen=True, kw_only=True)(cls)

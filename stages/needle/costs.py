@@ -121,7 +121,6 @@ def path_costs(
         See `NeedleEnvironment`.
     cost_map : Volume or None
         Without a map its costs are 0.
-    path : ArcPath
     terms : iterable of Term
         Which costs.
     """

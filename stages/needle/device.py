@@ -20,7 +20,7 @@ class Needle:
     max_length_mm : float
         Longest path from the start of the needle, mm.
     max_angle_from_start_deg : float
-        Largest angle between the tip and its direction at the start, degrees [Kuntz2015]_.
+        Largest angle between the tip and its direction at the start, degrees [Kuntz2015].
     max_accumulated_turn_deg : float
         Largest sum of the angles of all arcs, degrees.
     exit_exemption_mm : float
@@ -30,10 +30,6 @@ class Needle:
     ------
     SettingsError
         If a value is not finite, negative or absurd.
-
-    References
-    ----------
-    .. [Kuntz2015] docs/bibliography.md
     """
 
     diameter_mm: Annotated[float, quantity("outer diameter of the needle", above=0.0, at_most=5.0)]

@@ -37,14 +37,10 @@ class NeedleEnvironment:
 
     Parameters
     ----------
-    grid : Grid
-    needle : Needle
     required_clearance_mm : float
         Distance that the needle's axis keeps from obstacles.
     goal_tolerance_mm : float
         How far from the target a path may end.
-    obstacles : Obstacles
-    limits : Limits
     cost_map : Volume or None
         Cost of a mm of path at each voxel, on `grid`; infinite is an obstacle.
     """
@@ -75,9 +71,6 @@ def needle_environment(
 
     Parameters
     ----------
-    lung : Lung
-    needle : Needle
-    margins : Margins
     with_fissures : bool
         Whether fissures are obstacles.
     goal_tolerance_mm : float
@@ -108,8 +101,6 @@ def environment_of_labels(
     ----------
     labels : (ni, nj, nk) uint16
         See `anatomy.structures`.
-    grid : Grid
-    needle : Needle
     bits : int
         Structures that are obstacles.  Space beyond the grid is OUTSIDE.
     required_clearance_mm : float

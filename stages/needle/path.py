@@ -149,8 +149,6 @@ def blocker_on_path(
 
     Parameters
     ----------
-    environment : NeedleEnvironment
-    path : ArcPath
     branch : int
         Pierced branch, whose wall is exempt at the exit; -1 for none.
     inserted_mm : float

@@ -58,7 +58,6 @@ class ReachScan:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
     positions, tangents : (E, 3) float64, LPS mm
         Start poses; neighbours in the list should be alike.
     branches : (E,) int64

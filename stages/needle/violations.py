@@ -25,9 +25,6 @@ def violation(
 
     Parameters
     ----------
-    environment : NeedleEnvironment
-    query : Query
-    path : ArcPath
     goal_tolerance_mm : float
         How far from the target the path may end, where the environment's own tolerance is smaller.
     """

@@ -96,8 +96,6 @@ def find_sites(
 
     Parameters
     ----------
-    lung : Lung
-    scope : Bronchoscope
     reach_mm : float
         How far ahead of the scope tip the airway may be left.
     spacing_mm : float
@@ -105,10 +103,6 @@ def find_sites(
     turning : bool
         Whether tips are also turned aside, every 2 mm, by up to 45 degrees from where the scope comes from,
         as far as its body fits into the lumen.
-
-    References
-    ----------
-    .. [Kuntz2015] docs/bibliography.md
     """
     tree = lung.tree
     needed = scope.radius_mm + scope.lumen_margin_mm
@@ -153,11 +147,8 @@ def tip_is_feasible(lung: Lung, scope: Bronchoscope, sites: Sites, tip: ScopeTip
 
     Parameters
     ----------
-    lung : Lung
-    scope : Bronchoscope
     sites : Sites
         Those of this scope; they tell where it fits.
-    tip : ScopeTip
     """
     if not sites.passable[tip.tree_point]:
         return False

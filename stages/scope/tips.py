@@ -170,7 +170,6 @@ class MedialAxis:
 
     Parameters
     ----------
-    tree : AirwayTree
     allowed : (N,) bool
         Tree points that may be a site; a segment belongs to its distal point.
     """

@@ -1,16 +1,12 @@
 """The mechanics of concentric tubes as CasADi functions, for exact derivatives and as a second opinion.
 
-This is the model of `stages.tube.mechanics` in the form of [Rucker2010]_: the state is the frame of the
+This is the model of `stages.tube.mechanics` in the form of [Rucker2010]: the state is the frame of the
 innermost tube, the angles of the others relative to it and the torsional moments, and Runge-Kutta steps
 carry it from the tip to the front plate.  It is written from the equations and shares no arithmetic with
 the kernels, so that either can test the other.  It is slow, but can be part of a nonlinear program.
 
 Units are mm, N and rad.  Tubes are listed innermost first.  The base frame has its origin at the front
 plate, where the arc length is 0, and +z forward.  Tubes are held straight behind the plate.
-
-References
-----------
-.. [Rucker2010] docs/bibliography.md
 """
 
 from __future__ import annotations
@@ -96,7 +92,6 @@ class OrderedTubes:
     ----------
     tubes : sequence of Tube
         n >= 1 tubes, innermost first.
-    order : Order
     steps_per_piece : int
         Runge-Kutta steps between two landmarks.  The error falls with the fourth power.
     """

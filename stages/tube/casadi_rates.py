@@ -1,11 +1,7 @@
-"""The differential equations of concentric tubes [Rucker2010]_ in the symbols of CasADi.
+"""The differential equations of concentric tubes [Rucker2010] in the symbols of CasADi.
 
 The state is the position and the quaternion of the innermost tube's frame, its angle, the angles of the
 others relative to it, and the torsional moments in N mm.
-
-References
-----------
-.. [Rucker2010] docs/bibliography.md
 """
 
 from __future__ import annotations
@@ -44,7 +40,7 @@ def rest_curvature_per_mm(tube: Tube, marks: Sequence[float], index: int) -> Any
 def state_rates(
     state: Any, bending: Sequence[float], twisting: Sequence[float], rest: Sequence[Float]
 ) -> Any:
-    """Return the derivative of the state by the arc length [Rucker2010]_.
+    """Return the derivative of the state by the arc length [Rucker2010].
 
     The state is position, quaternion of the innermost tube's frame, its angle, the angles of the others
     relative to it, and the torsional moments in N mm.

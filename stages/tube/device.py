@@ -69,10 +69,6 @@ class Tube:
     ------
     SettingsError
         If a value is not finite or absurd, the tube has no wall, or the curved part contradicts itself.
-
-    References
-    ----------
-    .. [Rucker2010] docs/bibliography.md
     """
 
     outer_diameter_mm: Annotated[float, quantity("outer diameter of the tube", above=0.0, at_most=10.0)]
@@ -128,7 +124,7 @@ class Tube:
 
     @property
     def bending_stiffness_n_mm2(self) -> float:
-        """Bending stiffness E I, N mm^2 [Rucker2010]_."""
+        """Bending stiffness E I, N mm^2 [Rucker2010]."""
         return 1e3 * self.youngs_modulus_gpa * self.second_moment_mm4
 
     @property

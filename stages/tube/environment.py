@@ -20,7 +20,6 @@ def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
 
     Parameters
     ----------
-    lung : Lung
     with_fissures : bool
         Whether fissures are obstacles.
     """

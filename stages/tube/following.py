@@ -38,7 +38,6 @@ class SnapError(LungaccessError):
 
     Parameters
     ----------
-    why : str
     move : str
         During which move of the sequence.
     base_angles_rad, insertions_mm : (n,) float64
@@ -68,10 +67,8 @@ class DeployedSequence:
 
     Parameters
     ----------
-    sequence : Sequence
     move : (K,) int64
         The move of the sequence that a step belongs to.
-    steps : tuple of Equilibrium
     lateral_sweep_by_step_mm : (K,) float64
         Largest distance of a point of the body from its final place: the point of the final centreline at
         the same arc length from the scope tip, or the final tip if the body is longer by then.
@@ -113,15 +110,13 @@ def deploy(
     step_mm: float = DEFAULT_STEP_MM,
     step_rad: float = DEFAULT_STEP_RAD,
 ) -> DeployedSequence:
-    """Follow the equilibrium of the tubes through a sequence.
+    """Follow the equilibrium of the tubes through a sequence [Kuntz2015].
 
     Each step is solved from the tip angles of the one before.  A step is accepted if its equilibrium is
     stable, near the one before and, solved backwards, leads to it; otherwise the step is halved.
 
     Parameters
     ----------
-    mechanics : TubeMechanics
-    sequence : Sequence
     step_mm, step_rad : float
         Largest motion of any joint between two steps.
 
@@ -131,10 +126,6 @@ def deploy(
         If the tubes snap during the motion.
     SettingsError
         If the sequence does not fit the tubes.
-
-    References
-    ----------
-    .. [Kuntz2015] docs/bibliography.md
     """
     angles, beta, move = joint_steps(sequence, mechanics.tubes, step_mm=step_mm, step_rad=step_rad)
     steps = [_first(mechanics, angles[0], beta[0])]

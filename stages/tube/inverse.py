@@ -74,7 +74,6 @@ def inverse_kinematics(
 
     Parameters
     ----------
-    mechanics : TubeMechanics
     base_from_tip : (4, 4) float64
         Wanted pose of the innermost tube's tip, +z along its axis.
     match : {"position", "direction", "pose"}

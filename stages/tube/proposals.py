@@ -173,7 +173,6 @@ class DesignProposal:
 
     Parameters
     ----------
-    tubes : ConcentricTubes
     lateral_sweep_mm : float
         Largest distance of any point of the body from its final place.
     tip_offset_mm : float
@@ -206,7 +205,6 @@ def propose_designs(
         Insertions of the deployment.
     max_sweep_mm : float
         Designs that sweep more are left out.
-    limits : MakerLimits
 
     Raises
     ------
@@ -256,7 +254,6 @@ def evaluate_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) ->
 
     Parameters
     ----------
-    tubes : ConcentricTubes
     outer_mm, inner_mm : float
         Insertions of the deployment.
     """

@@ -31,7 +31,6 @@ class Sequence:
 
     Parameters
     ----------
-    name : str
     moves : tuple of str
         What happens during the motion to each waypoint after the first, W - 1 of them.
     base_angles_rad, beta_mm : (W, n) float64

@@ -25,7 +25,6 @@ def centreline(
 
     Parameters
     ----------
-    tubes : ConcentricTubes
     lps_from_scope_tip : (4, 4) float64
     rotation_rad : float
         Direction of the bend about +z of the scope tip, counted from its +x.

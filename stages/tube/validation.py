@@ -36,12 +36,8 @@ class Deployment:
 
     Parameters
     ----------
-    rotation_rad, outer_mm, inner_mm : float
     lps_from_tip : (4, 4) float64
         +z forward, +x towards the bend.
-    branch : int
-    exit_mm, wall_angle_rad : float
-    lateral_sweep_mm : float
     """
 
     rotation_rad: float
@@ -64,9 +60,6 @@ class DeploymentValidator:
 
     Parameters
     ----------
-    lung : Lung
-    tubes : ConcentricTubes
-    margins : Margins
     with_fissures : bool
         Whether fissures are obstacles.
     """

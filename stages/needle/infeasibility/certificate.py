@@ -65,8 +65,6 @@ class NoPathProof:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
-    query : Query
     max_bytes : int
         Most memory for states and tables.
 

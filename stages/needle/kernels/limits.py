@@ -17,7 +17,6 @@ class Limits(NamedTuple):
     ----------
     kappa : float
         Greatest curvature, 1/mm.
-    max_length_mm : float
     max_angle_rad : float
         Greatest angle between the tip and its direction at the start.
     max_turn_rad : float

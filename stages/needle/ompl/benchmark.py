@@ -34,8 +34,6 @@ def benchmark(
 
     Parameters
     ----------
-    problem : NeedleProblem
-    query : Query
     time_s : float
         Time limit of a run.  Our planners end with their first path.
     runs : int

@@ -100,7 +100,6 @@ class NeedlePlanner(base.Planner):
         Makes a search of a query and a seed.
     question : Question
         Where the query stands when `solve` is called.
-    name : str
     """
 
     def __init__(

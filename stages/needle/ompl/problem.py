@@ -32,7 +32,6 @@ class NeedleProblem:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
     searches : mapping of names to callables, optional
         Each makes a search of an environment, a query and a seed.  The first is the default; without any,
         all of `stages.needle.search.planners`.
@@ -121,7 +120,6 @@ class NeedleProblem:
 
         Parameters
         ----------
-        query : Query
         seed, iterations : int
             The same pair gives the same path, if the time does not run out first.
         time_s : float
@@ -154,7 +152,6 @@ class NeedleProblem:
 
         Parameters
         ----------
-        query : Query
         goal_tolerance_mm : float
             How far from the target a path may end, where the environment's own tolerance is smaller.  OMPL's
             planners steer by chance and need about 1 mm; ours aim at what the environment allows.

@@ -39,8 +39,6 @@ class PlannerRuns:
 
     Parameters
     ----------
-    name : str
-    runs : int
     times_s, lengths_mm : tuple of float
         Time and length of each run whose path is proved.
     refusals : tuple of str

@@ -40,7 +40,6 @@ def blocker_at(
 
     Parameters
     ----------
-    environment : NeedleEnvironment
     pose : (6,) floats
         See `anatomy.kernels.arcs`.
     inserted_mm : float
@@ -83,8 +82,6 @@ def roots_of_tip(
 
     Parameters
     ----------
-    environment : NeedleEnvironment
-    objective : ObjectiveArrays
     query : Query
         From the tip.
     longest_mm : float

@@ -80,7 +80,6 @@ def plan_ahead(plan: ArcPath, begin_mm: float) -> tuple[float, list[Ahead], list
 
     Parameters
     ----------
-    plan : ArcPath
     begin_mm : float
         How much of the plan lies behind.
 
@@ -131,9 +130,6 @@ class Attempts:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
-    objective : ObjectiveArrays
-    root : Root
     most_points : int
         Most points to pass on a path.
 

@@ -104,7 +104,6 @@ class Replan:
         Cost of the path under the objective, as estimated within the searches; infinite without a path.
     source : Source or None
         What the path was made of.
-    failure : Failure or None
     why : str
         The failure in a sentence, with numbers.
     reserve_spent : bool
@@ -132,7 +131,6 @@ def with_reserve(environment: NeedleEnvironment, reserve: float) -> NeedleEnviro
 
     Parameters
     ----------
-    environment : NeedleEnvironment
     reserve : float
         At least 0, less than 1.
 
@@ -165,13 +163,10 @@ class Replanner:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
     query : Query
         What the plan was made for.
     plan : ArcPath
         From the query's start.
-    objective : Objective
-    settings : ReplanSettings
     iterations : int
         Of the search, for each replan.
     seed : int

@@ -24,13 +24,6 @@ class Decision:
 
     The resolution search finds narrow passages soonest; the optimal search goes on where that has ended.
 
-    Parameters
-    ----------
-    environment : NeedleEnvironment
-    query : Query
-    seed : int
-    objective : Objective
-
     Attributes
     ----------
     outcome : str

@@ -45,11 +45,8 @@ class GuidePathFinder:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
-    query : Query
     seed : int
         Of how lattices are turned.
-    objective : Objective
     """
 
     def __init__(

@@ -45,11 +45,8 @@ class PortfolioSearch:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
-    query : Query
     seed : int
         Of the first search; it is alone until it has found a path.
-    objective : Objective
     """
 
     def __init__(

@@ -175,11 +175,8 @@ class ResolutionSearch:
 
     Parameters
     ----------
-    environment : NeedleEnvironment
     query : Query
         The directions of bending count from +x of the start pose.
-    resolution : Resolution, optional
-    objective : Objective
     duplicates : Cells, optional
         Poses that count as one; by default only those that are equal up to rounding, so that nothing is lost.
     max_memory_mb : float

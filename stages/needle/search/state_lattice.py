@@ -55,14 +55,7 @@ class GuidePath:
 
 
 class StateLatticeSearch:
-    """Finds guide paths on state lattices between a start pose and a target.
-
-    Parameters
-    ----------
-    environment : NeedleEnvironment
-    query : Query
-    objective : Objective
-    """
+    """Finds guide paths on state lattices between a start pose and a target."""
 
     def __init__(self, environment: NeedleEnvironment, query: Query, objective: Objective) -> None:
         self._environment, self._query = environment, query
@@ -108,7 +101,6 @@ class StateLatticeSearch:
             Size of a cell, as a share of what the greatest curvature allows.
         turn_rad : float
             Of the lattice about the line to the target.
-        bound : float
         """
         axes = self._axes(cells * self._largest_cell(len(controls) - 2), _beside(self._axis), turn_rad)
         return self._explore(controls, axes, np.zeros(2, dtype=np.int64), REACH_CELLS, bound)

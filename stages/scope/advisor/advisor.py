@@ -61,8 +61,6 @@ class ThinnerScope:
 
     Parameters
     ----------
-    radius_mm : float
-    reached : bool
     distance_mm : float
         Left to the centre of the goal voxel.
     """
@@ -77,10 +75,6 @@ class Advisor:
 
     Parameters
     ----------
-    lumen : Lumen
-    model : ScopeModel
-    goal : Goal
-    options : PathSettings, optional
     reproduction : bool, optional
         Eqs. 1 and 3 as printed, potential in steps of voxels, no halved look-ahead, no retreat [Rosell2012].
         What comes of it may touch the wall and must not feed a plan.
@@ -115,7 +109,6 @@ class Advisor:
 
         Parameters
         ----------
-        state : ScopeState
         own : Motion, optional
             A motion that the user is about to make, evaluated at its own advance, at most the look-ahead.
         rng : numpy Generator, optional
@@ -232,7 +225,6 @@ def why_stopped(path: ScopePath, field: NavigationField, tree: AirwayTree) -> st
 
     Parameters
     ----------
-    path : ScopePath
     field : NavigationField
         Of the path's goal.
     tree : AirwayTree

@@ -78,7 +78,6 @@ class Candidates:
 
     Parameters
     ----------
-    advance_mm : float
     best : int
         Row of least cost, -1 if none is valid.
     twist_rad, bend_rad : (C,) float64
@@ -151,12 +150,10 @@ def evaluate_motions(
 
     Parameters
     ----------
-    environment : ScopeEnvironment
     state : ScopeState
         Its tip lies in the lumen.
     advance_mm : float
         Look-ahead of the candidates.
-    weights : Weights
     rng : numpy Generator, optional
         Moves all candidates but the middle one at random within their spacing (fig. 5b); they stay on the
         grid of eq. 3 if None.

@@ -25,8 +25,6 @@ class ScopeEnvironment:
 
     Parameters
     ----------
-    model : ScopeModel
-    field : NavigationField
     reproduction : bool
         Eq. 1 decides about collisions and eq. 3 about twists as printed: i times a tenth of the range, held
         within the range.  Otherwise the scope's radius is kept along its whole body, and the twists cover

@@ -61,12 +61,6 @@ def camera_flight(
     Between two states base, twist and bend move evenly; there are so many poses that the camera neither
     moves nor turns farther than stated from one to the next.
 
-    Parameters
-    ----------
-    path : ScopePath
-    spacing_mm : float
-    turn_rad : float
-
     Raises
     ------
     SettingsError

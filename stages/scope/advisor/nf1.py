@@ -39,7 +39,6 @@ class Goal:
         Its centre.
     lesion_lps : (3,) float64, LPS mm
         Centre of the lesion.
-    lesion_radius_mm : float
     distance_mm : float
         From the centre of the lesion to that of the voxel.
     in_lesion : bool
@@ -61,9 +60,7 @@ def goal_at(
 
     Parameters
     ----------
-    lumen : Lumen
     lesion_lps : (3,) float64, LPS mm
-    lesion_radius_mm : float
     preferred : (N,) bool, optional
         Voxels of the lesion that come before all others, such as those where a scope fits.
 
@@ -100,7 +97,6 @@ class NavigationField:
 
     Parameters
     ----------
-    lumen : Lumen
     goal : int
         Number of the goal voxel.
     kind : str
@@ -140,21 +136,16 @@ def navigation_field(
     metric: Metric = "mm",
     largest_clearance: float | None = None,
 ) -> NavigationField:
-    """Compute NF1, or the clearance-based NF1 (eq. 2), from a goal voxel.
+    """Compute NF1, or the clearance-based NF1 [Rosell2012, eq. 2], from a goal voxel.
 
     Parameters
     ----------
-    lumen : Lumen
     goal : int
         Number of an interior voxel.
     kind, metric : str
         See `NavigationField`.
     largest_clearance : float, optional
         C_max in the unit of the metric; half the largest clearance in the lumen if None.
-
-    References
-    ----------
-    .. [Rosell2012] docs/bibliography.md
     """
     if not 0 <= goal < lumen.count:
         raise TargetError(

@@ -82,7 +82,6 @@ def measure_orientability(
     ----------
     environment : ScopeEnvironment
         Its model and lumen count, not its goal.
-    tree : AirwayTree
     point : int
         Index of a tree point.
     shaft_mm : float

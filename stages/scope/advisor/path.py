@@ -20,8 +20,6 @@ class ScopePath:
 
     Parameters
     ----------
-    model : ScopeModel
-    goal : Goal
     states : (M, 14) float64
         See `ScopeState.of_array`.
     steps_mm : (M,) float64

@@ -72,12 +72,10 @@ class PathSearch:
 
     Parameters
     ----------
-    environment : ScopeEnvironment
     goal : Goal
         Of the environment's field.
     options : PathSettings
         In reproduction the look-ahead is never shortened and nothing is retried.
-    seed : int
     """
 
     def __init__(self, environment: ScopeEnvironment, goal: Goal, options: PathSettings, seed: int) -> None:

@@ -33,7 +33,6 @@ class Session:
         Not in reproduction: the paper advises the best motion alone.
     start : ScopeState
         Where the scope is.
-    seed : int
 
     Examples
     --------

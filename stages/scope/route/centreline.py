@@ -175,7 +175,6 @@ def from_lung(lung: Lung, *, spacing_mm: float = DEFAULT_SPACING_MM) -> Centreli
 
     Parameters
     ----------
-    lung : Lung
     spacing_mm : float
         Longest edge.
     """
@@ -339,7 +338,6 @@ class _Walls:
     ----------
     lumen : bool array
         With at least one layer that is not lumen all around.
-    grid : Grid
     half_voxels : float
         Whether walls are solid boxes, or the centres of their voxels; then half of the smallest voxel edge
         is taken off, so that a flat wall stays where it is and only steps are rounded.

@@ -102,8 +102,6 @@ class Problem:
     ----------
     guide : GuidePath
         What it follows; its ends are the wanted ones.
-    centreline : Centreline
-    limits : RouteLimits
     """
 
     guide: GuidePath
@@ -127,11 +125,8 @@ def repaired(
 
     Parameters
     ----------
-    curve : Curve
-    problem : Problem
     free : (int, int)
         The other control points stay, and with them the curve three spans away and its smoothness.
-    level : Level
     start : sequence of Stage
         What to solve before, as `SMOOTH`.
 
@@ -167,8 +162,6 @@ def segments(proof: Proof, n_control: int, margin: int, *, ends_free: bool) -> l
 
     Parameters
     ----------
-    proof : Proof
-    n_control : int
     margin : int
         Spans added on both sides.
     ends_free : bool
@@ -192,7 +185,6 @@ def repair_exact(tentative: Curve, problem: Problem, executor: Executor | None =
     ----------
     tentative : Curve
         Spline through points of the guide path.
-    problem : Problem
     executor : concurrent.futures.Executor, optional
         Repairs the segments of a round side by side; threads are enough, the program runs without the lock.
 

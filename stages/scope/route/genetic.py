@@ -109,18 +109,10 @@ def repair_genetic(
 
     Parameters
     ----------
-    tentative : Curve
-    centreline : Centreline
-    limits : RouteLimits
     seed : int
         The same seed gives the same curve, with or without an executor.
-    settings : GeneticSettings, optional
     executor : concurrent.futures.Executor, optional
         Searches the segments side by side.
-
-    References
-    ----------
-    .. [Li2021] docs/bibliography.md
     """
     chosen = settings or GeneticSettings()
     points, parts = cut_segments(tentative, centreline, limits, chosen.margin_share)

@@ -20,7 +20,6 @@ class RouteMetrics:
     ----------
     normalised_length : float
         Length over the distance between the ends.
-    mean_curvature_per_mm, largest_curvature_per_mm : float
     mean_wall_mm, least_wall_mm : float
         Distance of the curve to the wall; negative outside.
     """
@@ -33,12 +32,7 @@ class RouteMetrics:
 
 
 def measure(curve: Curve, centreline: Centreline) -> RouteMetrics:
-    """Measure a curve at `PER_SPAN` samples a span.
-
-    References
-    ----------
-    .. [Li2021] docs/bibliography.md
-    """
+    """Measure a curve at `PER_SPAN` samples a span [Li2021]."""
     parameters = curve.parameters(PER_SPAN)
     points = curve.at(parameters)[0]
     curvature = curve.curvature_per_mm(parameters)

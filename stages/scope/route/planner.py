@@ -44,7 +44,6 @@ class Route:
         The route.
     proof : Proof
         Of `curve`.
-    limits : RouteLimits
     repair : str
         "exact", "ga" or "none".
     claimed : bool
@@ -118,10 +117,8 @@ def plan_route(
 
     Parameters
     ----------
-    centreline : Centreline
     start_mm, goal_mm : (3,) float64
         In the frame of the centreline (LPS mm), inside the lumen.
-    limits : RouteLimits
     repair : str
         "exact": a nonlinear program; "ga": the genetic search of the paper; "none".
     links : Links, optional
@@ -130,7 +127,6 @@ def plan_route(
         Distance of the points that the spline runs through; 0 for every node.
     seed : int
         Of the genetic search.
-    genetic : GeneticSettings, optional
     executor : concurrent.futures.Executor, optional
         Repairs segments side by side.
 
@@ -142,10 +138,6 @@ def plan_route(
         If start or goal lies too near to the wall, or outside.
     SettingsError
         If there is no such repair, or start and goal coincide.
-
-    References
-    ----------
-    .. [Li2021] docs/bibliography.md
     """
     route = try_route(
         centreline,
@@ -226,7 +218,6 @@ class Replanner:
 
     Parameters
     ----------
-    centreline : Centreline
     route : Route
         The route for the centreline as it was.
 

@@ -65,9 +65,6 @@ def prove(curve: Curve, centreline: Centreline, *, max_curvature_per_mm: float, 
 
     Parameters
     ----------
-    curve : Curve
-    centreline : Centreline
-    max_curvature_per_mm : float
     needed_mm : float
         Depth in the lumen that every point of the curve must have.
     """

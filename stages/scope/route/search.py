@@ -43,7 +43,6 @@ def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) 
 
     Parameters
     ----------
-    centreline : Centreline
     neighbours : int
         Number of nearest nodes, k of [Li2021].
 
@@ -51,10 +50,6 @@ def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) 
     ------
     SettingsError
         If `neighbours` is less than 1.
-
-    References
-    ----------
-    .. [Li2021] docs/bibliography.md
     """
     from scipy.spatial import KDTree
 

@@ -78,18 +78,10 @@ def combinations(subtree: Subtree) -> int:
 def circuits(subtree: Subtree) -> Circuits:
     """Compute the resistances of all combinations of exits.
 
-    Parameters
-    ----------
-    subtree : Subtree
-
     Raises
     ------
     SettingsError
         If there are more than 5 million combinations.
-
-    References
-    ----------
-    .. [Pan2025] docs/bibliography.md
     """
     sizes = np.bincount(subtree.exit_lesion, minlength=subtree.n_lesions)
     count = combinations(subtree)

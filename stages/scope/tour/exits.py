@@ -57,8 +57,6 @@ class Exit:
 
     Parameters
     ----------
-    lesion : int
-    tree_point : int
     roles : tuple of str
         Which of "P1", "P2", "P3" it is; "inside" for a lesion in the airway.
     distance_mm : float
@@ -88,9 +86,7 @@ def find_exits(
 
     Parameters
     ----------
-    tree : AirwayTree
     lesions_lps : (M, 3) float64, LPS mm
-    rule : ExitRule, optional
     accepts : callable, optional
         Tree points that it refuses are no candidates.
 
@@ -98,10 +94,6 @@ def find_exits(
     ------
     TargetError
         If a lesion has no candidate within reach.
-
-    References
-    ----------
-    .. [Pan2025] docs/bibliography.md
     """
     chosen = rule or ExitRule()
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)

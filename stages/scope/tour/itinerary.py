@@ -20,7 +20,6 @@ class Itinerary:
 
     Parameters
     ----------
-    subtree : Subtree
     chosen : tuple of int
         The exit of each lesion, an index into `subtree.exits`.
     order : tuple of int
@@ -72,7 +71,6 @@ def plan_itinerary(subtree: Subtree, chosen: Sequence[int], *, closed: bool = Fa
 
     Parameters
     ----------
-    subtree : Subtree
     chosen : sequence of int
         For each lesion, the index of one of its exits.
     closed : bool
@@ -119,7 +117,6 @@ def one_by_one_mm(subtree: Subtree, chosen: Sequence[int], *, closed: bool = Fal
 
     Parameters
     ----------
-    subtree : Subtree
     chosen : sequence of int
     closed : bool
         Whether it also returns after the last, the farthest one.

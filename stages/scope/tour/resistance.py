@@ -50,11 +50,6 @@ def branch_resistances(tree: AirwayTree, weights: Resistances) -> Float:
     """Return the resistance of every branch of a tree, `(B,)`.
 
     The angle is the one between the chord of a branch and that of its parent; that of the trachea is 0.
-
-    Parameters
-    ----------
-    tree : AirwayTree
-    weights : Resistances
     """
     first, last = tree.branch_start[:-1], tree.branch_start[1:] - 1
     hook = np.where(tree.parent_point[first] < 0, first, tree.parent_point[first])

@@ -25,7 +25,6 @@ def shortest_tour(subtree: Subtree, *, closed: bool = False) -> Itinerary:
 
     Parameters
     ----------
-    subtree : Subtree
     closed : bool
         Whether the tour returns to the root.
     """

@@ -93,10 +93,8 @@ def subtree_to(
 
     Parameters
     ----------
-    tree : AirwayTree
     exits : sequence of sequences of Exit
         For each lesion, as `find_exits` returns them.
-    weights : Resistances, optional
     exit_cost_mm : sequence of sequences of float, optional
         For each exit, not negative; 0 if None.
 

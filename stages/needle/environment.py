@@ -23,13 +23,6 @@ from stages.needle.kernels.limits import Limits
 from stages.needle.kernels.proof import Obstacles
 from stages.needle.objective import Objective
 
-RRT_STEP_MM = 20.0
-"""Longest arc of a tree.  The value is a free choice: a path across a lobe takes several arcs."""
-COST_STEP_MM = 0.5
-"""Step of estimated integrals: about a voxel, since clearance changes by no more than one moves."""
-ROUNDING_MM = 1e-6
-"""The searches keep a goal tolerance that is smaller by this, so that rounding leads no path out of it."""
-
 
 @frozen_record
 class NeedleEnvironment:
@@ -132,6 +125,14 @@ def environment_of_labels(
     return _environment(
         grid, needle, required_clearance_mm, clearance, read_only(labels), bits, cost_map, goal_tolerance_mm
     )
+
+
+RRT_STEP_MM = 20.0
+"""Longest arc of a tree.  The value is a free choice: a path across a lobe takes several arcs."""
+COST_STEP_MM = 0.5
+"""Step of estimated integrals: about a voxel, since clearance changes by no more than one moves."""
+ROUNDING_MM = 1e-6
+"""The searches keep a goal tolerance that is smaller by this, so that rounding leads no path out of it."""
 
 
 def _environment(

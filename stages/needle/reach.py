@@ -21,11 +21,6 @@ DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
     kernel.NO_CLEARANCE,
 )
 
-DEFAULT_ARCS = 4
-RRT_ITERATIONS = 200
-"""Iterations of a tree: those that succeed do so early, see `RESTART_ITERATIONS`."""
-ORDER_SEED = 1
-
 
 @frozen_record
 class Reached:
@@ -49,6 +44,12 @@ class Reached:
     cost: Float
     clearance_mm: Float
     entries: Int
+
+
+DEFAULT_ARCS = 4
+RRT_ITERATIONS = 200
+"""Iterations of a tree: those that succeed do so early, see `RESTART_ITERATIONS`."""
+ORDER_SEED = 1
 
 
 class ReachScan:

@@ -15,23 +15,6 @@ from anatomy.typed import Bool, Float, Int, Labels
 from stages.scope.device import Bronchoscope
 from stages.scope.tips import ScopeTip, approach, looks_ahead, tip_at, turned_aside
 
-WALL_PROBE_MM = 2.5
-"""Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes leave."""
-PROBE_DIRECTIONS = 8
-"""Directions across the airway in which tissue is looked for; at 2 to 6 mm they are a few voxels apart."""
-PROOF_STEP_MM = 0.05
-"""Spacing of the samples of a proof along the medial axis; half of it is lost, far less than a voxel."""
-APPROACH_STEP_MM = 0.25
-"""Spacing of the samples where a turned scope leaves the axis: coarser, for there are many more of them."""
-ARC_SAGITTA_MM = 0.01
-"""Distance between the arc of a bent scope and its polyline, at most; see `tips.approach`."""
-TURNED_SPACING_MM = 2.0
-"""Spacing of turned tips: each has 25 directions, and nearer ones give about the same poses."""
-TURNS_RAD = tuple(math.radians(angle) for angle in (0.0, 15.0, 30.0, 45.0))
-"""Angles of turned tips from the chord behind them, up to `tips.MAX_TURN_AT_TIP_RAD`."""
-TURN_DIRECTIONS = 8
-"""Directions of a turn about the chord, 45 degrees apart: at most 30 degrees apart at the largest angle."""
-
 
 @frozen_record
 class Sites:
@@ -83,6 +66,10 @@ class Sites:
             return tip_at(tree, point)
         frame = frames.pose(pose[:3], pose[3:])
         return ScopeTip(tree_point=point, back_mm=0.0, lps_from_scope_tip=frame, turned=True)
+
+
+TURNED_SPACING_MM = 2.0
+"""Spacing of turned tips: each has 25 directions, and nearer ones give about the same poses."""
 
 
 def find_sites(
@@ -157,6 +144,12 @@ def tip_is_feasible(lung: Lung, scope: Bronchoscope, sites: Sites, tip: ScopeTip
     return approach_depth_mm(lung, tip) >= scope.radius_mm + scope.lumen_margin_mm
 
 
+APPROACH_STEP_MM = 0.25
+"""Spacing of the samples where a turned scope leaves the axis: coarser, for there are many more of them."""
+ARC_SAGITTA_MM = 0.01
+"""Distance between the arc of a bent scope and its polyline, at most; see `tips.approach`."""
+
+
 def _approach_depths(lung: Lung, tips: list[ScopeTip]) -> Float:
     samples, owner = [], []
     depths = np.zeros(len(tips))
@@ -176,6 +169,12 @@ def _approach_depths(lung: Lung, tips: list[ScopeTip]) -> Float:
     return np.maximum(depths, 0.0)
 
 
+TURNS_RAD = tuple(math.radians(angle) for angle in (0.0, 15.0, 30.0, 45.0))
+"""Angles of turned tips from the chord behind them, up to `tips.MAX_TURN_AT_TIP_RAD`."""
+TURN_DIRECTIONS = 8
+"""Directions of a turn about the chord, 45 degrees apart: at most 30 degrees apart at the largest angle."""
+
+
 def _turned_tips(lung: Lung, scope: Bronchoscope, points: Int) -> tuple[list[ScopeTip], Float]:
     """Return the turned tips at tree points that the scope's body fits behind, and the lumen radii there."""
     tips = []
@@ -191,6 +190,10 @@ def _turned_tips(lung: Lung, scope: Bronchoscope, points: Int) -> tuple[list[Sco
 
 def _looking_ahead(tree: AirwayTree, points: Int) -> Int:
     return np.array([p for p in points if looks_ahead(tree, tip_at(tree, int(p)))], dtype=np.int64)
+
+
+PROOF_STEP_MM = 0.05
+"""Spacing of the samples of a proof along the medial axis; half of it is lost, far less than a voxel."""
 
 
 def _narrowest_on_the_route(lung: Lung) -> Float:
@@ -209,6 +212,12 @@ def _narrowest_on_the_route(lung: Lung) -> Float:
     for point in range(1, tree.n_points):
         narrowest[point] = min(narrowest[point], narrowest[tree.parent_point[point]])
     return np.asarray(narrowest, dtype=np.float64)
+
+
+WALL_PROBE_MM = 2.5
+"""Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes leave."""
+PROBE_DIRECTIONS = 8
+"""Directions across the airway in which tissue is looked for; at 2 to 6 mm they are a few voxels apart."""
 
 
 def _in_lung_tissue(lung: Lung) -> Bool:

@@ -12,26 +12,6 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
 
-TURN_CHORD_MM = 2.0
-"""The direction from which a scope comes is that of its last few points, about two voxels of the lumen."""
-MAX_TURN_AT_TIP_RAD = math.radians(45.0)
-"""A tip must look along the route, within this angle of its last TURN_CHORD_MM: more means sideways."""
-STRAIGHT_END_MM = 1.0
-"""So much of a scope whose tip is turned aside lies straight behind the tip."""
-BENDING_RADIUS_MM = 10.0
-"""Radius with which such a scope bends; thin bronchoscopes bend at least so tightly."""
-LEAVING_MM = 15.0
-"""A turned scope leaves the medial axis so far behind the tip: the length of a bending section."""
-MAX_BEND_RAD = math.radians(75.0)
-"""Largest bend of a turned scope where it leaves the axis: no more than scopes with a tool in them bend."""
-ARC_PIECE_RAD = math.radians(4.0)
-"""Angle of a piece of the arc: its polyline lies within BENDING_RADIUS_MM (1 - cos 2 degrees) < 0.01 mm."""
-MAX_PIECE_MM = 2.5
-"""Longest piece of the straight parts of an approach."""
-TINY_MM = 1e-9
-TINY_RAD = 1e-6
-"""Lengths and angles below these are 0 but for rounding."""
-
 
 @frozen_record
 class ScopeTip:
@@ -73,6 +53,10 @@ def tip_at(tree: AirwayTree, point: int, back_mm: float = 0.0) -> ScopeTip:
     )
 
 
+LEAVING_MM = 15.0
+"""A turned scope leaves the medial axis so far behind the tip: the length of a bending section."""
+
+
 def leaving_point(tree: AirwayTree, tip: ScopeTip) -> int:
     """Return the last tree point of the route that a scope with a turned tip still passes."""
     depth_mm = tree.distance_from_root_mm
@@ -81,6 +65,19 @@ def leaving_point(tree: AirwayTree, tip: ScopeTip) -> int:
     while depth_mm[point] > most and tree.parent_point[point] >= 0:
         point = int(tree.parent_point[point])
     return point
+
+
+STRAIGHT_END_MM = 1.0
+"""So much of a scope whose tip is turned aside lies straight behind the tip."""
+BENDING_RADIUS_MM = 10.0
+"""Radius with which such a scope bends; thin bronchoscopes bend at least so tightly."""
+MAX_BEND_RAD = math.radians(75.0)
+"""Largest bend of a turned scope where it leaves the axis: no more than scopes with a tool in them bend."""
+ARC_PIECE_RAD = math.radians(4.0)
+"""Angle of a piece of the arc: its polyline lies within BENDING_RADIUS_MM (1 - cos 2 degrees) < 0.01 mm."""
+TINY_MM = 1e-9
+TINY_RAD = 1e-6
+"""Lengths and angles below these are 0 but for rounding."""
 
 
 def approach(tree: AirwayTree, tip: ScopeTip) -> Float | None:
@@ -111,6 +108,10 @@ def approach(tree: AirwayTree, tip: ScopeTip) -> Float | None:
     return np.concatenate([_straight(begin, arc[0]), arc[1:], _straight(arc[-1], position)[1:]])
 
 
+MAX_PIECE_MM = 2.5
+"""Longest piece of the straight parts of an approach."""
+
+
 def _straight(begin: Float, end: Float) -> Float:
     """Return points from one to the other, at most MAX_PIECE_MM apart."""
     count = max(1, math.ceil(float(np.linalg.norm(end - begin)) / MAX_PIECE_MM - 1e-9))
@@ -127,6 +128,12 @@ def turned_aside(tree: AirwayTree, tip: ScopeTip, polar_rad: float, azimuth_rad:
     aside = frames.bending_directions(frame, azimuth_rad)[0]
     forward = math.cos(polar_rad) * frame[:3, 2] + math.sin(polar_rad) * aside
     return replace(tip, lps_from_scope_tip=frames.pose(position, forward), turned=True)
+
+
+TURN_CHORD_MM = 2.0
+"""The direction from which a scope comes is that of its last few points, about two voxels of the lumen."""
+MAX_TURN_AT_TIP_RAD = math.radians(45.0)
+"""A tip must look along the route, within this angle of its last TURN_CHORD_MM: more means sideways."""
 
 
 def looks_ahead(tree: AirwayTree, tip: ScopeTip) -> bool:

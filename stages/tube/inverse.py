@@ -19,8 +19,6 @@ from stages.tube.mechanics import TubeMechanics
 
 Match = Literal["position", "direction", "pose"]
 
-SAMPLES = 256
-"""Configurations sampled before the best of them are refined: enough to meet every kind of bend."""
 SHORTEST_MM = 1e-3
 """The innermost tube is ahead of the front plate by at least this."""
 
@@ -128,6 +126,10 @@ def inverse_kinematics(
             remedy="lower the precurvature, or raise the number of starts",
         )
     return _solution(best[1], wanted, match, position_tolerance_mm, angle_tolerance_rad)
+
+
+SAMPLES = 256
+"""Configurations sampled before the best of them are refined: enough to meet every kind of bend."""
 
 
 class _Problem:

@@ -19,9 +19,6 @@ from stages.tube.errors import ConvergenceError
 from stages.tube.kernels import all_equilibria, equilibrium
 from stages.tube.nesting import SAME_MM, NestedTubes
 
-LARGEST_COUNT = 64
-"""Of equilibria that are looked for: two tubes have a few, and one more for each turn of wind-up."""
-
 
 @frozen_record
 class Batch:
@@ -45,6 +42,10 @@ class Batch:
     stable: Bool
     least_determinant: Float
     residual_rad: Float
+
+
+LARGEST_COUNT = 64
+"""Of equilibria that are looked for: two tubes have a few, and one more for each turn of wind-up."""
 
 
 class TubeMechanics(NestedTubes):

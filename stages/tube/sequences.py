@@ -17,13 +17,6 @@ from stages.tube.device import Tube
 ROUNDING_MM = 1e-9
 """Rounding forgiven where lengths are compared."""
 
-NUDGE_MM = 1e-12
-"""More than the last digit of a length."""
-
-TURN = "turn"
-DEFAULT_INCREMENT_MM = 5.0
-"""Increment of the alternating sequences: a compromise of sweep and the number of motions."""
-
 
 @frozen_record
 class Sequence:
@@ -148,6 +141,10 @@ def inner_first(
     return _from_insertions("inner first", tubes, base_angles_rad, moves)
 
 
+DEFAULT_INCREMENT_MM = 5.0
+"""Increment of the alternating sequences: a compromise of sweep and the number of motions."""
+
+
 def alternating(
     tubes: collections.abc.Sequence[Tube],
     base_angles_rad: ArrayLike,
@@ -216,6 +213,10 @@ def joint_steps(
     return steps[:, : sequence.n_tubes], beta, np.concatenate(moves)
 
 
+NUDGE_MM = 1e-12
+"""More than the last digit of a length."""
+
+
 def _in_order(beta: Float, lengths: Float) -> Float:
     """Undo what rounding did to the order of tips that are flush, and of bases at the scope tip."""
     beta = np.minimum(np.maximum(beta, -lengths), 0.0)
@@ -280,6 +281,9 @@ def _one_each(base_angles_rad: ArrayLike, n: int) -> Float:
             f"The rotations are {np.asarray(base_angles_rad).tolist()}",
             expected=f"one angle, or one for each of the {n} tubes",
         ) from None
+
+
+TURN = "turn"
 
 
 def _from_insertions(

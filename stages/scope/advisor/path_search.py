@@ -21,15 +21,6 @@ from stages.scope.advisor.kinematics import ScopeState, tool_frames
 from stages.scope.advisor.nf1 import Goal
 from stages.scope.advisor.path import ScopePath
 
-RETREATS_MM = (3.0, 6.0, 12.0, 24.0, 48.0)
-"""Lengths of retreat, taken in turn, each times 0.5 to 1.5: from a fork just missed to a lost lobe."""
-LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
-"""For a retry one of these shares of the look-ahead is drawn: a shorter one fits into a tighter turn."""
-LOOKS_PER_MM = 4
-"""So many poses a mm of advance are tried for collision: the body moves by less than a voxel between two."""
-SAME_POTENTIAL = 1e-9
-"""Potentials nearer than this are equal: rounding of sums of steps."""
-
 
 @settings
 class PathSettings:
@@ -65,6 +56,16 @@ class PathSettings:
             raise impossible(
                 "sub_step_mm", self.sub_step_mm, f"at most look_ahead_mm = {self.look_ahead_mm:g}"
             )
+
+
+RETREATS_MM = (3.0, 6.0, 12.0, 24.0, 48.0)
+"""Lengths of retreat, taken in turn, each times 0.5 to 1.5: from a fork just missed to a lost lobe."""
+LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
+"""For a retry one of these shares of the look-ahead is drawn: a shorter one fits into a tighter turn."""
+LOOKS_PER_MM = 4
+"""So many poses a mm of advance are tried for collision: the body moves by less than a voxel between two."""
+SAME_POTENTIAL = 1e-9
+"""Potentials nearer than this are equal: rounding of sums of steps."""
 
 
 class PathSearch:

@@ -22,10 +22,6 @@ from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_
 from stages.scope.route.settings import RouteLimits
 
 Repair = Literal["exact", "ga", "none"]
-REPAIRS: tuple[Repair, ...] = get_args(Repair)
-
-CORRIDOR_MM = 3.0
-"""A tube counts for replanning if it comes so near to one that the route runs through."""
 
 
 @frozen_record
@@ -69,6 +65,9 @@ class Route:
         """How far the ends lie from the wanted start and goal, the larger of both."""
         off = self.curve.control_mm[[0, -1]] - self.guide.points_mm[[0, -1]]
         return float(np.linalg.norm(off, axis=1).max())
+
+
+REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
 
 def try_route(
@@ -283,6 +282,10 @@ class Replanner:
         node = self._route.nodes[end]
         point: Float = self._route.guide.points_mm[end] + moved[node] - self._centreline.nodes_mm[node]
         return point
+
+
+CORRIDOR_MM = 3.0
+"""A tube counts for replanning if it comes so near to one that the route runs through."""
 
 
 def _corridor(centreline: Centreline, nodes: Int) -> tuple[Int, Int]:

@@ -16,8 +16,6 @@ from stages.scope.tour.subtree import Subtree
 
 Reading = Literal["printed", "reduced"]
 
-MOST_COMBINATIONS = 5_000_000
-"""Every combination is computed and stored in two arrays: this many take seconds and 80 MB."""
 
 SAME_RESISTANCE = 1e-9
 """Relative difference up to which two resistances count as equal; sums in another order differ by less."""
@@ -73,6 +71,10 @@ class Circuits:
 def combinations(subtree: Subtree) -> int:
     """Return the number of choices of one exit a lesion."""
     return math.prod(np.bincount(subtree.exit_lesion).tolist())
+
+
+MOST_COMBINATIONS = 5_000_000
+"""Every combination is computed and stored in two arrays: this many take seconds and 80 MB."""
 
 
 def circuits(subtree: Subtree) -> Circuits:

@@ -17,16 +17,9 @@ if TYPE_CHECKING:
 
 @frozen_value
 class Select:
-    """Tells from labels which voxels belong to a structure.
+    """Tells from labels which voxels belong to a structure: those that have any of some bits.
 
-    Parameters
-    ----------
-    bits : int
-        Voxels that have any of these bits.
-    but_branch : int, optional
-        Airway voxels of this branch are left out.
-    complement : bool
-        Take all other voxels instead.
+    Airway voxels of `but_branch` are left out; with `complement` all other voxels are taken instead.
     """
 
     bits: int

@@ -6,7 +6,7 @@ Every class is a group of options that cyclopts flattens into those of a command
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -29,6 +29,12 @@ else:
 Method = Literal[
     "atlas", "kuntz2015", "kuntz2015-without-rejection", "reference", "reference-without-rejection"
 ]
+PatientFolder = Annotated[
+    Path,
+    Parameter(help="Folder of masks (Med-RAD, TotalSegmentator, or own masks with a lungaccess TOML file)."),
+]
+PlanFile = Annotated[Path, Parameter(help="The plan.json.")]
+PatientOfPlan = Annotated[Path, Parameter(help="Folder of the patient it was made for.")]
 DEFAULT_SYSTEM = "lung-default"
 DEFAULT_BUDGET_S = 10.0
 """Long enough that the best cost of most targets has settled, short enough to wait for."""
@@ -48,29 +54,19 @@ STEP_SHARES = {
 @Parameter(name="*")
 @frozen_value
 class OutputOptions:
-    """How a command answers.
+    """How a command answers."""
 
-    Parameters
-    ----------
-    json : bool
-        Print JSON instead of text and tables.
-    """
-
-    json: bool = False
+    json: Annotated[bool, Parameter(help="Print JSON instead of text and tables.")] = False
 
 
 @Parameter(name="*")
 @frozen_value
 class PatientOptions(OutputOptions):
-    """How a command answers, and where it keeps what it prepares.
+    """How a command answers, and where it keeps what it prepares."""
 
-    Parameters
-    ----------
-    cache : Path
-        Folder where the prepared anatomy is kept for the next command.
-    """
-
-    cache: Path | None = None
+    cache: Annotated[
+        Path | None, Parameter(help="Folder where the prepared anatomy is kept for the next command.")
+    ] = None
 
     def load(self, patient: Path, *, thick_slices: bool = False) -> Lung:
         """Return a patient's lung; see `load_lung`."""
@@ -87,18 +83,17 @@ class PatientOptions(OutputOptions):
 @Parameter(name="*")
 @frozen_value
 class TargetOptions:
-    """Where to go.
+    """Where to go."""
 
-    Parameters
-    ----------
-    target : str
-        Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
-    nodule : int
-        Go to the centre of this nodule of the nodule mask; 1, the largest, if no number follows.
-    """
-
-    target: str | None = None
-    nodule: int | None = None
+    target: Annotated[
+        str | None, Parameter(help="Target point in mm with its frame: ras:x,y,z or lps:x,y,z.")
+    ] = None
+    nodule: Annotated[
+        int | None,
+        Parameter(
+            help="Go to the centre of this nodule of the nodule mask; 1, the largest, if no number follows."
+        ),
+    ] = None
 
     def stated(self) -> StatedTarget:
         """Return what the user states, before any patient is read.
@@ -118,18 +113,14 @@ class TargetOptions:
 @Parameter(name="*")
 @frozen_value
 class SystemOptions:
-    """With which devices.
+    """With which devices."""
 
-    Parameters
-    ----------
-    system : str
-        Name of a preset (see `lungaccess presets`) or path of a TOML file.
-    allow_fissures : bool
-        Whether fissures may be crossed; as the system says if not given.
-    """
-
-    system: str = DEFAULT_SYSTEM
-    allow_fissures: bool | None = None
+    system: Annotated[
+        str, Parameter(help="Name of a preset (see `lungaccess presets`) or path of a TOML file.")
+    ] = DEFAULT_SYSTEM
+    allow_fissures: Annotated[
+        bool | None, Parameter(help="Whether fissures may be crossed; as the system says if not given.")
+    ] = None
 
     def load(self) -> System:
         """Return the system, with its rule about fissures replaced if the user states one."""
@@ -141,26 +132,17 @@ class SystemOptions:
 @Parameter(name="*")
 @frozen_value
 class BudgetOptions:
-    """How long to search.
+    """How long to search; SettingsError unless time and iterations are numbers that a search can end with."""
 
-    Parameters
-    ----------
-    budget : float
-        Planning time in seconds; 10 if neither this nor --iterations is given.
-    iterations : int
-        Number of iterations instead of a time: the same seed then gives the same plan.
-    seed : int
-        Seed of the random numbers.
-
-    Raises
-    ------
-    SettingsError
-        Unless time and iterations are numbers that a search can end with.
-    """
-
-    budget: float | None = None
-    iterations: int | None = None
-    seed: int = 0
+    budget: Annotated[
+        float | None,
+        Parameter(help="Planning time in seconds; 10 if neither this nor --iterations is given."),
+    ] = None
+    iterations: Annotated[
+        int | None,
+        Parameter(help="Number of iterations instead of a time: the same seed then gives the same plan."),
+    ] = None
+    seed: Annotated[int, Parameter(help="Seed of the random numbers.")] = 0
 
     def __post_init__(self) -> None:
         if self.budget is not None and not 0.0 < self.budget < float("inf"):
@@ -177,23 +159,23 @@ class BudgetOptions:
 @Parameter(name="*")
 @frozen_value
 class SearchOptions(BudgetOptions):
-    """How to search for plans, and how long.
+    """How to search for plans, and how long."""
 
-    Parameters
-    ----------
-    objective : str
-        What to make small: integral of 1/clearance, integral of the patient's cost map, its sum over the
-        voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5.
-    method : str
-        Search over the deployment atlas; Algorithm 1 of Kuntz et al. 2015; or reference: the same as
-        printed, with collisions of surface meshes, slow.
-    processes : int
-        How many processes refine the plan at the same time.
-    """
-
-    objective: ObjectiveText = "inverse-clearance"
-    method: Method = "atlas"
-    processes: int = 1
+    objective: Annotated[
+        ObjectiveText,
+        Parameter(
+            help="What to make small: integral of 1/clearance, integral of the patient's cost map, its sum "
+            "over the voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5."
+        ),
+    ] = "inverse-clearance"
+    method: Annotated[
+        Method,
+        Parameter(
+            help="Search over the deployment atlas; Algorithm 1 of Kuntz et al. 2015; or reference: the same "
+            "as printed, with collisions of surface meshes, slow."
+        ),
+    ] = "atlas"
+    processes: Annotated[int, Parameter(help="How many processes refine the plan at the same time.")] = 1
 
 
 def require_map(lung: Lung, objective: Objective) -> None:

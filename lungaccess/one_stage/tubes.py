@@ -41,18 +41,9 @@ BEND_RAD = 0.5 * math.pi
 
 @settings
 class TubePair:
-    """Two tubes without the rest of a system, both of which may be curved.
+    """The inner and the outer tube without the rest of a system, both of which may be curved.
 
-    Parameters
-    ----------
-    name : str
-    tubes : tuple of Tube
-        The inner and the outer one, in this order.
-
-    Raises
-    ------
-    SettingsError
-        If there are not two tubes, or they do not nest.
+    SettingsError is raised if there are not two tubes, or they do not nest.
     """
 
     name: Annotated[str, text("name of the tubes")]
@@ -74,7 +65,6 @@ class TubeAnswer:
     Parameters
     ----------
     name : str
-        Of the system or pair of tubes.
     system : System or None
         None for a bare pair of tubes.
     outer_mm, inner_mm, rotation_rad, relative_rad : float

@@ -36,23 +36,9 @@ def overview_png(plan: Plan, lung: Lung, path: str | os.PathLike[str]) -> Path:
     The axial projection is seen from the feet and the coronal one from the front, as radiologists
     do: the patient's left is on the right of the picture.  Ticks are LPS mm.  The two cuts below show
     scope, tubes and needle true to their width; vessels up to 2 mm beside the cut show faintly.
+    Fissures, nodules and cost may be missing.
 
-    Parameters
-    ----------
-    plan : Plan
-    lung : Lung
-        The patient of the plan.  Fissures, nodules and cost may be missing.
-    path : path of a PNG file in an existing folder
-
-    Returns
-    -------
-    Path
-        The file written.
-
-    Raises
-    ------
-    anatomy.errors.FileError
-        If the file cannot be written.
+    FileError is raised if the file cannot be written, as when the folder is missing.  Returns its path.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)

@@ -86,9 +86,7 @@ def key_numbers(plan: Plan) -> list[tuple[str, list[Row]]]:
     """Return headed rows of a label and a value with its unit."""
     return [
         ("Plan", _general_rows(plan)),
-        ("Scope", _scope_rows(plan)),
-        ("Tube", _tube_rows(plan)),
-        ("Needle", _needle_rows(plan)),
+        *_stage_rows(plan),
         ("Least distance found / required", _clearance_rows(plan)),
         ("Cost", costs_in_words(plan.costs)),
     ]
@@ -113,31 +111,26 @@ def _fissures(plan: Plan) -> str:
     return "may be crossed" if plan.system.fissures_allowed else "not known"
 
 
-def _scope_rows(plan: Plan) -> list[Row]:
-    return [
-        ("airway generation at the tip", f"{plan.scope.generation}"),
-        ("advance beyond the carina", f"{plan.scope.length_from_carina_mm:.1f} mm"),
-        ("lumen radius to spare", f"{plan.scope.min_lumen_margin_mm:.2f} mm"),
+def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
+    scope, tube, needle = plan.scope, plan.tube, plan.needle
+    insertions_mm = f"{tube.outer_insertion_mm:.1f} / {tube.inner_insertion_mm:.1f} mm"
+    scope_rows = [
+        ("airway generation at the tip", f"{scope.generation}"),
+        ("advance beyond the carina", f"{scope.length_from_carina_mm:.1f} mm"),
+        ("lumen radius to spare", f"{scope.min_lumen_margin_mm:.2f} mm"),
     ]
-
-
-def _tube_rows(plan: Plan) -> list[Row]:
-    tube = plan.tube
-    return [
+    tube_rows = [
         ("rotation", f"{np.degrees(tube.rotation_rad):.1f}°"),
-        ("outer / inner beyond scope", f"{tube.outer_insertion_mm:.1f} / {tube.inner_insertion_mm:.1f} mm"),
+        ("outer / inner beyond scope", insertions_mm),
         ("angle to the wall at the exit", f"{np.degrees(tube.exit.wall_angle_rad):.0f}°"),
         ("sideways sweep", f"{tube.lateral_sweep_mm:.2f} mm"),
     ]
-
-
-def _needle_rows(plan: Plan) -> list[Row]:
-    needle = plan.needle
-    return [
+    needle_rows = [
         ("length, arcs", f"{needle.length_mm:.1f} mm, {len(needle.arcs)}"),
         ("greatest angle from start", f"{np.degrees(needle.max_angle_from_start_rad):.1f}°"),
         ("accumulated turn", f"{np.degrees(needle.accumulated_turn_rad):.1f}°"),
     ]
+    return [("Scope", scope_rows), ("Tube", tube_rows), ("Needle", needle_rows)]
 
 
 def _clearance_rows(plan: Plan) -> list[Row]:

@@ -48,22 +48,7 @@ def reach_png(reach: ReachMap, lung: Lung, path: str | os.PathLike[str]) -> Path
     Each plane is the one with the most lung tissue.  Airways and vessels that it cuts are drawn over the
     map.  The upper row shows what is reached, the lower one the clearance of the best path found.
 
-    Parameters
-    ----------
-    reach : ReachMap
-    lung : Lung
-        The patient of the map.
-    path : path of a PNG file in an existing folder
-
-    Returns
-    -------
-    Path
-        The file written.
-
-    Raises
-    ------
-    anatomy.errors.FileError
-        If the file cannot be written.
+    FileError is raised if the file cannot be written, as when the folder is missing.  Returns its path.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)

@@ -32,10 +32,7 @@ def tour_png(answer: TourAnswer, lung: Lung, path: str | os.PathLike[str]) -> Pa
     Stretches that are passed once and twice have different colours; lesions are numbered in the order of
     visits, and joined to their exits.
 
-    Raises
-    ------
-    anatomy.errors.FileError
-        If the file cannot be written.
+    FileError is raised if the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)

@@ -35,10 +35,7 @@ def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     Every branch has the colour of its generation (trachea 0) and a width that follows its radius;
     the carina and every gap that was bridged are marked.
 
-    Raises
-    ------
-    anatomy.errors.FileError
-        If the file cannot be written.
+    FileError is raised if the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)

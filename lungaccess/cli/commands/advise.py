@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions, TargetOptions
+from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions, TargetOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def advise(
-    patient: Path,
+    patient: PatientFolder,
     *,
     target: TargetOptions = TargetOptions(),
     lesion_radius: float = 5.0,
@@ -32,8 +32,6 @@ def advise(
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks.
     lesion_radius : float
         Radius of the lesion, mm.
     system : str

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import ObjectiveText, PatientOptions, SystemOptions, TargetOptions, require_map
+from lungaccess.cli.options import (
+    ObjectiveText,
+    PatientFolder,
+    PatientOptions,
+    SystemOptions,
+    TargetOptions,
+    require_map,
+)
 from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
@@ -21,7 +28,7 @@ COLUMNS = (
 
 
 def alternatives(
-    patient: Path,
+    patient: PatientFolder,
     *,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
@@ -35,8 +42,6 @@ def alternatives(
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks.
     count : int
         How many plans at most.
     separation : float

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions, SystemOptions, TargetOptions
+from lungaccess.cli.options import PatientFolder, PatientOptions, SystemOptions, TargetOptions
 from lungaccess.cli.progress import progress
 
 
 def certify(
-    patient: Path,
+    patient: PatientFolder,
     *,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
@@ -25,8 +23,6 @@ def certify(
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks.
     most_boxes : int
         Ranges of deployments to look at for every 8 mm of airway before the proof is given up; 3 million if
         not given.

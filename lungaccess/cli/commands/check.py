@@ -6,11 +6,15 @@ from pathlib import Path
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions
+from lungaccess.cli.options import PatientOfPlan, PatientOptions
 
 
 def check(
-    plan: Path, patient: Path, *, system: str | None = None, output: PatientOptions = PatientOptions()
+    plan: Path,
+    patient: PatientOfPlan,
+    *,
+    system: str | None = None,
+    output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
 
@@ -18,8 +22,6 @@ def check(
     ----------
     plan : Path
         The plan.json to check.
-    patient : Path
-        Folder of the patient it was made for.
     system : str
         Check against this preset or TOML file instead of the devices stated in the plan.
     """

@@ -6,19 +6,17 @@ from pathlib import Path
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions
+from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.progress import progress
 
 
-def export(plan: Path, patient: Path, *, slicer: Path, output: PatientOptions = PatientOptions()) -> ExitCode:
+def export(
+    plan: PlanFile, patient: PatientOfPlan, *, slicer: Path, output: PatientOptions = PatientOptions()
+) -> ExitCode:
     """Write a stored plan and its patient for 3D Slicer; exit code 1 if the check refuses the plan.
 
     Parameters
     ----------
-    plan : Path
-        The plan.json.
-    patient : Path
-        Folder of the patient it was made for.
     slicer : Path
         Folder for the scene, curves, models and segmentation; drag its scene.mrml into 3D Slicer.
     """

@@ -11,19 +11,19 @@ from rich.table import Table
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import anatomy_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import OutputOptions, PatientOptions
+from lungaccess.cli.options import OutputOptions, PatientFolder, PatientOptions
 
 if TYPE_CHECKING:
     from lungaccess.problem.system import System
 
 
-def info(patient: Path, *, out: Path | None = None, output: PatientOptions = PatientOptions()) -> ExitCode:
+def info(
+    patient: PatientFolder, *, out: Path | None = None, output: PatientOptions = PatientOptions()
+) -> ExitCode:
     """Show what was understood of a patient: volumes, airway tree, sources and warnings.
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks.
     out : Path
         Folder for tree.png, a picture of the airway tree.
     """

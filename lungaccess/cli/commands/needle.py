@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -12,7 +11,14 @@ from anatomy.errors import SettingsError
 from anatomy.io.frames import Frame
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import BudgetOptions, ObjectiveText, PatientOptions, SystemOptions, TargetOptions
+from lungaccess.cli.options import (
+    BudgetOptions,
+    ObjectiveText,
+    PatientFolder,
+    PatientOptions,
+    SystemOptions,
+    TargetOptions,
+)
 from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
@@ -25,7 +31,7 @@ NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 
 
 def needle(
-    patient: Path,
+    patient: PatientFolder,
     *,
     start: str,
     frame: Frame = "lps",
@@ -40,8 +46,6 @@ def needle(
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks.
     start : str
         Number of a start pose that came with the patient, or path of a text file with a 4x4 pose whose +z
         column is the direction of insertion.

@@ -7,13 +7,20 @@ from pathlib import Path
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions, TargetOptions, require_map
+from lungaccess.cli.options import (
+    PatientFolder,
+    PatientOptions,
+    SearchOptions,
+    SystemOptions,
+    TargetOptions,
+    require_map,
+)
 from lungaccess.cli.plan_search import PlanRequest, plan_and_report
 from stages.needle import Objective
 
 
 def plan(
-    patient: Path,
+    patient: PatientFolder,
     *,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
@@ -26,8 +33,6 @@ def plan(
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks (Med-RAD, TotalSegmentator, or own masks with a lungaccess TOML file).
     thick_slices : bool
         Plan on masks from slices of more than 3 mm, which lack small airways and vessels.
     out : Path

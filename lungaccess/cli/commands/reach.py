@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions, SystemOptions
+from lungaccess.cli.options import PatientFolder, PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def reach(
-    patient: Path,
+    patient: PatientFolder,
     *,
     system: SystemOptions = SystemOptions(),
     spacing: float = 3.0,
@@ -34,8 +34,6 @@ def reach(
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks.
     spacing : float
         Side of the map's voxels, mm.
     search : int

@@ -9,7 +9,7 @@ from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions
+from lungaccess.cli.options import PatientOfPlan, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ HISTORY_FILE = "cost_over_time.csv"
 
 def report(
     plan: Path,
-    patient: Path,
+    patient: PatientOfPlan,
     *,
     out: Path | None = None,
     alternatives: int = 0,
@@ -39,8 +39,6 @@ def report(
     ----------
     plan : Path
         The plan.json; cost_over_time.csv beside it is shown, too.
-    patient : Path
-        Folder of the patient it was made for.
     out : Path
         The HTML file; report.html beside the plan if not given.
     alternatives : int

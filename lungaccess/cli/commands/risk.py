@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions
+from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 def risk(
-    plan: Path,
-    patient: Path,
+    plan: PlanFile,
+    patient: PatientOfPlan,
     *,
     errors: Path | None = None,
     samples: int = 10_000,
@@ -31,10 +31,6 @@ def risk(
 
     Parameters
     ----------
-    plan : Path
-        The plan.json.
-    patient : Path
-        Folder of the patient it was made for.
     errors : Path
         TOML file of the error model; the default one, all of it assumed, if not given.
     samples : int

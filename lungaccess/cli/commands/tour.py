@@ -9,7 +9,7 @@ from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions
+from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def tour(
-    patient: Path,
+    patient: PatientFolder,
     *,
     targets: Path,
     system: str = DEFAULT_SYSTEM,
@@ -36,8 +36,6 @@ def tour(
 
     Parameters
     ----------
-    patient : Path
-        Folder of masks.
     targets : Path
         Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm.
     system : str

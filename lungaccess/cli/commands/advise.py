@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
@@ -19,27 +21,19 @@ def advise(
     patient: PatientFolder,
     *,
     target: TargetOptions = TargetOptions(),
-    lesion_radius: float = 5.0,
-    system: str = DEFAULT_SYSTEM,
-    seed: int = 0,
-    out: Path = Path("lungaccess-advice"),
+    lesion_radius: Annotated[float, Parameter(help="Radius of the lesion, mm.")] = 5.0,
+    system: Annotated[str, Parameter(help="Preset or TOML file whose scope is used.")] = DEFAULT_SYSTEM,
+    seed: Annotated[int, Parameter(help="Seed of the random numbers.")] = 0,
+    out: Annotated[
+        Path,
+        Parameter(help="Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer."),
+    ] = Path("lungaccess-advice"),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Advise the bronchoscope: turn by turn to a lesion, or as near as it gets, and why not nearer.
 
     The goal is the airway voxel nearest to the lesion's centre, if possible one in the lesion where the scope
     fits.  Exit code 0 if the scope reaches it, 1 if it stops before.
-
-    Parameters
-    ----------
-    lesion_radius : float
-        Radius of the lesion, mm.
-    system : str
-        Preset or TOML file whose scope is used.
-    seed : int
-        Seed of the random numbers.
-    out : Path
-        Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer.
     """
     from lungaccess.one_stage import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
     from lungaccess.problem.system import load_system

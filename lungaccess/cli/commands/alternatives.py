@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
@@ -32,25 +34,20 @@ def alternatives(
     *,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    count: int = 15,
-    separation: float = 5.0,
-    objective: ObjectiveText = "inverse-clearance",
-    out: Path = Path("lungaccess-alternatives"),
+    count: Annotated[int, Parameter(help="How many plans at most.")] = 15,
+    separation: Annotated[
+        float,
+        Parameter(help="The needles of every two plans lie somewhere at least so many mm from each other."),
+    ] = 5.0,
+    objective: Annotated[
+        ObjectiveText, Parameter(help="By what the cheapest come first, as for `plan`.")
+    ] = "inverse-clearance",
+    out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on.")] = Path(
+        "lungaccess-alternatives"
+    ),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Show plans to one target that differ, check each, and write them; those no other beats are marked.
-
-    Parameters
-    ----------
-    count : int
-        How many plans at most.
-    separation : float
-        The needles of every two plans lie somewhere at least so many mm from each other.
-    objective : str
-        By what the cheapest come first, as for `plan`.
-    out : Path
-        Folder for plan-01.json and so on.
-    """
+    """Show plans to one target that differ, check each, and write them; those no other beats are marked."""
     from lungaccess.checking import check
     from lungaccess.coupled import alternatives as find_alternatives
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -10,21 +13,16 @@ from lungaccess.cli.options import PatientOfPlan, PatientOptions
 
 
 def check(
-    plan: Path,
+    plan: Annotated[Path, Parameter(help="The plan.json to check.")],
     patient: PatientOfPlan,
     *,
-    system: str | None = None,
+    system: Annotated[
+        str | None,
+        Parameter(help="Check against this preset or TOML file instead of the devices stated in the plan."),
+    ] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
-
-    Parameters
-    ----------
-    plan : Path
-        The plan.json to check.
-    system : str
-        Check against this preset or TOML file instead of the devices stated in the plan.
-    """
+    """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused."""
     from lungaccess.checking import check as check_plan
     from lungaccess.cli.plan_tables import check_tables
     from lungaccess.plans.plan import Plan

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from cyclopts import Parameter
 from rich.panel import Panel
 
 from anatomy.errors import AnatomyError
@@ -30,22 +31,14 @@ DEMO_SPACING_MM = 1.25
 
 def demo(
     *,
-    out: Path = Path("demo-output"),
-    budget: float = DEMO_BUDGET_S,
-    seed: int = DEMO_SEED,
+    out: Annotated[Path, Parameter(help="Folder for plan.json, the pictures and report.html.")] = Path(
+        "demo-output"
+    ),
+    budget: Annotated[float, Parameter(help="Planning time in seconds.")] = DEMO_BUDGET_S,
+    seed: Annotated[int, Parameter(help="Seed of the patient and of the search.")] = DEMO_SEED,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page about it.
-
-    Parameters
-    ----------
-    out : Path
-        Folder for plan.json, the pictures and report.html.
-    budget : float
-        Planning time in seconds.
-    seed : int
-        Seed of the patient and of the search.
-    """
+    """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it."""
     from lungaccess.cli.anatomy_tables import anatomy_tables
     from lungaccess.problem.target import stated_target
 

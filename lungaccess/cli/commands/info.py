@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.io.files import require_writable_folder
@@ -18,15 +19,12 @@ if TYPE_CHECKING:
 
 
 def info(
-    patient: PatientFolder, *, out: Path | None = None, output: PatientOptions = PatientOptions()
+    patient: PatientFolder,
+    *,
+    out: Annotated[Path | None, Parameter(help="Folder for tree.png, a picture of the airway tree.")] = None,
+    output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Show what was understood of a patient: volumes, airway tree, sources and warnings.
-
-    Parameters
-    ----------
-    out : Path
-        Folder for tree.png, a picture of the airway tree.
-    """
+    """Show what was understood of a patient: volumes, airway tree, sources and warnings."""
     if out is not None:
         require_writable_folder(out)
     lung = output.load(patient, thick_slices=True)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.errors import SettingsError
@@ -33,31 +34,34 @@ NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 def needle(
     patient: PatientFolder,
     *,
-    start: str,
-    frame: Frame = "lps",
+    start: Annotated[
+        str,
+        Parameter(
+            help="Number of a start pose that came with the patient, or path of a text file with a 4x4 pose "
+            "whose +z column is the direction of insertion."
+        ),
+    ],
+    frame: Annotated[Frame, Parameter(help="Frame of the numbers in that file.")] = "lps",
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    planner: NeedlePlanner = "decide",
-    objective: ObjectiveText = "length",
+    planner: Annotated[
+        NeedlePlanner,
+        Parameter(
+            help="decide: a path, or a proof that there is none; rrt; optimal: better and better paths; "
+            "resolution: the best path of pieces at a resolution, or the statement that it has none."
+        ),
+    ] = "decide",
+    objective: Annotated[
+        ObjectiveText,
+        Parameter(
+            help="What to make small: length, integral of 1/clearance, integral of the cost map, its sum "
+            "over voxels, or a weighted sum such as length=1,cost-map=0.5."
+        ),
+    ] = "length",
     budget: BudgetOptions = BudgetOptions(),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the needle alone from a given pose, or prove that no path exists.
-
-    Parameters
-    ----------
-    start : str
-        Number of a start pose that came with the patient, or path of a text file with a 4x4 pose whose +z
-        column is the direction of insertion.
-    frame : str
-        Frame of the numbers in that file.
-    planner : str
-        decide: a path, or a proof that there is none; rrt; optimal: better and better paths; resolution:
-        the best path of pieces at a resolution, or the statement that it has none.
-    objective : str
-        What to make small: length, integral of 1/clearance, integral of the cost map, its sum over voxels, or
-        a weighted sum such as length=1,cost-map=0.5.
-    """
+    """Plan the needle alone from a given pose, or prove that no path exists."""
     from lungaccess.one_stage import plan_needle
 
     stated, weighed = target.stated(), Objective.of(objective)

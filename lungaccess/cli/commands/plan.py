@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
@@ -25,19 +28,16 @@ def plan(
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     search: SearchOptions = SearchOptions(),
-    thick_slices: bool = False,
-    out: Path = Path("lungaccess-plan"),
+    thick_slices: Annotated[
+        bool,
+        Parameter(help="Plan on masks from slices of more than 3 mm, which lack small airways and vessels."),
+    ] = False,
+    out: Annotated[
+        Path, Parameter(help="Folder for plan.json, overview.png, cost_over_time.png and cost_over_time.csv.")
+    ] = Path("lungaccess-plan"),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the access to a target, check the plan, and write plan, pictures and cost over time.
-
-    Parameters
-    ----------
-    thick_slices : bool
-        Plan on masks from slices of more than 3 mm, which lack small airways and vessels.
-    out : Path
-        Folder for plan.json, overview.png, cost_over_time.png and cost_over_time.csv.
-    """
+    """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
@@ -21,29 +23,27 @@ def reach(
     patient: PatientFolder,
     *,
     system: SystemOptions = SystemOptions(),
-    spacing: float = 3.0,
-    search: int = 0,
-    compare: str | None = None,
-    out: Path = Path("lungaccess-reach"),
-    page: Path | None = None,
+    spacing: Annotated[float, Parameter(help="Side of the map's voxels, mm.")] = 3.0,
+    search: Annotated[
+        int, Parameter(help="Random trees for each point that no single arc reaches; 0 for single arcs only.")
+    ] = 0,
+    compare: Annotated[
+        str | None, Parameter(help="Further presets or TOML files to compare with, separated by commas.")
+    ] = None,
+    out: Annotated[Path, Parameter(help="Folder for the volumes, the pictures and reach.json.")] = Path(
+        "lungaccess-reach"
+    ),
+    page: Annotated[
+        Path | None,
+        Parameter(
+            help="HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline."
+        ),
+    ] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Map what a system reaches of the lung, and write the map as volumes for 3D Slicer and as a picture.
 
     A run that was stopped goes on where it was if it is started again with the same options.
-
-    Parameters
-    ----------
-    spacing : float
-        Side of the map's voxels, mm.
-    search : int
-        Random trees for each point that no single arc reaches; 0 for single arcs only.
-    compare : str
-        Further presets or TOML files to compare with, separated by commas.
-    out : Path
-        Folder for the volumes, the pictures and reach.json.
-    page : Path
-        HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
     """
     from lungaccess.problem.system import load_system
     from lungaccess.reachability.reach_map import compare_reach

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
@@ -21,40 +23,35 @@ HISTORY_FILE = "cost_over_time.csv"
 
 
 def report(
-    plan: Path,
+    plan: Annotated[Path, Parameter(help="The plan.json; cost_over_time.csv beside it is shown, too.")],
     patient: PatientOfPlan,
     *,
-    out: Path | None = None,
-    alternatives: int = 0,
-    ct: Path | None = None,
-    movie: Path | None = None,
-    samples: int = 2000,
-    seed: int = 0,
-    instructions: bool = True,
+    out: Annotated[
+        Path | None, Parameter(help="The HTML file; report.html beside the plan if not given.")
+    ] = None,
+    alternatives: Annotated[
+        int, Parameter(help="So many other plans to the same target are searched and shown on demand.")
+    ] = 0,
+    ct: Annotated[
+        Path | None,
+        Parameter(
+            help="CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, if"
+            " there is one, else the structures of the masks."
+        ),
+    ] = None,
+    movie: Annotated[
+        Path | None, Parameter(help="WebP file for the flight through the airway to the scope's place.")
+    ] = None,
+    samples: Annotated[
+        int, Parameter(help="Deviated plans of the estimate of risk; 0 leaves it out.")
+    ] = 2000,
+    seed: Annotated[int, Parameter(help="Seed of that estimate.")] = 0,
+    instructions: Annotated[
+        bool, Parameter(help="Whether instructions for the scope are searched and listed turn by turn.")
+    ] = True,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Write a page about a stored plan: it plays in 3-D, with slices, charts, limits and risk; one HTML file.
-
-    Parameters
-    ----------
-    plan : Path
-        The plan.json; cost_over_time.csv beside it is shown, too.
-    out : Path
-        The HTML file; report.html beside the plan if not given.
-    alternatives : int
-        So many other plans to the same target are searched and shown on demand.
-    ct : Path
-        CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, if there is
-        one, else the structures of the masks.
-    movie : Path
-        WebP file for the flight through the airway to the scope's place.
-    samples : int
-        Deviated plans of the estimate of risk; 0 leaves it out.
-    seed : int
-        Seed of that estimate.
-    instructions : bool
-        Whether instructions for the scope are searched and listed turn by turn.
-    """
+    """Write one HTML file about a stored plan: it plays in 3-D, with slices, charts, limits and risk."""
     from lungaccess.plans.plan import Plan
     from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page
     from lungaccess.report.html.volumes import find_ct, read_ct

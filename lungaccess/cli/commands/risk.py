@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -20,28 +22,22 @@ def risk(
     plan: PlanFile,
     patient: PatientOfPlan,
     *,
-    errors: Path | None = None,
-    samples: int = 10_000,
-    radius: float | None = None,
-    probability: float = 0.95,
-    seed: int = 0,
+    errors: Annotated[
+        Path | None,
+        Parameter(help="TOML file of the error model; the default one, all of it assumed, if not given."),
+    ] = None,
+    samples: Annotated[int, Parameter(help="Number of deviated plans.")] = 10_000,
+    radius: Annotated[
+        float | None,
+        Parameter(
+            help="Radius of the goal in mm; by default that of the nodule, or 5 if the target lies in none."
+        ),
+    ] = None,
+    probability: Annotated[float, Parameter(help="Probability of success that the tolerances keep.")] = 0.95,
+    seed: Annotated[int, Parameter(help="Seed of the random numbers.")] = 0,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Estimate how likely a stored plan succeeds if the devices deviate from it, open loop.
-
-    Parameters
-    ----------
-    errors : Path
-        TOML file of the error model; the default one, all of it assumed, if not given.
-    samples : int
-        Number of deviated plans.
-    radius : float
-        Radius of the goal in mm; by default that of the nodule, or 5 if the target lies in none.
-    probability : float
-        Probability of success that the tolerances keep.
-    seed : int
-        Seed of the random numbers.
-    """
+    """Estimate how likely a stored plan succeeds if the devices deviate from it, open loop."""
     from lungaccess.plans.plan import Plan
     from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors
 

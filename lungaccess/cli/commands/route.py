@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder, write_json
@@ -18,50 +20,41 @@ if TYPE_CHECKING:
 
 
 def route(
-    source: Path,
+    source: Annotated[
+        Path,
+        Parameter(
+            help="Folder of a patient, a centreline with radii (.vtp, .vtu), a mask of vessels, or a drawing "
+            "(.png)."
+        ),
+    ],
     *,
-    goal: str,
-    start: str | None = None,
-    curvature: float,
-    radius: float = 0.0,
-    margin: float = 0.0,
-    tolerance: float = 0.0,
-    repair: Literal["exact", "ga"] = "exact",
-    seed: int = 0,
-    frame: Frame | None = None,
-    pixel: float | None = None,
-    out: Path = Path("lungaccess-route"),
+    goal: Annotated[
+        str,
+        Parameter(
+            help="Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the right, "
+            "y down."
+        ),
+    ],
+    start: Annotated[str | None, Parameter(help="Start; the widest end of the tubes if not given.")] = None,
+    curvature: Annotated[float, Parameter(help="Largest curvature of the device, 1/mm.")],
+    radius: Annotated[float, Parameter(help="Outer radius of the device, mm.")] = 0.0,
+    margin: Annotated[float, Parameter(help="Gap that must remain between device and wall, mm.")] = 0.0,
+    tolerance: Annotated[
+        float, Parameter(help="How far the ends of the route may lie from start and goal, mm.")
+    ] = 0.0,
+    repair: Annotated[
+        Literal["exact", "ga"],
+        Parameter(help="exact: a nonlinear program; ga: the genetic search of Li et al. 2021."),
+    ] = "exact",
+    seed: Annotated[int, Parameter(help="Seed of the genetic search.")] = 0,
+    frame: Annotated[
+        Frame | None, Parameter(help="Frame of a centreline file or mask that states none.")
+    ] = None,
+    pixel: Annotated[float | None, Parameter(help="Size of a pixel of a drawing, mm.")] = None,
+    out: Annotated[Path, Parameter(help="Folder for route.json and route.png.")] = Path("lungaccess-route"),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, and draw it.
-
-    Parameters
-    ----------
-    source : Path
-        Folder of a patient, a centreline with radii (.vtp, .vtu), a mask of vessels, or a drawing (.png).
-    goal : str
-        Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the right, y down.
-    start : str
-        Start; the widest end of the tubes if not given.
-    curvature : float
-        Largest curvature of the device, 1/mm.
-    radius : float
-        Outer radius of the device, mm.
-    margin : float
-        Gap that must remain between device and wall, mm.
-    tolerance : float
-        How far the ends of the route may lie from start and goal, mm.
-    repair : str
-        exact: a nonlinear program; ga: the genetic search of Li et al. 2021.
-    seed : int
-        Seed of the genetic search.
-    frame : str
-        Frame of a centreline file or mask that states none.
-    pixel : float
-        Size of a pixel of a drawing, mm.
-    out : Path
-        Folder for route.json and route.png.
-    """
+    """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it."""
     from lungaccess.one_stage import open_source, route_record, widest_end
     from lungaccess.report.route import route_png
     from stages.scope.route import RouteLimits, try_route

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder, write_json
@@ -20,43 +22,40 @@ if TYPE_CHECKING:
 def tour(
     patient: PatientFolder,
     *,
-    targets: Path,
-    system: str = DEFAULT_SYSTEM,
-    require_plan: bool = True,
-    closed: bool = False,
-    reading: Literal["printed", "reduced"] = "printed",
-    beta: float = 0.2,
-    tissue_weight: float = 0.0,
-    speed: float = 10.0,
-    per_lesion: float = 300.0,
-    out: Path = Path("lungaccess-tour"),
+    targets: Annotated[Path, Parameter(help="Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm.")],
+    system: Annotated[
+        str, Parameter(help="Preset or TOML file whose devices reach the lesions from the airway.")
+    ] = DEFAULT_SYSTEM,
+    require_plan: Annotated[
+        bool,
+        Parameter(help="Count an exit only if a coupled plan of scope, tubes and needle from there exists."),
+    ] = True,
+    closed: Annotated[
+        bool, Parameter(help="Return to the root of the airway after the last lesion.")
+    ] = False,
+    reading: Annotated[
+        Literal["printed", "reduced"],
+        Parameter(
+            help="How the resistances of Pan et al. 2025 are merged: as printed, or by true reduction of the "
+            "tree."
+        ),
+    ] = "printed",
+    beta: Annotated[
+        float, Parameter(help="Weight of the angle in the resistance; the paper's worked example needs 2.5.")
+    ] = 0.2,
+    tissue_weight: Annotated[
+        float,
+        Parameter(
+            help="How many mm of the scope's travel a mm between exit and lesion is worth, for the shortest "
+            "tour."
+        ),
+    ] = 0.0,
+    speed: Annotated[float, Parameter(help="Speed of the scope, mm/s, for the times.")] = 10.0,
+    per_lesion: Annotated[float, Parameter(help="Time that each lesion takes besides, s.")] = 300.0,
+    out: Annotated[Path, Parameter(help="Folder for tour.json and tour.png.")] = Path("lungaccess-tour"),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out.
-
-    Parameters
-    ----------
-    targets : Path
-        Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm.
-    system : str
-        Preset or TOML file whose devices reach the lesions from the airway.
-    require_plan : bool
-        Count an exit only if a coupled plan of scope, tubes and needle from there exists.
-    closed : bool
-        Return to the root of the airway after the last lesion.
-    reading : str
-        How the resistances of Pan et al. 2025 are merged: as printed, or by true reduction of the tree.
-    beta : float
-        Weight of the angle in the resistance; the paper's worked example needs 2.5.
-    tissue_weight : float
-        How many mm of the scope's travel a mm between exit and lesion is worth, for the shortest tour.
-    speed : float
-        Speed of the scope, mm/s, for the times.
-    per_lesion : float
-        Time that each lesion takes besides, s.
-    out : Path
-        Folder for tour.json and tour.png.
-    """
+    """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out."""
     from lungaccess.one_stage import plan_tour, read_lesions, tour_record
     from lungaccess.problem.system import load_system
     from lungaccess.report.tour import tour_png

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
@@ -21,34 +23,31 @@ if TYPE_CHECKING:
 
 def tubes(
     *,
-    outer: float,
-    inner: float,
-    system: str = DEFAULT_SYSTEM,
-    rotate: float = 0.0,
-    relative: float = 0.0,
-    propose: bool = False,
-    out: Path = Path("tubes.png"),
+    outer: Annotated[float, Parameter(help="How far the outer tube comes out of the scope, mm.")],
+    inner: Annotated[float, Parameter(help="How far the inner tube comes out of the scope, mm.")],
+    system: Annotated[
+        str,
+        Parameter(
+            help="Name of a preset, or path of a TOML file: a system, or just two tables [[tubes]], the inner "
+            "one first."
+        ),
+    ] = DEFAULT_SYSTEM,
+    rotate: Annotated[
+        float,
+        Parameter(
+            help="Direction of the inner tube's bend about the scope's axis, from +x of its tip, degrees."
+        ),
+    ] = 0.0,
+    relative: Annotated[
+        float, Parameter(help="How much farther the base of the outer tube is turned, degrees.")
+    ] = 0.0,
+    propose: Annotated[
+        bool, Parameter(help="Compare sequences to the same place, and look for designs that sweep less.")
+    ] = False,
+    out: Annotated[Path, Parameter(help="PNG file for the picture.")] = Path("tubes.png"),
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
-    """Deploy the tubes alone: tip, stability, sideways motion and a picture; exit code 1 if they would snap.
-
-    Parameters
-    ----------
-    outer : float
-        How far the outer tube comes out of the scope, mm.
-    inner : float
-        How far the inner tube comes out of the scope, mm.
-    system : str
-        Name of a preset, or path of a TOML file: a system, or just two tables [[tubes]], the inner one first.
-    rotate : float
-        Direction of the inner tube's bend about the scope's axis, from +x of its tip, degrees.
-    relative : float
-        How much farther the base of the outer tube is turned, degrees.
-    propose : bool
-        Compare sequences to the same place, and look for designs that sweep less.
-    out : Path
-        PNG file for the picture.
-    """
+    """Deploy the tubes alone: tip, stability, sideways motion, picture; exit code 1 if they would snap."""
     from lungaccess.one_stage import deploy_tubes, load_tubes
 
     if out.suffix.lower() != ".png":

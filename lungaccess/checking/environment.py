@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 class Environment:
     """A lung, its structures as solid boxes, and its airway tree as lines.
 
-    Parameters
-    ----------
-    lung : Lung
-        Its arrays must not change while this is used.
+    The arrays of the lung must not change while this is used.
     """
 
     def __init__(self, lung: Lung) -> None:

@@ -22,12 +22,7 @@ STEP_MM = 0.05
 
 @frozen_record
 class Piece:
-    """A piece of constant curvature: turn about the tangent, then advance.
-
-    Parameters
-    ----------
-    length_mm, roll_rad, curvature_per_mm : float
-    """
+    """A piece of constant curvature: turn about the tangent, then advance."""
 
     length_mm: float
     roll_rad: float

@@ -68,13 +68,7 @@ class Cluster:
 
 
 class Tiles:
-    """The surfaces of a lung's structures; each tile is looked through once.
-
-    Parameters
-    ----------
-    lung : Lung
-        Its labels must not change while this is used.
-    """
+    """The surfaces of a lung's structures; each tile is looked through once, so labels must not change."""
 
     def __init__(self, lung: Lung) -> None:
         self.lung = lung

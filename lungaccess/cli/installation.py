@@ -31,16 +31,7 @@ class Library:
 
 @frozen_value
 class KernelCache:
-    """Compiled kernels on disk.
-
-    Parameters
-    ----------
-    folders : tuple of str
-        Where they are kept.
-    modules, warm : int
-        Modules of kernels, and those of them with compiled code that is not older than their source.
-    size_bytes : int
-    """
+    """Compiled kernels on disk: `warm` of the modules have compiled code not older than their source."""
 
     folders: tuple[str, ...]
     modules: int

@@ -66,17 +66,14 @@ def alternatives(
 
     Parameters
     ----------
-    lung : Lung
-    system : System
-    target : Target
+    lung, system, target, atlas
+        See `lungaccess.coupled.planner.plan`.
     objective : str or Objective
-        What "cheap" means; see `lungaccess.coupled.planner.plan`.
+        What "cheap" means; see there, too.
     count : int
         The most plans that are returned.
     separation_mm : float
         The least separation of the needles of two plans.
-    atlas : Atlas, optional
-        Made with `build_atlas` beforehand.
 
     Raises
     ------

@@ -115,16 +115,12 @@ def plan_needle(
     iterations: int | None = None,
     time_s: float | None = None,
 ) -> NeedleAnswer:
-    """Plan the needle from a pose to a target.
+    """Plan the needle of a system, with its margins, from a pose to a target.
 
     Parameters
     ----------
-    lung : Lung
-    system : System
-        Its needle and margins are used.
     lps_from_start : (4, 4) float64
         +z is the direction of insertion.
-    target : Target
     planner : str
         One of `search.planners.PLANNERS`, or of `OMPL_PLANNERS`: those look at no objective, end by time
         alone, and can be seeded once in a process, so each call needs a process of its own.

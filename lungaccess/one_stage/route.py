@@ -23,14 +23,7 @@ CURVE_SPACING_MM = 0.5
 
 @frozen_record
 class RouteSource:
-    """Where a route runs.
-
-    Parameters
-    ----------
-    name, kind : str
-        Kind: "patient", "centreline", "mask" or "drawing".
-    centreline : Centreline
-    """
+    """Where a route runs; its kind is "patient", "centreline", "mask" or "drawing"."""
 
     name: str
     kind: str

@@ -30,20 +30,11 @@ SHORTEST_ARC_MM = 1e-9
 
 @frozen_record
 class DeviceCurve:
-    """Where a device runs; N poses.
+    """Where a device ("scope", "tubes" or "needle") runs; N poses.
 
-    Parameters
-    ----------
-    name : str
-        "scope", "tubes" or "needle".
-    lps_from_device : (N, 4, 4) float64
-        Pose at each point; +z points the way the device moves.
-    radius_mm : (N,) float64
-        Outer radius of the device there.
-    arc_length_mm : (N,) float64
-        Length of the device from its first pose.
-    colour : tuple of float
-        Red, green and blue in [0, 1].
+    `lps_from_device` `(N, 4, 4)` are poses whose +z points the way the device moves; at each of them
+    `radius_mm` `(N,)` is the outer radius, and `arc_length_mm` `(N,)` the length of the device from its first
+    pose.  The colour is red, green and blue in [0, 1].
     """
 
     name: str

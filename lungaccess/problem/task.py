@@ -11,24 +11,9 @@ from stages.needle import Objective
 
 @frozen_record
 class Task:
-    """What a search for plans is asked.
+    """What a search for plans is asked: they keep the objective small, and state the search's name, `method`.
 
-    Parameters
-    ----------
-    lung : Lung
-    system : System
-    target : Target
-    objective : Objective
-        What a plan is to keep small.
-    method : str
-        The name of the search, which plans state.
-    seed : int
-        Of the search's random numbers.
-
-    Raises
-    ------
-    TargetError
-        If the target lies outside the lung or inside an obstacle.
+    TargetError is raised if the target lies outside the lung or inside an obstacle.
     """
 
     lung: Lung

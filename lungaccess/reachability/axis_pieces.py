@@ -25,18 +25,11 @@ SPARE_RAD = 1e-6
 
 @frozen_record
 class AxisPiece:
-    """A piece of the medial axis where the scope tip may be.
+    """A piece of the medial axis where the scope tip may be: N knots in LPS mm, `(N, 3)`.
 
-    Parameters
-    ----------
-    knots : (N, 3) float64, LPS mm
-    cones : (N - 1, 4) float64
-        For a tip between two knots, the middle of the directions that it may have, and the greatest angle
-        from it in rad.
-    frame : (3, 3) float64
-        Its rows are the axes of a frame whose +z is the mean direction of the tips.
-    wide : float
-        Greatest angle in rad between that +z and a direction of a tip.
+    For a tip between two knots, `cones` `(N - 1, 4)` hold the middle of the directions that it may have, and
+    the greatest angle from it in rad.  The rows of `frame` `(3, 3)` are the axes of a frame whose +z is the
+    mean direction of the tips; `wide` is the greatest angle in rad between that +z and such a direction.
     """
 
     knots: Float

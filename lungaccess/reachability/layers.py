@@ -115,13 +115,7 @@ def _as_rows(reached: Reached) -> Float32:
 
 
 class LayerStore:
-    """Finished layers on disk, in a folder named after what they depend on.
-
-    Parameters
-    ----------
-    work : Path
-    key : str
-    """
+    """Finished layers on disk, in a folder named after what they depend on."""
 
     def __init__(self, work: Path, key: str) -> None:
         self._folder = require_writable_folder(work / f".reach-{key}")

@@ -21,16 +21,10 @@ SMALLER_LUNG_SHARE = 0.1
 
 @frozen_record
 class Regions:
-    """The region of each voxel of a grid.
+    """The region of each voxel of a grid: a key of `names`, or 0, in a volume of uint8.
 
-    Parameters
-    ----------
-    volume : Volume of uint8
-        A key of `names`, or 0.
-    names : mapping of int to str
-    lungs_are_separate : bool
-        Whether the two lungs are parts of the mask without a bridge; else the plane through the carina
-        divides them.
+    If `lungs_are_separate`, the two are parts of the mask without a bridge; else the plane through the carina
+    divides them.
     """
 
     volume: Volume
@@ -39,19 +33,11 @@ class Regions:
 
 
 def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
-    """Return the side of the voxels of a grid.
+    """Return the side of the voxels of a grid, any in the same place, that are true in `where`; 0 of others.
 
     The lungs are the two largest parts of the free tissue between which no face is shared; smaller parts
     belong to the side of the carina on which they lie.  The anatomy keeps no lobes: fissures are open
     here and there, so that lobes are not separate parts.
-
-    Parameters
-    ----------
-    lung : Lung
-    grid : Grid
-        Any grid in the same place.
-    where : (ni, nj, nk) bool
-        Voxels of `grid` that get a side; the others are 0.
     """
     from scipy import ndimage
 

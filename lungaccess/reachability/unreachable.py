@@ -54,17 +54,8 @@ class ReachVerdict:
 
 
 class UnreachableProof:
-    """Tries to prove targets of one patient unreachable for one system.
+    """Tries to prove targets of one patient unreachable for one system, with fissures as obstacles or not.
 
-    Parameters
-    ----------
-    lung : Lung
-    system : System
-    with_fissures : bool
-        Whether fissures are obstacles.
-
-    Notes
-    -----
     What is ruled out is every place of the scope tip on the medial axis to which the scope fits, every
     direction that a tip can have there, and every rotation and insertion of the tubes, such that the tubes
     leave an airway outside the mediastinum, keep clear of vessels and pleura from there on, and sweep little,

@@ -87,14 +87,7 @@ class LocalAxis:
 class FixedTip:
     """A tip that is turned aside and stays where it is: it has no smooth axis along the airway.
 
-    Parameters
-    ----------
-    tip : ScopeTip
-
-    Attributes
-    ----------
-    low_mm, high_mm, points, tangents
-        See `LocalAxis`.
+    Its attributes are those of `LocalAxis`.
     """
 
     def __init__(self, tip: ScopeTip) -> None:

@@ -25,14 +25,9 @@ LUMEN_WIDTH_MM = 0.945
 
 @frozen_record
 class FieldBox:
-    """Values on a lattice, the first index fastest.
+    """Values `(V,)` on a lattice of a shape `(3,)`, the first index fastest.
 
-    Parameters
-    ----------
-    values : (V,) float64
-    shape : (3,) int64
-    lattice_from_lps : (3, 4) float64
-        Value `(i, j, k)` lies where this maps LPS mm to `i, j, k`.
+    Value `(i, j, k)` lies where `lattice_from_lps`, `(3, 4)`, maps LPS mm to `i, j, k`.
     """
 
     values: Float

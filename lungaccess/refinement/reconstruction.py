@@ -43,13 +43,7 @@ class Placement:
 
 
 class Reconstruction:
-    """Puts variables of a problem back into the numbers of a plan, and proves them.
-
-    Parameters
-    ----------
-    evaluator : CandidateEvaluator
-    problem : Problem
-    """
+    """Puts variables of a problem back into the numbers of a plan, and proves them."""
 
     def __init__(self, evaluator: CandidateEvaluator, problem: Problem) -> None:
         self._evaluator, self._problem = evaluator, problem

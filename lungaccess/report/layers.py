@@ -24,10 +24,7 @@ LUNG_POINTS = 3_000_000
 class Footprint:
     """A mask seen through: `thickness_mm[row, column]`, the first row at the bottom.
 
-    Parameters
-    ----------
-    thickness_mm : (rows, columns) float64
-    extent_mm : (left, right, bottom, top) in picture coordinates
+    The extent is left, right, bottom and top in picture coordinates.
     """
 
     thickness_mm: Float

@@ -72,12 +72,10 @@ def assess(
 ) -> RiskReport:
     """Return how likely a plan succeeds, and what it may touch, if the devices deviate from it.
 
+    The plan's own system is deployed, in the lung that the plan was made for.
+
     Parameters
     ----------
-    plan : Plan
-        Its own system is deployed.
-    lung : Lung
-        The one that the plan was made for.
     model : ErrorModel, optional
         The default one if None.
     samples : int

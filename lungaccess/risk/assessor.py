@@ -36,14 +36,9 @@ THREADS = 2
 
 @frozen_record
 class Outcomes:
-    """What became of N deviated plans.
+    """What became of N deviated plans, `(N,)` each.
 
-    Parameters
-    ----------
-    touched : (N,) int64
-        Flags of `STRUCTURES`.
-    miss_mm : (N,) float64
-        Distance of the needle's tip from the deviated target.
+    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the needle's tip is from the deviated target.
     """
 
     touched: Int

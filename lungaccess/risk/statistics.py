@@ -15,12 +15,7 @@ Z_95 = 1.959963984540054
 
 @frozen_value
 class Share:
-    """How many of a number of samples, and what that says of the probability.
-
-    Parameters
-    ----------
-    count, samples : int
-    """
+    """How many of a number of samples, and what that says of the probability."""
 
     count: int
     samples: int

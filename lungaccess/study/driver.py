@@ -27,17 +27,9 @@ Progress = Callable[[str, float | None], None]
 class StudyDone:
     """What a start of a study did.
 
-    Parameters
-    ----------
-    runs : int
-        How many the study has.
-    stored_before : int
-        How many of them the file had.
-    added : int
-        How many were stored now; less than the rest if another process stored some meanwhile.
-    failed : int
-        How many of those could not be made; the next start makes them again.
-    wall_s : float
+    The study has `runs`, of which the file had `stored_before`.  The start `added` some: fewer than the rest
+    if another process stored some meanwhile.  Those that `failed` could not be made; the next start makes
+    them again.
     """
 
     runs: int
@@ -58,11 +50,10 @@ def run_study(
 ) -> StudyDone:
     """Make the runs of a study that a results file does not have, and store them there one by one.
 
+    The results file is made if it is not there.
+
     Parameters
     ----------
-    study : Study
-    path : Path
-        Results file; made if it is not there.
     scheduler : str, optional
         Address of a running dask scheduler; processes on this machine if None.
     workers : int, optional

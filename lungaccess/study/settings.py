@@ -90,12 +90,10 @@ class Case:
 
 @settings
 class PlannerChoice:
-    """A planner of the study.
+    """A planner of the study, and how tables call it.
 
     Parameters
     ----------
-    name : str
-        How tables call it.
     kind : str
         "plan" for all three stages, "needle" for the needle alone from the case's start poses.
     method : str

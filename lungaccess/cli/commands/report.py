@@ -35,8 +35,8 @@ def report(
     ct: Annotated[
         Path | None,
         Parameter(
-            help="CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, if"
-            " there is one, else the structures of the masks."
+            help="CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, "
+            "if there is one, else the structures of the masks."
         ),
     ] = None,
     movie: Annotated[

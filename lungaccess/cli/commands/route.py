@@ -31,8 +31,8 @@ def route(
     goal: Annotated[
         str,
         Parameter(
-            help="Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the right, "
-            "y down."
+            help="Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the "
+            "right, y down."
         ),
     ],
     start: Annotated[str | None, Parameter(help="Start; the widest end of the tubes if not given.")] = None,

@@ -28,8 +28,8 @@ def tubes(
     system: Annotated[
         str,
         Parameter(
-            help="Name of a preset, or path of a TOML file: a system, or just two tables [[tubes]], the inner "
-            "one first."
+            help="Name of a preset, or path of a TOML file: a system, or just two tables [[tubes]], the "
+            "inner one first."
         ),
     ] = DEFAULT_SYSTEM,
     rotate: Annotated[

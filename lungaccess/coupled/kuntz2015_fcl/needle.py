@@ -24,12 +24,8 @@ SHORTEST_ARC_MM = 1e-6
 class Controls:
     """The controls [Kuntz2015, `steer`] that lead from N states to one point: length, bend and its direction.
 
-    Parameters
-    ----------
-    length_mm, curvature_per_mm : (N,) float64
-        Length infinite where the needle cannot bend so tightly.
-    normal : (N, 3) float64
-        Unit vector towards which each bends.
+    Lengths `(N,)` are infinite where the needle cannot bend so tightly; it bends towards the unit vectors
+    `normal`, `(N, 3)`.
     """
 
     length_mm: Float

@@ -51,11 +51,8 @@ class ReferenceSearch:
 
     Parameters
     ----------
-    task : Task
-    atlas : Atlas
-        Only its sites are used, to know where the scope fits.
-    rejects : bool
-        Whether line 8 is carried out; [Kuntz2015, sec. V] compares with a run without it.
+    task, atlas, rejects
+        See `lungaccess.coupled.search.kuntz2015.KuntzSearch`.
     rrt_iterations : int
         Samples of each RRT: the same seed then gives the same plans.
     rrt_time_s : float, optional

@@ -24,13 +24,7 @@ EXIT_SAMPLES = 51
 
 
 class TubeValidator:
-    """Validates deployments without sideways sweep, by the rules of `stages.tube` but none of its fields.
-
-    Parameters
-    ----------
-    system : System
-    obstacles : Obstacles
-    """
+    """Validates deployments without sideways sweep, by the rules of `stages.tube` but none of its fields."""
 
     def __init__(self, system: System, obstacles: Obstacles) -> None:
         self._system = system

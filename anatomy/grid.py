@@ -160,11 +160,8 @@ class Grid:
 class Volume:
     """An image on a grid; `array[i, j, k]` lies Fortran-contiguous (i fastest) in memory.
 
-    Parameters
-    ----------
-    grid : Grid
-    array : (ni, nj, nk) array of any dtype
-        Masks are bool.  Made read-only and Fortran-contiguous (copied only if it is not).
+    The array `(ni, nj, nk)` of any dtype (masks are bool) is made read-only and, if it is not, Fortran-
+    contiguous.
     """
 
     grid: Grid

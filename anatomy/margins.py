@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from anatomy.settings import quantity, settings
+
+
+def _allowance_for(what: str) -> Any:
+    return quantity(f"allowance for {what}", at_least=0.0, at_most=20.0)
 
 
 @settings
@@ -14,25 +18,14 @@ class Margins:
     Clearance is proved against the masks. The border of a mask is wrong by some fraction of a voxel and
     more (segmentation), and the patient on the table does not lie where the image says (registration).
 
-    Parameters
-    ----------
-    segmentation_margin_mm : float
-        Allowance for the border of the masks, mm.
-    registration_margin_mm : float
-        Allowance for the alignment of image and patient, mm.
-
     Raises
     ------
     SettingsError
         If a margin is negative, not finite or absurd.
     """
 
-    segmentation_margin_mm: Annotated[
-        float, quantity("allowance for the border of the masks", at_least=0.0, at_most=20.0)
-    ] = 0.5
-    registration_margin_mm: Annotated[
-        float, quantity("allowance for the alignment of image and patient", at_least=0.0, at_most=20.0)
-    ] = 0.0
+    segmentation_margin_mm: Annotated[float, _allowance_for("the border of the masks")] = 0.5
+    registration_margin_mm: Annotated[float, _allowance_for("the alignment of image and patient")] = 0.0
 
     @property
     def total_mm(self) -> float:

@@ -37,13 +37,8 @@ _RING = ((0, 0), (1, 0), (1, 1), (0, 1))
 class SurfaceMesh:
     """A triangle mesh, closed, its faces turned outwards.
 
-    Parameters
-    ----------
-    vertices_lps : (V, 3) float64, LPS mm
-    faces : (F, 3) int64
-        Vertices of each triangle.
-    bound_mm : float
-        No point of the mesh is farther than this from the boundary of the mask, nor the boundary from it.
+    Vertices are `(V, 3)` LPS mm, faces `(F, 3)` of their indices.  No point of the mesh is farther than
+    `bound_mm` from the boundary of the mask, nor the boundary from the mesh.
     """
 
     vertices_lps: Float
@@ -131,14 +126,10 @@ def smooth_surface(volume: Volume) -> SurfaceMesh:
 class MeshDistance:
     """Distances from segments, the axes of capsules, to a mesh (an FCL bounding volume hierarchy).
 
-    A capsule (a ball of radius r swept along a segment) touches the mesh if and only if the segment is not
-    farther than r from it.  Segments enter as flat triangles: FCL compares triangles in closed form
-    (error about 1e-14 mm), but capsules by iteration (error about 1e-5 mm).
-
-    Parameters
-    ----------
-    mesh : SurfaceMesh
-        May be empty: everything is then infinitely far.
+    A capsule (a ball of radius r swept along a segment) touches the mesh if and only if the segment is
+    not farther than r from it.  Segments enter as flat triangles: FCL compares triangles in closed form
+    (error about 1e-14 mm), but capsules by iteration (error about 1e-5 mm).  All is infinitely far from
+    an empty mesh.
     """
 
     def __init__(self, mesh: SurfaceMesh) -> None:

@@ -22,10 +22,8 @@ class PatientImages:
 
     Parameters
     ----------
-    name : str
-        How the patient is called in reports.
-    kind : str
-        Where the images come from: "med-rad", "totalsegmentator", "masks" or "phantom".
+    name, kind : str
+        What reports call it; where the images come from: "med-rad", "totalsegmentator", "masks" or "phantom".
     grid : Grid
         The voxel grid that all volumes share.
     lumen, vessels, lung : Volume

@@ -53,13 +53,12 @@ def settings(cls: type[T]) -> type[T]:
     return cast(type[T], made)
 
 
+End = float | None
+"""End of a range, exclusive (`above`, `below`) or inclusive; None where the range is open."""
+
+
 def quantity(
-    description: str,
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
+    description: str, *, above: End = None, at_least: End = None, below: End = None, at_most: End = None
 ) -> Any:
     """Annotate a finite number with its meaning and the range outside which it is absurd.
 
@@ -68,7 +67,7 @@ def quantity(
     description : str
         Meaning and effect; the unit is in the name of the field.
     above, at_least, below, at_most : float, optional
-        Exclusive and inclusive ends of the allowed range.
+        Ends of the allowed range.
 
     Returns
     -------

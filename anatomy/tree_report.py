@@ -8,15 +8,7 @@ from anatomy.typed import Float
 
 @frozen_record
 class Repair:
-    """A place where the tree differs from the mask.
-
-    Parameters
-    ----------
-    position_lps : (3,) float64
-        LPS mm.
-    length_mm : float
-        How large the difference is; the kinds of repairs say what is measured.
-    """
+    """A place, LPS mm, where the tree differs from the mask; its kind says what the length measures."""
 
     position_lps: Float
     length_mm: float
@@ -26,13 +18,9 @@ class Repair:
 class GapBridged(Repair):
     """A break of the lumen across which the tree was continued; its position is the middle of the gap.
 
-    The length is the distance between the two facing voxels, as solid boxes; 0 where they touch by an edge
-    or corner alone.
-
-    Parameters
-    ----------
-    voxels_joined : int
-        Voxels of the piece that was joined (0 where the pieces touch).
+    The length is the distance between the two facing voxels, as solid boxes; 0 where they touch by an
+    edge or corner alone.  `voxels_joined` is the size of the piece that was joined, 0 where the pieces
+    touch.
     """
 
     voxels_joined: int

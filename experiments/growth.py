@@ -35,16 +35,7 @@ OVERHEAD_S = 1e-3
 
 @frozen_value
 class Growth:
-    """What was measured of one workload.
-
-    Parameters
-    ----------
-    name : str
-    amounts : tuple of int
-        How much work, ascending.
-    cpu_s, peak_mb : tuple of float
-        Of each.
-    """
+    """CPU time and peak memory of one workload for each amount of work, ascending."""
 
     name: str
     amounts: tuple[int, ...]

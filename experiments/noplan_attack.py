@@ -43,15 +43,7 @@ MISSED, REFUSED = "missed", "refused"
 
 @dataclass
 class Attack:
-    """The attack on one patient and system.
-
-    Parameters
-    ----------
-    atlas : Atlas
-    planner_s, time_s : float
-        Planning time before the planner gives up, and processor time of the reference.
-    seed : int
-    """
+    """The attack on one patient and system: the planner may take `planner_s`, the reference `time_s`."""
 
     atlas: Atlas
     planner_s: float

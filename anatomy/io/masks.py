@@ -27,15 +27,9 @@ _MAY_BE_EMPTY = ("fissures", "nodules")
 
 @frozen_value
 class MaskSource:
-    """A file, or some labels of it, that makes up (a part of) the mask `role`.
+    """A file that makes up (a part of) the mask `role`, one of `anatomy.patient.MASKS`.
 
-    Parameters
-    ----------
-    role : str
-        "lumen", "wall", "vessels", "lung", "fissures" or "nodules".
-    path : Path
-    labels : tuple of int
-        Label values; empty for "any value but zero".
+    Of the file count the voxels of the labels, or, if there are none, all but zero.
     """
 
     role: str
@@ -61,10 +55,8 @@ def read_masks(sources: Sequence[MaskSource], frame: Frame | None = None) -> Mas
 
     Raises
     ------
-    AnatomyError
-        If a voxel is not a number.
-    FileError, FrameError
-        As `read_volume`.
+    AnatomyError, FileError, FrameError
+        As `read_mask`.
     GridMismatchError
         If a file lies on another grid than the first; it is named.
     """

@@ -36,21 +36,10 @@ ASIDE_RAD = (0.25, 0.5, 0.75)
 
 @frozen_value
 class GrowthRule:
-    """How branches divide.
+    """How branches divide, from the tube of `root_diameter_mm` that supplies all points of both lungs on.
 
-    Parameters
-    ----------
-    root_diameter_mm : float
-        Diameter of a tube that supplies all points.
-    total_points : int
-        Number of points of both lungs.
-    smallest_diameter_mm : float
-        Growth stops below it.
-    flow_exponent : float
-        Flow (number of points) goes with this power of the diameter [Kitaoka1999].
-    length_per_diameter : float
-    least_turn_rad, greatest_turn_rad : float
-        Range of the angle between a branch and its parent.
+    Growth stops below the smallest diameter.  Flow (number of points) goes with the power `flow_exponent`
+    of the diameter [Kitaoka1999].  The angle between a branch and its parent lies between the two turns.
     """
 
     root_diameter_mm: float

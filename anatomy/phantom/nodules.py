@@ -24,16 +24,7 @@ TUBES_LOOKED_AT = 8
 
 @frozen_record
 class Nodule:
-    """A ball of tissue in the lung.
-
-    Parameters
-    ----------
-    centre_lps : (3,) float64
-        LPS mm.
-    radius_mm : float
-    lobe : int
-        1 to 5.
-    """
+    """A ball of tissue in the lung; its centre is LPS mm, its lobe 1 to 5."""
 
     centre_lps: Float
     radius_mm: float

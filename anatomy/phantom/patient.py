@@ -61,8 +61,8 @@ class Phantom:
     ct: Volume
     labels: Volume
     lobes: Volume
-    centerlines: Mapping[str, Centerlines]
     nodules: tuple[Nodule, ...]
+    centerlines: Mapping[str, Centerlines]
 
     @property
     def grid(self) -> Grid:

@@ -36,13 +36,8 @@ NODULE_NEIGHBOUR_MM = 1.4
 class PlannedTree:
     """A tree of B branches and N points, ready to be drawn.
 
-    Parameters
-    ----------
-    sprouts : Sprouts
-    inner_mm, outer_mm : (N,) float64
-        Radius of the lumen and of the outside at each point; the same for a vessel.
-    freedom : (B,) uint8
-        Where a branch may be drawn, see `paint_tree`.
+    `inner_mm` and `outer_mm`, `(N,)`, are the radii of lumen and outside, the same for a vessel;
+    `freedom`, `(B,)`, tells where a branch may be drawn, see `paint_tree`.
     """
 
     sprouts: Sprouts

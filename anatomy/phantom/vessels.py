@@ -50,15 +50,7 @@ SQUEEZE = 0.5
 
 @frozen_record
 class Obstacles:
-    """Balls that vessels keep away from.
-
-    Parameters
-    ----------
-    centres : (N, 3) float64
-        LPS mm.
-    radii : (N,) float64
-        In mm.
-    """
+    """Balls that vessels keep away from: centres `(N, 3)` LPS mm, radii `(N,)` mm."""
 
     centres: Float
     radii: Float

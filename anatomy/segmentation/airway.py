@@ -38,16 +38,10 @@ GREATEST_HU = 16_383
 
 @frozen_record
 class Airways:
-    """The airways of both lungs on the grid of the CT.
+    """The airways of both lungs, bool `(ni, nj, nk)` on the grid of the CT.
 
-    Parameters
-    ----------
-    lumen, wall : (ni, nj, nk) bool
-        The lumen is one piece, connected by faces, from the trachea on; they share no voxel.
-    warnings : tuple of str
-        What should be looked at.
-    leak_mm3 : float
-        Volume that was grown and taken back as a leak.
+    The lumen is one piece, connected by faces, from the trachea on; it shares no voxel with the wall.
+    `leak_mm3` was grown and taken back as a leak.
     """
 
     lumen: Mask
@@ -101,15 +95,16 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     rough = np.ascontiguousarray(lungs.central_airway[box].T)
     sample = lung.reshape(-1)[::SAMPLE_STEP]
     tissue_hu = np.median(smooth.reshape(-1)[::SAMPLE_STEP][sample])
+    dark_hu = float(np.median(smooth[rough]) + tissue_hu) / 2
     noise = float(np.percentile(depth.reshape(-1)[::SAMPLE_STEP][sample], NOISE_PERCENTILE))
     ground = Ground(
         hu=hu,
+        dark_hu=dark_hu,
         smooth=smooth,
         depth=depth,
+        least_depth=max(noise, LEAST_DEPTH_HU),
         lung=lung,
         spacing_mm=spacing_mm,
-        dark_hu=float(np.median(smooth[rough]) + tissue_hu) / 2,
-        least_depth=max(noise, LEAST_DEPTH_HU),
     )
     tell("airway: growth")
     seed = lungs.trachea_seed_ijk - [s.start for s in box]

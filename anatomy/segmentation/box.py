@@ -16,15 +16,7 @@ BOX_PAD_MM = 10.0
 
 @frozen_record
 class Box:
-    """A box of voxels of a grid.
-
-    Parameters
-    ----------
-    grid : Grid
-        The whole grid.
-    low, high : (3,) int64
-        The voxels of the box are `low <= ijk < high`.
-    """
+    """The voxels `low <= ijk < high` of a whole grid; both ends `(3,)` int64."""
 
     grid: Grid
     low: Int

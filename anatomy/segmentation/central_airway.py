@@ -42,17 +42,10 @@ WIDE_SHARE = 0.35
 
 @frozen_record
 class CentralAirway:
-    """The large airways on coarse voxels.
+    """The large airways on coarse voxels, bool `(Ni, Nj, Nk)`.
 
-    Parameters
-    ----------
-    grown : (Ni, Nj, Nk) bool
-        Trachea and all bronchi that could be followed without a leak.
-    main : (Ni, Nj, Nk) bool
-        Of these, trachea and main bronchi.
-    seed : (3,) int64
-        A coarse voxel in the middle of the trachea.
-    warnings : tuple of str
+    `grown` are trachea and all bronchi that could be followed without a leak, `main` of these trachea and
+    main bronchi; the seed `(3,)` int64 is a voxel in the middle of the trachea.
     """
 
     grown: Mask

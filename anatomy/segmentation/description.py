@@ -15,10 +15,6 @@ class Description:
     """The `patient.toml` of a folder: set aside while images change, so that no half-made patient is read.
 
     A person's own edits are kept.
-
-    Parameters
-    ----------
-    folder : SegmentationFolder
     """
 
     def __init__(self, folder: SegmentationFolder, name: str) -> None:

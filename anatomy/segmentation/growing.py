@@ -86,14 +86,7 @@ class Grown:
 
 
 def grow(ground: Ground, start: Mask) -> Grown:
-    """Grow lumen and wall of the airway.
-
-    Parameters
-    ----------
-    ground : Ground
-    start : (nk, nj, ni) bool
-        Lumen that is certain: trachea and main bronchi.
-    """
+    """Grow lumen and wall from the lumen `(nk, nj, ni)` that is certain: trachea and main bronchi."""
     state = _padded(start.astype(np.uint8))
     hu, smooth = _padded(ground.hu, AIR_HU), _padded(ground.smooth, AIR_HU)
     shape = np.array(state.shape, dtype=np.int64)

@@ -97,10 +97,6 @@ def segment_lungs(
     ------
     AnatomyError
         If there is no trachea or no lung.
-
-    References
-    ----------
-    [Fu2018], III-A.1: seeded region growing and closing; [Hu2001] for the threshold.
     """
     tell = progress or (lambda _step: None)
     tell("lungs: coarse image")

@@ -29,21 +29,10 @@ BYTES_PER_VOXEL = 40
 
 @frozen_record
 class Segmentation:
-    """What a segmentation wrote.
+    """What a segmentation wrote; all images lie on the grid of the CT.
 
-    Parameters
-    ----------
-    folder : Path
-    grid : Grid
-        The grid of the CT, and of all images.
-    parts : Parts
-    recomputed : tuple of str
-        Steps that were run; the others were up to date.
-    corrected : tuple of str
-        Images taken from a person.
-    kept_description : bool
-        Whether an edited `patient.toml` was kept.
-    warnings : tuple of str
+    Steps not in `recomputed` were up to date; `corrected` images are a person's; `kept_description` tells
+    whether an edited `patient.toml` was kept.
     """
 
     folder: Path

@@ -22,18 +22,7 @@ USUAL_LUNGS_L = (1.5, 9.0)
 
 @frozen_record
 class Quality:
-    """Figures and warnings about one segmentation.
-
-    Parameters
-    ----------
-    volumes_l : dict of str to float
-        Volumes in litres.
-    tree : AirwayTree or None
-        None if no tree could be made of the airway.
-    ends : int
-        Ends of the airway.
-    warnings : tuple of str
-    """
+    """Figures and warnings about one segmentation; the tree is None if none could be made of the airway."""
 
     volumes_l: dict[str, float]
     tree: AirwayTree | None

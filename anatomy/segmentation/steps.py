@@ -38,17 +38,8 @@ _NOT_MASKS = ("lungs", "vesselness", "cost")
 class Parts:
     """The images of a segmentation on the grid of the CT, `(ni, nj, nk)`.
 
-    Parameters
-    ----------
-    left, right, central_airway, lumen, wall : bool
-    nodule : bool
-        Empty if none was given.
-    vesselness : float32
-        In [0, 1].
-    large_vessels, all_vessels : bool
-        Obstacles, and everything taken for a vessel.
-    cost : float32
-        In [0, 1], or infinite in obstacles.
+    The nodule is empty if none was given; vesselness is in [0, 1], cost too, or infinite in obstacles,
+    which the large vessels are.
     """
 
     left: Mask
@@ -64,18 +55,7 @@ class Parts:
 
 
 class Steps:
-    """Runs lungs, airway, nodule, vessels and cost map in this order.
-
-    Parameters
-    ----------
-    request : SegmentationRequest
-    folder : SegmentationFolder
-    description : Description
-        Set aside before the first image changes.
-    ct_digest : str
-    progress : callable
-        Told each step as it begins.
-    """
+    """Runs lungs, airway, nodule, vessels and cost map in this order; tells each step as it begins."""
 
     def __init__(
         self,

@@ -9,18 +9,10 @@ from anatomy.segmentation.scale_space import ScaleSpace
 from anatomy.typed import Float, Float32, Int16, Mask
 
 ALPHA, BETA, C_HU = 0.5, 0.5, 70.0
+"""Sensitivity to plates and to blobs; Hessian of 39 % of the greatest response [Fu2018]."""
 
 
-def vesselness(
-    hu: Int16 | Float32,
-    lung: Mask,
-    spacing_mm: ArrayLike,
-    *,
-    alpha: float = ALPHA,
-    beta: float = BETA,
-    c_hu: float = C_HU,
-    threads: int = 0,
-) -> Float32:
+def vesselness(hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, threads: int = 0) -> Float32:
     """Return the greatest response over the scales that apply at each voxel [Fu2018, eqs. 3-5].
 
     Parameters
@@ -31,10 +23,6 @@ def vesselness(
         Lungs with their vessels; the distance to its surface decides which scales apply.
     spacing_mm : (3,) float64
         Voxel size along i, j, k.
-    alpha, beta : float
-        Sensitivity to plates and to blobs.
-    c_hu : float
-        Strength of the Hessian, in HU, at which the response has 39 % of its greatest value.
     threads : int
         0 for all processors; the result does not depend on it.
 
@@ -45,14 +33,12 @@ def vesselness(
 
     Raises
     ------
-    GridMismatchError
-        If the shapes differ.
-    AnatomyError
-        If the lung is empty.
+    GridMismatchError, AnatomyError
+        If the shapes differ; if the lung is empty.
     """
     space = ScaleSpace.of(hu, lung, spacing_mm, threads=threads)
     best = np.zeros(space.hu.shape, dtype=np.float32)
-    settings = np.array([alpha, beta, c_hu])
+    settings = np.array([ALPHA, BETA, C_HU])
     for scale, (sigma, image) in enumerate(space.images()):
         add_vesselness_of(space, scale, sigma, image, settings, best)
     return space.whole(best, hu.shape)

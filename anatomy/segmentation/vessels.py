@@ -43,18 +43,8 @@ EDGE_VOXELS = 2
 class Vessels:
     """Vessels of both lungs on the grid of the CT, all `(ni, nj, nk)`.
 
-    Parameters
-    ----------
-    vesselness : float32
-        Response in [0, 1]: 1 in large vessels, 0 in airways and their walls and outside the lung.
-    large : bool
-        Vessels of more than about 2.8 mm radius.
-    mask : bool
-        All vessels: `vesselness >= threshold`.
-    threshold : float
-        Fixed on other data.
-    warnings : tuple of str
-        What was unusual.
+    Vesselness is 1 in large vessels, of more than about 2.8 mm radius, and 0 in airways and their walls
+    and outside the lung; `mask` are the voxels that reach `threshold`, which is fixed on other data.
     """
 
     vesselness: Float32

@@ -26,16 +26,10 @@ class NodeBranch:
 
 @frozen_record
 class Strand:
-    """A branch as points.
+    """A branch as points, `(n, 3)` LPS mm, and radii, `(n,)` mm.
 
-    Parameters
-    ----------
-    points_lps : (n, 3) float64
-    radius_mm : (n,) float64
-    parent : int
-        Index of the parent strand, which comes earlier; -1 for the trachea.
-    attach : int
-        Index of the point of the parent strand that it grows from; -1 for the trachea.
+    It grows from the point `attach` of the strand `parent`, which comes earlier; both are -1 for the
+    trachea.
     """
 
     points_lps: Float

@@ -24,13 +24,7 @@ ELONGATION = 1.5
 
 @frozen_record
 class Piece:
-    """A separate piece of the mask.
-
-    Parameters
-    ----------
-    voxels : (M, 3) int64
-        Its voxels, ijk.
-    """
+    """A separate piece of the mask; its voxels `(M, 3)` int64, ijk."""
 
     voxels: Int
 

@@ -31,18 +31,10 @@ SPUR_MAX_MM = 3.0
 
 @frozen_record
 class SkeletonTree:
-    """An unrooted tree of N nodes.
+    """An unrooted tree of N nodes: voxels `ijk` and `mm` (the same times the spacing), `(N, 3)`.
 
-    Parameters
-    ----------
-    ijk : (N, 3) int64
-        Voxels of the nodes.
-    mm : (N, 3) float64
-        The same times the spacing.
-    depth_mm : (N,) float64
-        Distance of each node to the border of the lumen.
-    neighbours : list of list of int
-        The nodes next to each node; none for nodes that were taken off.
+    `depth_mm` `(N,)` is the distance to the border of the lumen; nodes that were taken off have no
+    neighbours.
     """
 
     ijk: Int

@@ -40,16 +40,9 @@ MAX_TILT_COS = 0.5
 
 @frozen_record
 class Trunk:
-    """An end of the tree followed inwards over thin side branches to where it divides.
+    """An end of the tree followed inwards over thin side branches to where it divides, or else ends.
 
-    Parameters
-    ----------
-    nodes : list of int
-        From the end to the division.
-    radius_mm, length_mm : float
-        Its median radius, and its length along the nodes.
-    divides : bool
-        Whether it ends at a division, not at another end.
+    The radius is the median of its nodes, the length goes along them.
     """
 
     nodes: list[int]
@@ -59,14 +52,9 @@ class Trunk:
 
 
 def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
-    """Return the trachea; its first node is the root.
+    """Return the trachea of a tree that is pruned; its first node is the root.
 
-    Parameters
-    ----------
-    tree : SkeletonTree
-        Already pruned.
-    lps_from_mm : (3, 3) float64
-        Turns the directions of the tree's own frame into LPS.
+    `lps_from_mm` (3, 3) turns the directions of the tree's own frame into LPS.
 
     Raises
     ------

@@ -27,18 +27,10 @@ HALVINGS = 4
 
 @frozen_record
 class VoxelTree:
-    """A rooted tree of positions, parents before children.
+    """A rooted tree of M positions `ijk` in voxels of the prepared box, parents (-1: none) before children.
 
-    Parameters
-    ----------
-    ijk : (M, 3) float64
-        Positions in voxel units of the prepared box.
-    parent : (M,) int64
-        -1 at the root.
-    across_gap : (M,) bool
-        The step from the parent to this position leaves the lumen.
-    trunk_end : int
-        Where the trachea divides.
+    The step from the parent to a position `across_gap` leaves the lumen; the trachea divides at
+    `trunk_end`.
     """
 
     ijk: Float

@@ -41,16 +41,7 @@ LEAST_COST = 1.0
 
 @frozen_record
 class Scenario:
-    """A start pose and a goal.
-
-    Parameters
-    ----------
-    name : str
-        Of `SCENARIOS`.
-    query : Query
-    solved_share : float
-        Share of `TRIES` short searches that find a path.
-    """
+    """A start pose and a goal of `SCENARIOS`, with the share of `TRIES` short searches that find a path."""
 
     name: str
     query: Query

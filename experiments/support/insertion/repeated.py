@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_record
-from experiments.support.insertion.closed_loop import (
-    GAIN,
-    STEP_MM,
-    TOLERANCE_MM,
-    Insertion,
-    Outcome,
-    simulate,
-)
+from experiments.support.insertion.closed_loop import Insertion, Outcome, simulate
 from experiments.support.insertion.truth import Errors
 from lungaccess.risk import Share
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
-from stages.needle.replanning.replanner import DEFAULT_SETTINGS, ITERATIONS, ReplanSettings
 
 
 @frozen_record
@@ -67,16 +59,11 @@ def study(
     errors: Errors,
     *,
     seeds: Iterable[int],
-    step_mm: float = STEP_MM,
-    tolerance_mm: float = TOLERANCE_MM,
-    gain: float = GAIN,
-    objective: Objective = SHORTEST,
-    replanning: ReplanSettings = DEFAULT_SETTINGS,
-    iterations: int = ITERATIONS,
+    **settings: Any,
 ) -> Study:
     """Insert one needle for each seed, in open and in closed loop.
 
-    Parameters are those of `simulate`.
+    Parameters are those of `simulate`, to which the settings go.
 
     Raises
     ------
@@ -87,11 +74,7 @@ def study(
 
     def insertions(closed_loop: bool) -> Iterator[Insertion]:
         for seed in chosen:
-            yield simulate(
-                environment, query, plan, errors, closed_loop=closed_loop, seed=seed, step_mm=step_mm,
-                tolerance_mm=tolerance_mm, gain=gain, objective=objective, replanning=replanning,
-                iterations=iterations,
-            )  # fmt: skip
+            yield simulate(environment, query, plan, errors, closed_loop=closed_loop, seed=seed, **settings)
 
     return Study(open_loop=summary(insertions(False)), closed_loop=summary(insertions(True)))
 

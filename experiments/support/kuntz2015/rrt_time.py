@@ -20,13 +20,7 @@ PAPER_S, PAPER_SHARE = 0.05, 95.0
 
 
 class TimedRRT(NeedleRRT):
-    """A needle RRT that notes how long each success took, in `found_s`.
-
-    Parameters
-    ----------
-    plain : NeedleRRT
-        Whose needle and obstacles it takes.
-    """
+    """The needle RRT `plain` that notes how long each success took, in `found_s`."""
 
     def __init__(self, plain: NeedleRRT) -> None:
         vars(self).update(vars(plain))
@@ -44,14 +38,7 @@ class TimedRRT(NeedleRRT):
 
 
 class TimedSearch(ReferenceSearch):
-    """Algorithm 1 with `LONG_S` for each RRT, and the processor time of each success.
-
-    Parameters
-    ----------
-    task : Task
-    atlas : Atlas
-    obstacles : Obstacles
-    """
+    """Algorithm 1 with `LONG_S` for each RRT, and the processor time of each success."""
 
     def __init__(self, task: Task, atlas: Atlas, obstacles: Obstacles) -> None:
         super().__init__(task, atlas, rrt_time_s=LONG_S, obstacles=obstacles)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from experiments.support.mutants import motion, place, record, tissue
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng
+from experiments.support.mutants.draws import Rng
+from experiments.support.mutants.mutant import Case, Mutant, Mutation
 
 MUTATIONS: dict[str, Mutation] = {
     mutation.__name__: mutation for family in (record, motion, place, tissue) for mutation in family.MUTATIONS

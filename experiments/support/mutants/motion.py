@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from anatomy.typed import Float
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng, changed, direction, far, signed
+from experiments.support.mutants.draws import Rng, direction, far, signed
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath
 

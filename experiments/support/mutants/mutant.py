@@ -1,4 +1,4 @@
-"""What a mutation of a plan works on, what it makes, and the random sizes it draws.
+"""What a mutation of a plan works on and what it makes.
 
 A mutation takes a case and a random generator and returns a mutant, or None where the plan leaves it nothing
 to falsify (the roll of a straight needle, say).  A mutant is false or unsafe by a size that docs/check.md
@@ -11,16 +11,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
-from anatomy.typed import Float
+from experiments.support.mutants.draws import Rng
 from lungaccess.checking import CheckReport
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, system_fingerprint
-
-Rng = np.random.Generator
 
 
 @frozen_record
@@ -39,17 +35,9 @@ class Case:
 
 @frozen_record
 class Mutant:
-    """A plan that must be refused, perhaps because of one voxel.
+    """A plan that must be refused, perhaps because one voxel `(3,)` of the lung has another label.
 
-    Parameters
-    ----------
-    plan : Plan
-    voxel : (3,) int64, optional
-        Index of a voxel of the lung that has another label.
-    label : int
-        That label.
-    asked : bool
-        Whether the check is told for which system and target the plan has to be.
+    The check is told for which system and target the plan has to be if `asked`.
     """
 
     plan: Plan
@@ -88,26 +76,3 @@ def with_system(plan: Plan, system: System) -> Plan:
             "needle": system.needle.radius_mm + margin,
         },
     )
-
-
-def direction(rng: Rng) -> Float:
-    """Return a random direction `(3,)`."""
-    vector = rng.standard_normal(3)
-    return np.asarray(vector / np.linalg.norm(vector))
-
-
-def far(rng: Rng, low: float, high: float) -> float:
-    """Return a random size; small ones are as likely as large ones."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-def signed(rng: Rng, low: float, high: float) -> float:
-    """Return a random size of either sign."""
-    return far(rng, low, high) * float(rng.choice([-1.0, 1.0]))
-
-
-def rotation(axis: Float, angle_rad: float) -> Float:
-    """Return the `(3, 3)` rotation about an axis [Rodrigues]."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * cross @ cross)

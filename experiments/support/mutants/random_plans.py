@@ -15,7 +15,7 @@ from anatomy.errors import SettingsError, TargetError
 from anatomy.lung import Lung
 from anatomy.settings import override
 from anatomy.typed import Float
-from experiments.support.mutants.mutant import Rng
+from experiments.support.mutants.draws import Rng
 from lungaccess.coupled import DirectArcs, alternatives
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.plans.assemble import assemble

@@ -8,17 +8,8 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.settings import override, to_mapping
-from experiments.support.mutants.mutant import (
-    Case,
-    Mutant,
-    Mutation,
-    Rng,
-    changed,
-    direction,
-    far,
-    signed,
-    with_system,
-)
+from experiments.support.mutants.draws import Rng, direction, far, signed
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, with_system
 
 SEEN_MM = 0.05
 """A stated clearance may be so much too large."""

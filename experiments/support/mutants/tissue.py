@@ -8,7 +8,8 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.typed import Float
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, Rng, changed, direction
+from experiments.support.mutants.draws import Rng, direction
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath, direct_path

@@ -18,26 +18,7 @@ from stages.scope.route.settings import RouteLimits
 
 @settings
 class SamplingSettings:
-    """How the baselines are set up; the first three numbers are the paper's.
-
-    Parameters
-    ----------
-    samples : int
-        Most samples to take.
-    goal_probability : float
-        How often a sample is followed by an attempt to connect the goal.
-    neighbours : int
-        How many near vertices RRT* looks at.
-    step_mm : float
-        Longest edge; the paper states none.
-    look_mm : float
-        Spacing of the points at which an edge is tested.
-
-    Raises
-    ------
-    SettingsError
-        If a value is out of its range.
-    """
+    """How the baselines are set up; the first three numbers are those of the paper, which states no step."""
 
     samples: Annotated[int, quantity("most samples", at_least=1, at_most=10_000_000)] = 4048
     goal_probability: Annotated[float, quantity("chance to try the goal", at_least=0.0, at_most=1.0)] = 0.1
@@ -62,16 +43,7 @@ def sampled_route(
     The trees know nothing of curvature: each path to the goal becomes a cubic spline through its vertices,
     which keeps the limits more often than one through points every 3 mm; if it breaks one, sampling goes on.
 
-    Parameters
-    ----------
-    centreline : Centreline
-    start_mm, goal_mm : (3,) float64
-    limits : RouteLimits
-    star : bool
-    seed : int
-    settings : SamplingSettings, optional
-    any_curve : bool
-        Take the first path that is found, whether its curve keeps the limits or not.
+    Points are `(3,)` LPS mm.  With `any_curve`, the first path is taken, whatever limits its curve breaks.
 
     Returns
     -------
@@ -82,10 +54,6 @@ def sampled_route(
     ------
     NoRouteError
         If the goal was never connected within the samples.
-
-    References
-    ----------
-    .. [Li2021] docs/bibliography.md
     """
     chosen = settings or SamplingSettings()
     points, parent = np.zeros((chosen.samples + 1, 3)), np.full(chosen.samples + 1, -1, dtype=np.int64)

@@ -38,17 +38,7 @@ NEAREST_ENDS_MM = 20.0
 
 @frozen_record
 class Tubes:
-    """Tubes to plan in, with what is known of them beforehand.
-
-    Parameters
-    ----------
-    name : str
-    centreline : Centreline
-    links : Links
-        Which points of the centreline are neighbours.
-    root : int
-        The point of the centreline at which trials begin.
-    """
+    """Tubes to plan in, their links between points of the centreline, and the point at which trials begin."""
 
     name: str
     centreline: Centreline

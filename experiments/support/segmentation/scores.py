@@ -28,15 +28,7 @@ AUC_SAMPLES = 200_000
 
 @frozen_value
 class F1:
-    """Mean F1 of several draws of points.
-
-    Parameters
-    ----------
-    best, best_threshold : float
-        At the best threshold of each draw, and the mean of these thresholds.
-    fixed, fixed_deviation : float
-        At the fixed threshold, and its standard deviation over the draws.
-    """
+    """Mean F1 of several draws of points, at the best threshold of each draw and at the fixed threshold."""
 
     best: float
     best_threshold: float

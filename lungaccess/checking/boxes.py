@@ -21,7 +21,6 @@ class Boxes:
 
     Parameters
     ----------
-    tiles : Tiles
     select : Select
         Tells from the labels which voxels belong to the structure.
     reach_mm : float

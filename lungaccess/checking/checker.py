@@ -57,7 +57,6 @@ def check(
 
     Parameters
     ----------
-    plan : Plan
     lung : Lung
         The patient that the plan is for.
     system : System, optional

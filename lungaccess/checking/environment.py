@@ -39,12 +39,7 @@ class Environment:
 
 
 class AirwayAxis:
-    """The points and edges of the airway tree, for distances to it.
-
-    Parameters
-    ----------
-    tree : AirwayTree
-    """
+    """The points and edges of the airway tree, for distances to it."""
 
     def __init__(self, tree: AirwayTree) -> None:
         child = np.flatnonzero(tree.parent_point >= 0)

@@ -21,14 +21,12 @@ class Finding:
     ----------
     name : str
         Stage and property, such as "needle.clearance.vessel".
-    ok : bool
     value, limit : float or None
         What was found and the bound it had to keep; None for what is not a number.
     side : str or None
         Whether the value must be "at least" or "at most" the limit; None without a limit.
     tolerance : float
         It is ok if it misses the limit by no more than this.
-    unit : str
     detail : str
         What was compared, in words.
     """
@@ -85,13 +83,7 @@ class Finding:
 
 @frozen_value
 class CheckReport:
-    """The verdict of the check: accepted only if every finding is ok.
-
-    Parameters
-    ----------
-    accepted : bool
-    findings : tuple of Finding
-    """
+    """The verdict of the check: accepted only if every finding is ok."""
 
     accepted: bool
     findings: tuple[Finding, ...]

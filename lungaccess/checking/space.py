@@ -83,7 +83,6 @@ class Region:
 
     Parameters
     ----------
-    grid : Grid
     labels : (ni, nj, nk) uint16
     """
 

@@ -63,13 +63,10 @@ class Health:
 
     Parameters
     ----------
-    version, python, system : str
     cores, usable_cores : int
         Of the machine, and those that this process may use.
     memory_bytes, free_memory_bytes : int or None
         None where the system does not say.
-    libraries : tuple of Library
-    kernels : KernelCache
     cache : Folder
         Prepared anatomies and atlases.
     data : Folder or None

@@ -69,17 +69,7 @@ class CostHistory:
 
 @frozen_value
 class PlanRequest:
-    """What to plan, and where to write it.
-
-    Parameters
-    ----------
-    system : System
-    target : StatedTarget
-    search : SearchOptions
-    out : Path
-        Folder for the files.
-    output : PatientOptions
-    """
+    """What to plan, and the folder for the files."""
 
     system: System
     target: StatedTarget

@@ -75,10 +75,6 @@ class StepDisplay(_Shown):
     """Shows work that is done in steps.
 
     The bar moves back and forth as long as nobody knows which share is done.
-
-    Parameters
-    ----------
-    description : str
     """
 
     def __init__(self, description: str) -> None:

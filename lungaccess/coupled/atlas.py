@@ -34,11 +34,8 @@ class Atlas:
 
     Parameters
     ----------
-    lung : Lung
-    system : System
     with_fissures : bool
         Whether fissures are obstacles.
-    sites : Sites
     deployments : Deployments
         `deployments.site` indexes `sites`.
     index : StartIndex
@@ -85,8 +82,6 @@ def build_atlas(
 
     Parameters
     ----------
-    lung : Lung
-    system : System
     rotations : int
         Evenly spaced rotations of the tubes, and further ones where tube or exit is near a limit.
     stop_spacing_mm, site_spacing_mm : float

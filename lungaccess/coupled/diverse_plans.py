@@ -35,7 +35,6 @@ class Alternative:
 
     Parameters
     ----------
-    plan : Plan
     criteria : dict of str to float
         "clearance_mm" and "pleura_mm", least distance of tube and needle from any obstacle and from the
         pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" of the needle.

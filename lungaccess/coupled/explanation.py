@@ -18,8 +18,6 @@ def explain(task: Task, atlas: Atlas, blocked: Counter[str], iterations: int) ->
 
     Parameters
     ----------
-    task : Task
-    atlas : Atlas
     blocked : Counter of str
         How many direct arcs were stopped in the search, by what stopped them.
     iterations : int

@@ -40,7 +40,6 @@ class ProgressEvent:
 
     Parameters
     ----------
-    iteration : int
     elapsed_s : float
         Planning time, without that of the atlas.
     best_cost : float or None
@@ -74,9 +73,6 @@ def plan(
 
     Parameters
     ----------
-    lung : Lung
-    system : System
-    target : Target
     objective : str or Objective
         "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1], "length_mm", or a
         weighted sum of them such as "length=1,cost-map=0.5".

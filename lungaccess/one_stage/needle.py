@@ -126,9 +126,7 @@ def plan_needle(
         alone, and can be seeded once in a process, so each call needs a process of its own.
     objective : str or Objective
         What is made small; see `stages.needle.objective.Objective.of`.
-    seed : int
-    iterations : int, optional
-    time_s : float, optional
+    iterations, time_s : optional
         The search ends by whichever comes first, or by itself.  At least one is needed.
 
     Raises

@@ -37,7 +37,6 @@ def open_source(
 
     Parameters
     ----------
-    path : Path
     frame : str, optional
         Frame of a centreline file or mask that states none.
     pixel_mm : float, optional

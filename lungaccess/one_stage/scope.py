@@ -89,13 +89,10 @@ def advise_scope(
 
     Parameters
     ----------
-    lung : Lung
     system : System
         Its scope is used.
     lesion_lps : (3,) float64, LPS mm
         Centre of the lesion, anywhere.
-    lesion_radius_mm : float
-    seed : int
 
     Raises
     ------

@@ -54,13 +54,11 @@ class TourAnswer:
         Their numbers, from 1, in the order in which the user gave them.
     left_out : mapping of int to str
         Numbers of lesions that cannot be reached, and why.
-    subtree : Subtree
     shortest : Itinerary
         The shortest tour over all choices of exits.
     least_resistance : Itinerary or None
         The shortest tour over the exits of the circuit with the least resistance [Pan2025]; None if there
         are too many combinations.
-    circuits : Circuits or None
     one_by_one_mm : float
         Length of a tour in which the scope returns to the root between any two lesions, over the exits of
         `shortest`.
@@ -117,11 +115,9 @@ def plan_tour(
 
     Parameters
     ----------
-    lung : Lung
     lesions_lps : (M, 3) float64, LPS mm
     rule : ExitRule, optional
         By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
-    weights : Resistances, optional
     reading : str
         How resistances are merged: "printed" or "reduced", see `stages.scope.tour.circuit`.
     closed : bool

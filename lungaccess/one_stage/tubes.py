@@ -64,7 +64,6 @@ class TubeAnswer:
 
     Parameters
     ----------
-    name : str
     system : System or None
         None for a bare pair of tubes.
     outer_mm, inner_mm, rotation_rad, relative_rad : float
@@ -73,7 +72,6 @@ class TubeAnswer:
         The deployed tubes; if they snap before, an equilibrium that this sequence does not reach.
     deployed : DeployedSequence or None
         All steps; None if the tubes snap.
-    snap : SnapError or None
     """
 
     name: str
@@ -123,7 +121,6 @@ def deploy_tubes(
 
     Parameters
     ----------
-    device : System or TubePair
     outer_mm, inner_mm : float
         How far the tubes come out of the scope.
     rotation_rad : float

@@ -18,7 +18,6 @@ def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fis
     ----------
     lung : Lung
         Without a cost map, the costs of the map are 0.
-    path : ArcPath
     objective : str or Objective
         See `stages.needle.objective.Objective.of`.
     with_fissures : bool

@@ -21,10 +21,8 @@ def plan_html(
 
     Parameters
     ----------
-    heading : str
     rows : iterable of (str, str)
         Names and values of the table.
-    curves : DeviceCurves
     exit_lps, target_lps : (3,) float64, LPS mm
         Where rings are drawn.
     """

@@ -39,9 +39,6 @@ class NeedleArrays(NamedTuple):
 
     Parameters
     ----------
-    obstacles : Obstacles
-    limits : Limits
-    objective : ObjectiveArrays
     has_forbidden_voxels : bool
         Whether a cost map forbids voxels, by infinite costs, that the objective does not weigh.
     forbidden_map : (ni, nj, nk) float32
@@ -61,10 +58,6 @@ BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"
 
 class CandidateEvaluator:
     """Proves and costs the candidates of one task, from the numbers that a plan will state.
-
-    Parameters
-    ----------
-    task : Task
 
     Attributes
     ----------

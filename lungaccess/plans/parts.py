@@ -79,7 +79,6 @@ class TubeDeployment(Record):
         Lengths of outer and inner tube beyond the tip of the scope.
     lps_from_tip : (4, 4) float64
         Pose of the tip of the inner tube; +z is forward.
-    exit : WallExit
     lateral_sweep_mm : float
         Largest sideways motion of the tubes while they are deployed.
     follow_the_leader_error_mm : float
@@ -115,9 +114,7 @@ class NeedlePath(Record):
     ----------
     lps_from_start : (4, 4) float64
         Pose of the needle where it leaves the tube.
-    arcs : tuple of NeedleArc
     end_lps : (3,) float64, LPS mm
-    length_mm : float
     max_angle_from_start_rad : float
         Largest angle between the needle and its start direction.
     accumulated_turn_rad : float

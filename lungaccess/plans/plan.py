@@ -26,25 +26,21 @@ class Plan(Record):
     ----------
     schema : str
         `lungaccess.plans.file.SCHEMA`.
-    software_version : str
     patient_name, lung_key : str
         The patient, and the content hash of the lung planned on.
     sources : mapping of str to str
         SHA-256 of every image file.
     breath_hold : str or None
         In which breath-hold the image was taken.
-    system : System
     system_fingerprint : str
         SHA-256 of the system's settings.
     target_lps : (3,) float64, LPS mm
     target_origin : str
         Where the target came from; starts with "nodule" if it is the nodule mask.
-    fissures_are_obstacles : bool
     objective : str
         What was minimised: a key of `costs`; see `stages.needle.objective.Objective`.
     scope, tube, needle
         The three stages.
-    exemption : Exemption
     required_clearance_mm : mapping of str to float
         Radius plus margins of "outer_tube", "inner_tube" and "needle".
     clearance_mm : mapping of str to mapping of str to float
@@ -53,8 +49,6 @@ class Plan(Record):
     costs : mapping of str to float
         "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, and the cost under the
         objective where that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
-    method : str
-    seed, iterations : int
     timing : mapping of str to float
         Seconds; the only values that differ between two equal runs.
     """

@@ -22,7 +22,6 @@ def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
 
     Parameters
     ----------
-    lung : Lung
     per_lung : int
         How many on each side of the carina.
     seed : int

@@ -34,7 +34,6 @@ class System:
         What it is, for people.
     sources : tuple of str
         Where the numbers come from; what has no source says "assumption".
-    scope : Bronchoscope
     tubes : ConcentricTubes
         The outer tube runs in the channel of the scope.
     needle : Needle

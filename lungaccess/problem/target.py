@@ -91,7 +91,6 @@ def resolve_target(lung: Lung, text: str | None = None, nodule: int | None = Non
 
     Parameters
     ----------
-    lung : Lung
     text : str, optional
         A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm.
     nodule : int, optional

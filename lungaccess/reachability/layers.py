@@ -52,8 +52,6 @@ def scan_layers(
 
     Parameters
     ----------
-    scan : ReachScan
-    grid : Grid
     counted : (ni, nj, nk) bool
         Voxels whose centres are tried.
     store : LayerStore or None

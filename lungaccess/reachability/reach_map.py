@@ -51,7 +51,6 @@ class RegionReach:
 
     Parameters
     ----------
-    name : str
     volume_ml : float
         Lung tissue that is no obstacle.
     shares : tuple of float
@@ -78,8 +77,6 @@ class ReachMap:
 
     Parameters
     ----------
-    patient_name : str
-    system : System
     with_fissures : bool
         Whether fissures are obstacles.
     kinds : Volume of uint8
@@ -207,8 +204,6 @@ def map_reach(
 
     Parameters
     ----------
-    lung : Lung
-    system : System
     spacing_mm : float
         Side of the map's voxels.
     arcs, trees : int
@@ -273,7 +268,6 @@ def compare_reach(
     ----------
     lung, spacing_mm, arcs, trees, work
         See `map_reach`.
-    systems : iterable of System
     progress : callable, optional
         Told the name of the system and the share of its layers done.
     """

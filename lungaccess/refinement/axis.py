@@ -22,10 +22,8 @@ class LocalAxis:
 
     Parameters
     ----------
-    tree : AirwayTree
     sites : Sites
         Says where the scope passes.
-    tip : ScopeTip
     branch : int
         The branch that the tubes pierce: where the airway forks, the axis goes on towards it.
 

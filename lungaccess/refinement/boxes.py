@@ -49,7 +49,6 @@ def spared_box(lung: Lung, points: Float, margin_mm: float, *, bits: int, branch
     ----------
     bits : int
         Structures that are obstacles.
-    branch : int
     """
     geometry = corner_geometry(lung.grid)
     low, high = _range(geometry, lung.labels.shape, points, margin_mm)

@@ -28,7 +28,6 @@ def refine(
 
     Parameters
     ----------
-    task : Task
     atlas_sites : Sites
         Where the scope passes.
     candidate : Candidate

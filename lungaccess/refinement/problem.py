@@ -65,8 +65,6 @@ class Problem:
 
     Parameters
     ----------
-    task : Task
-    sites : Sites
     candidate : Candidate
         With at most as many arcs as the last of ARC_COUNTS.
     weights : tuple of 3 float

@@ -89,7 +89,6 @@ class Program:
 
     Parameters
     ----------
-    layout : Layout
     iterations : int
         Most steps of IPOPT.
     """

@@ -32,8 +32,6 @@ class Placement:
         Share of the step from the candidate (0) to what the program found (1).
     x : (n,) float64
         The site counts from `tip`.
-    tip : ScopeTip
-    deployment : Deployment
     """
 
     share: float

@@ -22,7 +22,6 @@ class CostPoint:
     ----------
     elapsed_s : float
         Planning time since the search began.
-    iteration : int
     best_cost : float or None
         Cost of the best plan yet, in the unit of the objective; None before the first plan.
     """

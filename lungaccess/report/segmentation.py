@@ -33,10 +33,8 @@ def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> 
 
     Parameters
     ----------
-    ct : Volume
     parts : Parts
         On the grid of the CT.
-    path : path
 
     Raises
     ------

@@ -60,7 +60,6 @@ def tubes_png(
         Its earlier steps are drawn as thin grey lines.
     scope_diameter_mm : float, optional
         Drawn around the tubes; a little more than the outermost tube's if None.
-    heading : str
     notes : sequence of str
         Lines to print beside the picture.
 

@@ -17,7 +17,6 @@ class View:
 
     Parameters
     ----------
-    name : str
     right, up : (3,) float64
         Unit LPS directions that point to the right and to the top of the picture.
     """

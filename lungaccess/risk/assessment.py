@@ -28,12 +28,8 @@ class RiskReport:
 
     Parameters
     ----------
-    model : ErrorModel
-    samples, seed : int
-    radius_mm : float
-        Radius of the goal about the target.
-    radius_origin : str
-        Where the radius came from.
+    radius_mm, radius_origin : float, str
+        Radius of the goal about the target, and where the radius came from.
     succeeds : Share
         Ends within the radius, leaves the airway, and touches nothing that is forbidden.
     reaches : Share

@@ -50,8 +50,6 @@ class RiskAssessor:
 
     Parameters
     ----------
-    plan : Plan
-    lung : Lung
     radius_mm : float, optional
         Radius of the goal; by default that of a ball of the volume of the target's nodule, or 5 mm if the
         target lies in no nodule of the mask.

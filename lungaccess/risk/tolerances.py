@@ -42,7 +42,6 @@ class Tolerance:
         See `lungaccess.risk.errors.UNITS`.
     stated : float or (float, float)
         The size in the error model; for the curvature its two factors.
-    probability : float
     largest : float
         The largest standard deviation at which successes are that probable, at most `LARGEST`; 0 if none
         was found.  For the curvature the largest `f` of factors uniform between 1 / f and f.

@@ -70,7 +70,6 @@ def export_slicer(
 
     Parameters
     ----------
-    plan : Plan
     lung : Lung
         The patient it was made for.
     folder : path

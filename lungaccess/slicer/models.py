@@ -24,7 +24,6 @@ def structure_surface(lung: Lung, name: str, *, most: int = MOST_TRIANGLES) -> S
 
     Parameters
     ----------
-    lung : Lung
     name : str
         "lung", "airway" (lumen and wall), "vessel", "fissure" or "nodule".
     most : int

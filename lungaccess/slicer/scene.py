@@ -38,8 +38,6 @@ class Item:
         Its file, beside the scene.
     colour : tuple of float
         Red, green, blue in [0, 1].
-    opacity : float
-    visible : bool
     """
 
     kind: Kind

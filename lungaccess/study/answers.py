@@ -28,7 +28,6 @@ class Improvement:
     ----------
     time_s : float
         Planning time.
-    iteration : int
     cost : float
         Under the run's objective.
     """
@@ -65,7 +64,6 @@ class Answer:
         Whether the independent check accepts the plan; for a needle path, whether nothing objects to it.
     costs : mapping of str to float
         "inverse_clearance", "cost_map", "voxel_sum", "length_mm".
-    improvements : tuple of Improvement
     findings : tuple of mapping
         What the check looked at; see `lungaccess.checking.findings.Finding.to_mapping`.
     rejections : mapping of str to int

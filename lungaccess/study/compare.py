@@ -20,10 +20,6 @@ def differences(first: Path, second: Path) -> list[str]:
     Runs, costs over iterations, findings, rejections and plans are compared value by value; a number must be
     the same to the last bit.
 
-    Parameters
-    ----------
-    first, second : Path
-
     Returns
     -------
     list of str

@@ -55,7 +55,6 @@ def answer(run: Run, cache: Path | None = None) -> Answer:
 
     Parameters
     ----------
-    run : Run
     cache : Path, optional
         Folder of prepared anatomies and atlases; `anatomy.cache.default_cache()` if None.
 

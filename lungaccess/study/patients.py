@@ -21,8 +21,6 @@ class Patient:
     ----------
     anatomy : str
         "phantom", or an absolute folder.
-    seed : int
-    size : str
     spacing_mm : float or None
         Of the synthetic patient.
     sources : tuple of (str, str)

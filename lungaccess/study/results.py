@@ -29,7 +29,6 @@ class ResultsFile:
 
     Parameters
     ----------
-    path : Path
     create : bool
         Whether a file that is not there is made.
 

@@ -33,10 +33,6 @@ class Problem:
 
     Parameters
     ----------
-    case : str
-    patient : Patient
-    system : System
-    objective : str
     target : int
         Number of the target in its case, from 1.
     target_lps : tuple of 3 float
@@ -45,10 +41,8 @@ class Problem:
         Where the target came from.
     start : int
         Number of the needle's start pose, 0 for none.
-    rotations : int
     stop_spacing_mm, site_spacing_mm : float
         Of the deployment atlas.
-    iterations : int or None
     time_s : float or None
         The budget.
     first_plan : bool
@@ -99,14 +93,7 @@ class Problem:
 
 @frozen_value
 class Run:
-    """One run: a problem, a planner and a seed.
-
-    Parameters
-    ----------
-    problem : Problem
-    planner : PlannerChoice
-    seed : int
-    """
+    """One run: a problem, a planner and a seed."""
 
     problem: Problem
     planner: PlannerChoice

@@ -50,7 +50,6 @@ class Case:
 
     Parameters
     ----------
-    name : str
     anatomy : str
         "phantom", or a patient's folder; a relative one is relative to the study's file.
     phantom : PhantomPatient
@@ -157,12 +156,6 @@ class Study:
 
     Parameters
     ----------
-    name : str
-    case : tuple of Case
-    planner : tuple of PlannerChoice
-    seeds : tuple of int
-    budget : Budget
-    atlas : AtlasGrid
     folder : str
         What relative paths are relative to; that of the file if it was read from one.
     """

@@ -22,10 +22,8 @@ class Group:
 
     Parameters
     ----------
-    case, objective, planner : str
-    runs : int
     failed : int
-        Of them, those that could not be made and will be made again; they count nowhere else.
+        Of the runs, those that could not be made and will be made again; they count nowhere else.
     solved_share : float
         Share of the runs with a plan.
     accepted_share : float

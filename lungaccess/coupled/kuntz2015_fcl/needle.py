@@ -103,10 +103,8 @@ class NeedleRRT:
 
     Parameters
     ----------
-    needle : Needle
     required_mm : float
         Distance that the needle's axis keeps from obstacles.
-    obstacles : Obstacles
     """
 
     def __init__(self, needle: Needle, required_mm: float, obstacles: Obstacles) -> None:
@@ -135,7 +133,6 @@ class NeedleRRT:
         goal_lps : (3,) float64, LPS mm
         branch : int
             Branch that the tube pierced.
-        rng : numpy.random.Generator
         iterations : int, optional
             Samples drawn; each is followed by one step towards the goal.
         time_s : float, optional

@@ -30,7 +30,6 @@ class Solid:
 
     Parameters
     ----------
-    lung : Lung
     holds : callable
         Tells from labels `(...,)` uint16 which voxels belong to it.
     low, high : (3,) int64, optional
@@ -56,7 +55,6 @@ class Solid:
         Parameters
         ----------
         line_lps : (N, 3) float64, LPS mm
-        distance_mm : float
         """
         if self._holds(labels_at(self._lung, line_lps)).any():
             return True
@@ -74,7 +72,6 @@ class Obstacles:
 
     Parameters
     ----------
-    lung : Lung
     with_fissures : bool
         Whether fissures are obstacles.
     reach_mm : float

@@ -30,12 +30,6 @@ WORTH_REFINING = 0.99
 class AtlasSearch:
     """Direct arcs from the whole atlas, then rounds of local search, sampling, needle search and refinement.
 
-    Parameters
-    ----------
-    task : Task
-    atlas : Atlas
-    settings : SearchSettings, optional
-
     Attributes
     ----------
     arcs : DirectArcs

@@ -27,11 +27,6 @@ FINALISTS = 3
 class DirectArcs:
     """The single arcs of a needle from the deployments of an atlas to a target.
 
-    Parameters
-    ----------
-    task : Task
-    atlas : Atlas
-
     Attributes
     ----------
     evaluator : CandidateEvaluator
@@ -140,12 +135,6 @@ class DirectArcs:
 
 class DirectArcSearch:
     """Evaluates the direct arcs of an atlas chunk by chunk, the nearest deployments first.
-
-    Parameters
-    ----------
-    arcs : DirectArcs
-    incumbent : Incumbent
-    settings : SearchSettings
 
     Attributes
     ----------

@@ -21,7 +21,6 @@ def different(entries: Deployments, ordered: Int) -> Int:
 
     Parameters
     ----------
-    entries : Deployments
     ordered : (N,) int64
         Which of them, the best first.
     """

@@ -28,7 +28,6 @@ class KuntzSearch:
 
     Parameters
     ----------
-    task : Task
     atlas : Atlas
         Only its sites are used, to know where the scope fits.
     rejects : bool

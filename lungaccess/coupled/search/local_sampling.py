@@ -33,10 +33,8 @@ class LocalSampling:
     ----------
     local_search : LocalSearch
         Has the arguments of the kernels.
-    arcs : DirectArcs
     chosen : (N,) int64
         Entries of the atlas, at least one.
-    rng : numpy.random.Generator
     """
 
     def __init__(
@@ -96,10 +94,7 @@ def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> I
 
     Parameters
     ----------
-    atlas : Atlas
-    needle : Needle
     target : (3,) float64, LPS mm
-    most : int
     """
     entries = atlas.deployments
     offset = target - entries.positions

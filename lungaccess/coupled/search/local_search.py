@@ -30,7 +30,6 @@ class LocalSearchRun:
 
     Parameters
     ----------
-    poses : ScopePoses
     x : (4,) float64
     vias : (MAX_VIAS, 3) float64
         The best choice so far; see `lungaccess.coupled.kernels.candidate`.
@@ -55,10 +54,8 @@ class LocalSearch:
 
     Parameters
     ----------
-    evaluator : CandidateEvaluator
     sites : Sites
         Where the scope passes.
-    rng : numpy.random.Generator
 
     Attributes
     ----------

@@ -36,10 +36,6 @@ def needle_searches(
 
     Parameters
     ----------
-    arcs : DirectArcs
-    incumbent : Incumbent
-    settings : SearchSettings
-    rng : numpy.random.Generator
     share : tuple of int
         Number of this process, and how many processes share the deployments.
 

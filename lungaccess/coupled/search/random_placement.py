@@ -20,7 +20,6 @@ class Placement:
 
     Parameters
     ----------
-    tip : ScopeTip
     rotation_rad, outer_mm, inner_mm : float
         Rotation and insertions of the tubes.
     needle_seed : int

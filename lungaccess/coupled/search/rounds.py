@@ -17,15 +17,7 @@ WORTH_EVALUATING = 0.999
 
 
 class LocalSearchRounds:
-    """Shares iterations among local searches.
-
-    Parameters
-    ----------
-    local_search : LocalSearch
-    evaluator : CandidateEvaluator
-    incumbent : Incumbent
-    settings : SearchSettings
-    """
+    """Shares iterations among local searches."""
 
     phase = "local search"
 

@@ -22,12 +22,8 @@ class ScopePoses:
 
     Parameters
     ----------
-    lung : Lung
-    scope : Bronchoscope
     places : Sites
         Where the scope passes.
-    tip : ScopeTip
-    rng : numpy.random.Generator
 
     Attributes
     ----------

@@ -149,7 +149,6 @@ def gathered(vertices: Float, faces: Int, cell_mm: float) -> tuple[Float, Int]:
     ----------
     vertices : (V, 3) float64, mm
     faces : (F, 3) int64
-    cell_mm : float
     """
     cells = np.floor((vertices - vertices.min(axis=0)) / cell_mm).astype(np.int64)
     shape = tuple((cells.max(axis=0) + 1).tolist())

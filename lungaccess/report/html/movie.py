@@ -47,8 +47,6 @@ def bronchoscopy_webp(
 
     Parameters
     ----------
-    plan : Plan
-    lung : Lung
     path : path of a WebP file in an existing folder
     frames, pixels : int
         Number of pictures, and their width and height.
@@ -97,7 +95,6 @@ class SmoothLumen:
 
     Parameters
     ----------
-    lung : Lung
     points_lps : (N, 3) float64, LPS mm
         What lies farther than `AROUND_MM` from the box of these is not seen.
     """

@@ -68,11 +68,9 @@ def plan_page(
 
     Parameters
     ----------
-    plan : Plan
     lung : Lung
         The patient that the plan was made for.
     path : path of an HTML file in an existing folder
-    options : PageOptions, optional
 
     Raises
     ------

@@ -34,7 +34,6 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
     ----------
     maps : sequence of ReachMap
         All of one lung; each has its own system.
-    lung : Lung
     path : path of an HTML file in an existing folder
 
     Raises

@@ -104,7 +104,6 @@ def page_grids(grid: Grid, device_lps: Float, factor: float = 1.0) -> tuple[Grid
 
     Parameters
     ----------
-    grid : Grid
     device_lps : (N, 3) float64, LPS mm
     factor : float
         Makes both voxels larger.

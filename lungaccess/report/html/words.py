@@ -24,10 +24,8 @@ def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[Cell]],
 
     Parameters
     ----------
-    caption : str
     headings : sequence of str
         Empty for a table of names and values.
-    rows : iterable of sequences of str
     kind : str
         Class of the table for the style sheet.
     """

@@ -13,6 +13,7 @@ import pytest
 from scipy import ndimage
 
 from anatomy.grid import Grid, Volume
+from lungaccess.cli import terminal
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
@@ -31,6 +32,13 @@ class _Field:
 
     def lower_bound_mm(self, lps: np.ndarray) -> np.ndarray:
         return ndimage.map_coordinates(self._distance, self._grid.ijk(lps).T, order=1, mode="nearest")
+
+
+@pytest.fixture
+def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no line break depend on the terminal of the test."""
+    for console in (terminal.console, terminal.error_console):
+        monkeypatch.setattr(console, "_width", 200)
 
 
 def _segment(points: np.ndarray, a: list[float], b: list[float], radius: float) -> np.ndarray:

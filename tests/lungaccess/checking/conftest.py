@@ -16,6 +16,7 @@ from experiments.support.mutants.mutant import changed
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, load_system, system_fingerprint
+from tests.stages.scenes import forked_tree
 
 SPACING_MM = (1.0, 0.9, 1.1)
 SHAPE = (150, 64, 104)
@@ -39,31 +40,7 @@ EXEMPT_MM = 5.0
 
 def toy_tree() -> AirwayTree:
     """The branches as points 0.5 mm apart."""
-    points, parents, branches, tangents, radii, start = [], [], [], [], [], [0]
-    for branch, (a, b, radius, parent) in enumerate(BRANCHES):
-        count = round(float(np.linalg.norm(b - a)) / 0.5)
-        t = np.arange(0 if branch == 0 else 1, count + 1) / count
-        points.append(a + t[:, None] * (b - a))
-        parents += [-1 if branch == 0 else start[parent + 1] - 1, *range(start[-1], start[-1] + len(t) - 1)]
-        branches += [branch] * len(t)
-        tangents.append(np.tile((b - a) / np.linalg.norm(b - a), (len(t), 1)))
-        radii += [radius] * len(t)
-        start.append(start[-1] + len(t))
-    place = np.concatenate(points)
-    way = np.zeros(len(place))
-    for n, parent in enumerate(parents[1:], start=1):
-        way[n] = way[parent] + np.linalg.norm(place[n] - place[parent])
-    return AirwayTree(
-        points_lps=place,
-        radius_mm=np.array(radii),
-        parent_point=np.array(parents),
-        branch_of_point=np.array(branches),
-        branch_start=np.array(start),
-        branch_parent=np.array([parent for *_, parent in BRANCHES]),
-        generation=np.array([0, 1, 1, 2]),
-        distance_from_root_mm=way,
-        tangents=np.concatenate(tangents),
-    )
+    return forked_tree(list(BRANCHES))
 
 
 def capsule(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius_mm: float) -> np.ndarray:

@@ -19,7 +19,6 @@ import lungaccess as la
 from anatomy.errors import AnatomyError, FrameError
 from lungaccess.checking import CheckReport, Finding
 from lungaccess.cli import app as cli
-from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import DEFAULT_BUDGET_S, DEFAULT_SYSTEM
 from lungaccess.plans.no_plan import NoPlan
@@ -28,12 +27,7 @@ from tests.lungaccess.loading import load_with
 
 WRITTEN = {"plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv"}
 
-
-@pytest.fixture(autouse=True)
-def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no line break depend on the terminal of the test."""
-    for console in (terminal.console, terminal.error_console):
-        monkeypatch.setattr(console, "_width", 200)
+pytestmark = pytest.mark.usefixtures("wide_terminal")
 
 
 @pytest.fixture

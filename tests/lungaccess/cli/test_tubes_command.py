@@ -12,7 +12,6 @@ import pytest
 
 from anatomy.errors import SettingsError
 from lungaccess.cli import app as cli
-from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage.tubes import TubePair, compare_sequences, deploy_tubes, design_choices, load_tubes
 from lungaccess.problem.system import load_system
@@ -53,12 +52,7 @@ curved_length_mm = 39.0
 precurvature_per_mm = 0.022
 """
 
-
-@pytest.fixture(autouse=True)
-def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no line break depend on the terminal of the test."""
-    for console in (terminal.console, terminal.error_console):
-        monkeypatch.setattr(console, "_width", 200)
+pytestmark = pytest.mark.usefixtures("wide_terminal")
 
 
 @pytest.fixture

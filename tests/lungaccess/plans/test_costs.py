@@ -102,13 +102,16 @@ def test_length() -> None:
     )
 
 
-def test_cost_map(lung: Lung) -> None:
-    """A map of 0.25 below z = 0 and 0.75 above, infinite beyond z = 12."""
+@pytest.fixture
+def mapped(lung: Lung) -> Lung:
+    """The lung with a map of 0.25 below z = 0 and 0.75 above, infinite beyond z = 12."""
     values = np.full(lung.grid.shape, 0.25, dtype=np.float32, order="F")
     values[:, :, 20:] = 0.75
     values[:, :, 32:] = np.inf
-    mapped = replace(lung, cost=Volume(grid=lung.grid, array=values))
+    return replace(lung, cost=Volume(grid=lung.grid, array=values))
 
+
+def test_cost_map(mapped: Lung) -> None:
     def cost(length: float) -> float:
         return path_cost(mapped, straight(length), "cost_map", with_fissures=False)
 
@@ -118,12 +121,8 @@ def test_cost_map(lung: Lung) -> None:
     assert cost(40.0) == math.inf, "beyond the grid"
 
 
-def test_sum_over_voxels(lung: Lung) -> None:
-    """The same map: voxels of 1 mm, from the face at z = -10, to the middle of one."""
-    values = np.full(lung.grid.shape, 0.25, dtype=np.float32, order="F")
-    values[:, :, 20:] = 0.75
-    values[:, :, 32:] = np.inf
-    mapped = replace(lung, cost=Volume(grid=lung.grid, array=values))
+def test_sum_over_voxels(mapped: Lung) -> None:
+    """Voxels of 1 mm, from the face at z = -10, to the middle of one."""
 
     def cost(length: float) -> float:
         return path_cost(mapped, straight(length, 0.5), "voxel_sum", with_fissures=False)

@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 
 from lungaccess.cli import app as cli
-from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.study.answers import NO_PLAN, TIMEOUT
 from lungaccess.study.export import export_csv, export_parquet
@@ -42,11 +41,7 @@ targets = ["lps:-81.25,51,-33.5", "lps:300,0,0"]
 name = "atlas"
 """
 
-
-@pytest.fixture(autouse=True)
-def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    for console in (terminal.console, terminal.error_console):
-        monkeypatch.setattr(console, "_width", 200)
+pytestmark = pytest.mark.usefixtures("wide_terminal")
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import read_only
+from anatomy.grid import freeze_arrays, read_only
 from anatomy.records import frozen_record
 from anatomy.tree_report import TreeReport
 from anatomy.typed import Bool, Float, Int
@@ -68,10 +68,9 @@ class AirwayTree:
     report: TreeReport = field(default_factory=TreeReport)
 
     def __post_init__(self) -> None:
-        for name in ("points_lps", "radius_mm", "distance_from_root_mm", "tangents"):
-            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.float64)))
-        for name in ("parent_point", "branch_of_point", "branch_start", "branch_parent", "generation"):
-            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.int64)))
+        freeze_arrays(self, "points_lps", "radius_mm", "distance_from_root_mm", "tangents", dtype=np.float64)
+        indices = ("parent_point", "branch_of_point", "branch_start", "branch_parent", "generation")
+        freeze_arrays(self, *indices, dtype=np.int64)
         problem = self._problem()
         if problem:
             raise AnatomyError(

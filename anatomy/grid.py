@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from anatomy.errors import FrameError, GridMismatchError
 from anatomy.records import frozen_record
@@ -22,6 +22,13 @@ def read_only(array: Array) -> Array:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def freeze_arrays(record: object, *names: str, dtype: DTypeLike | None = None) -> None:
+    """Make arrays of a frozen record read-only as it is made; with a dtype, copies of them."""
+    for name in names:
+        array = getattr(record, name)
+        object.__setattr__(record, name, read_only(array if dtype is None else np.array(array, dtype=dtype)))
 
 
 def transform_points(target_from_source: ArrayLike, points: ArrayLike) -> Float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from anatomy.grid import read_only
+from anatomy.grid import freeze_arrays
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
 
@@ -123,8 +123,9 @@ class Centerlines:
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        for key in ("points_lps", "radius_mm", "outer_radius_mm", "branch_start", "branch_parent", "lobe"):
-            object.__setattr__(self, key, read_only(getattr(self, key)))
+        freeze_arrays(
+            self, "points_lps", "radius_mm", "outer_radius_mm", "branch_start", "branch_parent", "lobe"
+        )
 
     @property
     def n_branches(self) -> int:

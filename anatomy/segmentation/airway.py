@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy.errors import AnatomyError, GridMismatchError
-from anatomy.grid import Volume, read_only
+from anatomy.grid import Volume, freeze_arrays
 from anatomy.morphology import Window, bounds, window
 from anatomy.records import frozen_record
 from anatomy.segmentation.airway_warnings import airway_warnings
@@ -50,8 +50,7 @@ class Airways:
     leak_mm3: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("lumen", "wall"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+        freeze_arrays(self, "lumen", "wall")
 
 
 def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] | None = None) -> Airways:

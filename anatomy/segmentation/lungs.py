@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, freeze_arrays
 from anatomy.morphology import bounds, grown_by_one, window
 from anatomy.records import frozen_record
 from anatomy.segmentation.central_airway import CentralAirway, find_central_airway
@@ -68,8 +68,7 @@ class Lungs:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("left", "right", "trachea_seed_ijk", "central_airway"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+        freeze_arrays(self, "left", "right", "trachea_seed_ijk", "central_airway")
 
     @property
     def mask(self) -> Mask:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.grid import read_only
+from anatomy.grid import freeze_arrays
 from anatomy.poses import poses_on_arc
 from anatomy.records import frozen_record
 from anatomy.typed import Float
@@ -44,8 +44,7 @@ class DeviceCurve:
     colour: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        for name in ("lps_from_device", "radius_mm", "arc_length_mm"):
-            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.float64)))
+        freeze_arrays(self, "lps_from_device", "radius_mm", "arc_length_mm", dtype=np.float64)
 
     @property
     def points_lps(self) -> Float:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.fields import DistanceField, corner_geometry, distance_field
-from anatomy.grid import Grid, Volume, read_only
+from anatomy.grid import Grid, Volume, freeze_arrays, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
@@ -54,8 +54,7 @@ class Lumen:
     _widths: dict[int, Float] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("index", "voxels", "neighbours"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+        freeze_arrays(self, "index", "voxels", "neighbours")
 
     @property
     def count(self) -> int:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from anatomy.grid import read_only
+from anatomy.grid import freeze_arrays, read_only
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.scope.advisor import kinematics
@@ -50,8 +50,7 @@ class ScopePath:
     reproduction: bool
 
     def __post_init__(self) -> None:
-        for name in ("states", "steps_mm", "costs", "potentials"):
-            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.float64)))
+        freeze_arrays(self, "states", "steps_mm", "costs", "potentials", dtype=np.float64)
 
     @property
     def count(self) -> int:

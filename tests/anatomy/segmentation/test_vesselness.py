@@ -14,6 +14,7 @@ from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.segmentation.kernels.eigenvalues import eigenvalues_of
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace, discrete_gaussian
 from anatomy.segmentation.vesselness import vesselness
+from tests.anatomy.segmentation.shapes import distance_to_surface
 
 LUNG_HU, BLOOD_HU = -860.0, 40.0
 
@@ -117,18 +118,9 @@ def cylinder(
     kind: str = "cylinder",
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the HU of a shape in lung tissue, and the distance to its surface (negative inside)."""
-    shape = tuple(int(40 / a) for a in spacing)
-    axes = [(np.arange(n) - (n - 1) / 2) * a for n, a in zip(shape, spacing, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    along = np.array([0.3, 0.2, 0.93]) / np.linalg.norm([0.3, 0.2, 0.93])
-    if kind == "cylinder":
-        away = np.linalg.norm(points - (points @ along)[..., None] * along, axis=-1)
-    elif kind == "plate":
-        away = np.abs(points @ along)
-    else:
-        away = np.linalg.norm(points, axis=-1)
-    share = np.clip(0.5 - (away - radius_mm) / 1.2, 0.0, 1.0)
-    return (LUNG_HU + (hu - LUNG_HU) * share).astype(np.float32), away - radius_mm
+    distance = distance_to_surface(kind, radius_mm, spacing, 40.0)
+    share = np.clip(0.5 - distance / 1.2, 0.0, 1.0)
+    return (LUNG_HU + (hu - LUNG_HU) * share).astype(np.float32), distance
 
 
 MIDDLE = np.s_[18:-18, 18:-18, 18:-18]

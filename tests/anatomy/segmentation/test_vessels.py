@@ -15,9 +15,11 @@ from anatomy.morphology import grown_by_one
 from anatomy.phantom import make_phantom
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.vessels import Vessels, segment_vessels
+from tests.anatomy.segmentation.shapes import distance_to_surface
 
 LUNG_HU = -860.0
 NOISE_HU = 25.0
+SIZE_MM = 44.0
 
 
 def airways(
@@ -25,21 +27,6 @@ def airways(
 ) -> Airways:
     nothing = np.zeros(shape, dtype=bool)
     return Airways(lumen=nothing if lumen is None else lumen, wall=nothing if wall is None else wall)
-
-
-def distance_to_surface(shape: str, radius_mm: float, spacing_mm: float, size_mm: float = 44.0) -> np.ndarray:
-    """Return the signed distance to a cylinder, plate or ball in the middle of a cube, mm."""
-    n = int(size_mm / spacing_mm)
-    axis = (np.arange(n) - (n - 1) / 2) * spacing_mm
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    along = np.array([0.3, 0.2, 0.93]) / np.linalg.norm([0.3, 0.2, 0.93])
-    if shape == "cylinder":
-        away = np.linalg.norm(points - (points @ along)[..., None] * along, axis=-1)
-    elif shape == "plate":
-        away = np.abs(points @ along)
-    else:
-        away = np.linalg.norm(points, axis=-1)
-    return away - radius_mm
 
 
 def image_of(distance: np.ndarray, hu: float, spacing_mm: float, seed: int = 0) -> Volume:
@@ -54,7 +41,7 @@ def found_in(
     shape: str, radius_mm: float, hu: float, spacing_mm: float = 0.7
 ) -> tuple[Vessels, np.ndarray, np.ndarray]:
     """Return the vessels, the distance to the surface, and the voxels 9 mm off the image's end."""
-    distance = distance_to_surface(shape, radius_mm, spacing_mm)
+    distance = distance_to_surface(shape, radius_mm, spacing_mm, SIZE_MM)
     ct = image_of(distance, hu, spacing_mm)
     found = segment_vessels(ct, np.ones(distance.shape, dtype=bool), airways(distance.shape))
     inner = np.zeros(distance.shape, dtype=bool)
@@ -99,7 +86,7 @@ def test_small_balls_are_no_large_vessels() -> None:
 
 
 def test_airway_walls_never_become_vessel() -> None:
-    distance = distance_to_surface("cylinder", 3.0, 0.7)
+    distance = distance_to_surface("cylinder", 3.0, 0.7, SIZE_MM)
     lumen, wall = distance < -1.2, (distance >= -1.2) & (distance <= 0.0)
     ct = image_of(np.maximum(distance, -1.2 - distance), 0.0, 0.7)
     shape = distance.shape
@@ -111,7 +98,7 @@ def test_airway_walls_never_become_vessel() -> None:
 
 
 def test_nothing_outside_the_lung() -> None:
-    distance = distance_to_surface("cylinder", 4.0, 0.7)
+    distance = distance_to_surface("cylinder", 4.0, 0.7, SIZE_MM)
     lung = np.zeros(distance.shape, dtype=bool)
     lung[:, :, :30] = True
     found = segment_vessels(image_of(distance, 40.0, 0.7), lung, airways(distance.shape))
@@ -119,7 +106,7 @@ def test_nothing_outside_the_lung() -> None:
 
 
 def test_threads_and_repeats_give_the_same_bits() -> None:
-    distance = distance_to_surface("cylinder", 4.0, 1.0)
+    distance = distance_to_surface("cylinder", 4.0, 1.0, SIZE_MM)
     ct, shape = image_of(distance, 40.0, 1.0), distance.shape
     first = segment_vessels(ct, np.ones(shape, dtype=bool), airways(shape), threads=1)
     for threads in (2, 5):
@@ -129,7 +116,7 @@ def test_threads_and_repeats_give_the_same_bits() -> None:
 
 
 def test_refuses_masks_of_another_shape() -> None:
-    ct = image_of(distance_to_surface("ball", 3.0, 1.5), 40.0, 1.5)
+    ct = image_of(distance_to_surface("ball", 3.0, 1.5, SIZE_MM), 40.0, 1.5)
     wrong = np.zeros((3, 3, 3), dtype=bool)
     with pytest.raises(GridMismatchError, match="lung"):
         segment_vessels(ct, wrong, airways(ct.array.shape))

@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
-from pydicom.dataset import Dataset, FileMetaDataset
-from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
@@ -17,6 +15,7 @@ from anatomy.io.images import write_volume
 from anatomy.phantom import Phantom
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
+from tests.anatomy.io.series import write_series
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -112,27 +111,11 @@ def test_what_is_no_chest_ct_is_refused(
 
 
 def _write_series(folder: Path, number: int = 1) -> list[Path]:
-    """A small CT series: 12 slices of 16 x 16 pixels."""
-    folder.mkdir(exist_ok=True)
-    uid, paths = generate_uid(), []
-    for k in range(12):
-        slice_ = Dataset()
-        slice_.file_meta = FileMetaDataset()
-        slice_.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-        slice_.file_meta.MediaStorageSOPClassUID = slice_.SOPClassUID = CTImageStorage
-        slice_.file_meta.MediaStorageSOPInstanceUID = slice_.SOPInstanceUID = generate_uid()
-        slice_.SeriesInstanceUID, slice_.SeriesNumber, slice_.Modality = uid, number, "CT"
-        slice_.Rows = slice_.Columns = 16
-        slice_.PixelSpacing = [8.0, 8.0]
-        slice_.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
-        slice_.ImagePositionPatient = [0.0, 0.0, 2.0 * k]
-        slice_.SamplesPerPixel, slice_.PhotometricInterpretation = 1, "MONOCHROME2"
-        slice_.BitsAllocated, slice_.BitsStored, slice_.HighBit, slice_.PixelRepresentation = 16, 16, 15, 0
-        slice_.RescaleSlope, slice_.RescaleIntercept = 1, -1024
-        slice_.PixelData = np.full((16, 16), 24 + k, dtype="<u2").tobytes()
-        paths.append(folder / f"{number}-{k:02}.dcm")
-        slice_.save_as(paths[-1], enforce_file_format=True)
-    return paths
+    """Write a small CT series, 12 slices of 16 x 16 pixels; return its files from slice to slice."""
+    grid = Grid.from_spacing((16, 16, 12), (8.0, 8.0, 2.0), (0.0, 0.0, 0.0))
+    array = np.broadcast_to(np.arange(12, dtype=np.int16) - 1000, grid.shape)
+    write_series(folder, Volume(grid=grid, array=array), number)
+    return [folder / f"{number}-{(k * 5) % 12}.dcm" for k in range(12)]
 
 
 def _edit(path: Path, **changes: object) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.fresh import FreshProcess
 from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.route.centreline import Centreline, from_tree
-from stages.scope.route.planner import Replanner, plan_route, try_route
+from stages.scope.route.planner import Replanner, plan_route
 from stages.scope.route.proof import prove
 from stages.scope.route.search import nearest_links
 from stages.scope.route.settings import RouteLimits
@@ -46,7 +46,7 @@ class Routes:
 
     def time_genetic(self) -> None:
         """The same with the genetic repair."""
-        try_route(self.line, *self.ends, LIMITS, links=self.links, repair="ga")
+        plan_route(self.line, *self.ends, LIMITS, links=self.links, repair="ga", require_proof=False)
 
     def time_replan(self) -> None:
         """The route for a moved centreline; a tracker gives 40 a second."""

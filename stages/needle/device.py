@@ -11,25 +11,8 @@ from anatomy.settings import quantity, settings
 class Needle:
     """A bevel-tip or flexure-tip needle that follows arcs of bounded curvature.
 
-    Parameters
-    ----------
-    diameter_mm : float
-        Outer diameter, mm.
-    max_curvature_per_mm : float
-        Curvature of the tightest arc that the needle follows in lung tissue, 1/mm.
-    max_length_mm : float
-        Longest path from the start of the needle, mm.
-    max_angle_from_start_deg : float
-        Largest angle between the tip and its direction at the start, degrees [Kuntz2015].
-    max_accumulated_turn_deg : float
-        Largest sum of the angles of all arcs, degrees.
-    exit_exemption_mm : float
-        First length of the needle that may lie in the wall of the branch which the tube pierced, mm.
-
-    Raises
-    ------
-    SettingsError
-        If a value is not finite, negative or absurd.
+    Its angle to the start is limited as in [Kuntz2015].  The wall that its first length may lie in is that of
+    the branch which the tube pierced.
     """
 
     diameter_mm: Annotated[float, quantity("outer diameter of the needle", above=0.0, at_most=5.0)]

@@ -9,26 +9,7 @@ from anatomy.settings import impossible, quantity, settings, text
 
 @settings
 class Bronchoscope:
-    """A flexible bronchoscope with one working channel.
-
-    Parameters
-    ----------
-    name : str
-        Model, for people.
-    outer_diameter_mm : float
-        Largest diameter of the part that enters the airways, mm.
-    channel_diameter_mm : float
-        Inner diameter of the working channel, mm.
-    lumen_margin_mm : float
-        Gap that must remain between the scope and the airway lumen on every side, mm.
-    bend_up_deg, bend_down_deg : float
-        Largest bending of the tip, degrees.
-
-    Raises
-    ------
-    SettingsError
-        If a value is not finite or absurd, or the channel is not thinner than the scope.
-    """
+    """A flexible bronchoscope with one working channel, which is thinner than the scope."""
 
     name: Annotated[str, text("model of the bronchoscope")]
     outer_diameter_mm: Annotated[

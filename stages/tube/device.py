@@ -15,17 +15,7 @@ from anatomy.typed import Float
 
 @settings
 class BentPiece:
-    """A piece of a tube that is an arc at rest.
-
-    Parameters
-    ----------
-    length_mm : float
-        Length along the tube, mm.
-    precurvature_per_mm : float
-        Curvature at rest, 1/mm; 0 for a straight piece.
-    direction_deg : float
-        Direction of the bend about the tube's axis, degrees; pieces of one direction lie in a plane.
-    """
+    """A piece of a tube that is an arc at rest, or straight; pieces of one direction lie in a plane."""
 
     length_mm: Annotated[float, quantity("length of the piece", above=0.0, at_most=500.0)]
     precurvature_per_mm: Annotated[float, quantity("curvature at rest", at_least=0.0, at_most=1.0)]
@@ -47,23 +37,7 @@ class Bend(NamedTuple):
 class Tube:
     """One superelastic tube: straight, with a curved distal part.
 
-    Parameters
-    ----------
-    outer_diameter_mm, inner_diameter_mm : float
-        Diameters, mm.
-    length_mm : float
-        Whole length, mm.
-    curved_length_mm : float
-        Length of the precurved distal part, mm; 0 for a straight tube.
-    precurvature_per_mm : float
-        Curvature of that part at rest, 1/mm; 0 for a straight tube.
-    bent_pieces : tuple of BentPiece
-        Instead of these two, for a distal part of several curvatures or out of one plane: its pieces, the
-        rearmost first.
-    youngs_modulus_gpa : float
-        Young's modulus, GPa.
-    poisson_ratio : float
-        Poisson's ratio.
+    The curved part is one arc or, for several curvatures or out of one plane, `bent_pieces`, rearmost first.
 
     Raises
     ------
@@ -181,23 +155,9 @@ class TubeArcs(NamedTuple):
 class ConcentricTubes:
     """A straight outer tube and a precurved inner tube, and the limits of their deployment.
 
-    Parameters
-    ----------
-    outer, inner : Tube
-        The two tubes.
-    max_lateral_sweep_mm : float
-        Largest sideways motion of any point of the tubes in tissue during deployment, mm.
-    min_wall_angle_deg : float
-        Smallest angle between tube and airway wall at the exit (90 is perpendicular), degrees.
-    max_extension_mm : float
-        Largest distance along the tubes from the tip of the scope to their own tip, mm.
-    max_strain : float
-        Largest strain of the tube material (dimensionless).
-    min_clearance_mm : float
-        Least difference between the bore of the outer tube and the outer diameter of the inner one, mm.
-    max_channel_curvature_per_mm : float
-        Largest curvature of the working channel in which a precurved tube is held, 1/mm; in the worst case it
-        bends the tube against its precurvature.
+    The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
+    perpendicular; the extension counts along the tubes.  In the worst case the working channel bends the tube
+    that it holds against its precurvature.
 
     Raises
     ------

@@ -25,22 +25,16 @@ SHORTEST_MM = 1e-3
 
 @frozen_record
 class InverseSolution:
-    """What the tubes can do towards a wanted tip pose.
+    """What the tubes can do towards a wanted tip pose: a stable equilibrium within the limits.
+
+    They have reached the pose if the errors are within the tolerances.  The direction error is the angle
+    between the tip's axis and the wanted one, 0 if only the position is wanted; the roll error is that of the
+    remaining turn about the axis, 0 unless the whole pose is wanted.
 
     Parameters
     ----------
-    reached : bool
-        Whether the errors are within the tolerances.
-    equilibrium : Equilibrium
-        Stable, within the limits.
     base_angles_rad, beta_mm : (n,) float64
         Joint values.
-    position_error_mm : float
-        Distance of the tip from the wanted position.
-    direction_error_rad : float
-        Angle between the tip's axis and the wanted one; 0 if only the position is wanted.
-    roll_error_rad : float
-        Angle of the remaining turn about the axis; 0 unless the whole pose is wanted.
     """
 
     reached: bool

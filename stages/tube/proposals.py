@@ -135,21 +135,7 @@ def _makers(
 class MakerLimits:
     """What limits the maker of a pair of tubes.
 
-    Parameters
-    ----------
-    channel_diameter_mm : float
-        Working channel of the scope.
-    longest_curve_mm : float
-        Longest curved part of the inner tube; 0 for the larger of its insertion and its present length.
-    thinnest_wall_mm : float
-        Thinnest wall of the outer tube.
-    nesting_clearance_mm, channel_clearance_mm : float
-        Differences of diameter between the tubes, and between outer tube and channel.
-
-    Raises
-    ------
-    SettingsError
-        If a value is not finite or absurd.
+    With 0 the curved part of the inner tube is as long as the larger of its insertion and its present length.
     """
 
     channel_diameter_mm: Annotated[float, quantity("working channel of the scope", above=0.0, at_most=10.0)]

@@ -23,13 +23,7 @@ def centreline(
 ) -> Float:
     """Return points `(N, 3)` LPS mm of the tubes' centreline at arc lengths `(N,)` from the scope tip.
 
-    Parameters
-    ----------
-    lps_from_scope_tip : (4, 4) float64
-    rotation_rad : float
-        Direction of the bend about +z of the scope tip, counted from its +x.
-    outer_mm, inner_mm : float
-        Insertions of the two tubes.
+    The deployment is given as to `DeploymentValidator.validate`.
     """
     constants = tube_constants(tubes, Margins())
     at_mm = np.array(arc_lengths_mm, dtype=np.float64, ndmin=1)

@@ -57,7 +57,7 @@ def route(
     """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it."""
     from lungaccess.one_stage import open_source, route_record, widest_end
     from lungaccess.report.route import route_png
-    from stages.scope.route import RouteLimits, try_route
+    from stages.scope.route import RouteLimits, plan_route
 
     limits = RouteLimits(
         max_curvature_per_mm=curvature,
@@ -75,7 +75,9 @@ def route(
         opened = open_source(source, frame=frame, pixel_mm=pixel, cache=output.cache)
         shown.step("planning")
         first = widest_end(opened.centreline) if begin is None else begin
-        found = try_route(opened.centreline, first, end, limits, repair=repair, seed=seed)
+        found = plan_route(
+            opened.centreline, first, end, limits, repair=repair, seed=seed, require_proof=False
+        )
     written = route_record(opened, found)
     write_json(out / "route.json", written)
     route_png(opened.name, opened.centreline, found, out / "route.png")

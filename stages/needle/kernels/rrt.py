@@ -94,6 +94,18 @@ def random_arc(pose, limits, state):
     return (kappa, c * ax + s * bx, c * ay + s * by, c * az + s * bz), length
 
 
+@inner_kernel
+def goal_from_root(obstacles, limits, objective, branch, goal, nodes, parents, count, state, best):
+    """Try the goal from a tree's root; return the new `count`, if growing ends here, and if it is solved."""
+    rho, h = seen_from(pose_of(nodes[0]), goal)
+    if math.hypot(rho, h) < MIN_ARC_MM:
+        return count, True, False
+    if count > 1:
+        return count, False, False
+    count = add_goal(obstacles, limits, objective, branch, nodes, parents, count, 0, goal, best, state)
+    return count, count > 1, count > 1
+
+
 @numba.njit(cache=True, nogil=True)
 def grow_rrt(
     obstacles, limits, objective, branch, goal, nodes, parents, count, iterations, random_share, state, best
@@ -126,15 +138,11 @@ def grow_rrt(
         Rows in use, iterations spent, and whether the last row is at the goal.
     """
     start = pose_of(nodes[0])
-    rho, h = seen_from(start, goal)
-    if math.hypot(rho, h) < MIN_ARC_MM:
-        return count, 0, False
-    if count == 1:
-        count = add_goal(
-            obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
-        )
-        if count > 1:
-            return count, 0, True
+    count, ends, solved = goal_from_root(
+        obstacles, limits, objective, branch, goal, nodes, parents, count, state, best
+    )
+    if ends:
+        return count, 0, solved
     for used in range(iterations):
         if count + ROWS_PER_STEP > nodes.shape[0]:
             return count, used, False

@@ -61,20 +61,8 @@ class Failure(StrEnum):
 class ReplanSettings:
     """What a replan may do.
 
-    Parameters
-    ----------
-    curvature_reserve : float
-        Share of the needle's largest curvature that is kept back.  It is spent only where there is no
-        path without it.
-    relaxed_mm : float
-        Length at the tip, mm, within which the required clearance must be regained if the tip has lost it.
-    largest_miss_mm : float
-        A target that cannot be met any more may be missed by this, mm.
-
-    Raises
-    ------
-    SettingsError
-        If a value is not finite or outside its range.
+    The reserve of curvature is spent only where there is no path without it.  A tip that has lost the
+    required clearance must regain it within `relaxed_mm`.  A target that cannot be met may be missed.
     """
 
     curvature_reserve: Annotated[
@@ -176,10 +164,6 @@ class Replanner:
     ------
     SettingsError
         If `iterations` is negative.
-
-    References
-    ----------
-    .. [Patil2014]
     """
 
     def __init__(

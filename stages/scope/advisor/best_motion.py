@@ -30,14 +30,7 @@ SUM_TOLERANCE = 1e-9
 class Weights:
     """Weights of the terms of a motion's cost (eq. 9); they add up to 1.
 
-    Parameters
-    ----------
-    nf1 : float
-        Nearness to the goal.
-    clearance : float
-        Towards the middle of the lumen.
-    twist : float
-        Small and steady twists.
+    The terms favour nearness to the goal, the middle of the lumen, and small and steady twists.
     """
 
     nf1: Annotated[float, quantity("weight of the potential", at_least=0.0, at_most=1.0)] = 0.4

@@ -28,22 +28,10 @@ TIP_FROM_TOOL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @settings
 class ScopeModel:
-    """A chain of links; the defaults are those of [Rosell2012].
+    """A chain of n = `links` links of length l; the defaults are those of [Rosell2012].
 
-    Parameters
-    ----------
-    links : int
-        Number n of links with coupled joints.
-    link_mm : float
-        Length l of a link; n l is the length of the bending tip.
-    radius_mm : float
-        Radius of the whole scope, with the gap it has to keep.
-    twist_low_deg, twist_high_deg : float
-        Range of alpha, which holds 0.
-    bend_low_deg, bend_high_deg : float
-        Range of beta, the bend of all links together, which holds 0.
-    bend_step_deg : float
-        Spacing of the candidates' bends (eq. 3).
+    n l is the length of the bending tip.  The ranges of the twist alpha and of the bend beta, which is that
+    of all links together, hold 0; `bend_step_deg` is the spacing of the candidates' bends (eq. 3).
 
     Raises
     ------

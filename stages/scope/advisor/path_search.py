@@ -24,22 +24,10 @@ from stages.scope.advisor.path import ScopePath
 
 @settings
 class PathSettings:
-    """How a path is computed.
+    """How a path is computed: dz is `look_ahead_mm`, `weights` are those of eq. 9.
 
-    Parameters
-    ----------
-    look_ahead_mm : float
-        Advance of the candidates (dz).
-    sub_step_mm : float
-        Advance until the candidates are evaluated again.
-    weights : Weights
-        Of eq. 9.
-    random_offsets : bool
-        Whether candidates are moved at random within their spacing.
-    retreats : int
-        Most retreats when stuck; 0 stops there, as the paper does.
-    max_length_mm : float
-        Longest path.
+    Candidates are moved at random within their spacing.  With 0 retreats the search stops where it is stuck,
+    as the paper does.
     """
 
     look_ahead_mm: Annotated[float, quantity("advance of the candidates", above=0.0, at_most=50.0)] = 5.0

@@ -21,8 +21,7 @@ class Curve:
 
     Parameters
     ----------
-    control_mm : (n, 3) float64
-        LPS mm; the curve begins at the first and ends at the last.
+    control_mm : (n, 3) float64, LPS mm
     knots : (n + 4,) float64
         About arc length in mm; four equal ones at each end, simple ones between.
 

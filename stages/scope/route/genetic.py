@@ -42,25 +42,11 @@ AROUND_MM = 10.0
 
 @settings
 class GeneticSettings:
-    """Settings of the genetic search.
+    """Settings of the genetic search; 8 chromosomes of which 4 mate are in the paper's figure.
 
-    Parameters
-    ----------
-    population, parents : int
-        Chromosomes, and how many of them mate; 8 and 4 in the paper's figure.
-    generations : int
-        Rounds before the first look at the cost.
-    most_generations : int
-        Rounds after which the search gives up; in place of the paper's time limit, so that runs repeat.
-    margin_share : float
-        By how much of all points a segment is widened on both sides.
-    mutation_share : float
-        Standard deviation of the noise on the genes, as a share of their range.
-
-    Raises
-    ------
-    SettingsError
-        If a value is out of its range.
+    The limit of the rounds stands in place of the paper's time limit, so that runs repeat.  A segment is
+    widened on both sides by a share of all points; the standard deviation of the noise is a share of the
+    range of the genes.
     """
 
     population: Annotated[int, quantity("chromosomes", at_least=2, at_most=10_000)] = 8

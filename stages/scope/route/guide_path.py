@@ -20,12 +20,11 @@ WAYPOINT_SPACING_MM = 3.0
 
 @frozen_record
 class GuidePath:
-    """Points from start to goal with the radius of the lumen; P points.
+    """P points from start to goal, of which no two neighbours coincide, with the radius of the lumen.
 
     Parameters
     ----------
-    points_mm : (P, 3) float64
-        The first is the start, the last the goal; no two that follow each other coincide.
+    points_mm : (P, 3) float64, LPS mm
     radius_mm : (P,) float64
     """
 

@@ -14,14 +14,9 @@ PER_SPAN = 16
 
 @frozen_value
 class RouteMetrics:
-    """Numbers of a curve, from dense samples.
+    """Numbers of a curve, from dense samples: curvature, and distance to the wall, which is negative outside.
 
-    Parameters
-    ----------
-    normalised_length : float
-        Length over the distance between the ends.
-    mean_wall_mm, least_wall_mm : float
-        Distance of the curve to the wall; negative outside.
+    `normalised_length` is the length over the distance between the ends.
     """
 
     normalised_length: float

@@ -70,32 +70,6 @@ class Route:
 REPAIRS: tuple[Repair, ...] = get_args(Repair)
 
 
-def try_route(
-    centreline: Centreline,
-    start_mm: ArrayLike,
-    goal_mm: ArrayLike,
-    limits: RouteLimits,
-    *,
-    repair: Repair = "exact",
-    links: Links | None = None,
-    waypoint_spacing_mm: float = WAYPOINT_SPACING_MM,
-    seed: int = 0,
-    genetic: GeneticSettings | None = None,
-    executor: Executor | None = None,
-) -> Route:
-    """Plan a route and say whether it is proved; see `plan_route`, which refuses one that is not."""
-    start, goal = (np.array(point, dtype=np.float64).reshape(3) for point in (start_mm, goal_mm))
-    if repair not in REPAIRS:
-        raise SettingsError(f"There is no repair {repair!r}", expected=f"one of {', '.join(REPAIRS)}")
-    centreline.require_inside(start, limits.needed_mm, "start")
-    centreline.require_inside(goal, limits.needed_mm, "goal")
-    links = nearest_links(centreline) if links is None else links
-    nodes = fewest_hops(links, centreline.nearest_node(start), centreline.nearest_node(goal))
-    guide = guide_path_along(centreline, nodes, start, goal)
-    tentative = guide.curve(waypoint_spacing_mm)
-    return _route(centreline, nodes, guide, tentative, limits, repair, seed, genetic, executor)
-
-
 def plan_route(
     centreline: Centreline,
     start_mm: ArrayLike,
@@ -108,6 +82,7 @@ def plan_route(
     seed: int = 0,
     genetic: GeneticSettings | None = None,
     executor: Executor | None = None,
+    require_proof: bool = True,
 ) -> Route:
     """Plan a route that is proved to keep its limits on the whole curve.
 
@@ -128,6 +103,8 @@ def plan_route(
         Of the genetic search.
     executor : concurrent.futures.Executor, optional
         Repairs segments side by side.
+    require_proof : bool
+        Whether a curve that cannot be proved is refused; else `Route.proved` tells.
 
     Raises
     ------
@@ -138,19 +115,18 @@ def plan_route(
     SettingsError
         If there is no such repair, or start and goal coincide.
     """
-    route = try_route(
-        centreline,
-        start_mm,
-        goal_mm,
-        limits,
-        repair=repair,
-        links=links,
-        waypoint_spacing_mm=waypoint_spacing_mm,
-        seed=seed,
-        genetic=genetic,
-        executor=executor,
-    )
-    require_proved(route)
+    start, goal = (np.array(point, dtype=np.float64).reshape(3) for point in (start_mm, goal_mm))
+    if repair not in REPAIRS:
+        raise SettingsError(f"There is no repair {repair!r}", expected=f"one of {', '.join(REPAIRS)}")
+    centreline.require_inside(start, limits.needed_mm, "start")
+    centreline.require_inside(goal, limits.needed_mm, "goal")
+    links = nearest_links(centreline) if links is None else links
+    nodes = fewest_hops(links, centreline.nearest_node(start), centreline.nearest_node(goal))
+    guide = guide_path_along(centreline, nodes, start, goal)
+    tentative = guide.curve(waypoint_spacing_mm)
+    route = _route(centreline, nodes, guide, tentative, limits, repair, seed, genetic, executor)
+    if require_proof:
+        require_proved(route)
     return route
 
 

@@ -9,23 +9,9 @@ from anatomy.settings import quantity, settings
 
 @settings
 class RouteLimits:
-    """What the device can follow.
+    """What the device can follow; the largest curvature is S of [Li2021].
 
-    Parameters
-    ----------
-    max_curvature_per_mm : float
-        Largest curvature, S of [Li2021].
-    device_radius_mm : float
-        Outer radius of the device.
-    wall_margin_mm : float
-        Gap that must remain between device and wall.
-    end_tolerance_mm : float
-        How far the ends of the route may lie from the wanted points; 0 for exactly there.
-
-    Raises
-    ------
-    SettingsError
-        If a value is not finite or absurd.
+    With an end tolerance of 0 the route ends exactly at the wanted points.
     """
 
     max_curvature_per_mm: Annotated[float, quantity("largest curvature", above=0.0, at_most=10.0)]

@@ -22,21 +22,8 @@ ExitTest = Callable[[int, int], bool]
 class ExitRule:
     """How target positions are chosen.
 
-    Parameters
-    ----------
-    reach_mm : float
-        Largest distance from the lesion; the paper's 40 mm, the length of common needles.
-    step_mm : float
-        By which the sphere around the lesion grows.
-    calibration : float
-        k of eq. 2, 0.5 to 2 in the paper.
-    depth_over_diameter : float
-        L / S of eq. 2: how deep a biopsy goes, over the diameter of the lesion.
-
-    Raises
-    ------
-    SettingsError
-        If a value is out of its range.
+    The reach is the paper's 40 mm, the length of common needles; k of eq. 2 is 0.5 to 2 there.  L / S is how
+    deep a biopsy goes, over the diameter of the lesion.  The sphere that grows is the one around the lesion.
     """
 
     reach_mm: Annotated[float, quantity("largest distance from the lesion", above=0.0, at_most=200.0)] = 40.0

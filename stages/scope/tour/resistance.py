@@ -17,22 +17,10 @@ EXAMPLE_BETA = 2.5
 
 @settings
 class Resistances:
-    """Weights of the equivalent resistance.
+    """Weights of the equivalent resistance [Pan2025, eq. 3], with the values that the paper states.
 
-    Parameters
-    ----------
-    alpha, beta, gamma : float
-        Weights of length over diameter, of the angle with the preceding branch in rad, and of cartilage; the
-        values that the paper states.  Its worked example needs beta = 2.5, see `EXAMPLE_BETA`.
-    eta : float
-        Resistance of a lesion itself.
-    cartilage_generations : int
-        Branches down to this generation have cartilage; a reading, the paper tells it case by case.
-
-    Raises
-    ------
-    SettingsError
-        If a value is out of its range.
+    Its worked example needs beta = 2.5, see `EXAMPLE_BETA`.  Angles are those with the preceding branch, in
+    rad.  Down to which generation branches have cartilage is a reading: the paper tells it case by case.
     """
 
     alpha: Annotated[float, quantity("weight of length over diameter", at_least=0.0, at_most=1e3)] = 1.0

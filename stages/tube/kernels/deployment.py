@@ -7,18 +7,7 @@ from __future__ import annotations
 
 import numba
 
-from stages.tube.kernels.planar import (
-    INNER_CURVATURE,
-    INNER_RADIUS,
-    MARGIN,
-    MAX_EXTENSION,
-    MAX_PROTRUSION,
-    MAX_SWEEP,
-    OUTER_RADIUS,
-    OVERLAP_CURVATURE,
-    lateral_sweep,
-    tube_pieces,
-)
+from stages.tube.kernels import planar
 from stages.tube.kernels.wall_exit import (
     ACCEPTED,
     BRANCH,
@@ -47,17 +36,17 @@ def validate_deployment(environment, tubes, base, normal, outer, inner, trace, t
     Fills `trace` and `tip` (9,): tip pose and the normal there.  Returns a reason.
     """
     reset(trace)
-    if inner > tubes[MAX_EXTENSION]:
+    if inner > tubes[planar.MAX_EXTENSION]:
         return TOO_LONG
-    if inner - outer > tubes[MAX_PROTRUSION]:
+    if inner - outer > tubes[planar.MAX_PROTRUSION]:
         return PROTRUDES
-    sweep = lateral_sweep(tubes, outer, inner)
-    if sweep > tubes[MAX_SWEEP]:
+    sweep = planar.lateral_sweep(tubes, outer, inner)
+    if sweep > tubes[planar.MAX_SWEEP]:
         return SWEEPS
-    clearance = tubes[MARGIN] + sweep
+    clearance = tubes[planar.MARGIN] + sweep
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])
     towards = (normal[0], normal[1], normal[2])
-    for start, stop, kappa, radius in tube_pieces(tubes, outer, inner):
+    for start, stop, kappa, radius in planar.tube_pieces(tubes, outer, inner):
         if stop - start <= 0.0:
             continue
         reason, pose, towards = advance(
@@ -125,7 +114,7 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
     outer_trace = work[0]
     inner_trace = work[1]
     n_stops = stops.shape[0]
-    margin = tubes[MARGIN]
+    margin = tubes[planar.MARGIN]
     for t in range(normals.shape[0]):
         reset(outer_trace)
         pose = (base[0], base[1], base[2], base[3], base[4], base[5])
@@ -133,8 +122,8 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
         for m in range(n_stops):
             if m > 0:
                 reason, pose, towards = advance(
-                    environment, tubes, outer_trace, pose, towards, tubes[OVERLAP_CURVATURE],
-                    stops[m - 1], stops[m], tubes[OUTER_RADIUS], margin,
+                    environment, tubes, outer_trace, pose, towards, tubes[planar.OVERLAP_CURVATURE],
+                    stops[m - 1], stops[m], tubes[planar.OUTER_RADIUS], margin,
                 )  # fmt: skip
                 if reason != ACCEPTED:
                     reasons[reason] += (n_stops - m) * (n_stops - m + 1) // 2
@@ -146,10 +135,11 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
             inner_towards = towards
             for e in range(m + 1, n_stops):
                 reason = PROTRUDES
-                if stops[e] - stops[m] <= tubes[MAX_PROTRUSION]:
+                if stops[e] - stops[m] <= tubes[planar.MAX_PROTRUSION]:
                     reason, inner_pose, inner_towards = advance(
-                        environment, tubes, inner_trace, inner_pose, inner_towards, tubes[INNER_CURVATURE],
-                        stops[e - 1], stops[e], tubes[INNER_RADIUS], margin,
+                        environment, tubes, inner_trace, inner_pose, inner_towards,
+                        tubes[planar.INNER_CURVATURE], stops[e - 1], stops[e],
+                        tubes[planar.INNER_RADIUS], margin,
                     )  # fmt: skip
                 if reason != ACCEPTED:
                     reasons[reason] += n_stops - e

@@ -22,18 +22,12 @@ from stages.tube import (
     tracking_length_mm,
     tube_constants,
 )
-from stages.tube.device import ConcentricTubes, Tube
+from stages.tube.device import ConcentricTubes
 from tests.stages.scenes import Canvas
+from tests.stages.tube.pairs import thin_pair
 
-OUTER = Tube(outer_diameter_mm=1.6, inner_diameter_mm=1.38, length_mm=640.0)
-INNER = Tube(
-    outer_diameter_mm=1.2, inner_diameter_mm=1.05, length_mm=680.0, curved_length_mm=30.0,
-    precurvature_per_mm=0.025,
-)  # fmt: skip
-TUBES = ConcentricTubes(outer=OUTER, inner=INNER)
-STRAIGHT = ConcentricTubes(
-    outer=OUTER, inner=Tube(outer_diameter_mm=1.2, inner_diameter_mm=1.05, length_mm=680.0)
-)
+TUBES, STRAIGHT = thin_pair(30.0), thin_pair(0.0)
+INNER, OUTER = TUBES.inner, TUBES.outer
 MARGINS = Margins(segmentation_margin_mm=0.3, registration_margin_mm=0.2)
 TIPS = np.array(
     [[-3.0, 0.0, -15.0, 0.0, 0.0, 1.0], [-1.0, 2.0, -12.0, 0.1, 0.0, 1.0], [8.0, 0, 0, 0, 0, 1.0]]

@@ -9,15 +9,9 @@ import pytest
 
 from anatomy.errors import SettingsError
 from stages.tube.device import ConcentricTubes, Tube
+from tests.stages.tube.pairs import WIDE
 
-OUTER = Tube(outer_diameter_mm=1.90, inner_diameter_mm=1.65, length_mm=640.0)
-INNER = Tube(
-    outer_diameter_mm=1.50,
-    inner_diameter_mm=1.30,
-    length_mm=660.0,
-    curved_length_mm=40.0,
-    precurvature_per_mm=0.025,
-)
+INNER, OUTER = replace(WIDE.inner, length_mm=660.0), WIDE.outer
 TUBES = ConcentricTubes(outer=OUTER, inner=INNER)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from anatomy.errors import SettingsError
-from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.following import deploy
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.proposals import (
@@ -21,13 +20,9 @@ from stages.tube.proposals import (
     propose_designs,
 )
 from stages.tube.sequences import kuntz2015
+from tests.stages.tube.pairs import WIDE
 
-INNER = Tube(
-    outer_diameter_mm=1.5, inner_diameter_mm=1.3, length_mm=680.0, curved_length_mm=40.0,
-    precurvature_per_mm=0.025,
-)  # fmt: skip
-OUTER = Tube(outer_diameter_mm=1.9, inner_diameter_mm=1.65, length_mm=640.0)
-TUBES = ConcentricTubes(outer=OUTER, inner=INNER)
+INNER, OUTER = WIDE.inner, WIDE.outer
 LIMITS = MakerLimits(channel_diameter_mm=2.0)
 
 
@@ -72,14 +67,14 @@ class TestSequences:
 
 
 class TestDesigns:
-    FOUND = propose_designs(TUBES, 30.0, 50.0, 2.0, LIMITS)
+    FOUND = propose_designs(WIDE, 30.0, 50.0, 2.0, LIMITS)
 
     def test_they_are_sorted_and_within_all_limits(self) -> None:
         sweeps = [each.lateral_sweep_mm for each in self.FOUND]
         assert sweeps == sorted(sweeps) and sweeps[-1] <= 2.0 and len(sweeps) > 10
         for each in self.FOUND:
             inner, outer = each.tubes.inner, each.tubes.outer
-            assert inner.rest_strain <= TUBES.max_strain
+            assert inner.rest_strain <= WIDE.max_strain
             assert 20.0 <= inner.curved_length_mm <= 50.0
             assert outer.inner_diameter_mm >= inner.outer_diameter_mm + 0.15 - 1e-12
             assert outer.outer_diameter_mm <= 2.0 - 0.1 + 1e-12
@@ -113,26 +108,26 @@ class TestDesigns:
 
     def test_there_is_a_design_that_reaches_as_far_without_sweep(self) -> None:
         """Its curve is as long as it is inserted."""
-        present = evaluate_design(TUBES, 30.0, 50.0)
+        present = evaluate_design(WIDE, 30.0, 50.0)
         assert present.lateral_sweep_mm > 2.0
         still = [each for each in self.FOUND if each.lateral_sweep_mm == 0.0]
         assert max(each.tip_offset_mm for each in still) > present.tip_offset_mm
         assert all(each.tubes.inner.curved_length_mm == 50.0 for each in still)
 
     def test_a_smaller_sweep_leaves_fewer_designs(self) -> None:
-        few = propose_designs(TUBES, 30.0, 50.0, 0.5, LIMITS)
+        few = propose_designs(WIDE, 30.0, 50.0, 0.5, LIMITS)
         assert 0 < len(few) < len(self.FOUND)
         assert few[-1].lateral_sweep_mm <= 0.5
 
     def test_the_longest_curve_is_respected(self) -> None:
         short = replace(LIMITS, longest_curve_mm=30.0)
-        found = propose_designs(TUBES, 30.0, 50.0, 2.0, short)
+        found = propose_designs(WIDE, 30.0, 50.0, 2.0, short)
         assert max(each.tubes.inner.curved_length_mm for each in found) == 30.0
         assert min(each.lateral_sweep_mm for each in found) > 0.0
 
     def test_a_thicker_channel_allows_a_thicker_wall(self) -> None:
         walls = {each.tubes.outer.outer_diameter_mm for each in self.FOUND}
-        wide = propose_designs(TUBES, 30.0, 50.0, 2.0, MakerLimits(channel_diameter_mm=2.4))
+        wide = propose_designs(WIDE, 30.0, 50.0, 2.0, MakerLimits(channel_diameter_mm=2.4))
         assert max(each.tubes.outer.outer_diameter_mm for each in wide) > max(walls)
 
     @pytest.mark.parametrize(
@@ -147,21 +142,21 @@ class TestDesigns:
     )
     def test_impossible_wishes(self, arguments: Any, message: str) -> None:
         with pytest.raises(SettingsError, match=message):
-            propose_designs(TUBES, *arguments, LIMITS)
+            propose_designs(WIDE, *arguments, LIMITS)
 
     def test_an_outer_tube_that_does_not_fit(self) -> None:
         with pytest.raises(SettingsError, match="space for"):
-            propose_designs(TUBES, 30.0, 50.0, 1.0, MakerLimits(channel_diameter_mm=1.8))
+            propose_designs(WIDE, 30.0, 50.0, 1.0, MakerLimits(channel_diameter_mm=1.8))
 
     def test_limits_are_checked(self) -> None:
         with pytest.raises(SettingsError, match="thinnest_wall_mm"):
             MakerLimits(channel_diameter_mm=2.0, thinnest_wall_mm=0.0)
 
     def test_a_straight_inner_tube_has_no_sweep_and_no_reach(self) -> None:
-        straight = replace(TUBES, inner=replace(INNER, curved_length_mm=0.0, precurvature_per_mm=0.0))
+        straight = replace(WIDE, inner=replace(INNER, curved_length_mm=0.0, precurvature_per_mm=0.0))
         found = evaluate_design(straight, 30.0, 50.0)
         assert (found.lateral_sweep_mm, found.tip_offset_mm, found.tip_angle_rad) == (0.0, 0.0, 0.0)
 
     def test_the_bore_keeps_its_clearance(self) -> None:
-        wide = propose_designs(TUBES, 30.0, 50.0, 2.0, replace(LIMITS, nesting_clearance_mm=0.2))
+        wide = propose_designs(WIDE, 30.0, 50.0, 2.0, replace(LIMITS, nesting_clearance_mm=0.2))
         assert all(each.tubes.outer.inner_diameter_mm == pytest.approx(1.7) for each in wide)

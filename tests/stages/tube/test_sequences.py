@@ -13,17 +13,13 @@ from hypothesis import strategies as st
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.margins import Margins
 from stages.tube import Equilibrium, TubeMechanics, kernels, tube_constants
-from stages.tube.device import BentPiece, ConcentricTubes, Tube
+from stages.tube.device import BentPiece, Tube
 from stages.tube.following import DeployedSequence, SnapError, deploy, motion_by_step
 from stages.tube.sequences import Sequence, alternating, inner_first, joint_steps, kuntz2015, together
+from tests.stages.tube.pairs import WIDE
 
-INNER = Tube(
-    outer_diameter_mm=1.5, inner_diameter_mm=1.3, length_mm=680.0, curved_length_mm=40.0,
-    precurvature_per_mm=0.025,
-)  # fmt: skip
-OUTER = Tube(outer_diameter_mm=1.9, inner_diameter_mm=1.65, length_mm=640.0)
-DEFAULT = ConcentricTubes(outer=OUTER, inner=INNER)
-NUMBERS = tube_constants(DEFAULT, Margins())
+INNER, OUTER = WIDE.inner, WIDE.outer
+NUMBERS = tube_constants(WIDE, Margins())
 MECHANICS = TubeMechanics((INNER, OUTER))
 
 

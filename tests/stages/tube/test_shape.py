@@ -9,15 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.shape import centreline
+from tests.stages.tube.pairs import thin_pair
 
-OUTER = Tube(outer_diameter_mm=1.6, inner_diameter_mm=1.38, length_mm=640.0)
-INNER = Tube(
-    outer_diameter_mm=1.2, inner_diameter_mm=1.05, length_mm=680.0, curved_length_mm=40.0,
-    precurvature_per_mm=0.025,
-)  # fmt: skip
-TUBES = ConcentricTubes(outer=OUTER, inner=INNER)
+TUBES = thin_pair(40.0)
+INNER, OUTER = TUBES.inner, TUBES.outer
 STIFF = [t.outer_diameter_mm**4 - t.inner_diameter_mm**4 for t in (INNER, OUTER)]
 OVERLAP = 0.025 * STIFF[0] / sum(STIFF)
 

@@ -13,15 +13,20 @@ ONE = np.uint64(1)
 ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 
 
+@inner_kernel
+def _shift(dx):
+    """Return a move by cells as whole words and the rest in bits, with the shifts of a word and its carry."""
+    step = dx // 64
+    rest = dx - 64 * step
+    return step, rest, np.uint64(rest), np.uint64(64 - rest)
+
+
 @numba.njit(cache=True)
 def or_shifted(target, source, dy, dx):
     """OR a bitmap into another one, moved by whole cells; what falls off is dropped."""
     rows, words = source.shape
     to_rows, to_words = target.shape
-    step = dx // 64
-    rest = dx - 64 * step
-    low = np.uint64(rest)
-    high = np.uint64(64 - rest)
+    step, rest, low, high = _shift(dx)
     for y in range(max(0, -dy), min(rows, to_rows - dy)):
         for w in range(words):
             value = source[y, w]
@@ -39,10 +44,7 @@ def and_shifted(target, source, dy, dx):
     """Keep of a bitmap what another one, moved by whole cells, holds; beyond its edge is nothing."""
     rows, words = source.shape
     to_rows, to_words = target.shape
-    step = dx // 64
-    rest = dx - 64 * step
-    low = np.uint64(rest)
-    high = np.uint64(64 - rest)
+    step, rest, low, high = _shift(dx)
     for y in range(to_rows):
         from_y = y - dy
         for to in range(to_words):

@@ -11,7 +11,7 @@ from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import length_ahead, seen_from
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
-from stages.needle.kernels.rrt import random_arc, sample_between
+from stages.needle.kernels.rrt import goal_from_root, random_arc, sample_between
 from stages.needle.kernels.tree import (
     PATH_COST,
     PATH_LENGTH,
@@ -78,15 +78,11 @@ def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, cou
     Parameters and results as those of `stages.needle.kernels.rrt.grow_rrt`.
     """
     start = pose_of(nodes[0])
-    rho, h = seen_from(start, goal)
-    if math.hypot(rho, h) < MIN_ARC_MM:
-        return count, 0, False
-    if count == 1:
-        count = add_goal(
-            obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
-        )
-        if count > 1:
-            return count, 0, True
+    count, ends, solved = goal_from_root(
+        obstacles, limits, objective, branch, goal, nodes, parents, count, state, best
+    )
+    if ends:
+        return count, 0, solved
     rate = objective.least_rate
     for used in range(iterations):
         if count + ROWS_PER_STEP > nodes.shape[0]:

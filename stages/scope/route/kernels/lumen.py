@@ -109,7 +109,7 @@ def _cell_range(cones, index, e, axis):
     high = max(cones[e, axis] + cones[e, 3], cones[e, 4 + axis] + cones[e, 7])
     last = int(index[4 + axis]) - 1
     first = max(int(math.floor((low - index[axis]) / index[3])), 0)
-    return first, min(int(math.floor((high - index[axis]) / index[3])), last)
+    return range(first, min(int(math.floor((high - index[axis]) / index[3])), last) + 1)
 
 
 @numba.njit(cache=True)
@@ -118,24 +118,18 @@ def list_cells(cones, index):
     n_cells = int(index[4] * index[5] * index[6])
     start = np.zeros(n_cells + 1, dtype=np.int64)
     for e in range(cones.shape[0]):
-        i0, i1 = _cell_range(cones, index, e, 0)
-        j0, j1 = _cell_range(cones, index, e, 1)
-        k0, k1 = _cell_range(cones, index, e, 2)
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                for k in range(k0, k1 + 1):
+        for i in _cell_range(cones, index, e, 0):
+            for j in _cell_range(cones, index, e, 1):
+                for k in _cell_range(cones, index, e, 2):
                     start[int((i * index[5] + j) * index[6] + k) + 1] += 1
     for cell in range(n_cells):
         start[cell + 1] += start[cell]
     filled = start[:-1].copy()
     listed = np.zeros(start[n_cells], dtype=np.int64)
     for e in range(cones.shape[0]):
-        i0, i1 = _cell_range(cones, index, e, 0)
-        j0, j1 = _cell_range(cones, index, e, 1)
-        k0, k1 = _cell_range(cones, index, e, 2)
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                for k in range(k0, k1 + 1):
+        for i in _cell_range(cones, index, e, 0):
+            for j in _cell_range(cones, index, e, 1):
+                for k in _cell_range(cones, index, e, 2):
                     cell = int((i * index[5] + j) * index[6] + k)
                     listed[filled[cell]] = e
                     filled[cell] += 1

@@ -30,12 +30,8 @@ def _blossom(control, knots, first, x0, x1, x2, axis):
     d1 = control[first + 1, axis]
     d2 = control[first + 2, axis]
     d3 = control[first + 3, axis]
-    k1 = knots[first + 1]
-    k2 = knots[first + 2]
-    k3 = knots[first + 3]
-    k4 = knots[first + 4]
-    k5 = knots[first + 5]
-    k6 = knots[first + 6]
+    k1, k2, k3 = knots[first + 1], knots[first + 2], knots[first + 3]
+    k4, k5, k6 = knots[first + 4], knots[first + 5], knots[first + 6]
     e0 = d0 + (x0 - k1) / (k4 - k1) * (d1 - d0)
     e1 = d1 + (x0 - k2) / (k5 - k2) * (d2 - d1)
     e2 = d2 + (x0 - k3) / (k6 - k3) * (d3 - d2)
@@ -206,12 +202,8 @@ def prove_spans(
 @numba.njit(cache=True)
 def basis_rows(knots, first, u, rows):
     """Fill `rows` (3, 4) with the four basis functions at `u` and their first and second derivatives."""
-    k1 = knots[first + 1]
-    k2 = knots[first + 2]
-    k3 = knots[first + 3]
-    k4 = knots[first + 4]
-    k5 = knots[first + 5]
-    k6 = knots[first + 6]
+    k1, k2, k3 = knots[first + 1], knots[first + 2], knots[first + 3]
+    k4, k5, k6 = knots[first + 4], knots[first + 5], knots[first + 6]
     for c in range(4):
         d0 = 1.0 if c == 0 else 0.0
         d1 = 1.0 if c == 1 else 0.0

@@ -68,6 +68,13 @@ def _spread(union, part):
     return local
 
 
+@inner_kernel
+def _parts(union, above, a, b):
+    """Return in the bits of `union`: what closes, what stays open, what both children have, what only `a`."""
+    closing, keep = _spread(union, union & ~above), _spread(union, union & above)
+    return closing, keep, _spread(union, a & b), _spread(union, a & ~b)
+
+
 @numba.njit(cache=True)
 def solve(left, right, lift, cost, below, open_sets, offset, closed_tour, best, split, chosen):
     """Return the least cost, and mark the chosen exits.
@@ -111,10 +118,7 @@ def solve(left, right, lift, cost, below, open_sets, offset, closed_tour, best, 
         union = open_sets[a] | open_sets[b]
         _table(union, open_sets[a], to_a)
         _table(union, open_sets[b], to_b)
-        closing = _spread(union, union & ~open_sets[t])
-        keep = _spread(union, union & open_sets[t])
-        shared = _spread(union, open_sets[a] & open_sets[b])
-        only_a = _spread(union, open_sets[a] & ~open_sets[b])
+        closing, keep, shared, only_a = _parts(union, open_sets[t], open_sets[a], open_sets[b])
         empty_allowed = below[t] == open_sets[t]
         # Subsets of `keep`, ascending, are the node's own bits in order.
         own = np.int64(0)
@@ -182,10 +186,7 @@ def _choose(left, right, open_sets, offset, split, ends_below, chosen):
         to_b = np.zeros(size, dtype=np.int64)
         _table(union, open_sets[a], to_a)
         _table(union, open_sets[b], to_b)
-        closing = _spread(union, union & ~open_sets[t])
-        keep = _spread(union, union & open_sets[t])
-        shared = _spread(union, open_sets[a] & open_sets[b])
-        only_a = _spread(union, open_sets[a] & ~open_sets[b])
+        closing, keep, shared, only_a = _parts(union, open_sets[t], open_sets[a], open_sets[b])
         own = np.int64(0)
         for _ in range(want[t]):
             own = (own - keep) & keep

@@ -13,7 +13,7 @@ from stages.scope.route.centreline import Centreline, from_image
 from stages.scope.route.exact import segments
 from stages.scope.route.genetic import repair_genetic
 from stages.scope.route.metrics import measure
-from stages.scope.route.planner import Replanner, plan_route, try_route
+from stages.scope.route.planner import Replanner, plan_route
 from stages.scope.route.proof import Proof
 from stages.scope.route.search import NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.settings import RouteLimits
@@ -94,7 +94,7 @@ def double_bend() -> Centreline:
 
 def test_two_bends_are_two_segments() -> None:
     tube = double_bend()
-    route = try_route(tube, tube.nodes_mm[0], tube.nodes_mm[-1], LIMITS, repair="none")
+    route = plan_route(tube, tube.nodes_mm[0], tube.nodes_mm[-1], LIMITS, repair="none", require_proof=False)
     parts = segments(route.proof, len(route.curve.control_mm), 8, ends_free=False)
     assert len(parts) == 2
     assert parts[0][1] <= parts[1][0]
@@ -163,7 +163,9 @@ def test_a_route_in_a_drawing_stays_in_its_plane() -> None:
 def test_genetic_repair_repeats_from_a_seed_and_claims_no_more_than_it_tests() -> None:
     tube = corner(40.0, 5.0)
     limits = RouteLimits(max_curvature_per_mm=0.15)
-    route = try_route(tube, tube.nodes_mm[0], tube.nodes_mm[-1], limits, repair="ga", seed=4)
+    route = plan_route(
+        tube, tube.nodes_mm[0], tube.nodes_mm[-1], limits, repair="ga", seed=4, require_proof=False
+    )
     again, passed = repair_genetic(route.tentative, tube, limits, seed=4)
     np.testing.assert_array_equal(route.curve.control_mm, again.control_mm)
     assert route.claimed is passed is True

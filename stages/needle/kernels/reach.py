@@ -22,10 +22,7 @@ from stages.needle.kernels.proof import PROBE_SPACING_MM, blocker_on_arc
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
 
-DIRECT = 1
-SEARCHED = 2
-UNREACHED = 3
-NO_CLEARANCE = 4
+DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = range(1, 5)
 
 # Columns of `found`: estimated integral of 1 / clearance, least clearance beyond the exempt length (mm).
 COST = 0

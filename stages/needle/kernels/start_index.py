@@ -19,11 +19,7 @@ import numba
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import seen_from, workspace_length
 
-MIDDLE = 0
-DIRECTION = 3
-DISTANCE = 6
-ANGLE = 7
-N_BOUNDS = 8
+MIDDLE, DIRECTION, DISTANCE, ANGLE, N_BOUNDS = 0, 3, 6, 7, 8
 
 ROUNDING_MM = 1e-6
 """Added to bounds, so that rounding excludes no pose."""

@@ -27,12 +27,7 @@ from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 from stages.needle.kernels.proof import blocker_on_arc
 
 # Columns: pose (6), arc from the parent: length, bend (4); path length, accumulated turn, path cost.
-ARC_LENGTH = 6
-BEND = 7
-PATH_LENGTH = 11
-PATH_TURN = 12
-PATH_COST = 13
-NODE_COLUMNS = 14
+ARC_LENGTH, BEND, PATH_LENGTH, PATH_TURN, PATH_COST, NODE_COLUMNS = 6, 7, 11, 12, 13, 14
 ROWS_PER_STEP = 5
 """Rows that a step of any search adds at most, with one to spare."""
 

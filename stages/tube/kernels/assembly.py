@@ -20,15 +20,7 @@ SHORTEST_PIECE_MM = 1e-9
 
 # Columns of `pieces`: arc lengths of both ends; the tubes whose shift moves them (-1: none); 1 / the sum of
 # bending stiffnesses; how many tubes are bent here; the only one if it is one; number of steps.
-NEAR = 0
-FAR = 1
-NEAR_OWNER = 2
-FAR_OWNER = 3
-SOFTNESS = 4
-BENT = 5
-BENT_TUBE = 6
-STEPS = 7
-PIECE_COLUMNS = 8
+NEAR, FAR, NEAR_OWNER, FAR_OWNER, SOFTNESS, BENT, BENT_TUBE, STEPS, PIECE_COLUMNS = range(9)
 
 
 @inner_kernel

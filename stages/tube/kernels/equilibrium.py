@@ -35,12 +35,7 @@ SHARES = 8
 """Places at which the determinant is looked at between two rear ends, for four tubes or more."""
 
 # Columns of a result: converged, stable, least determinant, residual (rad), then the tip frame as a pose.
-CONVERGED = 0
-STABLE = 1
-LEAST_DETERMINANT = 2
-RESIDUAL = 3
-TIP = 4
-RESULT_COLUMNS = 16
+CONVERGED, STABLE, LEAST_DETERMINANT, RESIDUAL, TIP, RESULT_COLUMNS = 0, 1, 2, 3, 4, 16
 
 
 @inner_kernel

@@ -13,17 +13,8 @@ import numba
 
 from anatomy.kernels.arcs import normal_on_arc, pose_on_arc, sine_length, versine_length
 
-OVERLAP_CURVATURE = 0
-INNER_CURVATURE = 1
-CURVED_LENGTH = 2
-OUTER_RADIUS = 3
-INNER_RADIUS = 4
-MARGIN = 5
-MIN_WALL_ANGLE = 6
-MAX_SWEEP = 7
-MAX_EXTENSION = 8
-MAX_PROTRUSION = 9
-N_TUBES = 10
+OVERLAP_CURVATURE, INNER_CURVATURE, CURVED_LENGTH, OUTER_RADIUS, INNER_RADIUS, MARGIN = range(6)
+MIN_WALL_ANGLE, MAX_SWEEP, MAX_EXTENSION, MAX_PROTRUSION, N_TUBES = range(6, 11)
 
 SWEEP_SAMPLES = 100
 """Samples of the sweep between its two sharp peaks; it is smooth there, and they are computed exactly."""

@@ -18,31 +18,13 @@ from anatomy.typed import Bool, Float, Labels, UInt16
 from stages.tube.kernels.planar import MIN_WALL_ANGLE
 
 # trace
-PHASE = 0
-LEFT_AT = 1
-BRANCH = 2
-WALL_ANGLE = 3
-HAZARD = 4
-N_TRACE = 5
+PHASE, LEFT_AT, BRANCH, WALL_ANGLE, HAZARD, N_TRACE = range(6)
 
-IN_LUMEN = 0.0
-IN_WALL = 1.0
-IN_TISSUE = 2.0
+IN_LUMEN, IN_WALL, IN_TISSUE = 0.0, 1.0, 2.0
 
 # reasons why a deployment is refused
-ACCEPTED = 0
-NO_EXIT = 1
-NEAR_VESSEL = 2
-NEAR_PLEURA = 3
-NEAR_FISSURE = 4
-NEAR_OTHER_BRANCH = 5
-REENTERS_LUMEN = 6
-FLAT_EXIT = 7
-SWEEPS = 8
-TOO_LONG = 9
-PROTRUDES = 10
-LEAVES_MEDIASTINAL = 11
-N_REASONS = 12
+ACCEPTED, NO_EXIT, NEAR_VESSEL, NEAR_PLEURA, NEAR_FISSURE, NEAR_OTHER_BRANCH, REENTERS_LUMEN = range(7)
+FLAT_EXIT, SWEEPS, TOO_LONG, PROTRUDES, LEAVES_MEDIASTINAL, N_REASONS = range(7, 13)
 
 FINE_STEP_MM = 0.05
 """Least step in the lumen, where the axis may cut corners of voxels: a tenth of a voxel."""

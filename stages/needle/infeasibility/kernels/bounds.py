@@ -12,24 +12,12 @@ from stages.needle.infeasibility.kernels.bitmaps import find_box
 
 # What `scale` holds: sides of cells in mm and as a slope, slope of the start (v, u), curvature in 1/mm, and
 # the largest sine of the angle between a path and the planes' normal.
-CELL = 0
-SLOPE_CELL = 1
-FIRST_V = 2
-FIRST_U = 3
-KAPPA = 4
-TOP_SINE = 5
-SCALE_SIZE = 6
+CELL, SLOPE_CELL, FIRST_V, FIRST_U, KAPPA, TOP_SINE, SCALE_SIZE = range(7)
 
 # What `ends` holds: distance from start to target, goal tolerance, longest detour from start to target
 # through any point of a path; of the spindle the depth of its middle, how far aside of it the centres of its
 # arcs lie, and their radius (infinite: no spindle), all in mm.
-TOTAL = 0
-TOLERANCE = 1
-LONGEST = 2
-SPINDLE_MIDDLE = 3
-SPINDLE_OFFSET = 4
-SPINDLE_RADIUS = 5
-ENDS_SIZE = 6
+TOTAL, TOLERANCE, LONGEST, SPINDLE_MIDDLE, SPINDLE_OFFSET, SPINDLE_RADIUS, ENDS_SIZE = range(7)
 HALF_DIAGONAL = 0.7072
 """Half the diagonal of a square of side 1, rounded up."""
 SPARE = 1e-6

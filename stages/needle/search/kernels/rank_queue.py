@@ -19,11 +19,7 @@ from anatomy.kernels.compiling import inner_kernel
 LOOK_AHEAD = 3
 
 # Columns of `entries`: two numbers of the user's, rank, next entry of a list.
-FIRST = 0
-SECOND = 1
-RANK = 2
-NEXT = 3
-ENTRY_COLUMNS = 4
+FIRST, SECOND, RANK, NEXT, ENTRY_COLUMNS = range(5)
 
 # Columns of `ranks`.
 HEAD = 0
@@ -31,12 +27,7 @@ COUNT = 1
 
 # What `state` holds, all 0 at first but FREE, -1: entries ever used, head of the list of free ones, entries
 # waiting, entries in the heap, lowest rank.
-USED = 0
-FREE = 1
-WAITING = 2
-HEAPED = 3
-LOWEST = 4
-STATE_SIZE = 5
+USED, FREE, WAITING, HEAPED, LOWEST, STATE_SIZE = range(6)
 
 
 @inner_kernel

@@ -40,25 +40,15 @@ from stages.needle.search.kernels.resolution_nodes import (
 )
 
 # What `best` holds: its last node, then length and bend of each of the two legs from there to the goal.
-BEST_NODE = 0
-BEST_LEGS = 1
+BEST_NODE, BEST_LEGS = 0, 1
 LEG_SIZE = 5
 BEST_SIZE = BEST_LEGS + 2 * LEG_SIZE
 
 # What `counts` holds.
-NODES = 0
-POPS = 1
-DUPLICATES = 2
-PRUNED = 3
-REFUSED = 4
-COUNTS = 5
+NODES, POPS, DUPLICATES, PRUNED, REFUSED, COUNTS = range(6)
 
 # Why the search returns.
-SPENT = 0
-BETTER = 1
-EXHAUSTED = 2
-FULL_OF_NODES = 3
-FULL_OF_ENTRIES = 4
+SPENT, BETTER, EXHAUSTED, FULL_OF_NODES, FULL_OF_ENTRIES = range(5)
 
 
 @inner_kernel

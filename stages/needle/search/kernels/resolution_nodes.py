@@ -22,18 +22,10 @@ SAME = 1e-6
 """Poses that differ by less than this, in mm and in each component of a direction, are equal."""
 
 # Columns of `nodes`: pose (6), first direction of bending (3), path length, accumulated turn, path cost.
-NORMAL = 6
-PATH_LENGTH = 9
-PATH_TURN = 10
-PATH_COST = 11
-NODE_COLUMNS = 12
+NORMAL, PATH_LENGTH, PATH_TURN, PATH_COST, NODE_COLUMNS = 6, 9, 10, 11, 12
 
 # Columns of `links`: node before, direction and steps of the primitive from there, rank.
-PARENT = 0
-DIRECTION = 1
-STEPS = 2
-NODE_RANK = 3
-LINK_COLUMNS = 4
+PARENT, DIRECTION, STEPS, NODE_RANK, LINK_COLUMNS = range(5)
 
 # Of a node and a direction, `proved` holds the most steps proved clear, and the least that are of no use.
 CLEAR = 0

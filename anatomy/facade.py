@@ -18,13 +18,7 @@ from typing import Any
 
 @cache
 def public_names(file: str) -> dict[str, str]:
-    """Return the public names of a package and the modules that define them.
-
-    Parameters
-    ----------
-    file : str
-        The `__init__.py` of the package.
-    """
+    """Return the public names of a package by its file `__init__.py`, and the modules that define them."""
     for node in ast.parse(Path(file).read_text(encoding="utf-8")).body:
         if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
             imports = [each for each in node.body if isinstance(each, ast.ImportFrom) and each.module]
@@ -35,10 +29,7 @@ def public_names(file: str) -> dict[str, str]:
 def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and the `__dir__` of a package whose names are imported when they are used.
 
-    Parameters
-    ----------
-    package, file : str
-        `__name__` and `__file__` of the package.
+    `package` and `file` are its `__name__` and `__file__`.
     """
 
     def get(name: str) -> Any:

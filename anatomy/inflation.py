@@ -18,12 +18,7 @@ ROUNDING = 1e-6
 def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> Int:
     """Return by how many voxels obstacles grow along i, j and k: `ceil(r_total / s_i)` [Fu2018, sec. IV-B].
 
-    Parameters
-    ----------
-    spacing_mm : (3,) float64
-        Voxel size along i, j, k.
-    total_radius_mm : float
-        Radius of the needle and safety margin.
+    The spacing `(3,)` is that along i, j, k; the total radius is that of the needle and the safety margin.
     """
     quotient = total_radius_mm / np.asarray(spacing_mm, dtype=np.float64)
     return np.ceil(quotient * (1.0 - ROUNDING)).astype(np.int64)

@@ -134,13 +134,7 @@ class Lung:
         return Volume(grid=self.grid, array=(self.labels & structures.BITS[name]) != 0)
 
     def surface(self, name: str) -> SurfaceMesh:
-        """Return the surface mesh of a structure, made anew at each call: exactly the faces of its voxels.
-
-        Parameters
-        ----------
-        name : str
-            See `mask`.
-        """
+        """Return the mesh of the faces of the voxels of a structure (see `mask`), made anew at each call."""
         from anatomy.meshes import box_surface
 
         mask = self.mask(name)

@@ -138,10 +138,7 @@ class MeshDistance:
     def segment_distance_mm(self, starts_lps: ArrayLike, ends_lps: ArrayLike) -> Float:
         """Return the `(N,)` distances in mm from the segments to the surface, 0 where they cross it.
 
-        Parameters
-        ----------
-        starts_lps, ends_lps : (N, 3) float64, LPS mm
-            Ends of each segment; they may coincide.
+        Their ends, `(N, 3)` LPS mm, may coincide.
         """
         starts = np.asarray(starts_lps, dtype=np.float64).reshape(-1, 3)
         ends = np.asarray(ends_lps, dtype=np.float64).reshape(-1, 3)
@@ -150,14 +147,9 @@ class MeshDistance:
         return np.array([self._distance(a[None], b[None]) for a, b in zip(starts, ends, strict=True)])
 
     def polyline_distance_mm(self, points_lps: ArrayLike) -> float:
-        """Return the distance in mm from a polyline to the surface, 0 where it crosses it.
+        """Return the distance in mm from a polyline `(N, 3)`, LPS mm, to the surface, 0 where it crosses it.
 
-        All segments enter as one mesh, several times faster than one by one.
-
-        Parameters
-        ----------
-        points_lps : (N, 3) float64, LPS mm
-            N >= 1; one point is a polyline of no length.
+        All segments enter as one mesh, several times faster than one by one.  One point is a polyline, too.
         """
         points = np.asarray(points_lps, dtype=np.float64).reshape(-1, 3)
         if self._mesh is None:

@@ -25,11 +25,7 @@ def grown_by_one(mask: Mask) -> Mask:
 def bounds(mask: Array, pad: int | Int = 0) -> tuple[Int, Int]:
     """Return `low` and `high` such that every voxel of a mask has `low <= ijk < high`; zeros if it is empty.
 
-    Parameters
-    ----------
-    mask : (ni, nj, nk) bool
-    pad : int or (3,) int
-        Voxels by which the bounds are wider, as far as the array reaches.
+    They are wider by `pad` voxels, of all axes or of each `(3,)`, as far as the array reaches.
     """
     low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
     lines = (mask.any(axis=(1, 2)), mask.any(axis=(0, 2)), mask.any(axis=(0, 1)))

@@ -53,11 +53,11 @@ def _hashes(folder: Path, files: set[Path]) -> dict[str, str]:
 
 
 def _files_beside(folder: Path) -> set[Path]:
-    return {file for file in folder.iterdir() if file.is_file() and _may_be_read(file)}
-
-
-def _may_be_read(path: Path) -> bool:
-    return bool(image_suffix(path)) or path.suffix in TEXT_SUFFIXES
+    return {
+        file
+        for file in folder.iterdir()
+        if file.is_file() and (image_suffix(file) or file.suffix in TEXT_SUFFIXES)
+    }
 
 
 def _detached_data(image: Path) -> set[Path]:

@@ -6,7 +6,6 @@ import base64
 import binascii
 import re
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -119,7 +118,7 @@ class _Reader:
     def named(self, parent: Element | None) -> dict[str, Array]:
         if parent is None:
             return {}
-        return {element.get("Name", ""): self.array(element) for element in _arrays(parent)}
+        return {e.get("Name", ""): self.array(e) for e in parent if e.tag in ("DataArray", "Array")}
 
     def array(self, element: Element) -> Array:
         dtype = np.dtype(self.order + _TYPES[element.get("type", "")])
@@ -160,10 +159,6 @@ class _Reader:
         packed = stream.take(0, sum(sizes))
         ends = np.cumsum(sizes).tolist()
         return b"".join(zlib.decompress(packed[e - n : e]) for e, n in zip(ends, sizes, strict=True))
-
-
-def _arrays(parent: Element) -> Iterator[Element]:
-    yield from (e for e in parent if e.tag in ("DataArray", "Array"))
 
 
 class _Raw:

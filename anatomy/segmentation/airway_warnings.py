@@ -21,12 +21,7 @@ GREATEST_LOOPS_SHARE = 0.25
 def airway_warnings(lumen: Volume, left: Mask, right: Mask) -> tuple[str, ...]:
     """Judge a lumen by its tree: trachea cut, airway that stops early, leak.
 
-    Parameters
-    ----------
-    lumen : Volume
-        The lumen, bool.
-    left, right : (ni, nj, nk) bool
-        The lungs, on the same grid.
+    Lumen and lungs are bool `(ni, nj, nk)` on the same grid.
     """
     from anatomy.tree import tree_from_mask
 

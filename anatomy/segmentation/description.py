@@ -45,15 +45,8 @@ class Description:
 def description_text(name: str, has_nodule: bool, target_lps: Float | None, thick_slices_mm: float) -> str:
     """Return the `patient.toml` of a segmentation.
 
-    Parameters
-    ----------
-    name : str
-        How reports call the patient; left out if empty.
-    has_nodule : bool
-    target_lps : (3,) float64 or None
-        LPS mm.
-    thick_slices_mm : float
-        Distance of slices that were accepted although they are thick, else 0.
+    An empty name is left out; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that
+    were accepted although they are thick, else 0.
     """
     lines = [f"name = {json.dumps(name, ensure_ascii=False)}"] if name else []
     lines += [

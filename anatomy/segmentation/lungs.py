@@ -57,7 +57,6 @@ class Lungs:
         Lumen of trachea and main bronchi, roughly.
     threshold_hu : float
         What was taken for lung lies below.
-    warnings : tuple of str
     """
 
     left: Mask

@@ -166,13 +166,7 @@ def without_nodule(vessels: Mask, nodule: Mask, grid: Grid) -> Mask:
     """Return the vessels without the nodule, which is a target and no obstacle.
 
     Around the nodule, the rim of `RIM_MM` that its blur turned into vessel is taken away too, except for
-    what lies within `ATTACHED_MM` of a vessel that runs on beyond the rim.
-
-    Parameters
-    ----------
-    vessels, nodule : (ni, nj, nk) bool
-    grid : Grid
-        The grid of both.
+    what lies within `ATTACHED_MM` of a vessel that runs on beyond the rim.  Both are bool on the grid.
     """
     from scipy import ndimage
 

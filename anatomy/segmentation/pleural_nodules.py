@@ -23,15 +23,9 @@ SOFT_HU = 150.0
 
 
 def notches(ct: CoarseCt, right: Mask, left: Mask, closing_mm: float) -> tuple[Mask, Mask]:
-    """Return nodule-like notches in the costal side of each lung, on coarse voxels.
+    """Return nodule-like notches in the costal side of each lung, bool `(Ni, Nj, Nk)` on coarse voxels.
 
-    Parameters
-    ----------
-    ct : CoarseCt
-    right, left : (Ni, Nj, Nk) bool
-        The lungs; one may be empty.
-    closing_mm : float
-        Radius of the closing that fills what is narrower anyway.
+    One lung may be empty; a closing of the radius `closing_mm` fills what is narrower anyway.
     """
     hull = _near_hull(right | left, ct)
     return _notches_of(ct, right, left, hull, closing_mm), _notches_of(ct, left, right, hull, closing_mm)

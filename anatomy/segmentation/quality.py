@@ -47,14 +47,7 @@ class Quality:
 
 
 def quality_of(parts: Parts, grid: Grid) -> Quality:
-    """Measure a segmentation.
-
-    Parameters
-    ----------
-    parts : Parts
-    grid : Grid
-        Its grid.
-    """
+    """Measure a segmentation."""
     from anatomy.tree import tree_from_mask
 
     litre = grid.voxel_volume_mm3 * 1e-6

@@ -47,14 +47,7 @@ class Join:
 def join_pieces(main: Int, pieces: list[Piece], spacing_mm: Float, max_gap_mm: float) -> Iterator[Join]:
     """Yield the pieces to join, nearest first; a piece may be joined to one joined before.
 
-    Parameters
-    ----------
-    main : (M, 3) int64
-        Voxels of the main piece.
-    pieces : list of Piece
-    spacing_mm : (3,) float64
-    max_gap_mm : float
-        Longest gap between two facing voxels, as solid boxes.
+    `main` are the voxels `(M, 3)` of the main piece; a gap lies between two facing voxels, as solid boxes.
     """
     best = [_best_gap(main, piece.voxels, spacing_mm, max_gap_mm) for piece in pieces]
     open_pieces = set(range(len(pieces)))

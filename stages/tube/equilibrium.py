@@ -39,7 +39,7 @@ class Equilibrium:
         self.tip_angles_rad = read_only(tip_angles_rad.copy())
         self.beta_mm = read_only(beta_mm.copy())
         self._cutting, n_steps = mechanics.cut(beta_mm)
-        self._nodes, self._steps = torsion_workspace(n_steps, n, 2 * n)
+        self._nodes, self._steps = torsion_scratch(n_steps, n, 2 * n)
         owners = np.concatenate([-1 - np.arange(n), np.arange(n)])
         torsion.twist(mechanics.design, self._cutting, tip_angles_rad, owners, self._nodes, self._steps)
         self._poses = np.zeros((n_steps + 1, 12))
@@ -223,7 +223,7 @@ def matrices(poses: Float) -> Float:
     return found
 
 
-def torsion_workspace(n_steps: int, n: int, columns: int) -> tuple[Any, Any]:
+def torsion_scratch(n_steps: int, n: int, columns: int) -> tuple[Any, Any]:
     """Return the arrays `nodes` and `steps` that `torsion.twist` fills."""
     nodes = (
         np.zeros(n_steps + 1), np.zeros((n_steps + 1, n)), np.zeros((n_steps + 1, n)),

@@ -14,7 +14,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
-from stages.tube.equilibrium import Equilibrium, matrices, torsion_workspace
+from stages.tube.equilibrium import Equilibrium, matrices, torsion_scratch
 from stages.tube.errors import ConvergenceError
 from stages.tube.kernels import all_equilibria, equilibrium
 from stages.tube.nesting import SAME_MM, NestedTubes
@@ -155,7 +155,7 @@ class TubeMechanics(NestedTubes):
                 remedy="use given_base_angles with several guesses",
             )
         cutting, n_steps = self.cut(beta)
-        nodes, steps = torsion_workspace(n_steps, 2, 1)
+        nodes, steps = torsion_scratch(n_steps, 2, 1)
         found = np.zeros(LARGEST_COUNT)
         number = all_equilibria.all_of_two(
             self.design, cutting, beta, float(base[0] - base[1]), nodes, steps, found

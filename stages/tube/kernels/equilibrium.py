@@ -285,7 +285,7 @@ def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stab
 
 
 @inner_kernel
-def workspace_for(n_steps, n, columns):
+def scratch_for(n_steps, n, columns):
     """Return `nodes` and `steps` as `torsion.twist` fills them."""
     angles = np.zeros((2, n_steps + 1, n))
     derivatives = np.zeros((2, n_steps + 1, columns, n))
@@ -316,13 +316,13 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
     pieces, moments, directions = np.zeros((most, PIECE_COLUMNS)), np.zeros((most, n)), np.zeros((most, n))
     owners = -1 - np.arange(n - 1)
     allocated = 0
-    nodes, steps = workspace_for(allocated, n, n - 1)
+    nodes, steps = scratch_for(allocated, n, n - 1)
     poses = np.zeros((allocated + 1, 12))
     for m in range(beta.shape[0]):
         count, n_steps = cut(design, beta[m], step, pieces, moments, directions)
         if n_steps != allocated:
             allocated = n_steps
-            nodes, steps = workspace_for(allocated, n, n - 1)
+            nodes, steps = scratch_for(allocated, n, n - 1)
             poses = np.zeros((allocated + 1, 12))
         cutting = (pieces, moments, directions, count)
         worst, least = settle(

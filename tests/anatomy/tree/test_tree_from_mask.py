@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from skimage.measure import euler_number
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
@@ -293,6 +294,8 @@ def _random_airways(draw: st.DrawFn) -> tuple[list[Tube], int]:
 def test_random_tree_is_recovered(case: tuple[list[Tube], int]):
     parts, levels = case
     lumen = tubes(parts, (1.0, 1.0, 1.0))
+    # Two tubes that part may touch once more at a corner of voxels: then the mask does have a loop.
+    assume(euler_number(lumen.array, connectivity=3) == 1)
     tree = tree_from_mask(lumen)
     assert outside_mm(tree, lumen) == 0.0
     assert (tree.radius_mm > 0).all()

@@ -81,7 +81,7 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
     float
         The cost of the cheapest clear arc, or `best`.
     """
-    limits = needle.limits
+    obstacles, objective, limits = needle.obstacles, needle.objective, needle.limits
     end = _clearance_bound(needle, target[0], target[1], target[2])
     for n in range(positions.shape[0]):
         x, y, z = positions[n]
@@ -95,13 +95,11 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
         if _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length) > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        costs[n] = cost_of_arc(
-            needle.obstacles, needle.objective, limits.cost_step_mm, pose, bend, length, True
-        )
+        costs[n] = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, True)
         if costs[n] > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        blockers[n] = blocker_on_arc(needle.obstacles, limits, pose, bend, length, 0.0, branches[n])
+        blockers[n] = blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branches[n])
         if blockers[n] == 0 and costs[n] < best:
             best = costs[n]
     return best

@@ -48,11 +48,12 @@ def _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm):
     The airway of the branch `spared` counts for nothing (-1: none is spared), but the lumen of any airway
     nearer than `lumen_mm` does (negative: it does not).
     """
+    _clearance, labels, geometry, bits = obstacles
     reach = radius + EXACT_REACH_MM
     gap = EXACT_REACH_MM
-    left = obstacles.bits & ~touched
+    left = bits & ~touched
     while left != 0:
-        distance, label = exact_distance(obstacles.labels, obstacles.geometry, x, y, z, left, spared, reach)
+        distance, label = exact_distance(labels, geometry, x, y, z, left, spared, reach)
         if distance >= radius - TOUCHES_MM:
             gap = distance - radius
             break
@@ -63,7 +64,7 @@ def _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm):
         left &= ~hit
     if lumen_mm >= 0.0 and not touched & AIRWAY:
         distance, _label = exact_distance(
-            obstacles.labels, obstacles.geometry, x, y, z, _LUMEN, _NOBODY, lumen_mm + EXACT_REACH_MM
+            labels, geometry, x, y, z, _LUMEN, _NOBODY, lumen_mm + EXACT_REACH_MM
         )
         if distance < lumen_mm - TOUCHES_MM or distance == 0.0:
             touched |= AIRWAY

@@ -57,13 +57,14 @@ class ObjectiveArrays(NamedTuple):
 @numba.njit(cache=True)
 def inverse_clearance_on_arc(obstacles, step, pose, bend, length):
     """Estimate the integral of 1 / clearance along an arc [Kuntz2015, eq. 1] by the trapezoid rule."""
+    # Fields of a tuple are taken before a loop: each access to an array counts its references.
+    clearance, geometry = obstacles.clearance, obstacles.geometry
     count = max(int(math.ceil(length / step)), 1)
     total = 0.0
     for m in range(count + 1):
         x, y, z = point_on_arc(pose, bend, length * m / count)
         weight = 0.5 if m == 0 or m == count else 1.0
-        estimate = distance_estimate(obstacles.clearance, obstacles.geometry, x, y, z)
-        total += weight / max(estimate, CLEARANCE_FLOOR_MM)
+        total += weight / max(distance_estimate(clearance, geometry, x, y, z), CLEARANCE_FLOOR_MM)
     return total * length / count
 
 

@@ -50,14 +50,13 @@ class Obstacles(NamedTuple):
 @inner_kernel
 def _early_blocker(obstacles, required, pose, bend, begin, length):
     """Look for an obstacle at a few points of an arc, the middle first; 0 if none is met."""
+    clearance, labels, geometry, bits = obstacles
     count = 1
     while (length - begin) / count > PROBE_SPACING_MM:
         for m in range(count):
             x, y, z = point_on_arc(pose, bend, begin + (length - begin) * (m + 0.5) / count)
-            if distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) < required:
-                distance, label = exact_distance(
-                    obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, _NOBODY, required
-                )
+            if distance_bound(clearance, geometry, x, y, z) < required:
+                distance, label = exact_distance(labels, geometry, x, y, z, bits, _NOBODY, required)
                 if distance < required:
                     return label
         count *= 2
@@ -67,11 +66,12 @@ def _early_blocker(obstacles, required, pose, bend, begin, length):
 @inner_kernel
 def _blocker_by_lookup(obstacles, step, pose, bend, length):
     """Look up the voxels at the ends of steps of an arc [Fu2018, fig. 6, right]: no proof."""
+    _clearance, labels, geometry, bits = obstacles
     count = max(int(math.ceil(length / step)), 1)
     for m in range(count + 1):
         x, y, z = point_on_arc(pose, bend, length * m / count)
-        label = label_at(obstacles.labels, obstacles.geometry, x, y, z)
-        if label & obstacles.bits:
+        label = label_at(labels, geometry, x, y, z)
+        if label & bits:
             return label
     return 0
 
@@ -89,6 +89,7 @@ def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
     """
     if limits.lookup_step_mm > 0.0:
         return _blocker_by_lookup(obstacles, limits.lookup_step_mm, pose, bend, length)
+    clearance, labels, geometry, bits = obstacles
     required = limits.required_mm
     reach = required + EXACT_REACH_MM
     exempt = limits.exempt_mm - s0 if branch >= 0 else 0.0
@@ -98,18 +99,14 @@ def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
     s = 0.0
     while True:
         x, y, z = point_on_arc(pose, bend, s)
-        gap = distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) - required
+        gap = distance_bound(clearance, geometry, x, y, z) - required
         if gap < MIN_GAP_MM:
             in_exit = s < exempt - TINY
             spared = branch if in_exit else -1
-            distance, label = exact_distance(
-                obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, spared, reach
-            )
+            distance, label = exact_distance(labels, geometry, x, y, z, bits, spared, reach)
             gap = distance - required
             if in_exit:
-                lumen, lumen_label = exact_distance(
-                    obstacles.labels, obstacles.geometry, x, y, z, _LUMEN, _NOBODY, reach
-                )
+                lumen, lumen_label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
                 if lumen - limits.radius_mm < gap:
                     gap = lumen - limits.radius_mm
                     label = lumen_label

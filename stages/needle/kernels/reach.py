@@ -46,9 +46,10 @@ def _least_clearance(obstacles, limits, pose, bend, length, s0, least):
     begin = min(max(limits.exempt_mm - s0, 0.0), length)
     count = max(int(math.ceil((length - begin) / CLEARANCE_STEP_MM)), 1)
     half = 0.5 * (length - begin) / count
+    clearance, geometry = obstacles.clearance, obstacles.geometry
     for m in range(count + 1):
         x, y, z = point_on_arc(pose, bend, begin + (length - begin) * m / count)
-        least = min(least, distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) - half)
+        least = min(least, distance_bound(clearance, geometry, x, y, z) - half)
     return max(least, 0.0)
 
 

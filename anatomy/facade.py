@@ -7,18 +7,19 @@ costs nothing, and the names stand in one place.
 
 from __future__ import annotations
 
-import ast
 import sys
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 
 @cache
 def public_names(file: str) -> dict[str, str]:
     """Return the public names of a package by its file `__init__.py`, and the modules that define them."""
+    import ast  # Not before a name is asked for, so that importing a package stays fast.
+    from pathlib import Path
+
     for node in ast.parse(Path(file).read_text(encoding="utf-8")).body:
         if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
             imports = [each for each in node.body if isinstance(each, ast.ImportFrom) and each.module]

@@ -2,7 +2,7 @@
 
 The `__init__` of a package imports its public names for type checkers alone, under `if TYPE_CHECKING:`, each
 as itself.  `lazy_exports` reads that block when a name is first asked for.  Importing the package therefore
-costs nothing, and the names stand in one place.
+loads none of its modules, and the names stand in one place.
 """
 
 from __future__ import annotations

@@ -75,7 +75,8 @@ def _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm):
 @inner_kernel
 def _in_lumen(obstacles, depth, x, y, z):
     """Return the step to the next point in a lumen, and the branch; NOT_IN_LUMEN outside of all."""
-    label = label_at(obstacles.labels, obstacles.geometry, x, y, z)
+    _clearance, labels, geometry, _bits = obstacles
+    label = label_at(labels, geometry, x, y, z)
     if not label & LUMEN:
         return 0.0, NOT_IN_LUMEN
     corners, depth_geometry = depth
@@ -85,6 +86,7 @@ def _in_lumen(obstacles, depth, x, y, z):
 @inner_kernel
 def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm):
     """Follow one chain; return what it touches and the point where it ends."""
+    clearance, _labels, geometry, bits = obstacles
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
     nx, ny, nz = start[6], start[7], start[8]
     touched = 0
@@ -103,7 +105,7 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm):
         if p == n_tube and pierced == IN_LUMEN:
             touched |= STAYS_INSIDE
         at = 0.0
-        while not touched & STAYS_INSIDE and touched & obstacles.bits != obstacles.bits:
+        while not touched & STAYS_INSIDE and touched & bits != bits:
             x, y, z = point_on_arc(pose, bend, at)
             if pierced == IN_LUMEN:
                 step, here = _in_lumen(obstacles, depth, x, y, z)
@@ -111,13 +113,13 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm):
                     if branch == IN_LUMEN:
                         touched |= STAYS_INSIDE
                     elif branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
-                        touched |= obstacles.bits & OUTSIDE
+                        touched |= bits & OUTSIDE
                     pierced = branch
                     left_at = done + at
                     continue
                 branch = here
             else:
-                step = distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) - radius
+                step = distance_bound(clearance, geometry, x, y, z) - radius
                 if step < MIN_GAP_MM:
                     spared = pierced if p < n_tube or done + at < tube_mm + exempt_mm else -1
                     lumen_mm = -1.0

@@ -113,7 +113,7 @@ def wall_angle(labels, geometry, pose):
 @numba.njit(cache=True)
 def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
     """Find where the axis leaves the lumen between two arc lengths of a piece, and validate the exit."""
-    labels, geometry, mediastinal = environment.labels, environment.geometry, environment.mediastinal
+    _field, labels, geometry, _bits, _lumen, _lumen_geometry, mediastinal = environment
     branch = int(trace[BRANCH])
     if branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
         return LEAVES_MEDIASTINAL
@@ -138,13 +138,13 @@ def _tissue_gap(environment, trace, x, y, z, required):
 
     Exempt is the wall of the pierced branch; its lumen must stay out of reach of the axis.
     """
-    labels, geometry = environment.labels, environment.geometry
-    gap = distance_bound(environment.field, geometry, x, y, z) - required
+    field, labels, geometry, bits, _lumen, _lumen_geometry, _mediastinal = environment
+    gap = distance_bound(field, geometry, x, y, z) - required
     if gap >= MIN_GAP_MM:
         return gap, 0
     reach = required + EXACT_REACH_MM
     branch = int(trace[BRANCH])
-    distance, label = exact_distance(labels, geometry, x, y, z, environment.bits, branch, reach)
+    distance, label = exact_distance(labels, geometry, x, y, z, bits, branch, reach)
     gap = distance - required
     if trace[PHASE] == IN_TISSUE:
         lumen, _label = exact_distance(labels, geometry, x, y, z, LUMEN, -1, reach)
@@ -160,15 +160,14 @@ def _lumen_step(environment, trace, x, y, z, radius, required):
     Where the tube touches the wall, what lies behind it must be as clear as in the tissue, unless the
     tube comes free again before it leaves.
     """
-    labels, geometry = environment.labels, environment.geometry
+    _field, labels, geometry, bits, lumen, lumen_geometry, _mediastinal = environment
     trace[BRANCH] = (label_at(labels, geometry, x, y, z) >> BRANCH_SHIFT) - 1
-    depth = distance_bound(environment.lumen, environment.lumen_geometry, x, y, z)
+    depth = distance_bound(lumen, lumen_geometry, x, y, z)
     if depth >= radius:
         trace[HAZARD] = ACCEPTED
         return max(depth - radius, FINE_STEP_MM)
     reach = required + EXACT_REACH_MM
-    bits = environment.bits & ~AIRWAY
-    distance, label = exact_distance(labels, geometry, x, y, z, bits, -1, reach)
+    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY, -1, reach)
     if distance - required < FINE_STEP_MM:
         trace[HAZARD] = _reason(label)
         return max(0.5 * depth, FINE_STEP_MM)

@@ -61,5 +61,5 @@ results-quick: $(VENV)/.installed-study
 	$(BIN)/python -m experiments.run_all --quick
 
 clean:
-	rm -rf site docs/reference docs/pictures build dist demo-output *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .asv
+	rm -rf site docs/reference/packages docs/pictures build dist demo-output *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .asv
 	find anatomy stages lungaccess tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

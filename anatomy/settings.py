@@ -18,7 +18,7 @@ from anatomy.errors import SettingsError
 
 T = TypeVar("T")
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
-_REMEDY = "docs/devices.md explains every key"
+_REMEDY = "docs/how_to/devices.md explains every key"
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))

@@ -38,6 +38,7 @@ suppress_warnings = ["ref.citation", "ref.python", "ref.ref"]
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
+PACKAGES = HERE / "reference" / "packages"
 OPTIONS = {"class": ["   :members:"], "function": [], "data": ["   :no-value:"]}
 
 
@@ -63,11 +64,11 @@ def write_reference() -> None:
                 continue
             described.add(full)
             page += [f".. auto{kind}:: {full}", *OPTIONS[kind], ""]
-        (HERE / "reference" / f"{package}.rst").write_text("\n".join(page), encoding="utf-8")
+        (PACKAGES / f"{package}.rst").write_text("\n".join(page), encoding="utf-8")
 
 
-(HERE / "reference").mkdir(exist_ok=True)
-for old in (HERE / "reference").iterdir():
+PACKAGES.mkdir(exist_ok=True)
+for old in PACKAGES.iterdir():
     old.unlink()
 write_reference()
 

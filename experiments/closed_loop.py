@@ -5,7 +5,7 @@
 Random peripheral targets are planned for with `lungaccess.plan`.  From each start the needle is inserted
 many times with errors drawn at random, in open and in closed loop: by size of the errors, and by curvature
 held in reserve for a needle that bends too little.  What the errors are, and what counts as reached:
-docs/replanning.md.
+docs/explanation/replanning.md.
 """
 
 from __future__ import annotations

@@ -32,9 +32,9 @@ OUR_TITLE = "Our own studies"
 HEAD = """# Results
 
 Made by `python -m experiments.write_results` from the files in `{folder}/`; do not edit.  `make results` runs
-all studies in the full setting, and `make results-quick` in the quick one; [how](docs/results.md).  "Ratio"
-is ours divided by the paper's, of the full setting where there is one.  What was not reproduced is said below
-each table, with the reason.
+all studies in the full setting, and `make results-quick` in the quick one
+([how](docs/measurements/results.md)).  "Ratio" is ours divided by the paper's, of the full setting where
+there is one.  What was not reproduced is said below each table, with the reason.
 """
 
 Found = dict[str, dict[str, Any]]

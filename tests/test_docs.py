@@ -17,7 +17,7 @@ from anatomy.phantom import make_phantom, write_phantom
 from lungaccess.cli.app import _with_nodule_number, app
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/tutorial.md")
+PAGES = ("README.md", "docs/tutorials/first_steps.md")
 LUNGACCESS = Path(sys.executable).with_name("lungaccess")
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 ELSEWHERE = ("pip ", "make ", ". .venv", "git ", "cd ", "lungaccess segment ")
@@ -70,7 +70,7 @@ def test_the_pages_have_code() -> None:
 
 
 @pytest.mark.parametrize(
-    "page", sorted((ROOT / "docs").glob("*.md")) + [ROOT / "README.md"], ids=lambda p: p.name
+    "page", sorted((ROOT / "docs").rglob("*.md")) + [ROOT / "README.md"], ids=lambda p: p.name
 )
 def test_every_command_has_the_options_of_the_command_line(page: Path) -> None:
     """Commands in a console block of any page, with names in capitals for what the reader knows."""

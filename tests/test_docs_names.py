@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
     [
-        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "docs").rglob("*.md"),
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
         *(ROOT / "examples").glob("*.py"),
@@ -89,7 +89,7 @@ def test_every_name_on_the_page_exists(page: Path) -> None:
 
 def paper_rows() -> list[list[str]]:
     """Return the cells of every row of the tables of papers: place, implementation, test, study, result."""
-    lines = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "docs" / "reference" / "papers.md").read_text(encoding="utf-8").splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
     return [row for row in rows if row[0] not in ("paper", "---")]
 
@@ -116,9 +116,10 @@ def test_each_test_and_study_of_a_paper_exists() -> None:
 
 def test_the_index_lists_every_page() -> None:
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    pages = {page.stem for page in (ROOT / "docs").glob("*.md")} - {"index"}
-    assert pages == {page for page in pages if f"({page}.md)" in index}
-    assert pages == {page for page in pages if re.search(rf"^{page}$", index, re.MULTILINE)}
+    docs = ROOT / "docs"
+    pages = {page.relative_to(docs).with_suffix("").as_posix() for page in docs.rglob("*.md")} - {"index"}
+    assert not [page for page in pages if f"({page}.md)" not in index]
+    assert not [page for page in pages if not re.search(rf"^{page}$", index, re.MULTILINE)]
 
 
 def test_a_wrong_name_is_seen() -> None:

@@ -16,10 +16,10 @@ OURS = ("anatomy", "stages", "lungaccess")
 
 
 def test_the_page_shows_every_script_in_the_order_in_which_they_run() -> None:
-    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
-    shown = re.findall(r"\{literalinclude\} \.\./examples/(\w+)\.py", page)
+    page = (ROOT / "docs" / "tutorials" / "gallery.md").read_text(encoding="utf-8")
+    shown = re.findall(r"\{literalinclude\} \.\./\.\./examples/(\w+)\.py", page)
     assert tuple(shown) == runpy.run_path(str(EXAMPLES / "run_all.py"))["NAMES"]
-    assert shown == re.findall(r"\(pictures/(\w+)\.png\)", page)
+    assert shown == re.findall(r"\(\.\./pictures/(\w+)\.png\)", page)
     assert sorted(shown) == [path.stem for path in SCRIPTS]
 
 

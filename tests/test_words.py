@@ -1,4 +1,4 @@
-"""The names of the product are the field's words; docs/glossary.md defines each once."""
+"""The names of the product are the field's words; docs/reference/glossary.md defines each once."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any
         raise AnatomyError(
             f"{where} holds no mask of: {', '.join(missing)}",
             expected="masks of the airway lumen, the vessels and the lung",
-            remedy="docs/patients.md lists the file names that are understood",
+            remedy="docs/reference/patients.md lists the file names that are understood",
         )
     volumes: dict[str, Any] = {}
     warnings = list(others.pop("warnings", ()))

@@ -127,7 +127,7 @@ def _read_description(path: Path) -> PatientFile:
         return parse(PatientFile, content, path.name)
     except SettingsError as error:
         raise SettingsError(
-            error.found, expected=error.expected, remedy="docs/patients.md explains every key"
+            error.found, expected=error.expected, remedy="docs/reference/patients.md explains every key"
         ) from error
 
 

@@ -59,5 +59,5 @@ def load_patient(path: str | Path) -> PatientImages:
     raise FileError(
         f"There is no patient at {path}" if not path.exists() else f"{path} is no patient of a known kind",
         expected="a folder with patient.toml, a Med-RAD folder, or output of TotalSegmentator's lung_vessels",
-        remedy="docs/patients.md describes the three kinds of folders",
+        remedy="docs/reference/patients.md describes the three kinds of folders",
     )

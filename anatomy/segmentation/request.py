@@ -85,7 +85,7 @@ def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
         raise FileError(
             f"{folder} holds no lobes, airways or vessels of TotalSegmentator",
             expected="output of the tasks lung_vessels or total",
-            remedy="docs/patients.md lists the file names that are understood",
+            remedy="docs/reference/patients.md lists the file names that are understood",
         )
     on = read_masks(sources).grid
     return {

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 VESSEL_THRESHOLD = 0.25
-"""Fixed on made cylinders and the phantom, see docs/segmentation.md."""
+"""Fixed on made cylinders and the phantom, see docs/explanation/segmentation.md."""
 LARGE_RADIUS_MM = 2.0 * math.sqrt(2.0)
 """One of the paper's scales: from this radius on vessels are obstacles, thinner ones are costs."""
 REFERENCE_HU, BRIGHTEST_HU = 300.0, 200.0

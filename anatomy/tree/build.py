@@ -48,7 +48,7 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
 
     References
     ----------
-    [Lee1994] for the thinning; `docs/airway_tree.md` for the rest.
+    [Lee1994] for the thinning; `docs/explanation/airway_tree.md` for the rest.
     """
     prepared = prepare_lumen(lumen, max_gap_mm)
     grid = prepared.grid

@@ -1,6 +1,6 @@
 """Find the trachea in an unrooted skeleton tree, or say why there is none.
 
-The rule is stated with its reasons in `docs/airway_tree.md`.
+The rule is stated with its reasons in `docs/explanation/airway_tree.md`.
 """
 
 from __future__ import annotations

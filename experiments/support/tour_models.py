@@ -48,7 +48,7 @@ def random_airway(seed: int, *, orders: int = ORDERS) -> AirwayTree:
 
     References
     ----------
-    .. [Pan2025] docs/bibliography.md
+    .. [Pan2025] docs/reference/bibliography.md
     """
     if not 2 <= orders <= 12:
         raise SettingsError(f"A random airway of {orders} orders", expected="2 to 12 orders")

@@ -52,8 +52,8 @@ def check(
 
     The kinematics are re-integrated, clearances are measured with FCL to the exact surface of the voxel
     boxes, containment is looked up in the label volume, and every stated value is recomputed.  Nothing
-    of the planners' arithmetic is used, nor the clearance fields.  `docs/check.md` explains every finding.
-    For many plans of one lung use `Checker`.
+    of the planners' arithmetic is used, nor the clearance fields.  `docs/explanation/check.md` explains every
+    finding.  For many plans of one lung use `Checker`.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
     Parameters
     ----------
     shell : str
-        bash, zsh or fish; docs/command_line.md says where the script goes.
+        bash, zsh or fish; docs/reference/command_line.md says where the script goes.
     """
     terminal.console.file.write(app.generate_completion(prog_name="lungaccess", shell=shell))
     return ExitCode.OK

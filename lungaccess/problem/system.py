@@ -112,7 +112,7 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
         raise SettingsError(
             f"There is no system called {given!r}",
             expected=f"a preset ({', '.join(preset_names())}) or the path of a .toml file",
-            remedy=did_you_mean(given, preset_names()) or "docs/devices.md shows how to write one",
+            remedy=did_you_mean(given, preset_names()) or "docs/how_to/devices.md shows how to write one",
         )
     else:
         content = _read(Path(name_or_path))
@@ -149,6 +149,6 @@ def _parse_toml(content: bytes, where: str) -> System:
         raise SettingsError(
             f"{where} is not valid TOML ({error})",
             expected="UTF-8 text in TOML syntax",
-            remedy="docs/devices.md has a working example",
+            remedy="docs/how_to/devices.md has a working example",
         ) from error
     return parse(System, mapping, where)

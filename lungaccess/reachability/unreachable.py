@@ -1,4 +1,7 @@
-"""Proof that no deployment of a system has a target in its needle's workspace; see docs/unreachable.md."""
+"""Proof that no deployment of a system has a target in its needle's workspace.
+
+docs/explanation/unreachable.md derives it.
+"""
 
 from __future__ import annotations
 

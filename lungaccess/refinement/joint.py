@@ -10,7 +10,7 @@ from lungaccess.refinement.reconstruction import Reconstruction
 from stages.scope import Sites
 
 ITERATIONS = 40
-"""Most steps of IPOPT by default; docs/refinement.md has what they save."""
+"""Most steps of IPOPT by default; docs/explanation/refinement.md has what they save."""
 NEEDLE_SHARES = (1.0, 0.5)
 """Where the needle that the program ends at is refused, the one half as far is tried."""
 BETTER = 1e-3

@@ -31,7 +31,7 @@ class ErrorModel:
     """How large the errors of devices and target are, independent of each other and open loop.
 
     Sizes are standard deviations of normal errors without bias, except for the needle's curvature.  All
-    defaults are assumptions, see docs/risk.md.
+    defaults are assumptions, see docs/explanation/risk.md.
 
     Parameters
     ----------
@@ -122,6 +122,6 @@ def load_errors(path: str | os.PathLike[str]) -> ErrorModel:
         raise SettingsError(
             f"{os.fspath(path)} is not valid TOML ({error})",
             expected="one line a key, such as scope_position_mm = 1.0",
-            remedy="docs/risk.md has a working example",
+            remedy="docs/explanation/risk.md has a working example",
         ) from error
     return parse(ErrorModel, mapping, os.fspath(path))

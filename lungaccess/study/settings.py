@@ -18,7 +18,7 @@ from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
 PHANTOM = "phantom"
-_REMEDY = "docs/studies.md explains every key"
+_REMEDY = "docs/how_to/studies.md explains every key"
 Seed = Annotated[int, Field(strict=True, ge=0)]
 Iterations = Annotated[int, Field(strict=True, ge=0, description="iterations beyond the direct arcs")]
 

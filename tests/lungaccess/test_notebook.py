@@ -21,7 +21,7 @@ from anatomy.lung import Lung
 from lungaccess.checking import CheckReport, Finding
 from lungaccess.plans.plan import Plan
 
-TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "tutorial.ipynb"
+TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "tutorial.ipynb"
 EVIL = "<script>alert('x')</script>&\""
 VOID = {"br", "img", "hr"}
 

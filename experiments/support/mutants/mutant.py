@@ -1,8 +1,8 @@
 """What a mutation of a plan works on and what it makes.
 
 A mutation takes a case and a random generator and returns a mutant, or None where the plan leaves it nothing
-to falsify (the roll of a straight needle, say).  A mutant is false or unsafe by a size that docs/check.md
-says is refused; its digest fits.
+to falsify (the roll of a straight needle, say).  A mutant is false or unsafe by a size that
+docs/explanation/check.md says is refused; its digest fits.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def segment(
     out : Path
         Patient folder to write or to bring up to date.
     nodule_contours : Path
-        Contours of radiologists (JSON, see docs/segmentation.md); the nodule becomes the target.
+        Contours of radiologists (JSON, see docs/explanation/segmentation.md); the nodule becomes the target.
     nodule_mask : Path
         Mask of the nodule, which becomes the target.
     target : str

@@ -12,7 +12,7 @@ ESTIMATE_SLACK = 1.03
 
 @settings
 class SearchSettings:
-    """How the search shares its iterations among its phases; `docs/planning.md` explains the phases.
+    """How the search shares its iterations among its phases; `docs/explanation/planning.md` explains them.
 
     The defaults are free choices; the results on that page were measured with them.
 

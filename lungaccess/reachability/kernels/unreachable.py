@@ -1,7 +1,7 @@
-"""A proof by boxes that no deployment has a target in its needle's workspace; see docs/unreachable.md.
+"""A proof by boxes that no deployment has a target in its needle's workspace.
 
 What all deployments of a box have in common follows from the one in its middle and from bounds of how far the
-others differ.  A box that cannot be ruled out is halved.
+others differ.  A box that cannot be ruled out is halved; see docs/explanation/unreachable.md.
 
 `cones` (N, 4) is, for a tip between two knots, the middle of what it may look to and the angle (rad) from it.
 """

@@ -255,7 +255,7 @@ class PlanPage {
     });
   }
 
-  // What a test may read; docs/report.md names the fields.
+  // What a test may read; docs/how_to/report.md names the fields.
   report() {
     const { state } = this;
     return {

@@ -200,7 +200,7 @@ class ReachPage {
     }));
   }
 
-  // What a test may read; docs/report.md names the fields.
+  // What a test may read; docs/how_to/report.md names the fields.
   report() {
     return {
       system: this.map.name, quantity: find("quantity").value, place_lps: this.place, words: this.words(),

@@ -1,7 +1,7 @@
 """The needle problem in OMPL: an SE(3) control problem, and planners whose search is a compiled kernel.
 
-The only package that imports OMPL; docs/ompl.md tells how it is used and which traps it avoids.  What
-OMPL's own planners propagate is proved clear step by step; what they find is proved once more as arcs.
+The only package that imports OMPL; docs/explanation/ompl.md tells how it is used and which traps it avoids.
+What OMPL's own planners propagate is proved clear step by step; what they find is proved once more as arcs.
 """
 
 from stages.needle.ompl.benchmark import benchmark

@@ -41,7 +41,7 @@ from stages.needle.replanning.reaiming import (
 from stages.needle.search.base import root_of
 
 ITERATIONS = 1500
-"""Iterations of the search in a replan; see docs/replanning.md for what they take."""
+"""Iterations of the search in a replan; see docs/explanation/replanning.md for what they take."""
 
 MAX_ESCAPES_SEARCHED = 3
 

@@ -51,4 +51,4 @@ PLANNERS: dict[str, MakeSearch] = {
     "resolution": _resolution,
     "decide": _decide,
 }
-"""See docs/needle.md."""
+"""See docs/explanation/needle.md."""

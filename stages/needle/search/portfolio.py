@@ -26,7 +26,8 @@ SLICE = 100
 """A search without a path goes on in slices of so many iterations, and stops when it has a path."""
 GUIDED_SHARE = 2 / 3
 """Share of the iterations, once there is a path, for rounds of guided searches, if there are guide paths: on
-cost maps they find most cheap paths, but in narrow passages a lattice may have none (docs/needle.md)."""
+cost maps they find most cheap paths, but in narrow passages a lattice may have none
+(docs/explanation/needle.md)."""
 
 FREE, GUIDED = 0, 1
 

@@ -171,7 +171,8 @@ class Counts:
 class ResolutionSearch:
     """The search over words of arcs and straight pieces, from coarse to fine [Fu2021, Fu2022].
 
-    See docs/resolution_search.md; it is a `stages.needle.search.base.Search`.  Nothing in it is random.
+    It is a `stages.needle.search.base.Search`, and nothing in it is random;
+    docs/explanation/resolution_search.md says how it works.
 
     Parameters
     ----------

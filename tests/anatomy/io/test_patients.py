@@ -365,7 +365,7 @@ def test_a_wrong_description_is_refused(own_folder, change, problem):
     describe(own_folder, **change)
     with pytest.raises(SettingsError, match=problem) as caught:
         load_patient(own_folder)
-    assert "patient.toml" in str(caught.value) and "docs/patients.md" in str(caught.value)
+    assert "patient.toml" in str(caught.value) and "docs/reference/patients.md" in str(caught.value)
 
 
 def test_broken_toml_bare_targets_and_missing_files_are_refused(own_folder):

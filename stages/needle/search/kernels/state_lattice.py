@@ -8,7 +8,7 @@ polygon too: an arc leads from the middle of each piece to that of the next, and
 
 All guide paths are in one graph without cycles: its states are vertices with steps, its edges the arcs
 between the middles of their pieces.  The cheapest path to each state is known after a pass forward.  See
-docs/needle.md.
+docs/explanation/needle.md.
 """
 
 from __future__ import annotations

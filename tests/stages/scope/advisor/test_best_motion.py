@@ -47,7 +47,7 @@ def states(forked: tuple[Lung, Lumen]) -> list[ScopeState]:
 def by_the_paper(
     environment: ScopeEnvironment, state: ScopeState, dz: float, moved: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Eqs. 3 to 9 as printed, with the readings of docs/deviations.md."""
+    """Eqs. 3 to 9 as printed, with the readings of docs/explanation/deviations.md."""
     model, lumen, field = environment.model, environment.lumen, environment.field
     low, high = np.radians([model.twist_low_deg, model.twist_high_deg])
     least, most = np.radians([model.bend_low_deg, model.bend_high_deg])

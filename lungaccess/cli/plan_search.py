@@ -15,14 +15,17 @@ from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from lungaccess.checking import CheckReport
     from lungaccess.coupled import ProgressEvent
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
     from lungaccess.report import CostPoint
 
-WRITTEN = ("plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv")
-"""Files that a found plan leaves in its folder."""
+PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
+"""The plan, saved as soon as there is one and again when there is a better one; how its cost fell."""
+PICTURES = ("overview.png", "tree.png", "cost_over_time.png")
+"""Pictures of a found plan, unless the user wants none."""
 
 
 class Display(AbstractContextManager[Any], Protocol):
@@ -76,6 +79,12 @@ class PlanRequest:
     search: SearchOptions
     out: Path
     output: PatientOptions
+    pictures: bool = True
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the files that a found plan leaves in the folder."""
+        return (PLAN_FILE, HISTORY_FILE, *(PICTURES if self.pictures else ()))
 
 
 def run_search(
@@ -83,7 +92,8 @@ def run_search(
 ) -> tuple[Plan, list[CostPoint]]:
     """Search until the budget is spent and return the best plan and the history of its cost.
 
-    An interruption from the keyboard ends the search early; the best plan so far is kept.
+    The first plan is saved as soon as it is found, and the best one at the end, whatever happens after.  An
+    interruption from the keyboard ends the search early; the best plan so far is kept.
 
     Raises
     ------
@@ -116,19 +126,26 @@ def run_search(
             on_progress=history.on_progress,
         )
         try:
-            for best in plans:
-                history.on_plan(best)
+            for found in plans:
+                first, best = best is None, found
+                if first:
+                    found.save(request.out / PLAN_FILE)
+                history.on_plan(found)
         except KeyboardInterrupt:
             if best is None:
                 raise
             display.interrupted()
     if best is None:
         raise NoPlan("The search ended without a plan", reasons={}, advice="Give it more time")
+    best.save(request.out / PLAN_FILE)
     return best, history.points
 
 
 def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
-    """Search, check, write everything to the request's folder, show it, and return the exit code.
+    """Search, check, show the plan and what the check says, draw it, and return the exit code.
+
+    What is known is saved and shown before anything slower begins: the first plan, then the best one with its
+    check, then the pictures.
 
     Raises
     ------
@@ -136,25 +153,44 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
         If no plan was found.
     """
     from lungaccess.checking import check
-    from lungaccess.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
 
-    target, search, out = request.target.resolve(lung), request.search, request.out
+    target, search = request.target.resolve(lung), request.search
     found, history = run_search(lung, target, request, SearchDisplay(search.time_s, search.iterations))
-    found.save(out / "plan.json")
-    with progress("checking and drawing the plan"):
+    with progress("checking the plan"):
         report = check(found, lung, system=request.system, target_lps=target.lps_mm)
-        overview_png(found, lung, out / "overview.png")
-        tree_png(lung, out / "tree.png")
-        cost_over_time_csv(history, out / "cost_over_time.csv")
-        words = Objective.of(found.objective).words
-        cost_over_time_png(history, out / "cost_over_time.png", words)
+    if not request.output.json:
+        show_plan(found, report, lung)
+    write_history(found, history, lung, request)
     if request.output.json:
-        terminal.show_json(plan_tables.plan_record(found, report, out, WRITTEN))
-        return ExitCode.of(report.accepted)
-    terminal.show(plan_tables.plan_tables(found))
-    terminal.show_warnings(lung.warnings)
+        terminal.show_json(plan_tables.plan_record(found, report, request.out, request.files))
+    else:
+        terminal.say(f"Written to {request.out}: {', '.join(request.files)}")
+    return ExitCode.of(report.accepted)
+
+
+def show_plan(plan: Plan, report: CheckReport, lung: Lung) -> None:
+    """Print what the check says of a plan, then the plan."""
+    terminal.show_verdict(report.accepted)
     if not report.accepted:
         terminal.show(plan_tables.check_tables(report, refusals_only=True))
-    terminal.say(f"Written to {out}: {', '.join(WRITTEN)}")
-    terminal.show_verdict(report.accepted)
-    return ExitCode.of(report.accepted)
+    terminal.show(plan_tables.plan_tables(plan))
+    terminal.show_warnings(lung.warnings)
+
+
+def write_history(plan: Plan, history: list[CostPoint], lung: Lung, request: PlanRequest) -> None:
+    """Write how the cost fell, and the pictures if they are wanted."""
+    from lungaccess.report import cost_over_time_csv
+
+    cost_over_time_csv(history, request.out / HISTORY_FILE)
+    if request.pictures:
+        with progress("drawing the plan"):
+            draw_plan(plan, history, lung, request.out)
+
+
+def draw_plan(plan: Plan, history: list[CostPoint], lung: Lung, out: Path) -> None:
+    """Write the pictures of a plan and of its search into a folder."""
+    from lungaccess.report import cost_over_time_png, overview_png, tree_png
+
+    overview_png(plan, lung, out / "overview.png")
+    tree_png(lung, out / "tree.png")
+    cost_over_time_png(history, out / "cost_over_time.png", Objective.of(plan.objective).words)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from lungaccess.report.overview import overview_png
-from lungaccess.report.reach import reach_png
-from lungaccess.report.search import CostPoint, cost_over_time_csv, cost_over_time_png
-from lungaccess.report.tree import tree_png
-from lungaccess.report.tubes import tubes_png
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "CostPoint",
-    "cost_over_time_csv",
-    "cost_over_time_png",
-    "overview_png",
-    "reach_png",
-    "tree_png",
-    "tubes_png",
-]
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.report.cost_points import CostPoint, cost_over_time_csv
+    from lungaccess.report.overview import overview_png
+    from lungaccess.report.reach import reach_png
+    from lungaccess.report.search import cost_over_time_png
+    from lungaccess.report.tree import tree_png
+    from lungaccess.report.tubes import tubes_png
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,51 +1,15 @@
-"""Best cost over time of a search, as a table and as a picture."""
+"""Best cost over time of a search, as a picture."""
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
 
-from anatomy.io.files import atomic_write
-from anatomy.records import frozen_value
 from lungaccess.report import drawing, style
-
-
-@frozen_value
-class CostPoint:
-    """The state of a search at one moment.
-
-    Parameters
-    ----------
-    elapsed_s : float
-        Planning time since the search began.
-    best_cost : float or None
-        Cost of the best plan yet, in the unit of the objective; None before the first plan.
-    """
-
-    elapsed_s: float
-    iteration: int
-    best_cost: float | None
-
-
-def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str]) -> Path:
-    """Write one line a point: elapsed_s, iteration, best_cost (empty before the first plan).
-
-    Raises
-    ------
-    anatomy.errors.FileError
-        If the file cannot be written.
-    """
-    with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["elapsed_s", "iteration", "best_cost"])
-        for point in history:
-            cost = "" if point.best_cost is None else repr(float(point.best_cost))
-            writer.writerow([f"{point.elapsed_s:.6f}", point.iteration, cost])
-    return Path(path)
+from lungaccess.report.cost_points import CostPoint
 
 
 def cost_over_time_png(

@@ -15,7 +15,7 @@ from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions
-from lungaccess.cli.plan_search import PlanRequest, plan_and_report
+from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, PlanRequest, plan_and_report
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -73,12 +73,11 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
 
 def _write_page(lung: Lung, out: Path) -> None:
     """Write report.html about the plan in `out`."""
-    from lungaccess.cli.commands.report import HISTORY_FILE
     from lungaccess.plans.plan import Plan
     from lungaccess.report.html import PageOptions, plan_page
 
     options = PageOptions(cost_over_time=out / HISTORY_FILE)
-    plan_page(Plan.load(out / "plan.json"), lung, out / "report.html", options)
+    plan_page(Plan.load(out / PLAN_FILE), lung, out / "report.html", options)
 
 
 def _first_reachable_nodule(lung: Lung, request: PlanRequest) -> ExitCode:

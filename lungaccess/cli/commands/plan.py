@@ -32,9 +32,12 @@ def plan(
         bool,
         Parameter(help="Plan on masks from slices of more than 3 mm, which lack small airways and vessels."),
     ] = False,
-    out: Annotated[
-        Path, Parameter(help="Folder for plan.json, overview.png, cost_over_time.png and cost_over_time.csv.")
-    ] = Path("lungaccess-plan"),
+    out: Annotated[Path, Parameter(help="Folder for plan.json, cost_over_time.csv and the pictures.")] = Path(
+        "lungaccess-plan"
+    ),
+    pictures: Annotated[
+        bool, Parameter(help="Whether overview.png, tree.png and cost_over_time.png are drawn.")
+    ] = True,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
@@ -46,7 +49,9 @@ def plan(
     device = system.load()
     lung = output.load(patient, thick_slices=thick_slices)
     require_map(lung, objective)
-    request = PlanRequest(system=device, target=stated, search=search, out=out, output=output)
+    request = PlanRequest(
+        system=device, target=stated, search=search, out=out, output=output, pictures=pictures
+    )
     try:
         return plan_and_report(lung, request)
     except NoPlan as failure:

@@ -12,14 +12,12 @@ from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOfPlan, PatientOptions
+from lungaccess.cli.plan_search import HISTORY_FILE
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans.plan import Plan
-
-HISTORY_FILE = "cost_over_time.csv"
-"""The command `plan` writes it beside the plan."""
 
 
 def report(

@@ -18,7 +18,7 @@ from anatomy.errors import SettingsError
 
 T = TypeVar("T")
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
-_REMEDY = "docs/how_to/devices.md explains every key"
+_REMEDY = "Correct what is named; keys that are left out take their defaults"
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))
@@ -111,7 +111,7 @@ def impossible(key: str, value: object, allowed: str) -> PydanticCustomError:
     )
 
 
-def parse(cls: type[T], mapping: Mapping[str, object], where: str) -> T:
+def parse(cls: type[T], mapping: Mapping[str, object], where: str, remedy: str = _REMEDY) -> T:
     """Build settings from plain values, as read from TOML or JSON.
 
     Parameters
@@ -122,6 +122,8 @@ def parse(cls: type[T], mapping: Mapping[str, object], where: str) -> T:
         Values by key; nested settings are nested mappings.
     where : str
         Where the values come from (a file name), for the message.
+    remedy : str, optional
+        What the user can do about a wrong value, for the message.
 
     Returns
     -------
@@ -136,7 +138,7 @@ def parse(cls: type[T], mapping: Mapping[str, object], where: str) -> T:
     try:
         return TypeAdapter(cls).validate_python(mapping)
     except ValidationError as error:
-        raise _settings_error(cls, error, where) from None
+        raise _settings_error(cls, error, where, remedy) from None
 
 
 def to_mapping(values: object) -> dict[str, Any]:
@@ -189,12 +191,12 @@ def _plain(value: object) -> object:
     return value
 
 
-def _settings_error(cls: type, error: ValidationError, where: str) -> SettingsError:
+def _settings_error(cls: type, error: ValidationError, where: str, remedy: str = _REMEDY) -> SettingsError:
     faults = [_explain(cls, detail) for detail in error.errors(include_url=False)]
     return SettingsError(
         f"{where}: " + "; ".join(found for found, _ in faults),
         expected="; ".join(dict.fromkeys(allowed for _, allowed in faults)),
-        remedy=_REMEDY,
+        remedy=remedy,
     )
 
 

@@ -14,7 +14,8 @@ import pytest
 import lungaccess as la
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.phantom import make_phantom, write_phantom
-from lungaccess.cli.app import _with_nodule_number, app
+from lungaccess.cli.app import app
+from lungaccess.cli.usage import with_nodule_number
 
 ROOT = Path(__file__).parents[1]
 PAGES = ("README.md", "docs/tutorials/first_steps.md")
@@ -77,7 +78,7 @@ def test_every_command_has_the_options_of_the_command_line(page: Path) -> None:
     for kind, text in BLOCK.findall(page.read_text(encoding="utf-8")):
         for words in commands(text) if kind == "console" else ():
             if words[0] == "lungaccess":
-                app.parse_args(_with_nodule_number(words[1:]), print_error=False, exit_on_error=False)
+                app.parse_args(with_nodule_number(words[1:]), print_error=False, exit_on_error=False)
 
 
 @pytest.mark.slow

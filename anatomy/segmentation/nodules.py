@@ -86,7 +86,7 @@ def _not_contours(path: Path, what: str) -> FileError:
     return FileError(
         f"{path} {what}",
         expected='{"annotations": [{"contours": [{"z_mm": ..., "ij": [[column, row], ...]}]}]}',
-        remedy="docs/explanation/segmentation.md describes the file; a mask can be given with --nodule-mask",
+        remedy="`lungaccess template contours` prints an example; a mask can be given with --nodule-mask",
     )
 
 

@@ -84,8 +84,8 @@ def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
     if not roles & set(_ROLES):
         raise FileError(
             f"{folder} holds no lobes, airways or vessels of TotalSegmentator",
-            expected="output of the tasks lung_vessels or total",
-            remedy="docs/reference/patients.md lists the file names that are understood",
+            expected="output of the tasks lung_vessels or total, such as lung_vessels.nii.gz",
+            remedy="Run TotalSegmentator with `-ta lung_vessels`, or give masks: --airway, --vessels, --lungs",
         )
     on = read_masks(sources).grid
     return {

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
-from anatomy.errors import AnatomyError, LungaccessError
-from lungaccess.cli import terminal
+from anatomy.errors import AnatomyError, FileError, LungaccessError
+from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.commands.advise import advise
 from lungaccess.cli.commands.alternatives import alternatives
 from lungaccess.cli.commands.certify import certify
@@ -23,6 +23,7 @@ from lungaccess.cli.commands.doctor import doctor
 from lungaccess.cli.commands.export import export
 from lungaccess.cli.commands.info import info, presets
 from lungaccess.cli.commands.needle import needle
+from lungaccess.cli.commands.phantom import phantom
 from lungaccess.cli.commands.plan import plan
 from lungaccess.cli.commands.reach import reach
 from lungaccess.cli.commands.report import report
@@ -30,10 +31,13 @@ from lungaccess.cli.commands.risk import risk
 from lungaccess.cli.commands.route import route
 from lungaccess.cli.commands.segment import segment
 from lungaccess.cli.commands.study import study
+from lungaccess.cli.commands.template import template
 from lungaccess.cli.commands.tour import tour
 from lungaccess.cli.commands.tubes import tubes
+from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXIT_CODES, START_PAGE, epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.terminal import error_console
+from lungaccess.cli.usage import asks_json, usage_error, with_nodule_number
 
 _TOO_LARGE = AnatomyError(
     "There is not enough memory for this patient",
@@ -54,8 +58,9 @@ def _version() -> str:
 app = App(
     name="lungaccess",
     help="Plan access to a lung nodule with three stages: bronchoscope, concentric tubes, steerable needle.",
-    help_epilogue="Exit codes: 0 a plan that the check accepts, 1 no plan or a refused one, 2 bad input.",
+    help_epilogue=f"{EXAMPLE_OF_ALL}\n\n{EXIT_CODES}",
     version=_version,
+    console=terminal.help_console,
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
@@ -74,10 +79,11 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 
 
 for _command in (
-    plan, needle, certify, check, info, presets, demo, advise, alternatives, route, tour, tubes, risk, reach,
-    segment, study, report, export, doctor, completion,
+    plan, needle, certify, check, info, presets, template, phantom, demo, advise, alternatives, route, tour,
+    tubes, risk, reach, segment, report, export, doctor, completion,
 ):  # fmt: skip
-    app.command(_command)
+    app.command(_command, help_epilogue=epilogue(_command.__name__))
+app.command(study)
 
 
 # Cyclopts would end the process by itself.
@@ -97,7 +103,7 @@ def _run(
         Print neither results nor progress, only errors and what --json asks for.
     """
     terminal.set_quiet(quiet)
-    code: int | None = app(words, exit_on_error=False, error_console=error_console)
+    code: int | None = app(words, exit_on_error=False, print_error=False)
     return code
 
 
@@ -111,39 +117,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = app.meta(_with_nodule_number(words), exit_on_error=False, error_console=error_console)
-    except CycloptsError:
-        return ExitCode.BAD_INPUT
+        code = _answer(words)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        terminal.give_up_output()
+        return ExitCode.PIPE_CLOSED
+    return code
+
+
+def _answer(words: list[str]) -> int:
+    """Run one command, turn what a user can cause and mend into an exit code."""
+    if not words:
+        terminal.console.file.write(START_PAGE)
+        return ExitCode.OK
+    as_json = asks_json(words)
+    try:
+        code = app.meta(with_nodule_number(words), exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        return _explain(usage_error(error), as_json)
     except LungaccessError as error:
-        return _explain(error)
+        return _explain(error, as_json)
+    except BrokenPipeError:
+        raise
     except MemoryError:
-        terminal.show_error(_TOO_LARGE)
-        return ExitCode.BAD_INPUT
+        return _explain(_TOO_LARGE, as_json)
+    except OSError as error:
+        return _explain(_unusable(error), as_json)
     except KeyboardInterrupt:
         error_console.print("interrupted")
         return ExitCode.INTERRUPTED
     return int(code or ExitCode.OK)
 
 
-def _explain(error: LungaccessError) -> ExitCode:
-    """Print an error for people and return the exit code that belongs to it."""
+def _explain(error: LungaccessError, as_json: bool) -> ExitCode:
+    """Print an error for people, also as JSON if that is asked for, and return its exit code."""
     from lungaccess.plans.no_plan import NoPlan
 
     if isinstance(error, NoPlan):
-        terminal.show_no_plan(error)
+        if as_json:
+            terminal.show_json(plan_tables.no_plan_record(error))
+        else:
+            terminal.show_no_plan(error)
         return ExitCode.NEGATIVE
     terminal.show_error(error)
+    if as_json:
+        terminal.show_json(terminal.error_record(error))
     return ExitCode.BAD_INPUT
 
 
-def _with_nodule_number(words: list[str]) -> list[str]:
-    """Let `--nodule` stand alone for `--nodule 1`."""
-    completed: list[str] = []
-    for word, following in zip(words, [*words[1:], ""], strict=True):
-        completed.append(word)
-        if word == "--nodule" and not following.lstrip("+-").isdigit():
-            completed.append("1")
-    return completed
+def _unusable(error: OSError) -> FileError:
+    """Return the error for a file or folder that the system refuses."""
+    return FileError(
+        f"{error.filename or 'A file'} cannot be used: {error.strerror or error}",
+        expected="files and folders that can be read and written, and room on the disk",
+        remedy="Check the name, the permissions and the free space",
+    )
 
 
 __all__ = ["app", "main"]

@@ -16,6 +16,8 @@ class ExitCode(IntEnum):
     """The input is bad, and the error says how."""
     INTERRUPTED = 130
     """The user pressed Ctrl-C; shells state the same number."""
+    PIPE_CLOSED = 141
+    """What reads the output, such as `head`, stopped before its end; shells state the same number."""
 
     @classmethod
     def of(cls, positive: bool) -> ExitCode:

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_value
+from lungaccess.cli.numbers import Count, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from stages.needle import TERMS, Objective
 
@@ -89,9 +90,10 @@ class TargetOptions:
         str | None, Parameter(help="Target point in mm with its frame: ras:x,y,z or lps:x,y,z.")
     ] = None
     nodule: Annotated[
-        int | None,
+        Whole | None,
         Parameter(
-            help="Go to the centre of this nodule of the nodule mask; 1, the largest, if no number follows."
+            metavar="[INT]",
+            help="Go to the centre of this nodule of the nodule mask; 1, the largest, if no number follows.",
         ),
     ] = None
 
@@ -135,14 +137,14 @@ class BudgetOptions:
     """How long to search; SettingsError unless time and iterations are numbers that a search can end with."""
 
     budget: Annotated[
-        float | None,
+        Seconds | None,
         Parameter(help="Planning time in seconds; 10 if neither this nor --iterations is given."),
     ] = None
     iterations: Annotated[
-        int | None,
+        Count | None,
         Parameter(help="Number of iterations instead of a time: the same seed then gives the same plan."),
     ] = None
-    seed: Annotated[int, Parameter(help="Seed of the random numbers.")] = 0
+    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0
 
     def __post_init__(self) -> None:
         if self.budget is not None and not 0.0 < self.budget < float("inf"):
@@ -175,7 +177,7 @@ class SearchOptions(BudgetOptions):
             "as printed, with collisions of surface meshes, slow."
         ),
     ] = "atlas"
-    processes: Annotated[int, Parameter(help="How many processes refine the plan at the same time.")] = 1
+    processes: Annotated[Count, Parameter(help="How many processes refine the plan at the same time.")] = 1
 
 
 def require_map(lung: Lung, objective: Objective) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import sys
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
 from rich.panel import Panel
@@ -15,9 +17,19 @@ if TYPE_CHECKING:
     from anatomy.errors import LungaccessError
     from lungaccess.plans.no_plan import NoPlan
 
-console = Console()
-error_console = Console(stderr=True)
-progress_console = Console(stderr=True)
+
+class _Console(Console):
+    """A console that leaves it to the command line what happens when nobody reads on."""
+
+    def on_broken_pipe(self) -> NoReturn:
+        """Raise BrokenPipeError."""
+        raise BrokenPipeError
+
+
+console = _Console()
+error_console = _Console(stderr=True)
+progress_console = _Console(stderr=True)
+help_console = _Console()
 
 Row = tuple[str, ...]
 
@@ -25,6 +37,11 @@ Row = tuple[str, ...]
 def set_quiet(quiet: bool) -> None:
     """Let commands print neither results nor progress, or let them again; JSON and errors still come."""
     console.quiet = progress_console.quiet = quiet
+
+
+def give_up_output() -> None:
+    """Send what is still to be printed nowhere: what read standard output has ended."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def show_json(value: object) -> None:
@@ -109,6 +126,18 @@ def show_error(error: LungaccessError) -> None:
     if error.remedy:
         lines.append(f"[dim]remedy[/]    {escaped(error.remedy)}")
     error_console.print(Panel("\n".join(lines), title="bad input", title_align="left", border_style="red"))
+
+
+def error_record(error: LungaccessError) -> dict[str, object]:
+    """Return an error as plain values: its kind, what was found, what was expected, what to do."""
+    return {
+        "error": {
+            "kind": type(error).__name__,
+            "found": error.found,
+            "expected": error.expected,
+            "remedy": error.remedy,
+        }
+    }
 
 
 def show_no_plan(failure: NoPlan) -> None:

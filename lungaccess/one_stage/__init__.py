@@ -16,7 +16,14 @@ if TYPE_CHECKING:
     )
     from lungaccess.one_stage.route import RouteSource, open_source, read_drawing, route_record, widest_end
     from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, ScopeAdvice, advise_scope, save_advice
-    from lungaccess.one_stage.tour import TourAnswer, coupled_plan_test, plan_tour, read_lesions, tour_record
+    from lungaccess.one_stage.tour import (
+        TourAnswer,
+        coupled_plan_test,
+        lesions_of,
+        plan_tour,
+        read_lesions,
+        tour_record,
+    )
     from lungaccess.one_stage.tubes import (
         TubeAnswer,
         TubePair,

@@ -100,6 +100,24 @@ def read_lesions(path: str | Path) -> Float:
     return np.array(points)
 
 
+def lesions_of(lung: Lung) -> Float:
+    """Return the targets that came with a patient, `(M, 3)` LPS mm.
+
+    Raises
+    ------
+    TargetError
+        If none came with it, or more than 62.
+    """
+    count = len(lung.targets_lps)
+    if not 1 <= count <= MOST_LESIONS:
+        raise TargetError(
+            f"Patient {lung.name} came with {count} targets",
+            expected=f"1 to {MOST_LESIONS} lesions",
+            remedy="Name them in a file for --targets; `lungaccess template lesions` prints an example",
+        )
+    return np.array(lung.targets_lps, dtype=np.float64)
+
+
 def plan_tour(
     lung: Lung,
     lesions_lps: Float,

@@ -33,6 +33,7 @@ from stages.tube import (
     propose_designs,
 )
 
+_REMEDY = "`lungaccess template tubes` prints a complete file to start from"
 AS_FAR = 0.95
 """Share of the present reach that counts as about as far."""
 BEND_RAD = 0.5 * math.pi
@@ -85,9 +86,31 @@ class TubeAnswer:
     snap: SnapError | None
 
     @property
+    def refusals(self) -> tuple[str, ...]:
+        """Why the device would not allow this deployment, a sentence each; none for one that it allows."""
+        why = []
+        if self.snap is not None:
+            why.append(f"The tubes would snap: {self.snap.found}")
+        elif not self.final.stable:
+            why.append("The deployed tubes are not stable")
+        limits = None if self.system is None else self.system.tubes
+        if limits is not None and self.inner_mm > limits.max_extension_mm:
+            why.append(
+                f"The inner tube comes {self.inner_mm:g} mm out of the scope, more than max_extension_mm = "
+                f"{limits.max_extension_mm:g}"
+            )
+        sweep_mm = None if self.deployed is None else self.deployed.lateral_sweep_mm
+        if limits is not None and sweep_mm is not None and sweep_mm > limits.max_lateral_sweep_mm:
+            why.append(
+                f"The tubes sweep {sweep_mm:.3f} mm sideways, more than max_lateral_sweep_mm = "
+                f"{limits.max_lateral_sweep_mm:g}"
+            )
+        return tuple(why)
+
+    @property
     def acceptable(self) -> bool:
-        """Whether the tubes are stable at every step."""
-        return self.snap is None and self.final.stable
+        """Whether the device allows it: stable at every step, and within the limits of the system."""
+        return not self.refusals
 
 
 def load_tubes(name_or_path: str | os.PathLike[str]) -> System | TubePair:
@@ -105,7 +128,7 @@ def load_tubes(name_or_path: str | os.PathLike[str]) -> System | TubePair:
         except tomllib.TOMLDecodeError:
             mapping = {}  # load_system says what is wrong with the file
         if isinstance(mapping.get("tubes"), list):
-            return parse(TubePair, mapping, given)
+            return parse(TubePair, mapping, given, remedy=_REMEDY)
     return load_system(given)
 
 
@@ -216,6 +239,8 @@ def tubes_record(answer: TubeAnswer) -> dict[str, Any]:
         "tip_mm": answer.final.base_from_tip[:3, 3].tolist(),
         "tip_direction": answer.final.base_from_tip[:3, 2].tolist(),
         "tip_angles_rad": answer.final.tip_angles_rad.tolist(),
+        "allowed": answer.acceptable,
+        "refusals": list(answer.refusals),
         "stable": answer.final.stable,
         "least_determinant": answer.final.least_determinant,
         "lateral_sweep_mm": None if deployed is None else deployed.lateral_sweep_mm,

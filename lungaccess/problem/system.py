@@ -22,6 +22,7 @@ from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes
 
 _PRESETS = "presets"
+_REMEDY = "`lungaccess presets --show lung-default` prints a complete file to start from"
 
 
 @settings
@@ -79,6 +80,27 @@ def preset_names() -> tuple[str, ...]:
     return tuple(sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml")))
 
 
+def preset_text(name: str) -> str:
+    """Return the TOML text of a preset, with its comments.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such preset.
+    """
+    if name not in preset_names():
+        raise _unknown(name)
+    return (resources.files("lungaccess") / _PRESETS / f"{name}.toml").read_text(encoding="utf-8")
+
+
+def _unknown(given: str) -> SettingsError:
+    return SettingsError(
+        f"There is no system called {given!r}",
+        expected=f"a preset ({', '.join(preset_names())}) or the path of a .toml file",
+        remedy=did_you_mean(given, preset_names()) or _REMEDY,
+    )
+
+
 def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool | None = None) -> System:
     """Read a system from a preset or from a TOML file.
 
@@ -107,13 +129,9 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     """
     given = os.fspath(name_or_path)
     if given in preset_names():
-        content = (resources.files("lungaccess") / _PRESETS / f"{given}.toml").read_bytes()
+        content = preset_text(given).encode("utf-8")
     elif isinstance(name_or_path, str) and not given.endswith(".toml"):
-        raise SettingsError(
-            f"There is no system called {given!r}",
-            expected=f"a preset ({', '.join(preset_names())}) or the path of a .toml file",
-            remedy=did_you_mean(given, preset_names()) or "docs/how_to/devices.md shows how to write one",
-        )
+        raise _unknown(given)
     else:
         content = _read(Path(name_or_path))
     loaded = _parse_toml(content, given)
@@ -147,8 +165,6 @@ def _parse_toml(content: bytes, where: str) -> System:
         mapping = tomllib.loads(content.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(
-            f"{where} is not valid TOML ({error})",
-            expected="UTF-8 text in TOML syntax",
-            remedy="docs/how_to/devices.md has a working example",
+            f"{where} is not valid TOML ({error})", expected="UTF-8 text in TOML syntax", remedy=_REMEDY
         ) from error
-    return parse(System, mapping, where)
+    return parse(System, mapping, where, remedy=_REMEDY)

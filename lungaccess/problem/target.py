@@ -77,7 +77,7 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
         raise TargetError(
             "No target was given" if text is None else "Both a target and a nodule were given",
             expected="either --target ras:x,y,z (or lps:x,y,z) or --nodule",
-            remedy="lungaccess plan --help shows examples",
+            remedy="Add --nodule for the largest nodule, or a point such as --target ras:-41.5,22,-110",
         )
     if text is None:
         return StatedTarget(lps_mm=None, nodule=nodule or 0, origin=f"nodule {nodule}")

@@ -10,6 +10,7 @@ from anatomy.errors import SettingsError
 from anatomy.io.files import read_text
 from anatomy.settings import impossible, parse, quantity, settings
 
+_REMEDY = "`lungaccess template errors` prints a complete file to start from"
 CURVATURE = "needle_curvature"
 """The one kind whose size is a pair of factors and no standard deviation."""
 
@@ -122,6 +123,6 @@ def load_errors(path: str | os.PathLike[str]) -> ErrorModel:
         raise SettingsError(
             f"{os.fspath(path)} is not valid TOML ({error})",
             expected="one line a key, such as scope_position_mm = 1.0",
-            remedy="docs/explanation/risk.md has a working example",
+            remedy=_REMEDY,
         ) from error
-    return parse(ErrorModel, mapping, os.fspath(path))
+    return parse(ErrorModel, mapping, os.fspath(path), remedy=_REMEDY)

@@ -18,7 +18,7 @@ from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
 PHANTOM = "phantom"
-_REMEDY = "docs/how_to/studies.md explains every key"
+_REMEDY = "`lungaccess template study` prints a complete file to start from"
 Seed = Annotated[int, Field(strict=True, ge=0)]
 Iterations = Annotated[int, Field(strict=True, ge=0, description="iterations beyond the direct arcs")]
 

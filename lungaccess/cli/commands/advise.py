@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Positive, Seed
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions, TargetOptions
 from lungaccess.cli.progress import progress
 
@@ -21,9 +22,9 @@ def advise(
     patient: PatientFolder,
     *,
     target: TargetOptions = TargetOptions(),
-    lesion_radius: Annotated[float, Parameter(help="Radius of the lesion, mm.")] = 5.0,
+    lesion_radius: Annotated[Positive, Parameter(help="Radius of the lesion, mm.")] = 5.0,
     system: Annotated[str, Parameter(help="Preset or TOML file whose scope is used.")] = DEFAULT_SYSTEM,
-    seed: Annotated[int, Parameter(help="Seed of the random numbers.")] = 0,
+    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
     out: Annotated[
         Path,
         Parameter(help="Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer."),

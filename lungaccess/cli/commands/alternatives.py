@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Count, NotNegative
 from lungaccess.cli.options import (
     ObjectiveText,
     PatientFolder,
@@ -34,9 +35,9 @@ def alternatives(
     *,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    count: Annotated[int, Parameter(help="How many plans at most.")] = 15,
+    count: Annotated[Count, Parameter(help="How many plans at most.")] = 15,
     separation: Annotated[
-        float,
+        NotNegative,
         Parameter(help="The needles of every two plans lie somewhere at least so many mm from each other."),
     ] = 5.0,
     objective: Annotated[

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Count
 from lungaccess.cli.options import PatientFolder, PatientOptions, SystemOptions, TargetOptions
 from lungaccess.cli.progress import progress
 
@@ -14,7 +14,7 @@ def certify(
     *,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    most_boxes: int | None = None,
+    most_boxes: Count | None = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Prove that a target is unreachable: from no place in the airways, however scope and tubes are turned.
@@ -30,8 +30,6 @@ def certify(
     from lungaccess.reachability import MOST_BOXES, UnreachableProof
 
     stated = target.stated()
-    if most_boxes is not None and most_boxes < 1:
-        raise SettingsError(f"--most-boxes is {most_boxes}", expected="at least 1")
     device = system.load()
     lung = output.load(patient)
     point = stated.centre_lps(lung)

@@ -14,6 +14,7 @@ from anatomy.errors import AnatomyError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Seconds, Seed
 from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions
 from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, PlanRequest, plan_and_report
 from lungaccess.cli.progress import progress
@@ -34,8 +35,8 @@ def demo(
     out: Annotated[Path, Parameter(help="Folder for plan.json, the pictures and report.html.")] = Path(
         "demo-output"
     ),
-    budget: Annotated[float, Parameter(help="Planning time in seconds.")] = DEMO_BUDGET_S,
-    seed: Annotated[int, Parameter(help="Seed of the patient and of the search.")] = DEMO_SEED,
+    budget: Annotated[Seconds, Parameter(help="Planning time in seconds.")] = DEMO_BUDGET_S,
+    seed: Annotated[Seed, Parameter(help="Seed of the patient and of the search.")] = DEMO_SEED,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it."""

@@ -42,15 +42,25 @@ def info(
     return ExitCode.OK
 
 
-def presets(*, output: OutputOptions = OutputOptions()) -> ExitCode:
-    """List the systems that ship with lungaccess.
+def presets(
+    *,
+    show: Annotated[
+        str | None,
+        Parameter(help="Print the TOML file of this system: edit it, and hand it over with --system FILE."),
+    ] = None,
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
+    """List the systems that ship with lungaccess, or print one as a file to start from.
 
     Its JSON holds every setting.
     """
     from anatomy.settings import to_mapping
-    from lungaccess.problem.system import load_system, preset_names
+    from lungaccess.problem.system import load_system, preset_names, preset_text
 
-    systems = {name: load_system(name) for name in preset_names()}
+    if show is not None and not output.json:
+        terminal.console.file.write(preset_text(show))
+        return ExitCode.OK
+    systems = {name: load_system(name) for name in (preset_names() if show is None else (show,))}
     if output.json:
         terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
     else:

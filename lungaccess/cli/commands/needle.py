@@ -37,11 +37,11 @@ def needle(
     start: Annotated[
         str,
         Parameter(
-            help="Number of a start pose that came with the patient, or path of a text file with a 4x4 pose "
-            "whose +z column is the direction of insertion."
+            help="Number of a start pose that came with the patient; a plan.json, whose needle starts there; or "
+            "a text file with a 4x4 pose whose +z column is the direction of insertion."
         ),
     ],
-    frame: Annotated[Frame, Parameter(help="Frame of the numbers in that file.")] = "lps",
+    frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     planner: Annotated[
@@ -125,10 +125,13 @@ def _tables(answer: NeedleAnswer) -> list[Table]:
 
 
 def _start_pose(lung: Lung, start: str, frame: Frame) -> Float:
-    """Return a pose by its number among those of the patient, or from a file."""
+    """Return a pose by its number among those of the patient, from a plan, or from a file of numbers."""
     from anatomy.io.frames import read_pose
+    from lungaccess.plans.plan import Plan
 
-    if not start.isdigit():
+    if start.endswith(".json"):
+        return Plan.load(start).tube.lps_from_tip
+    if not start.isdecimal():
         return read_pose(start, frame)
     number = int(start)
     if not 1 <= number <= len(lung.starts):

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import CountOrNone, Positive
 from lungaccess.cli.options import PatientFolder, PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 
@@ -23,9 +24,10 @@ def reach(
     patient: PatientFolder,
     *,
     system: SystemOptions = SystemOptions(),
-    spacing: Annotated[float, Parameter(help="Side of the map's voxels, mm.")] = 3.0,
+    spacing: Annotated[Positive, Parameter(help="Side of the map's voxels, mm.")] = 3.0,
     search: Annotated[
-        int, Parameter(help="Random trees for each point that no single arc reaches; 0 for single arcs only.")
+        CountOrNone,
+        Parameter(help="Random trees for each point that no single arc reaches; 0 for single arcs only."),
     ] = 0,
     compare: Annotated[
         str | None, Parameter(help="Further presets or TOML files to compare with, separated by commas.")

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import CountOrNone, Seed
 from lungaccess.cli.options import PatientOfPlan, PatientOptions
 from lungaccess.cli.plan_search import HISTORY_FILE
 from lungaccess.cli.progress import progress
@@ -28,7 +28,8 @@ def report(
         Path | None, Parameter(help="The HTML file; report.html beside the plan if not given.")
     ] = None,
     alternatives: Annotated[
-        int, Parameter(help="So many other plans to the same target are searched and shown on demand.")
+        CountOrNone,
+        Parameter(help="So many other plans to the same target are searched and shown on demand."),
     ] = 0,
     ct: Annotated[
         Path | None,
@@ -41,9 +42,9 @@ def report(
         Path | None, Parameter(help="WebP file for the flight through the airway to the scope's place.")
     ] = None,
     samples: Annotated[
-        int, Parameter(help="Deviated plans of the estimate of risk; 0 leaves it out.")
+        CountOrNone, Parameter(help="Deviated plans of the estimate of risk; 0 leaves it out.")
     ] = 2000,
-    seed: Annotated[int, Parameter(help="Seed of that estimate.")] = 0,
+    seed: Annotated[Seed, Parameter(help="Seed of that estimate.")] = 0,
     instructions: Annotated[
         bool, Parameter(help="Whether instructions for the scope are searched and listed turn by turn.")
     ] = True,
@@ -54,10 +55,6 @@ def report(
     from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page
     from lungaccess.report.html.volumes import find_ct, read_ct
 
-    if alternatives < 0 or samples < 0:
-        raise SettingsError(
-            f"{alternatives} alternatives and {samples} samples are asked for", expected="no negative number"
-        )
     page = plan.with_name("report.html") if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)

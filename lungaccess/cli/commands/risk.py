@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Count, Positive, Probability, Seed
 from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.progress import progress
 
@@ -26,15 +27,17 @@ def risk(
         Path | None,
         Parameter(help="TOML file of the error model; the default one, all of it assumed, if not given."),
     ] = None,
-    samples: Annotated[int, Parameter(help="Number of deviated plans.")] = 10_000,
+    samples: Annotated[Count, Parameter(help="Number of deviated plans.")] = 10_000,
     radius: Annotated[
-        float | None,
+        Positive | None,
         Parameter(
             help="Radius of the goal in mm; by default that of the nodule, or 5 if the target lies in none."
         ),
     ] = None,
-    probability: Annotated[float, Parameter(help="Probability of success that the tolerances keep.")] = 0.95,
-    seed: Annotated[int, Parameter(help="Seed of the random numbers.")] = 0,
+    probability: Annotated[
+        Probability, Parameter(help="Probability of success that the tolerances keep.")
+    ] = 0.95,
+    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it, open loop."""

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import Frame, parse_point
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import NotNegative, Positive, Seed
 from lungaccess.cli.options import PatientOptions
 from lungaccess.cli.progress import progress
 
@@ -36,21 +36,21 @@ def route(
         ),
     ],
     start: Annotated[str | None, Parameter(help="Start; the widest end of the tubes if not given.")] = None,
-    curvature: Annotated[float, Parameter(help="Largest curvature of the device, 1/mm.")],
-    radius: Annotated[float, Parameter(help="Outer radius of the device, mm.")] = 0.0,
-    margin: Annotated[float, Parameter(help="Gap that must remain between device and wall, mm.")] = 0.0,
+    curvature: Annotated[Positive, Parameter(help="Largest curvature of the device, 1/mm.")],
+    radius: Annotated[NotNegative, Parameter(help="Outer radius of the device, mm.")] = 0.0,
+    margin: Annotated[NotNegative, Parameter(help="Gap that must remain between device and wall, mm.")] = 0.0,
     tolerance: Annotated[
-        float, Parameter(help="How far the ends of the route may lie from start and goal, mm.")
+        NotNegative, Parameter(help="How far the ends of the route may lie from start and goal, mm.")
     ] = 0.0,
     repair: Annotated[
         Literal["exact", "ga"],
         Parameter(help="exact: a nonlinear program; ga: the genetic search of Li et al. 2021."),
     ] = "exact",
-    seed: Annotated[int, Parameter(help="Seed of the genetic search.")] = 0,
+    seed: Annotated[Seed, Parameter(help="Seed of the genetic search.")] = 0,
     frame: Annotated[
         Frame | None, Parameter(help="Frame of a centreline file or mask that states none.")
     ] = None,
-    pixel: Annotated[float | None, Parameter(help="Size of a pixel of a drawing, mm.")] = None,
+    pixel: Annotated[Positive | None, Parameter(help="Size of a pixel of a drawing, mm.")] = None,
     out: Annotated[Path, Parameter(help="Folder for route.json and route.png.")] = Path("lungaccess-route"),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
@@ -67,8 +67,6 @@ def route(
     )
     end = parse_point(goal)
     begin = None if start is None else parse_point(start)
-    if seed < 0:
-        raise SettingsError(f"--seed is {seed}", expected="at least 0")
     require_writable_folder(out)
     with progress("route") as shown:
         shown.step("reading the tubes")

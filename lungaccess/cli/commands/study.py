@@ -10,7 +10,9 @@ from cyclopts import App, Parameter
 
 from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
+from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Count
 from lungaccess.cli.options import OutputOptions, PatientOptions
 from lungaccess.cli.progress import progress
 
@@ -20,16 +22,20 @@ if TYPE_CHECKING:
     from lungaccess.study.summary import Group
 
 
-study = App(name="study", help="Run many plans from one file, into one file of results.")
+study = App(
+    name="study",
+    help="Run many plans from one file, into one file of results.",
+    help_epilogue=epilogue("study run"),
+)
 
 
-@study.command
+@study.command(help_epilogue=epilogue("study run"))
 def run(
     study: Path,
     *,
     out: Path = Path("results.db"),
     scheduler: str | None = None,
-    workers: Annotated[int | None, Parameter(name="--workers")] = None,
+    workers: Annotated[Count | None, Parameter(name="--workers")] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Make the runs of a study that the results do not have yet; exit code 1 if one could not be made.
@@ -51,10 +57,11 @@ def run(
     from lungaccess.study.settings import read_study
     from lungaccess.study.summary import summarise
 
-    if workers is not None and (workers < 1 or scheduler is not None):
+    if workers is not None and scheduler is not None:
         raise SettingsError(
-            f"--workers is {workers}" + (" and a scheduler is given" if scheduler else ""),
-            expected="at least 1, and no --scheduler, which has workers of its own",
+            f"--workers is {workers} and --scheduler is {scheduler}",
+            expected="one of them: a scheduler has workers of its own",
+            remedy="Leave out --workers",
         )
     asked = read_study(study)
     with progress(asked.name) as shown:
@@ -78,7 +85,7 @@ def run(
     return ExitCode.of(not done.failed)
 
 
-@study.command
+@study.command(help_epilogue=epilogue("study show"))
 def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Show what is stored, by case and planner.
 
@@ -97,7 +104,7 @@ def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     return ExitCode.OK
 
 
-@study.command
+@study.command(help_epilogue=epilogue("study export"))
 def export(
     results: Path,
     *,
@@ -130,7 +137,7 @@ def export(
     return ExitCode.OK
 
 
-@study.command
+@study.command(help_epilogue=epilogue("study compare"))
 def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Compare two results files, but for times and memory; exit code 1 if they differ.
 

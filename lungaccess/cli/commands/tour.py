@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import NotNegative, Positive
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
 
@@ -22,7 +22,13 @@ if TYPE_CHECKING:
 def tour(
     patient: PatientFolder,
     *,
-    targets: Annotated[Path, Parameter(help="Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm.")],
+    targets: Annotated[
+        Path | None,
+        Parameter(
+            help="Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm; the patient's own targets if not "
+            "given."
+        ),
+    ] = None,
     system: Annotated[
         str, Parameter(help="Preset or TOML file whose devices reach the lesions from the airway.")
     ] = DEFAULT_SYSTEM,
@@ -41,36 +47,32 @@ def tour(
         ),
     ] = "printed",
     beta: Annotated[
-        float, Parameter(help="Weight of the angle in the resistance; the paper's worked example needs 2.5.")
+        NotNegative,
+        Parameter(help="Weight of the angle in the resistance; the paper's worked example needs 2.5."),
     ] = 0.2,
     tissue_weight: Annotated[
-        float,
+        NotNegative,
         Parameter(
             help="How many mm of the scope's travel a mm between exit and lesion is worth, for the shortest "
             "tour."
         ),
     ] = 0.0,
-    speed: Annotated[float, Parameter(help="Speed of the scope, mm/s, for the times.")] = 10.0,
-    per_lesion: Annotated[float, Parameter(help="Time that each lesion takes besides, s.")] = 300.0,
+    speed: Annotated[Positive, Parameter(help="Speed of the scope, mm/s, for the times.")] = 10.0,
+    per_lesion: Annotated[NotNegative, Parameter(help="Time that each lesion takes besides, s.")] = 300.0,
     out: Annotated[Path, Parameter(help="Folder for tour.json and tour.png.")] = Path("lungaccess-tour"),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out."""
-    from lungaccess.one_stage import plan_tour, read_lesions, tour_record
+    from lungaccess.one_stage import lesions_of, plan_tour, read_lesions, tour_record
     from lungaccess.problem.system import load_system
     from lungaccess.report.tour import tour_png
     from stages.scope.tour import Resistances
 
-    if not tissue_weight >= 0.0:
-        raise SettingsError(f"--tissue-weight is {tissue_weight:g}", expected="at least 0")
-    if not speed > 0.0 or not per_lesion >= 0.0:
-        raise SettingsError(
-            f"--speed is {speed:g}, --per-lesion {per_lesion:g}", expected="above 0; at least 0"
-        )
-    lesions = read_lesions(targets)
+    stated = None if targets is None else read_lesions(targets)
     require_writable_folder(out)
     device = load_system(system)
     lung, atlas = output.load(patient), None
+    lesions = lesions_of(lung) if stated is None else stated
     if require_plan:
         atlas = output.open_atlas(lung, device)
     with progress("planning the tour"):

@@ -12,6 +12,7 @@ from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Finite, NotNegative
 from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 
 def tubes(
     *,
-    outer: Annotated[float, Parameter(help="How far the outer tube comes out of the scope, mm.")],
-    inner: Annotated[float, Parameter(help="How far the inner tube comes out of the scope, mm.")],
+    outer: Annotated[NotNegative, Parameter(help="How far the outer tube comes out of the scope, mm.")],
+    inner: Annotated[NotNegative, Parameter(help="How far the inner tube comes out of the scope, mm.")],
     system: Annotated[
         str,
         Parameter(
@@ -33,13 +34,13 @@ def tubes(
         ),
     ] = DEFAULT_SYSTEM,
     rotate: Annotated[
-        float,
+        Finite,
         Parameter(
             help="Direction of the inner tube's bend about the scope's axis, from +x of its tip, degrees."
         ),
     ] = 0.0,
     relative: Annotated[
-        float, Parameter(help="How much farther the base of the outer tube is turned, degrees.")
+        Finite, Parameter(help="How much farther the base of the outer tube is turned, degrees.")
     ] = 0.0,
     propose: Annotated[
         bool, Parameter(help="Compare sequences to the same place, and look for designs that sweep less.")
@@ -47,7 +48,10 @@ def tubes(
     out: Annotated[Path, Parameter(help="PNG file for the picture.")] = Path("tubes.png"),
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
-    """Deploy the tubes alone: tip, stability, sideways motion, picture; exit code 1 if they would snap."""
+    """Deploy the tubes alone: tip, stability, sideways motion, picture.
+
+    Exit code 0 if the device allows it; 1 if the tubes would snap or exceed a limit of the system.
+    """
     from lungaccess.one_stage import deploy_tubes, load_tubes
 
     if out.suffix.lower() != ".png":
@@ -60,11 +64,27 @@ def tubes(
         rotation_rad=math.radians(rotate),
         relative_rad=math.radians(relative),
     )
-    _show_json(answer, propose) if output.json else _show_tables(answer, propose)
     _draw(answer, out)
-    if not output.json:
-        terminal.say(f"Written to {out}")
+    if output.json:
+        _show_json(answer, propose)
+        return ExitCode.of(answer.acceptable)
+    _show_tables(answer, propose)
+    terminal.say(f"Written to {out}")
+    _show_verdict(answer, propose)
     return ExitCode.of(answer.acceptable)
+
+
+def _show_verdict(answer: TubeAnswer, propose: bool) -> None:
+    """Print whether the device allows the deployment, why not, and what to try."""
+    if answer.acceptable:
+        limits = "" if answer.system is None else " and within the limits of the system"
+        terminal.console.print(f"[bold green]Allowed: stable at every step{limits}.[/]")
+        return
+    terminal.console.print("[bold red]Not allowed by this device.[/]")
+    for why in answer.refusals:
+        terminal.say(f"- {why}.")
+    if answer.system is not None and not propose:
+        terminal.say("Less of the outer tube sweeps less; --propose compares sequences and other designs.")
 
 
 def _show_tables(answer: TubeAnswer, propose: bool) -> None:
@@ -86,8 +106,13 @@ def _rows(answer: TubeAnswer) -> list[terminal.Row]:
     tip, final, deployed = answer.final.base_from_tip, answer.final, answer.deployed
     turned = math.degrees(math.acos(max(-1.0, min(1.0, float(tip[2, 2])))))
     extension = f"at most {limits.max_extension_mm:g} mm" if limits else ""
+    too_far = limits is not None and answer.inner_mm > limits.max_extension_mm
     rows = [
-        ("outer, inner tube out", f"{answer.outer_mm:g} mm, {answer.inner_mm:g} mm", extension),
+        (
+            "outer, inner tube out",
+            _marked(f"{answer.outer_mm:g} mm, {answer.inner_mm:g} mm", too_far),
+            extension,
+        ),
         ("tip (x, y, z of the scope tip)", f"{_numbers(tip[:3, 3], 3)} mm", ""),
         ("tip direction", _numbers(tip[:3, 2], 4), ""),
         ("angle between tip and scope", f"{turned:.2f} deg", ""),
@@ -98,12 +123,18 @@ def _rows(answer: TubeAnswer) -> list[terminal.Row]:
         snap = answer.snap
         return [*rows, ("deployment", f"SNAPS: {snap.found}" if snap else "", "")]
     sweep = f"at most {limits.max_lateral_sweep_mm:g} mm" if limits else ""
+    sweeps = limits is not None and deployed.lateral_sweep_mm > limits.max_lateral_sweep_mm
     return [
         *rows,
         ("least determinant on the way", f"{deployed.least_determinant:.4f}", "above 0"),
-        ("largest sideways sweep", f"{deployed.lateral_sweep_mm:.3f} mm", sweep),
+        ("largest sideways sweep", _marked(f"{deployed.lateral_sweep_mm:.3f} mm", sweeps), sweep),
         ("follow-the-leader error", f"{deployed.follow_the_leader_error_mm:.3f} mm", ""),
     ]
+
+
+def _marked(text: str, exceeds: bool) -> str:
+    """Return a value with a mark if it exceeds its limit."""
+    return f"{text}  EXCEEDS" if exceeds else text
 
 
 def _numbers(values: object, digits: int) -> str:

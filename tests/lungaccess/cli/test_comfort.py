@@ -38,8 +38,8 @@ HEAVY = (
     "SimpleITK", "casadi", "edt", "fcl", "matplotlib", "networkx", "numba", "ompl", "pydicom", "scipy",
     "skimage", "trimesh",
 )  # fmt: skip
-WITHOUT_RESULT = {"completion"}
-"""Commands that print a script."""
+WITHOUT_RESULT = {"completion", "template"}
+"""Commands that print a script or a file."""
 
 HANGS_AFTER_S = 120.0
 START = (

@@ -1,0 +1,53 @@
+"""The command `lungaccess phantom`: a synthetic patient as a folder, to try the other commands on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from anatomy.io.files import require_writable_folder
+from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Positive, Seed
+from lungaccess.cli.options import OutputOptions
+from lungaccess.cli.progress import progress
+
+
+def phantom(
+    *,
+    out: Annotated[Path, Parameter(help="Folder for patient.toml, masks and CT.")] = Path("PATIENT"),
+    seed: Annotated[Seed, Parameter(help="Seed of the patient: another one, another patient.")] = 2,
+    size: Annotated[
+        Literal["adult", "small"], Parameter(help="small: 0.7 times an adult, a child of about ten years.")
+    ] = "adult",
+    spacing: Annotated[
+        Positive | None,
+        Parameter(help="Edge of the voxels, mm; 1 for the adult, 1.25 for the small patient."),
+    ] = None,
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
+    """Write a synthetic patient as a folder of masks with its CT and the truth about it; no data are needed."""
+    from anatomy.phantom import make_phantom, write_phantom
+
+    require_writable_folder(out)
+    with progress("making a synthetic patient"):
+        made = make_phantom(seed=seed, spacing_mm=spacing, size=size)
+    with progress(f"writing {out}"):
+        write_phantom(made, out)
+    nodules = [
+        {"lps_mm": nodule.centre_lps.tolist(), "radius_mm": float(nodule.radius_mm)}
+        for nodule in made.nodules
+    ]
+    if output.json:
+        terminal.show_json({"folder": str(out), "name": made.images.name, "nodules": nodules})
+        return ExitCode.OK
+    rows = [
+        ("lps:" + ",".join(f"{value:.1f}" for value in nodule.centre_lps), f"{2.0 * nodule.radius_mm:.1f}")
+        for nodule in made.nodules
+    ]
+    terminal.show([terminal.table(f"Nodules of {made.images.name}", ("centre, mm", "diameter, mm"), rows)])
+    terminal.say(f"Written to {out}: patient.toml, its masks, ct.nii.gz, truth.json.")
+    terminal.say(f"Plan with: lungaccess plan {out} --nodule")
+    return ExitCode.OK

@@ -1,0 +1,52 @@
+"""The command `lungaccess template`: an example of each file that a user writes."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from anatomy.io.files import atomic_write
+from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+
+Kind = Literal["patient", "errors", "study", "tubes", "lesions", "pose", "contours"]
+FILES = {
+    "patient": "patient.toml",
+    "errors": "errors.toml",
+    "study": "study.toml",
+    "tubes": "tubes.toml",
+    "lesions": "lesions.txt",
+    "pose": "pose.txt",
+    "contours": "contours.json",
+}
+"""The file of each kind among the templates."""
+
+
+def template(
+    kind: Annotated[
+        Kind,
+        Parameter(
+            help="patient: a folder of own masks; errors: sizes of errors for `risk`; study: many plans; tubes: "
+            "two tubes alone; lesions: points for `tour`; pose: a start for `needle`; contours: an outlined "
+            "nodule for `segment`."
+        ),
+    ],
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="File to write; it is printed if not given.")] = None,
+) -> ExitCode:
+    """Print an example of a file that a command reads, every key explained; edit it and hand it over.
+
+    Devices have templates of their own: `lungaccess presets --show NAME`.
+    """
+    text = (resources.files("lungaccess") / "cli" / "templates" / FILES[kind]).read_text(encoding="utf-8")
+    if out is None:
+        terminal.console.file.write(text)
+        return ExitCode.OK
+    with atomic_write(out) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    terminal.say(f"Written to {out}")
+    return ExitCode.OK

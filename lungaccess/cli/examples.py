@@ -1,0 +1,64 @@
+"""One example for every command: help and error messages show it.
+
+The examples work as they stand, in this order, in an empty folder: each uses what those before it wrote.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+EXAMPLES = MappingProxyType(
+    {
+        "demo": "lungaccess demo --out demo-output",
+        "phantom": "lungaccess phantom --out PATIENT",
+        "info": "lungaccess info PATIENT --out info",
+        "presets": "lungaccess presets --show ultrathin",
+        "template": "lungaccess template study --out study.toml",
+        "plan": "lungaccess plan PATIENT --nodule --budget 5 --out plan",
+        "check": "lungaccess check plan/plan.json PATIENT",
+        "report": "lungaccess report plan/plan.json PATIENT",
+        "risk": "lungaccess risk plan/plan.json PATIENT --samples 2000",
+        "export": "lungaccess export plan/plan.json PATIENT --slicer slicer",
+        "alternatives": "lungaccess alternatives PATIENT --nodule --count 5 --out plans",
+        "needle": "lungaccess needle PATIENT --start plan/plan.json --nodule",
+        "advise": "lungaccess advise PATIENT --nodule --lesion-radius 8",
+        "certify": "lungaccess certify PATIENT --nodule --system ultrathin",
+        "tour": "lungaccess tour PATIENT --no-require-plan --out tour",
+        "route": "lungaccess route PATIENT --goal lps:20,5,-30 --curvature 0.1 --tolerance 5",
+        "tubes": "lungaccess tubes --outer 10 --inner 40 --out tubes.png",
+        "reach": "lungaccess reach PATIENT --spacing 10 --out reach",
+        "segment": "lungaccess segment PATIENT/ct.nii.gz --out SEGMENTED",
+        "study run": "lungaccess study run study.toml --out results.db",
+        "study show": "lungaccess study show results.db",
+        "study export": "lungaccess study export results.db --csv tables",
+        "study compare": "lungaccess study compare results.db results.db",
+        "doctor": "lungaccess doctor",
+        "completion": "lungaccess completion bash",
+    }
+)
+"""A command line for each command."""
+
+EXAMPLE_OF_ALL = f"Example: {EXAMPLES['demo']}"
+EXIT_CODES = "Exit codes: 0 a plan that the check accepts, 1 no plan or a refused one, 2 bad input."
+
+START_PAGE = """\
+lungaccess plans the access to a lung nodule: bronchoscope, concentric tubes, steerable needle.
+
+Without data:
+  lungaccess demo                             a synthetic patient, a plan, its pictures and a page
+  lungaccess phantom --out PATIENT            the folder of a synthetic patient, to try commands on
+
+With a patient, which is a folder of masks:
+  lungaccess segment CT --out PATIENT         makes one of a CT
+  lungaccess info PATIENT                     what was understood of it
+  lungaccess plan PATIENT --nodule            a plan to its largest nodule
+  lungaccess report lungaccess-plan/plan.json PATIENT
+
+lungaccess --help lists all commands; each explains itself, as in: lungaccess plan --help
+"""
+"""What `lungaccess` prints if it is given no command."""
+
+
+def epilogue(command: str) -> str:
+    """Return what ends the help of a command: its example, and the exit codes."""
+    return f"Example: {EXAMPLES[command]}\n\n{EXIT_CODES}"

@@ -1,0 +1,66 @@
+"""Numbers that options take, each with the range in which it makes sense."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+from cyclopts import Parameter, Token
+
+from anatomy.records import frozen_value
+
+LARGEST_SEED = 2**32 - 1
+"""Compiled kernels take seeds of 32 bits."""
+MOST = 10**9
+"""More of anything that is counted would run for years."""
+FARTHEST_MM = 1e4
+"""No length in a patient comes near ten metres; larger numbers are slips."""
+
+
+@frozen_value
+class Within:
+    """Refuses a number outside a range; ends are inclusive but for `above` and `below`, None is open."""
+
+    above: float | None = None
+    at_least: float | None = None
+    below: float | None = None
+    at_most: float | None = None
+
+    def __call__(self, kind: object, value: float | None) -> None:
+        """Raise ValueError, whose text says what is allowed, if a value lies outside."""
+        if value is None or (math.isfinite(value) and self._holds(value)):
+            return
+        noun = "a whole number" if isinstance(value, int) else "a finite number"
+        raise ValueError(f"{noun} {self._ends}".strip())
+
+    def _holds(self, value: float) -> bool:
+        return (
+            (self.above is None or value > self.above)
+            and (self.at_least is None or value >= self.at_least)
+            and (self.below is None or value < self.below)
+            and (self.at_most is None or value <= self.at_most)
+        )
+
+    @property
+    def _ends(self) -> str:
+        """The range in words."""
+        ends = (("above", self.above), ("at least", self.at_least), ("below", self.below))
+        stated = [f"{word} {end:.10g}" for word, end in (*ends, ("at most", self.at_most)) if end is not None]
+        return " and ".join(stated)
+
+
+def whole(kind: object, tokens: Sequence[Token]) -> int:
+    """Read a whole number; one with decimals is refused, not rounded."""
+    return int(tokens[0].value)
+
+
+Whole = Annotated[int, Parameter(converter=whole)]
+Seed = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=LARGEST_SEED))]
+Count = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST))]
+CountOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=MOST))]
+Seconds = Annotated[float, Parameter(validator=Within(above=0.0))]
+Positive = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FARTHEST_MM))]
+NotNegative = Annotated[float, Parameter(validator=Within(at_least=0.0, at_most=FARTHEST_MM))]
+Finite = Annotated[float, Parameter(validator=Within())]
+Probability = Annotated[float, Parameter(validator=Within(above=0.0, below=1.0))]

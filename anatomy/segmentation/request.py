@@ -85,7 +85,7 @@ def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
         raise FileError(
             f"{folder} holds no lobes, airways or vessels of TotalSegmentator",
             expected="output of the tasks lung_vessels or total, such as lung_vessels.nii.gz",
-            remedy="Run TotalSegmentator with `-ta lung_vessels`, or give masks: --airway, --vessels, --lungs",
+            remedy="Run its task lung_vessels, or give masks one by one: --airway, --vessels, --lungs",
         )
     on = read_masks(sources).grid
     return {

@@ -37,8 +37,8 @@ def needle(
     start: Annotated[
         str,
         Parameter(
-            help="Number of a start pose that came with the patient; a plan.json, whose needle starts there; or "
-            "a text file with a 4x4 pose whose +z column is the direction of insertion."
+            help="Number of a start pose that came with the patient; a plan.json, whose needle starts there; "
+            "or a text file with a 4x4 pose whose +z column is the direction of insertion."
         ),
     ],
     frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",

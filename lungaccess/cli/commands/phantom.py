@@ -28,7 +28,7 @@ def phantom(
     ] = None,
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
-    """Write a synthetic patient as a folder of masks with its CT and the truth about it; no data are needed."""
+    """Write a synthetic patient: masks, CT and the truth about it; no data are needed."""
     from anatomy.phantom import make_phantom, write_phantom
 
     require_writable_folder(out)

@@ -29,9 +29,9 @@ def template(
     kind: Annotated[
         Kind,
         Parameter(
-            help="patient: a folder of own masks; errors: sizes of errors for `risk`; study: many plans; tubes: "
-            "two tubes alone; lesions: points for `tour`; pose: a start for `needle`; contours: an outlined "
-            "nodule for `segment`."
+            help="patient: a folder of own masks; errors: sizes of errors for `risk`; study: many plans; "
+            "tubes: two tubes alone; lesions: points for `tour`; pose: a start for `needle`; contours: an "
+            "outlined nodule for `segment`."
         ),
     ],
     /,

@@ -25,8 +25,8 @@ def tour(
     targets: Annotated[
         Path | None,
         Parameter(
-            help="Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm; the patient's own targets if not "
-            "given."
+            help="Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm; the patient's own targets "
+            "if not given."
         ),
     ] = None,
     system: Annotated[

@@ -24,7 +24,16 @@ if TYPE_CHECKING:
     from anatomy.errors import LungaccessError
     from anatomy.lung import Lung
     from lungaccess.checking import CheckReport, check
-    from lungaccess.coupled import Alternative, Atlas, alternatives, build_atlas, open_atlas, plan
+    from lungaccess.coupled import (
+        Alternative,
+        Atlas,
+        alternatives,
+        build_atlas,
+        open_atlas,
+        plan,
+        plan_with_presets,
+    )
+    from lungaccess.explanation import Explanation, explain_no_plan, save_explanation
     from lungaccess.one_stage import advise_scope, deploy_tubes, plan_needle, plan_tour
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
@@ -36,6 +45,7 @@ if TYPE_CHECKING:
         peripheral_targets,
         point_target,
         preset_names,
+        presets_by_invasiveness,
         resolve_target,
     )
     from lungaccess.reachability import UnreachableProof, compare_reach, map_reach

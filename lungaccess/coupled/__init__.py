@@ -10,11 +10,17 @@ if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas, build_atlas
     from lungaccess.coupled.atlas_measures import tip_clearances_mm, tube_stability
     from lungaccess.coupled.atlas_store import open_atlas
-    from lungaccess.coupled.counterfactuals import Counterfactual, find_counterfactuals
+    from lungaccess.coupled.counterfactuals import (
+        Counterfactual,
+        find_counterfactuals,
+        needle_changes,
+        scope_changes,
+    )
     from lungaccess.coupled.diverse_plans import Alternative, alternatives, criteria, with_front
     from lungaccess.coupled.explanation import explain
     from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
     from lungaccess.coupled.planner import METHODS, ProgressEvent, atlas_event, plan
+    from lungaccess.coupled.presets import Attempt, choice_in_words, first_attempt, plan_with_presets
     from lungaccess.coupled.search.atlas_search import AtlasSearch
     from lungaccess.coupled.search.base import Incumbent, ParallelSearch, PlanSearch, Step, evaluated_step
     from lungaccess.coupled.search.direct_arcs import DirectArcs

@@ -76,8 +76,14 @@ def find_counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]
     more than a single arc of the needle demands.  Whether such a device exists, and what else it would need,
     is not asked.
     """
-    found = [*_curvature(task, atlas), *_needle_diameter(task, atlas), *_scope_diameter(task, atlas)]
+    found = [*needle_changes(task, atlas), *scope_changes(task, atlas)]
     return tuple(sorted(found, key=lambda change: change.relative_change))
+
+
+def needle_changes(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
+    """Yield the changes of the needle alone: a tighter curvature, then a thinner needle."""
+    yield from _curvature(task, atlas)
+    yield from _needle_diameter(task, atlas)
 
 
 def _curvature(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
@@ -128,10 +134,18 @@ def _least_change(
     yield Counterfactual(parameter=name, present=present, needed=round(needed, 6), plan=best)
 
 
-def _scope_diameter(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
-    """Enumerate what the thinnest scope could do; where it reaches the target, find how thick it may be."""
+def scope_changes(
+    task: Task, atlas: Atlas, progress: Callable[[float], None] | None = None
+) -> Iterator[Counterfactual]:
+    """Enumerate what the thinnest scope could do; where it reaches the target, find how thick it may be.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Told the share of the enumeration done, which takes seconds; it may raise to end it.
+    """
     scope = task.system.scope
-    thin_atlas = _with_the_thinnest_scope(atlas)
+    thin_atlas = _with_the_thinnest_scope(atlas, progress)
     if thin_atlas is None:
         return
     thin = DirectArcs(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), thin_atlas)
@@ -159,14 +173,16 @@ def _thinnest_mm(scope: Bronchoscope) -> float:
     return max(THINNEST_SCOPE_MM, scope.channel_diameter_mm + LEAST_WALL_MM)
 
 
-def _with_the_thinnest_scope(atlas: Atlas) -> Atlas | None:
+def _with_the_thinnest_scope(atlas: Atlas, progress: Callable[[float], None] | None) -> Atlas | None:
     """Return the atlas of the thinnest scope around the same channel, made once; None if it is no thinner."""
     thinnest = _thinnest_mm(atlas.system.scope)
     if thinnest >= atlas.system.scope.outer_diameter_mm:
         return None
     if atlas not in _THIN:
         thin = _with_scope(atlas.system, thinnest)
-        _THIN[atlas] = build_atlas(atlas.lung, thin, rotations=ROTATIONS, stop_spacing_mm=STOP_MM)
+        _THIN[atlas] = build_atlas(
+            atlas.lung, thin, rotations=ROTATIONS, stop_spacing_mm=STOP_MM, progress=progress
+        )
     return _THIN[atlas]
 
 

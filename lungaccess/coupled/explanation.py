@@ -13,7 +13,9 @@ from lungaccess.problem.task import Task
 from stages.needle import needle_environment
 
 
-def explain(task: Task, atlas: Atlas, blocked: Counter[str], iterations: int) -> NoPlan:
+def explain(
+    task: Task, atlas: Atlas, blocked: Counter[str], iterations: int, *, counterfactuals: bool = True
+) -> NoPlan:
     """Return the `NoPlan` of a search that ended without a plan.
 
     Parameters
@@ -22,13 +24,21 @@ def explain(task: Task, atlas: Atlas, blocked: Counter[str], iterations: int) ->
         How many direct arcs were stopped in the search, by what stopped them.
     iterations : int
         How many the search had.
+    counterfactuals : bool
+        Whether changes of the device are looked for; without them the advice is empty.
     """
     arcs = DirectArcs(task, atlas)
+    main_reason = _main_reason(arcs, blocked)
+    found = f"No plan to the target after {iterations} iterations: {main_reason}"
+    reasons = _reasons(arcs, blocked)
+    if not counterfactuals:
+        return NoPlan(found, reasons=reasons, main_reason=main_reason)
     direct = _reached(arcs)
     changes = find_counterfactuals(task, atlas) if atlas.deployments.count and not direct else ()
     return NoPlan(
-        f"No plan to the target after {iterations} iterations: {_main_reason(arcs, blocked)}",
-        reasons=_reasons(arcs, blocked),
+        found,
+        reasons=reasons,
+        main_reason=main_reason,
         advice=_advice(arcs, direct, changes),
         counterfactuals={str(change): change.plan for change in changes},
     )

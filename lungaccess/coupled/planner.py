@@ -65,8 +65,10 @@ def plan(
     seed: int = 0,
     iterations: int | None = None,
     time_s: float | None = None,
+    first_plan_s: float | None = None,
     atlas: Atlas | None = None,
     processes: int = 1,
+    counterfactuals: bool = True,
     on_progress: Callable[[ProgressEvent], None] | None = None,
 ) -> Iterator[Plan]:
     """Plan all three stages; yield each plan that is better than the one before.
@@ -91,11 +93,15 @@ def plan(
     time_s : float, optional
         Stop after so many seconds of planning, but not without a plan before the direct arcs have been tried.
         With neither limit the caller stops the iterator.
+    first_plan_s : float, optional
+        Stop after so many seconds if there is no plan by then.
     atlas : Atlas, optional
         Made with `build_atlas` beforehand; made here if None.
     processes : int
         How many processes vary the best candidate at the same time.  The same seed, number of processes and
         `iterations` give the same plans.
+    counterfactuals : bool
+        Whether a `NoPlan` looks for the change of device that would help, which takes up to some ten seconds.
     on_progress : callable, optional
         Gets a `ProgressEvent` about ten times a second.
 
@@ -119,7 +125,27 @@ def plan(
     atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(atlas_event(share)))
     search = METHODS[method](task, atlas)
     steps = search.steps() if processes == 1 else _parallel(search, method, processes)
-    return _run(task, atlas, search, steps, iterations, time_s, tell)
+    limits = Limits(
+        iterations=iterations,
+        time_s=math.inf if time_s is None else time_s,
+        first_plan_s=math.inf if first_plan_s is None else first_plan_s,
+    )
+    return _run(task, atlas, search, steps, limits, counterfactuals, tell)
+
+
+@frozen_value
+class Limits:
+    """How long a search may take: in iterations, in seconds, and in seconds without a plan."""
+
+    iterations: int | None
+    time_s: float
+    first_plan_s: float
+
+    def are_reached(self, iteration: int, elapsed_s: float, found: bool) -> bool:
+        """Tell whether the search ends; never without a plan before the direct arcs have been tried."""
+        if found:
+            return elapsed_s > self.time_s
+        return iteration > 0 and elapsed_s > min(self.time_s, self.first_plan_s)
 
 
 def _parallel(search: PlanSearch, method: str, processes: int) -> Iterator[Step]:
@@ -149,26 +175,25 @@ def _run(
     atlas: Atlas,
     search: PlanSearch,
     steps: Iterator[Step],
-    iterations: int | None,
-    time_s: float | None,
+    limits: Limits,
+    counterfactuals: bool,
     tell: Callable[[ProgressEvent], None],
 ) -> Iterator[Plan]:
     """Drive a search within its budget."""
     from lungaccess.coupled.explanation import explain
 
     clock = Clock()
-    limit_s = math.inf if time_s is None else time_s
     best: float | None = None
     iteration = 0
     for step in steps:
-        if iterations is not None and step.iteration > iterations:
+        if limits.iterations is not None and step.iteration > limits.iterations:
             break
         iteration = step.iteration
         if step.candidate is not None:
             best = step.cost
             timing = {"planning_s": clock.elapsed_s, "atlas_s": atlas.build_s}
             yield assemble(task, atlas.sites, step.candidate, iteration=iteration, timing=timing)
-        if (best is not None or iteration > 0) and clock.elapsed_s > limit_s:
+        if limits.are_reached(iteration, clock.elapsed_s, best is not None):
             break
         if clock.due():
             tell(
@@ -177,7 +202,7 @@ def _run(
                 )
             )
     if best is None:
-        raise explain(task, atlas, search.blocked, iteration)
+        raise explain(task, atlas, search.blocked, iteration, counterfactuals=counterfactuals)
 
 
 class Clock:

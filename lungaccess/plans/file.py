@@ -18,7 +18,7 @@ import numpy as np
 
 from anatomy.errors import PlanFileError, SettingsError
 from anatomy.settings import parse, to_mapping
-from lungaccess.plans.record import Record
+from lungaccess.plans.record import LEFT_OUT_IF_EMPTY, Record
 from lungaccess.problem.system import System
 
 SCHEMA = "lungaccess-plan-1"
@@ -111,6 +111,7 @@ def _encode(value: Any, where: str) -> Any:
         return {
             item.name: _encode(_as_declared(item.type, getattr(value, item.name)), f"{where}.{item.name}")
             for item in fields(value)
+            if not item.metadata.get(LEFT_OUT_IF_EMPTY) or getattr(value, item.name)
         }
     if isinstance(value, Mapping):
         return {str(key): _encode(inner, f"{where}.{key}") for key, inner in value.items()}
@@ -156,10 +157,13 @@ def _record(cls: type, value: Any, where: str) -> Any:
     content = _is(dict, value, where)
     hints = typing.get_type_hints(cls)
     names = {item.name for item in fields(cls)}
-    for problem, keys in (("lacks", names - content.keys()), ("has the unknown key", content.keys() - names)):
+    optional = {item.name for item in fields(cls) if item.metadata.get(LEFT_OUT_IF_EMPTY)}
+    lacks, unknown = names - optional - content.keys(), content.keys() - names
+    for problem, keys in (("lacks", lacks), ("has the unknown key", unknown)):
         if keys:
             raise PlanFileError(f"{where} {problem} {', '.join(sorted(keys))}", remedy=_REMEDY)
-    return cls(**{name: _decode(hints[name], content[name], f"{where}.{name}") for name in names})
+    present = names & content.keys()
+    return cls(**{name: _decode(hints[name], content[name], f"{where}.{name}") for name in present})
 
 
 def _system(value: Any, where: str) -> System:

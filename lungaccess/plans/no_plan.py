@@ -21,10 +21,14 @@ class NoPlan(LungaccessError):  # noqa: N818
         One sentence: what prevents a plan.
     reasons : mapping of str to int
         How many sites, deployments or needle paths each reason ruled out.
+    main_reason : str
+        What prevents a plan, without the length of the search; `found` if it is not stated.
     advice : str
         The smallest change of device that would make the target reachable, if one was found.
     counterfactuals : mapping of str to Plan
         For each change of one device parameter that makes the target reachable, a plan with that change.
+    attempts : mapping of str to str
+        Where several systems were tried: why each failed, by its name, in the order in which they were tried.
     """
 
     def __init__(
@@ -32,10 +36,14 @@ class NoPlan(LungaccessError):  # noqa: N818
         found: str,
         *,
         reasons: Mapping[str, int],
+        main_reason: str = "",
         advice: str = "",
         counterfactuals: Mapping[str, Plan] | None = None,
+        attempts: Mapping[str, str] | None = None,
     ) -> None:
         self.counterfactuals: Mapping[str, Plan] = MappingProxyType(dict(counterfactuals or {}))
+        self.attempts: Mapping[str, str] = MappingProxyType(dict(attempts or {}))
         self.reasons: Mapping[str, int] = MappingProxyType(dict(reasons))
+        self.main_reason = main_reason or found
         self.advice = advice
         super().__init__(found, remedy=advice)

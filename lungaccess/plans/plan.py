@@ -14,7 +14,7 @@ from anatomy.typed import Float
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
 from lungaccess.plans.parts import Exemption, NeedlePath, ScopeRoute, TubeDeployment
-from lungaccess.plans.record import Record, shaped
+from lungaccess.plans.record import LEFT_OUT_IF_EMPTY, Record, shaped
 from lungaccess.problem.system import System
 
 
@@ -49,6 +49,9 @@ class Plan(Record):
     costs : mapping of str to float
         "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, and the cost under the
         objective where that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
+    system_choice : tuple of str
+        Where the system was chosen among several: in sentences, which were tried, why each failed, and why
+        this one was chosen; see `lungaccess.coupled.presets`.  Empty otherwise.
     timing : mapping of str to float
         Seconds; the only values that differ between two equal runs.
     """
@@ -76,6 +79,7 @@ class Plan(Record):
     seed: int
     iterations: int
     timing: Mapping[str, float]
+    system_choice: tuple[str, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
@@ -120,6 +124,7 @@ class Plan(Record):
             ("costs", f"{costs}; made small: {self.objective}"),
             ("made by", f"{self.method}, seed {self.seed}, {self.iterations} iterations"),
             ("digest", self.digest[:16]),
+            *((("choice of the system", " ".join(self.system_choice)),) if self.system_choice else ()),
         ]
 
     def least_required_clearance_mm(self, device: str) -> float:

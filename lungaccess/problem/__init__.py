@@ -9,6 +9,13 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.problem.patients import load_patient
     from lungaccess.problem.peripheral import peripheral_targets
+    from lungaccess.problem.preset_order import (
+        WHY_THIS_ORDER,
+        Invasiveness,
+        invasiveness,
+        least_invasive_first,
+        presets_by_invasiveness,
+    )
     from lungaccess.problem.system import System, load_system, preset_names, system_fingerprint
     from lungaccess.problem.target import (
         StatedTarget,

@@ -1,0 +1,17 @@
+"""What one learns from a `NoPlan`: the nearest misses, what blocks, which system would do, what is proved."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, Structure
+    from lungaccess.explanation.explain import DEFAULT_TIME_S, explain_no_plan
+    from lungaccess.explanation.explanation import Change, Explanation, Part
+    from lungaccess.explanation.neighbours import Neighbour, ReachedShare
+    from lungaccess.explanation.record import explanation_record, save_explanation
+    from lungaccess.explanation.starts import FAILS, StartMap
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,0 +1,248 @@
+"""Explain why a search found no plan: part by part, the most useful first, until the time is spent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+from anatomy.lung import Lung
+from lungaccess.checking import Checker
+from lungaccess.coupled import (
+    Atlas,
+    Attempt,
+    Counterfactual,
+    DirectArcs,
+    build_atlas,
+    first_attempt,
+    needle_changes,
+    plan,
+    scope_changes,
+)
+from lungaccess.explanation.blocking import arc_beyond_limits, look_along
+from lungaccess.explanation.explanation import DONE, NOT_TRIED, Change, Explanation, Part
+from lungaccess.explanation.neighbours import Surroundings
+from lungaccess.explanation.starts import map_starts
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
+from lungaccess.reachability import ReachVerdict, UnreachableProof
+from stages.needle import Objective, needle_environment
+
+DEFAULT_TIME_S = 10.0
+"""All parts of a patient whose atlases are cached take about so long, and a user still waits."""
+ITERATIONS = 20
+"""Of the search with each preset: those that reach the target mostly do so with a direct arc."""
+PROOF_BOXES = 300_000
+"""Boxes a piece of airway: a tenth of what `certify` looks at, which can take minutes."""
+TIME_IS_UP = "the time was up"
+
+AtlasOf = Callable[[System, Callable[[float], None]], Atlas]
+
+
+class OutOfTime(Exception):  # noqa: N818
+    """The time for the explanation is spent."""
+
+
+def explain_no_plan(
+    lung: Lung,
+    system: System,
+    target: Target,
+    failure: NoPlan,
+    *,
+    atlas: Atlas | None = None,
+    objective: str | Objective = "inverse_clearance",
+    seed: int = 0,
+    time_s: float | None = DEFAULT_TIME_S,
+    atlas_of: AtlasOf | None = None,
+    attempts: tuple[Attempt, ...] = (),
+    on_part: Callable[[str], None] | None = None,
+) -> Explanation:
+    """Return what can be learned from a search that found no plan.
+
+    Each part does the same whenever it is done, so that the same input gives the same explanation as far as
+    the time goes.  Parts that were not done are named in `Explanation.parts`.
+
+    Parameters
+    ----------
+    failure : NoPlan
+        What the search with this system raised.
+    atlas : Atlas, optional
+        The system's; made here if None.
+    objective, seed
+        As for `lungaccess.coupled.planner.plan`.
+    time_s : float, optional
+        No part begins after so many seconds, and long ones end; None for no limit.
+    atlas_of : callable, optional
+        Returns the atlas of a system, and tells a function the share of it made; `build_atlas` if None.
+    attempts : tuple of Attempt
+        Systems that were tried already: they are not tried again.
+    on_part : callable, optional
+        Told the name of each part as it begins.
+    """
+    own = atlas or build_atlas(lung, system)
+    task = Task(lung=lung, system=system, target=target, objective=Objective.of(objective), seed=seed)
+    made = Explainer(task, own, time_s, atlas_of or _built(lung), on_part or (lambda _name: None))
+    return made.explanation(failure, attempts)
+
+
+def _built(lung: Lung) -> AtlasOf:
+    return lambda system, progress: build_atlas(lung, system, progress=progress)
+
+
+class Explainer:
+    """Does the parts of one explanation, and keeps the time.
+
+    Parameters
+    ----------
+    task : Task
+        What was not achieved.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        atlas: Atlas,
+        time_s: float | None,
+        atlas_of: AtlasOf,
+        on_part: Callable[[str], None],
+    ) -> None:
+        self._task, self._atlas, self._time_s = task, atlas, time_s
+        self._atlas_of, self._on_part = atlas_of, on_part
+        self._arcs = DirectArcs(task, atlas)
+        self._checker = Checker(task.lung)
+        self._began = time.perf_counter()
+        self._parts: list[Part] = []
+        self._found: dict[str, Any] = {}
+
+    def explanation(self, failure: NoPlan, attempts: tuple[Attempt, ...]) -> Explanation:
+        """Do all parts for which there is time, the most useful first."""
+        others = presets_by_invasiveness(fissures_allowed=self._fissures_allowed())
+        known = {self._task.system.name, *(attempt.system.name for attempt in attempts)}
+        untried = [each for each in others if each.name not in known]
+        tried = list(attempts)
+        self._what_blocks()
+        self._neighbour()
+        for share_atlas in (True, False):
+            for system in [each for each in untried if self._shares_atlas(each) == share_atlas]:
+                with self._part(f"preset {system.name}"):
+                    tried.append(self._attempt(system))
+            if share_atlas:
+                self._changes("change of the needle", lambda: needle_changes(self._task, self._atlas))
+                self._shares()
+        self._changes(
+            "change of the bronchoscope", lambda: scope_changes(self._task, self._atlas, self._alive_share)
+        )
+        self._proof()
+        done = {attempt.system.name for attempt in tried}
+        order = {each.name: n for n, each in enumerate(least_invasive_first([a.system for a in tried]))}
+        changes = self._found.pop("changes", [])
+        return Explanation(
+            patient_name=self._task.lung.name,
+            system=self._task.system,
+            target=self._task.target,
+            with_fissures=self._task.with_fissures,
+            failure=failure,
+            attempts=tuple(sorted(tried, key=lambda attempt: order[attempt.system.name])),
+            untried=tuple(each.name for each in untried if each.name not in done),
+            changes=tuple(sorted(changes, key=lambda each: each.change.relative_change)),
+            parts=tuple(self._parts),
+            time_s=time.perf_counter() - self._began,
+            **self._found,
+        )
+
+    def _fissures_allowed(self) -> bool | None:
+        """Return the rule about fissures that the presets take over: only if it is not their own."""
+        return True if self._task.system.fissures_allowed else None
+
+    @contextmanager
+    def _part(self, name: str) -> Iterator[None]:
+        """Do a part, unless the time is up before or during it."""
+        self._on_part(name)
+        try:
+            self._alive()
+            yield
+        except OutOfTime:
+            self._parts.append(Part(name=name, outcome=NOT_TRIED, why=TIME_IS_UP))
+        else:
+            self._parts.append(Part(name=name, outcome=DONE))
+
+    def _alive(self) -> None:
+        if self._time_s is not None and time.perf_counter() - self._began > self._time_s:
+            raise OutOfTime
+
+    def _alive_share(self, _share: float) -> None:
+        self._alive()
+
+    def _what_blocks(self) -> None:
+        with self._part("what blocks the direct arcs"):
+            blocking, arc = look_along(self._arcs)
+            self._found |= {"blocking": blocking, "blocked_arc": arc}
+            if arc is None:
+                self._found["arc_beyond_limits"] = arc_beyond_limits(self._arcs)
+        with self._part("map of the starts"):
+            self._found["starts"] = map_starts(self._arcs)
+        if self._task.with_fissures:
+            with self._part("crossing a fissure"):
+                self._found["through_fissures"] = self._reached_through_fissures()
+
+    def _reached_through_fissures(self) -> bool:
+        """Tell whether a direct arc from the same deployments is clear if fissures are no obstacles."""
+        lung, system = self._task.lung, self._task.system
+        environment = needle_environment(lung, system.needle, system.margins, with_fissures=False)
+        return bool((self._arcs.blockers(self._arcs.in_workspace, environment)[0] == 0).any())
+
+    def _neighbour(self) -> None:
+        with self._part("nearest point that is reached"):
+            found = Surroundings(self._arcs).nearest(self._alive) if self._atlas.deployments.count else None
+            if found is not None and self._checker.check(found.plan, self._task.system).accepted:
+                self._found["neighbour"] = found
+
+    def _shares(self) -> None:
+        with self._part("share of the surroundings that is reached"):
+            shares = Surroundings(self._arcs).shares(self._alive) if self._atlas.deployments.count else ()
+            self._found["shares"] = tuple(shares)
+
+    def _shares_atlas(self, system: System) -> bool:
+        own = self._task.system
+        return (system.scope, system.tubes, system.margins, system.fissures_allowed) == (
+            own.scope, own.tubes, own.margins, own.fissures_allowed
+        )  # fmt: skip
+
+    def _attempt(self, system: System) -> Attempt:
+        task = self._task
+        if self._shares_atlas(system):
+            atlas = replace(self._atlas, system=system)
+        else:
+            atlas = self._atlas_of(system, self._alive_share)
+        plans = plan(
+            task.lung, system, task.target, objective=task.objective, seed=task.seed, iterations=ITERATIONS,
+            atlas=atlas, counterfactuals=False,
+        )  # fmt: skip
+        return first_attempt(plans, system, self._checker)
+
+    def _changes(self, name: str, found: Callable[[], Iterator[Counterfactual]]) -> None:
+        with self._part(name):
+            if not self._atlas.deployments.count:
+                return
+            for change in found():
+                accepted = self._checker.check(change.plan, change.plan.system).accepted
+                self._found.setdefault("changes", []).append(Change(change=change, accepted=accepted))
+                self._alive()
+
+    def _proof(self) -> None:
+        with self._part("proof that the target is unreachable"):
+            task = self._task
+            if len(self._arcs.in_workspace):
+                # What a deployment of the atlas has in its workspace cannot be proved to be in none.
+                self._found["verdict"] = ReachVerdict(proved=False, boxes=0)
+                return
+            proof = UnreachableProof(task.lung, task.system, with_fissures=task.with_fissures)
+            self._alive()
+            self._found["verdict"] = proof.prove(
+                task.target.lps_mm, most_boxes=PROOF_BOXES, progress=self._alive_share
+            )

@@ -1,0 +1,135 @@
+"""`Explanation`: what was learned from a search that found no plan, and what was not tried."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from anatomy.records import frozen_record, frozen_value
+from lungaccess.coupled import Attempt, Counterfactual
+from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking
+from lungaccess.explanation.neighbours import Neighbour, ReachedShare
+from lungaccess.explanation.starts import StartMap
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target
+from lungaccess.reachability import ReachVerdict
+
+DONE, NOT_TRIED = "done", "not tried"
+
+
+@frozen_value
+class Part:
+    """One part of an explanation: whether it was tried, and why not."""
+
+    name: str
+    outcome: str
+    why: str = ""
+
+
+@frozen_record
+class Change:
+    """A change of one device parameter with which the target is reached, and whether the check accepts it."""
+
+    change: Counterfactual
+    accepted: bool
+
+
+@frozen_record
+class Explanation:
+    """What was learned from a search that found no plan.
+
+    What is None or empty was looked for and not found, or was not tried: `parts` tells which.
+
+    Parameters
+    ----------
+    with_fissures : bool
+        Whether fissures are obstacles.
+    failure : NoPlan
+        The answer of the search, with its reasons counted.
+    starts : StartMap or None
+        Where needles can start, and why each start fails.
+    blocking : tuple of Blocking
+        What stops the direct arcs, most first.
+    blocked_arc : BlockedArc or None
+        The arc to the target that violates least, of those within the needle's limits.
+    arc_beyond_limits : ArcBeyondLimits or None
+        Where there is no such arc: the one that exceeds the limits least.
+    neighbour : Neighbour or None
+        The nearest point to the target that was found to be reached, with its plan.
+    attempts : tuple of Attempt
+        The presets that were tried, the least invasive first.
+    untried : tuple of str
+        Presets that were not tried.
+    changes : tuple of Change
+        Changes of one device parameter that reach the target, the smallest first.
+    through_fissures : bool or None
+        Whether a single arc reaches the target if fissures may be crossed; None if they may be or there are
+        none.
+    shares : tuple of ReachedShare
+        How much of the surroundings is reached.
+    verdict : ReachVerdict or None
+        Whether the target is proved unreachable.
+    parts : tuple of Part
+        What was done and what was not, in the order of doing.
+    time_s : float
+        Seconds that it took.
+    """
+
+    patient_name: str
+    system: System
+    target: Target
+    with_fissures: bool
+    failure: NoPlan
+    starts: StartMap | None = None
+    blocking: tuple[Blocking, ...] = ()
+    blocked_arc: BlockedArc | None = None
+    arc_beyond_limits: ArcBeyondLimits | None = None
+    neighbour: Neighbour | None = None
+    attempts: tuple[Attempt, ...] = ()
+    untried: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
+    through_fissures: bool | None = None
+    shares: tuple[ReachedShare, ...] = ()
+    verdict: ReachVerdict | None = None
+    parts: tuple[Part, ...] = ()
+    time_s: float = 0.0
+
+    @property
+    def headline(self) -> str:
+        """One sentence: that there is no plan, the main reason, and the preset that would do."""
+        return f"No plan found with {self.system.name}: {self.failure.main_reason}; {self._way_on}"
+
+    @property
+    def _way_on(self) -> str:
+        names = [attempt.system.name for attempt in self.attempts if attempt.succeeded]
+        if names:
+            return f"{names[0]} would reach it"
+        if self.verdict is not None and self.verdict.proved:
+            return "this system is proved not to reach it"
+        if self.untried:
+            tried = f"of {len(self.attempts)} other presets tried none reaches it" if self.attempts else ""
+            return f"{tried + ', ' if tried else ''}{', '.join(self.untried)} not tried"
+        return "no other preset reaches it"
+
+    @property
+    def plans(self) -> Mapping[str, Plan]:
+        """The plans that came about, by the names of their files: each is one that the check accepts."""
+        found = {
+            f"plan-{attempt.system.name}.json": attempt.plan
+            for attempt in self.attempts
+            if attempt.succeeded and attempt.plan is not None
+        }
+        if self.neighbour is not None:
+            found["plan-nearest.json"] = self.neighbour.plan
+        found |= {
+            f"plan-change-{number}.json": each.change.plan
+            for number, each in enumerate(self.changes, start=1)
+            if each.accepted
+        }
+        return found
+
+    @property
+    def not_tried(self) -> tuple[Part, ...]:
+        """The parts that were not done: nothing follows from them."""
+        return tuple(part for part in self.parts if part.outcome == NOT_TRIED)

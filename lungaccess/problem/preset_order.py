@@ -1,0 +1,80 @@
+"""How invasive a system is, from the sizes of its devices: the order in which systems are tried."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from lungaccess.problem.system import System, load_system, preset_names
+
+WHY_THIS_ORDER = (
+    "A system is less invasive if it may cross no fissure; then if its outer tube, which pierces the airway "
+    "wall, is thinner; then if its needle is thinner; then if its bronchoscope, which stays in the airways, "
+    "is thinner; then if its needle bends less tightly, since a bent needle presses on the tissue beside it"
+)
+
+
+class Invasiveness(NamedTuple):
+    """What a system does to the tissue; of two systems the smaller one is the less invasive.
+
+    The fields are compared one after the other, the worst injury first.
+
+    Parameters
+    ----------
+    fissures_allowed : bool
+        Whether a fissure may be crossed, which pierces the pleura twice.
+    hole_mm2 : float
+        Cross-section of the outer tube: the hole in the airway wall.
+    needle_mm2 : float
+        Cross-section of the needle: its track through the lung.
+    scope_diameter_mm : float
+        Outer diameter of the bronchoscope, which stays in the airways and injures least.
+    needle_curvature_per_mm : float
+        Greatest curvature of the needle.
+    """
+
+    fissures_allowed: bool
+    hole_mm2: float
+    needle_mm2: float
+    scope_diameter_mm: float
+    needle_curvature_per_mm: float
+
+
+def invasiveness(system: System) -> Invasiveness:
+    """Return how invasive a system is.
+
+    Examples
+    --------
+    >>> invasiveness(load_system("ultrathin")) < invasiveness(load_system("therapeutic-scope"))
+    True
+    """
+    return Invasiveness(
+        fissures_allowed=system.fissures_allowed,
+        hole_mm2=_area_mm2(system.tubes.outer.outer_diameter_mm),
+        needle_mm2=_area_mm2(system.needle.diameter_mm),
+        scope_diameter_mm=float(system.scope.outer_diameter_mm),
+        needle_curvature_per_mm=float(system.needle.max_curvature_per_mm),
+    )
+
+
+def least_invasive_first(systems: Iterable[System]) -> tuple[System, ...]:
+    """Return systems in the order of their invasiveness, equal ones by their names."""
+    return tuple(sorted(systems, key=lambda system: (*invasiveness(system), system.name)))
+
+
+def presets_by_invasiveness(*, fissures_allowed: bool | None = None) -> tuple[System, ...]:
+    """Return the systems that ship with the package, the least invasive first.
+
+    Parameters
+    ----------
+    fissures_allowed : bool, optional
+        Whether fissures may be crossed, instead of what each system says.
+    """
+    return least_invasive_first(
+        load_system(name, fissures_allowed=fissures_allowed) for name in preset_names()
+    )
+
+
+def _area_mm2(diameter_mm: float) -> float:
+    return 0.25 * math.pi * float(diameter_mm) ** 2

@@ -152,10 +152,10 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     lungaccess.plans.no_plan.NoPlan
         If no plan was found.
     """
-    from lungaccess.checking import check
-
     target, search = request.target.resolve(lung), request.search
     found, history = run_search(lung, target, request, SearchDisplay(search.time_s, search.iterations))
+    from lungaccess.checking import check  # After the search: the first plan does not wait for it.
+
     with progress("checking the plan"):
         report = check(found, lung, system=request.system, target_lps=target.lps_mm)
     if not request.output.json:

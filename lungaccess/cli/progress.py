@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Self
 
-from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TaskID, TextColumn
 from rich.text import Text
 
 from lungaccess.cli.terminal import escaped, progress_console
@@ -14,6 +14,8 @@ BAR_WIDTH = 24
 """Leaves room for the description and the times on a line of 80 characters."""
 LEAST_SHARE = 0.02
 """From less than this share no time is extrapolated: its error would be larger than the time itself."""
+
+COMPILING_ONCE = "Compiling kernels, once per installation; that takes some minutes and counts for no budget."
 
 
 class _Times(ProgressColumn):
@@ -57,11 +59,22 @@ def _bar(*more: ProgressColumn) -> Progress:
 
 
 class _Shown:
-    """Something whose progress is shown within a `with` statement."""
+    """Something whose progress is shown within a `with` statement.
+
+    While kernels are compiled the bar says so, with the name of the kernel instead of what is being done.
+    """
 
     _progress: Progress
+    _task: TaskID
+    _announced = False
+    """Whether this process has said that kernels are compiled."""
 
     def __enter__(self) -> Self:
+        from anatomy.kernels.clock import told_of_compilations
+
+        self._interrupted_words: str | None = None
+        self._compilations = told_of_compilations(self._compiling)
+        self._compilations.__enter__()
         self._progress.start()
         return self
 
@@ -69,6 +82,21 @@ class _Shown:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
+        self._compilations.__exit__(kind, error, trace)
+
+    def _compiling(self, kernel: str | None) -> None:
+        """Show that a kernel is compiled, or with None what was shown before."""
+        if not _Shown._announced:
+            _Shown._announced = True
+            self._progress.console.print(COMPILING_ONCE, highlight=False)
+        if self._interrupted_words is None:
+            self._interrupted_words = self._progress.tasks[0].description
+        words = f"compiling kernels, once per installation: {kernel}"
+        self._progress.update(
+            self._task, description=self._interrupted_words if kernel is None else escaped(words)
+        )
+        if kernel is None:
+            self._interrupted_words = None
 
 
 class StepDisplay(_Shown):

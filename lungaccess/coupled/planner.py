@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 
 from anatomy.errors import SettingsError
+from anatomy.kernels.clock import working_s
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
@@ -206,20 +206,23 @@ def _run(
 
 
 class Clock:
-    """Measures planning time; time in which the caller holds a yielded plan counts too."""
+    """Measures planning time, in which kernels are neither compiled nor loaded.
+
+    Time in which the caller holds a yielded plan counts too.
+    """
 
     def __init__(self) -> None:
-        self._began = time.perf_counter()
+        self._began = working_s()
         self._reported = self._began
 
     @property
     def elapsed_s(self) -> float:
         """Seconds since the start."""
-        return time.perf_counter() - self._began
+        return working_s() - self._began
 
     def due(self) -> bool:
         """Tell whether the next progress report is due, and start counting anew if so."""
-        now = time.perf_counter()
+        now = working_s()
         if now - self._reported < PROGRESS_EVERY_S:
             return False
         self._reported = now

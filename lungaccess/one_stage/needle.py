@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from typing import Any
 
 from anatomy.errors import SettingsError, TargetError
+from anatomy.kernels.clock import working_s
 from anatomy.kernels.field import exact_distance
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
@@ -165,16 +165,16 @@ def plan_needle(
         return _by_ompl(environment, query, planner, weighed, seed, time_s or 0.0)
     search = PLANNERS[planner](environment, query, seed, weighed)
     first_path_s = None
-    began = time.perf_counter()
+    began = working_s()
     left = iterations
     while not search.finished and (left is None or left > 0):
-        if time_s is not None and time.perf_counter() - began >= time_s:
+        if time_s is not None and working_s() - began >= time_s:
             break
         portion = SLICE if left is None else min(SLICE, left)
         search.advance(portion)
         left = None if left is None else left - portion
         if first_path_s is None and search.path is not None:
-            first_path_s = time.perf_counter() - began
+            first_path_s = working_s() - began
     return NeedleAnswer(
         outcome=_outcome(search),
         path=search.path,
@@ -196,9 +196,9 @@ def _by_ompl(
     problem = NeedleProblem(environment)
     problem.setup.setPlanner(problem.planners()[planner](problem.si))
     problem.pose(query, goal_tolerance_mm=OMPL_TOLERANCE_MM)
-    began = time.perf_counter()
+    began = working_s()
     problem.setup.solve(time_s)
-    first_path_s = time.perf_counter() - began
+    first_path_s = working_s() - began
     path = problem.solution()
     return NeedleAnswer(
         outcome="nothing found" if path is None else "path",

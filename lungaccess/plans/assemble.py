@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from anatomy.errors import AnatomyError
 from anatomy.lung import Lung
@@ -108,6 +107,8 @@ def _scope_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
 
 def _turned_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
     """Return the route of a scope whose tip is turned aside: it leaves the medial axis before the tip."""
+    from scipy.spatial import cKDTree  # Here: the import takes longer than a short search.
+
     lung, tree = task.lung, task.lung.tree
     on_axis = tree.route(leaving_point(tree, tip))
     aside = approach(tree, tip)

@@ -7,6 +7,7 @@ import numpy as np
 from anatomy.errors import TargetError
 from anatomy.grid import Volume, read_only
 from anatomy.lung import Lung
+from anatomy.morphology import components
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
 from anatomy.typed import Float, Int
@@ -148,19 +149,14 @@ def nodule_target(lung: Lung, number: int) -> Target:
 
 
 def _nodule_voxels(nodules: Volume, number: int) -> Int:
-    from scipy import ndimage
-
-    voxels = np.argwhere(nodules.array)
-    low, high = voxels.min(axis=0), voxels.max(axis=0) + 1
-    window = nodules.array[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    parts, count = ndimage.label(window, np.ones((3, 3, 3)))
+    voxels, part = components(nodules.array)
+    sizes = np.bincount(part)
+    count = len(sizes)
     if not 1 <= number <= count:
         raise TargetError(
             f"There is no nodule {number}", expected=f"a number from 1 to {count}, 1 being the largest"
         )
-    sizes = np.bincount(parts.ravel())[1:]
-    chosen = int(np.argsort(-sizes, kind="stable")[number - 1]) + 1
-    return np.asarray(np.argwhere(parts == chosen) + low, dtype=np.int64)
+    return np.asarray(voxels[part == np.argsort(-sizes, kind="stable")[number - 1]])
 
 
 def _is_free(lung: Lung, point: Float) -> bool:

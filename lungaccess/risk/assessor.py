@@ -10,6 +10,7 @@ import numpy as np
 
 from anatomy.errors import PlanFileError, SettingsError
 from anatomy.lung import Lung
+from anatomy.morphology import components
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
@@ -130,11 +131,10 @@ def goal_radius(lung: Lung, plan: Plan) -> tuple[float, str]:
     nodules = lung.nodules
     inside = nodules is not None and bool(nodules.grid.contains(plan.target_lps))
     if nodules is not None and inside:
-        i, j, k = np.floor(nodules.grid.ijk(plan.target_lps) + 0.5).astype(int)
-        if nodules.array[i, j, k]:
-            from scipy import ndimage
-
-            parts, _count = ndimage.label(nodules.array, np.ones((3, 3, 3)))
-            volume = float(np.count_nonzero(parts == parts[i, j, k])) * nodules.grid.voxel_volume_mm3
+        ijk = np.floor(nodules.grid.ijk(plan.target_lps) + 0.5).astype(int)
+        if nodules.array[tuple(ijk)]:
+            voxels, part = components(nodules.array)
+            own = part[(voxels == ijk).all(axis=1)]
+            volume = float(np.count_nonzero(part == own)) * nodules.grid.voxel_volume_mm3
             return (0.75 * volume / math.pi) ** (1.0 / 3.0), "ball of the nodule's volume"
     return DEFAULT_RADIUS_MM, "assumed: the target lies in no nodule of a mask"

@@ -70,7 +70,7 @@ class _Shown:
     """Whether this process has said that kernels are compiled."""
 
     def __enter__(self) -> Self:
-        from anatomy.kernels.clock import told_of_compilations
+        from anatomy.kernel_clock import told_of_compilations
 
         self._interrupted_words: str | None = None
         self._compilations = told_of_compilations(self._compiling)

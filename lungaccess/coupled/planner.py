@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from anatomy.errors import SettingsError
-from anatomy.kernels.clock import working_s
+from anatomy.kernel_clock import working_s
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same

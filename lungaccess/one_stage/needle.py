@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from anatomy.errors import SettingsError, TargetError
-from anatomy.kernels.clock import working_s
+from anatomy.kernel_clock import working_s
 from anatomy.kernels.field import exact_distance
 from anatomy.lung import Lung
 from anatomy.records import frozen_record

@@ -140,6 +140,15 @@ class Grid:
         matrix[:3, 3] = self.lps(start)
         return Grid(shape=(int(shape[0]), int(shape[1]), int(shape[2])), lps_from_ijk=matrix)
 
+    def window(self, points_lps: ArrayLike, border_mm: float) -> tuple[slice, slice, slice]:
+        """Return slices of the box of voxels that lie within a border around points `(..., 3)` in LPS mm."""
+        ijk = self.ijk(points_lps).reshape(-1, 3)
+        border = border_mm / self.spacing_mm
+        low = np.clip(np.floor(ijk.min(axis=0) - border).astype(int), 0, self.shape)
+        high = np.clip(np.ceil(ijk.max(axis=0) + border).astype(int) + 1, 0, self.shape)
+        i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        return i, j, k
+
     def is_close(self, other: Grid, tolerance_mm: float = 1e-2) -> bool:
         """Tell whether every voxel of the two grids agrees to `tolerance_mm`."""
         if self.shape != other.shape:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.one_stage.needle import (
-        OMPL_PLANNERS,
-        OMPL_TOLERANCE_MM,
-        NeedleAnswer,
-        pierced_branch,
-        plan_needle,
+    from lungaccess.one_stage.needle import NeedleAnswer, begins_at_wall, pierced_branches, plan_needle
+    from lungaccess.one_stage.needle_search import OMPL_PLANNERS, OMPL_TOLERANCE_MM, PathSearch, search_path
+    from lungaccess.one_stage.obstruction import (
+        obstruction_record,
+        obstruction_rows,
+        point_in_words,
+        reason_in_words,
     )
     from lungaccess.one_stage.route import RouteSource, open_source, read_drawing, route_record, widest_end
     from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, ScopeAdvice, advise_scope, save_advice

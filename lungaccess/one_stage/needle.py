@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
+import numpy as np
+
 from anatomy.errors import SettingsError, TargetError
-from anatomy.kernel_clock import working_s
 from anatomy.kernels.field import exact_distance
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
-from anatomy.structures import AIRWAY, BRANCH_SHIFT
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN
 from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float
+from lungaccess.one_stage.needle_search import OMPL_PLANNERS, search_path
+from lungaccess.one_stage.obstruction import obstruction_record
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import (
@@ -20,18 +22,13 @@ from stages.needle import (
     ArcPath,
     NeedleEnvironment,
     Objective,
+    Obstruction,
     Query,
-    Search,
+    begun_at_wall,
     needle_environment,
     path_costs,
 )
 
-SLICE = 500
-"""Iterations between two looks at the clock: some milliseconds."""
-OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
-"""Planners of OMPL itself.  They steer by chance, and end within OMPL_TOLERANCE_MM of the target."""
-OMPL_TOLERANCE_MM = 1.0
-"""Distance to the target that counts as reached; random steering hardly ever comes nearer."""
 WALL_MM = 3.0
 """A start so near to an airway is taken to have pierced its wall."""
 
@@ -48,8 +45,13 @@ class NeedleAnswer:
         Proved clear and within all limits.
     cost : float
         Of the path under the objective, as estimated within the search.
-    branch : int
-        Branch of the airway tree whose wall the start is taken to have pierced, -1 for none.
+    branches : tuple of int
+        Branches of the airway tree whose wall the start is taken to have pierced, the nearest first; none if
+        no airway is near.
+    at_wall : bool
+        Whether the needle begins so near to the lumen that it pierces the wall itself.
+    obstruction : Obstruction or None
+        What stands in the way, if there is no path.
     environment : NeedleEnvironment
         What the planner looked at.
     objective : Objective
@@ -61,10 +63,22 @@ class NeedleAnswer:
     outcome: str
     path: ArcPath | None
     cost: float
-    branch: int
+    branches: tuple[int, ...]
+    at_wall: bool
+    obstruction: Obstruction | None
     environment: NeedleEnvironment
     objective: Objective
     first_path_s: float | None
+
+    @property
+    def branch(self) -> int:
+        """The branch that is exempt at the exit; -1 for none."""
+        return self.branches[0] if self.branches else -1
+
+    @property
+    def proved(self) -> bool:
+        """Whether it is proved that no path exists."""
+        return self.outcome == "no path"
 
     @property
     def costs(self) -> dict[str, float]:
@@ -83,7 +97,12 @@ class NeedleAnswer:
         path = self.path
         record: dict[str, Any] = {
             "outcome": self.outcome,
-            "pierced_branch": self.branch if self.branch >= 0 else None,
+            "no_path_is_proved": self.proved,
+            "pierced_branches": list(self.branches),
+            "begins_at_the_wall": self.at_wall,
+            "blocked": None
+            if self.obstruction is None
+            else obstruction_record(self.obstruction, self.proved),
             "path": None,
         }
         if path is None:
@@ -159,67 +178,66 @@ def plan_needle(
     environment = needle_environment(
         lung, system.needle, system.margins, with_fissures=not system.fissures_allowed
     )
-    branch = pierced_branch(lung, lps_from_start[:3, 3])
-    query = Query(lps_from_start=lps_from_start, target=target.lps_mm, branch=branch)
-    if planner in OMPL_PLANNERS:
-        return _by_ompl(environment, query, planner, weighed, seed, time_s or 0.0)
-    search = PLANNERS[planner](environment, query, seed, weighed)
-    first_path_s = None
-    began = working_s()
-    left = iterations
-    while not search.finished and (left is None or left > 0):
-        if time_s is not None and working_s() - began >= time_s:
-            break
-        portion = SLICE if left is None else min(SLICE, left)
-        search.advance(portion)
-        left = None if left is None else left - portion
-        if first_path_s is None and search.path is not None:
-            first_path_s = working_s() - began
+    point = lps_from_start[:3, 3]
+    branches = pierced_branches(lung, point, environment.required_clearance_mm)
+    at_wall = begins_at_wall(lung, point, system.needle.radius_mm)
+    if at_wall:
+        environment = begun_at_wall(environment, point, branches)
+    query = Query(lps_from_start=lps_from_start, target=target.lps_mm, branch=[*branches, -1][0])
+    found = search_path(
+        environment, query, planner, objective=weighed, seed=seed, iterations=iterations, time_s=time_s
+    )
     return NeedleAnswer(
-        outcome=_outcome(search),
-        path=search.path,
-        cost=search.cost,
-        branch=branch,
+        outcome=found.outcome,
+        path=found.path,
+        cost=found.cost,
+        branches=branches,
+        at_wall=at_wall,
+        obstruction=found.obstruction,
         environment=environment,
         objective=weighed,
-        first_path_s=first_path_s,
+        first_path_s=found.first_path_s,
     )
 
 
-def _by_ompl(
-    environment: NeedleEnvironment, query: Query, planner: str, objective: Objective, seed: int, time_s: float
-) -> NeedleAnswer:
-    """Let a planner of OMPL search; its cost is the length of the path."""
-    from stages.needle.ompl import NeedleProblem, seed_ompl
+def pierced_branches(lung: Lung, point: Float, near_mm: float) -> tuple[int, ...]:
+    """Return the airway branch within `WALL_MM` of a point `(3,)` LPS mm that is nearest to it, and its company.
 
-    seed_ompl(seed + 1)
-    problem = NeedleProblem(environment)
-    problem.setup.setPlanner(problem.planners()[planner](problem.si))
-    problem.pose(query, goal_tolerance_mm=OMPL_TOLERANCE_MM)
-    began = working_s()
-    problem.setup.solve(time_s)
-    first_path_s = working_s() - began
-    path = problem.solution()
-    return NeedleAnswer(
-        outcome="nothing found" if path is None else "path",
-        path=path,
-        cost=math.inf if path is None else path.length_mm,
-        branch=query.branch,
-        environment=environment,
-        objective=objective,
-        first_path_s=None if path is None else first_path_s,
-    )
-
-
-def _outcome(search: Search) -> str:
-    stated = str(getattr(search, "outcome", "running"))
-    if stated != "running":
-        return stated
-    return "nothing found" if search.path is None else "path"
-
-
-def pierced_branch(lung: Lung, point: Float) -> int:
-    """Return the airway branch within `WALL_MM` of a point that is nearest to it, -1 if there is none."""
+    Near a junction the tree draws the line between branches, not the anatomy: those that meet the nearest
+    one and come within `near_mm` of the point are pierced with it.
+    """
     x, y, z = (float(c) for c in point)
     _distance, label = exact_distance(lung.labels, lung.geometry, x, y, z, AIRWAY, -1, WALL_MM)
-    return (int(label) >> BRANCH_SHIFT) - 1 if label else -1
+    branch = (int(label) >> BRANCH_SHIFT) - 1
+    if branch < 0:
+        return ()
+    around = lung.labels[lung.grid.window(point, near_mm)]
+    others = np.setdiff1d((around[(around & AIRWAY) != 0] >> BRANCH_SHIFT).astype(int) - 1, [-1, branch])
+    meeting = {int(b) for b in others} & _meeting(lung, branch)
+    near = [b for b in sorted(meeting) if _distance_to_branch(lung, point, b, near_mm) < near_mm]
+    return (branch, *near)
+
+
+def _meeting(lung: Lung, branch: int) -> set[int]:
+    """Return the parent, the children, and the other children of the parent of a branch."""
+    tree = lung.tree
+    parent = int(tree.branch_parent[branch])
+    joined = {int(b) for b in tree.children(branch)}
+    if parent >= 0:
+        joined |= {parent, *(int(b) for b in tree.children(parent))}
+    return joined - {branch}
+
+
+def _distance_to_branch(lung: Lung, point: Float, branch: int, cap_mm: float) -> float:
+    """Return the distance in mm from a point to the airway voxels of a branch as boxes, at most `cap_mm`."""
+    part = lung.grid.window(point, cap_mm)
+    labels = lung.labels[part]
+    found = np.argwhere(((labels & AIRWAY) != 0) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == branch))
+    found = found + np.array([axis.start for axis in part])
+    gap = np.maximum(np.abs(found - lung.grid.ijk(point)) - 0.5, 0.0) * lung.grid.spacing_mm
+    return float(np.linalg.norm(gap, axis=1).min(initial=cap_mm))
+
+
+def begins_at_wall(lung: Lung, point: Float, radius_mm: float) -> bool:
+    """Tell whether a needle of this radius at a point `(3,)` LPS mm touches the lumen of an airway."""
+    return bool(lung.exact_clearance_mm(point, LUMEN, cap_mm=radius_mm)[0] < radius_mm)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from stages.needle.environment import (
         RRT_STEP_MM,
         NeedleEnvironment,
+        begun_at_wall,
         direct_arcs,
         environment_of_labels,
         needle_environment,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from stages.needle.kernels.limits import Limits
     from stages.needle.kernels.proof import Obstacles
     from stages.needle.objective import NO_MAP, SHORTEST, TERMS, Objective, Term
+    from stages.needle.obstruction import Obstruction, easiest_obstruction, find_obstruction
     from stages.needle.path import (
         CURVATURE,
         LENGTH,

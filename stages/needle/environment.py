@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import field
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.fields import CENTRES, SOLID, DistanceField, distance_field
 from anatomy.grid import Grid, Volume, read_only
+from anatomy.kernels.field import EXACT_REACH_MM
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.records import frozen_record
-from anatomy.structures import OBSTACLES, obstacle_bits
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, obstacle_bits
 from anatomy.typed import Float, Int, Labels
 from stages.needle.device import Needle
 from stages.needle.kernels import scan
@@ -125,6 +126,38 @@ def environment_of_labels(
     return _environment(
         grid, needle, required_clearance_mm, clearance, read_only(labels), bits, cost_map, goal_tolerance_mm
     )
+
+
+LEAVING_DEG = 10.0
+"""A needle that pierces the wall itself leaves it at this angle at least: the least of the presets' tubes."""
+
+
+def begun_at_wall(
+    environment: NeedleEnvironment, point: ArrayLike, branches: tuple[int, ...]
+) -> NeedleEnvironment:
+    """Return an environment for a needle that begins at the wall of a branch and pierces it itself.
+
+    See `stages.needle.kernels.proof.exact_gap` for the rule, which is that of all searches and proofs.
+
+    Parameters
+    ----------
+    point : (3,) float64, LPS mm
+        Where the needle begins.
+    branches : tuple of int
+        The pierced branch and those that are pierced with it: their airway counts as that of the first,
+        as far as the exemption reaches.
+    """
+    limits = environment.limits._replace(leaving_sine=math.sin(math.radians(LEAVING_DEG)))
+    obstacles = environment.obstacles
+    if len(branches) > 1:
+        far = limits.exempt_mm + limits.required_mm + EXACT_REACH_MM
+        labels = obstacles.labels.copy(order="F")
+        part = labels[environment.grid.window(point, far)]
+        joined = ((part & AIRWAY) != 0) & np.isin((part >> BRANCH_SHIFT) - 1, branches[1:])
+        names = np.uint16((1 << BRANCH_SHIFT) - 1)
+        part[joined] = (part[joined] & names) | np.uint16((branches[0] + 1) << BRANCH_SHIFT)
+        obstacles = obstacles._replace(labels=read_only(labels))
+    return replace(environment, limits=limits, obstacles=obstacles)
 
 
 RRT_STEP_MM = 20.0

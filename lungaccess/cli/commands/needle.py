@@ -90,15 +90,21 @@ def needle(
 
 def _tables(answer: NeedleAnswer) -> list[Table]:
     """Return what a needle planner found: the outcome, and the path arc by arc."""
+    from lungaccess.one_stage import obstruction_rows
+
     words = {
         "path": "a path, proved clear",
         "no path": "no path exists (proved against the masks)",
-        "nothing found": "nothing found within the limit; no proof either",
+        "nothing found": "nothing found within the limit; not proved that there is none",
     }
     rows = [("outcome", words.get(answer.outcome, answer.outcome))]
-    if answer.branch >= 0:
-        rows.append(("taken to have pierced", f"branch {answer.branch}"))
+    if answer.branches:
+        pierced = ", ".join(f"{branch}" for branch in answer.branches)
+        how = "begins at the wall of branch" if answer.at_wall else "taken to have pierced branch"
+        rows.append((how, pierced))
     path = answer.path
+    if answer.obstruction is not None:
+        rows += obstruction_rows(answer.obstruction, answer.proved)
     if path is None:
         return [terminal.table("needle", ("", ""), rows)]
     if answer.first_path_s is not None:

@@ -24,6 +24,7 @@ from stages.needle.infeasibility.kernels import reachability_pruning as pruning
 from stages.needle.infeasibility.kernels import reachable_sets as sets
 from stages.needle.infeasibility.path_bounds import ROUNDING, PathBounds
 from stages.needle.infeasibility.plane import Plane
+from stages.needle.obstruction import blocked_end
 from stages.needle.query import Query
 
 # None of these numbers can make the proof wrong: they trade time and memory for how much is proved.
@@ -162,8 +163,8 @@ class NoPathProof:
             self._end("undecided", "the target lies at the start")
         elif total - self._tolerance > length:
             self._end("no path", "the target is farther than the needle is long")
-        elif self._clearance_at_most(start) < self._required - bounds.SPARE:
-            self._end("no path", "the start is too near to obstacles")
+        elif found := blocked_end(environment, query):
+            self._end("no path", f"the {found.place} is too near to obstacles")
         else:
             ahead = float(chord @ forward)
             aside = math.sqrt(max(total**2 - ahead**2, 0.0))
@@ -181,12 +182,6 @@ class NoPathProof:
             self._scale[bounds.KAPPA] = self._kappa
             if self._along > 0.0:
                 self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
-
-    def _clearance_at_most(self, point: Float) -> float:
-        exempt = self._query.branch if self._exempt_mm > 0.0 else -1
-        return float(
-            blocked.clearance_above(self._environment.obstacles, self._required, 0.0, exempt, *point)
-        )
 
     def _parted(self, side: float) -> bool:
         """Tell whether cubes that no path can pass part the target from the start."""

@@ -33,6 +33,9 @@ class Limits(NamedTuple):
         Longest step of integrals of 1 / clearance.
     goal_tolerance_mm : float
         How far from the target a path may end.
+    leaving_sine : float
+        0: the needle begins in tissue.  More: it begins at the wall of the pierced branch, in or beside its
+        lumen, and leaves it at this sine of an angle or more, see `stages.needle.kernels.proof.exact_gap`.
     lookup_step_mm : float
         0: arcs are proved clear.  More: voxels are looked up at steps of so many mm, which proves nothing.
     """
@@ -47,4 +50,5 @@ class Limits(NamedTuple):
     max_step_mm: float
     cost_step_mm: float
     goal_tolerance_mm: float
+    leaving_sine: float = 0.0
     lookup_step_mm: float = 0.0

@@ -21,6 +21,9 @@ from stages.needle.kernels.limits import TINY
 PROBE_SPACING_MM = 1.5
 """Before the proof, arcs are looked at in points at most so far apart: most obstacles are met there."""
 
+WALL_ZONE_MM = 1.0
+"""The wall of a bronchus of some generations is thinner: so much needle is spent on piercing it, as of a tube."""
+
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
@@ -77,22 +80,59 @@ def _blocker_by_lookup(obstacles, step, pose, bend, length):
 
 
 @numba.njit(cache=True)
+def exact_gap(obstacles, limits, inserted, x, y, z, branch):
+    """Tell how far a needle may go on from a point where it is `inserted` mm long: the rule at the exit.
+
+    Everywhere the needle's axis keeps `limits.required_mm` from obstacles.  Up to `limits.exempt_mm` the
+    pierced `branch` (-1: none) does not count, but the axis keeps a distance from every lumen.  That is the
+    needle's radius.  A needle that begins at the wall (`limits.leaving_sine` > 0) begins nearer: for
+    WALL_ZONE_MM the lumen of the pierced branch does not count either; from there on the axis is outside, and
+    the distance kept grows by `leaving_sine` a mm, up to the radius.
+
+    Returns
+    -------
+    gap : float
+        The next `gap` mm are clear, as far as the rule stays the same; negative if the point is not.
+    label : int
+        Of the voxel that limits it, 0 for none near.
+    distance, needed : float
+        From that voxel, mm.
+    """
+    _clearance, labels, geometry, bits = obstacles
+    reach = limits.required_mm + EXACT_REACH_MM
+    in_exit = branch >= 0 and inserted < limits.exempt_mm - TINY
+    distance, label = exact_distance(labels, geometry, x, y, z, bits, branch if in_exit else -1, reach)
+    needed = limits.required_mm
+    gap = distance - needed
+    if in_exit and not (limits.leaving_sine > 0.0 and inserted < WALL_ZONE_MM - TINY):
+        kept, rate = limits.radius_mm, 0.0
+        beyond = inserted - WALL_ZONE_MM
+        if limits.leaving_sine > 0.0 and limits.leaving_sine * beyond < kept:
+            kept, rate = max(limits.leaving_sine * beyond, 0.0), limits.leaving_sine
+        lumen, lumen_label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
+        # The distance falls by 1 a mm at most, while what is kept grows by `rate`.
+        if (lumen - kept) / (1.0 + rate) < gap:
+            return (lumen - kept) / (1.0 + rate), lumen_label, lumen, kept
+    return gap, label, distance, needed
+
+
+@numba.njit(cache=True)
 def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
     """Prove an arc clear of obstacles: 0 if it is, else the label of the voxel that is too near.
 
     Clearance is 1-Lipschitz: where it exceeds the required one by `gap`, the next `gap` mm are clear.
-    The field's lower bound is tried first, then the exact distance to the voxels as solid boxes.
-    The first `limits.exempt_mm` mm of the needle (this arc starts at `s0`) may be near the
-    wall of the pierced `branch` (-1: none), but never nearer than the needle's radius to any lumen.
+    The field's lower bound is tried first, then the exact distance to the voxels as solid boxes, with the
+    exemption of the pierced `branch` (`exact_gap`; -1: none).  This arc starts at the length `s0` of the
+    needle.
 
     With `limits.lookup_step_mm` voxels are looked up instead, and nothing is proved.
     """
     if limits.lookup_step_mm > 0.0:
         return _blocker_by_lookup(obstacles, limits.lookup_step_mm, pose, bend, length)
-    clearance, labels, geometry, bits = obstacles
+    clearance, _labels, geometry, _bits = obstacles
     required = limits.required_mm
-    reach = required + EXACT_REACH_MM
     exempt = limits.exempt_mm - s0 if branch >= 0 else 0.0
+    zone = WALL_ZONE_MM - s0 if limits.leaving_sine > 0.0 else 0.0
     early = _early_blocker(obstacles, required, pose, bend, max(exempt, 0.0), length)
     if early != 0:
         return early
@@ -101,19 +141,13 @@ def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
         x, y, z = point_on_arc(pose, bend, s)
         gap = distance_bound(clearance, geometry, x, y, z) - required
         if gap < MIN_GAP_MM:
-            in_exit = s < exempt - TINY
-            spared = branch if in_exit else -1
-            distance, label = exact_distance(labels, geometry, x, y, z, bits, spared, reach)
-            gap = distance - required
-            if in_exit:
-                lumen, lumen_label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
-                if lumen - limits.radius_mm < gap:
-                    gap = lumen - limits.radius_mm
-                    label = lumen_label
+            gap, label, _distance, _needed = exact_gap(obstacles, limits, s0 + s, x, y, z, branch)
             if gap < MIN_GAP_MM:
                 return label
-            if in_exit:
+            if s < exempt - TINY:
                 gap = min(gap, exempt - s)
+            if s < zone - TINY:
+                gap = min(gap, zone - s)
         if s >= length:
             return 0
         s = min(s + gap, length)

@@ -1,0 +1,162 @@
+"""One search for a needle path, by our planners or those of OMPL, with what stands in the way if there is none."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from anatomy.records import frozen_record
+from stages.needle import (
+    PLANNERS,
+    SHORTEST,
+    ArcPath,
+    NeedleEnvironment,
+    Objective,
+    Obstruction,
+    Query,
+    Search,
+    easiest_obstruction,
+    find_obstruction,
+)
+
+SLICE = 500
+"""Iterations between two looks at the clock: some milliseconds."""
+OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
+"""Planners of OMPL itself.  They steer by chance, and end within OMPL_TOLERANCE_MM of the target."""
+OMPL_TOLERANCE_MM = 1.0
+"""Distance to the target that counts as reached; random steering hardly ever comes nearer."""
+
+
+@frozen_record
+class PathSearch:
+    """What one search found.
+
+    Parameters
+    ----------
+    outcome : str
+        "path"; "no path", if there is a proof; a search's own words for its end; else "nothing found".
+    path, first_path : ArcPath or None
+        The best path and the first one: proved clear and within all limits.
+    cost : float
+        Of the path under the objective, as estimated within the search.
+    first_path_s : float or None
+        Time to the first path, by the clock of the search.
+    obstruction : Obstruction or None
+        What stands in the way, if there is no path.
+    """
+
+    outcome: str
+    path: ArcPath | None = None
+    first_path: ArcPath | None = None
+    cost: float = math.inf
+    first_path_s: float | None = None
+    obstruction: Obstruction | None = None
+
+    @property
+    def proved(self) -> bool:
+        """Whether it is proved that no path exists."""
+        return self.outcome == "no path"
+
+
+def search_path(
+    environment: NeedleEnvironment,
+    query: Query,
+    planner: str,
+    *,
+    objective: Objective = SHORTEST,
+    seed: int = 0,
+    iterations: int | None = None,
+    time_s: float | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+    portion: int = SLICE,
+    until_first: bool = False,
+) -> PathSearch:
+    """Search a path; what is proved to have none at reach, start or target is not searched.
+
+    Parameters
+    ----------
+    planner : str
+        One of `stages.needle.search.planners.PLANNERS` or of `OMPL_PLANNERS`; those end by time alone.
+    iterations, time_s : optional
+        The search ends by whichever comes first, or by itself.
+    clock : callable
+        Returns seconds: of the wall, or of this process.
+    portion : int
+        Iterations between two looks at the clock.
+    until_first : bool
+        Whether to stop at the first path.
+    """
+    blocked = find_obstruction(environment, query)
+    if blocked is not None and blocked.proved:
+        return PathSearch(outcome="no path", obstruction=blocked)
+    if planner in OMPL_PLANNERS:
+        found = _by_ompl(environment, query, planner, seed, time_s or 0.0, clock)
+    else:
+        search = PLANNERS[planner](environment, query, seed, objective)
+        found = _advance(search, iterations, time_s, clock, portion, until_first)
+    if found.path is not None:
+        return found
+    return PathSearch(outcome=found.outcome, obstruction=blocked or easiest_obstruction(environment, query))
+
+
+def _advance(
+    search: Search,
+    iterations: int | None,
+    time_s: float | None,
+    clock: Callable[[], float],
+    portion: int,
+    until_first: bool,
+) -> PathSearch:
+    first, first_path_s = None, None
+    began, left = clock(), iterations
+    while not search.finished and (left is None or left > 0):
+        if time_s is not None and clock() - began >= time_s:
+            break
+        count = portion if left is None else min(portion, left)
+        search.advance(count)
+        left = None if left is None else left - count
+        if first is None and search.path is not None:
+            first, first_path_s = search.path, clock() - began
+            if until_first:
+                break
+    return PathSearch(
+        outcome=_outcome(search),
+        path=search.path,
+        first_path=first,
+        cost=search.cost,
+        first_path_s=first_path_s,
+    )
+
+
+def _by_ompl(
+    environment: NeedleEnvironment,
+    query: Query,
+    planner: str,
+    seed: int,
+    time_s: float,
+    clock: Callable[[], float],
+) -> PathSearch:
+    """Let a planner of OMPL search; its cost is the length of the path."""
+    from stages.needle.ompl import NeedleProblem, seed_ompl
+
+    seed_ompl(seed + 1)
+    problem = NeedleProblem(environment)
+    problem.setup.setPlanner(problem.planners()[planner](problem.si))
+    problem.pose(query, goal_tolerance_mm=max(OMPL_TOLERANCE_MM, environment.goal_tolerance_mm))
+    began = clock()
+    problem.setup.solve(time_s)
+    first_path_s = clock() - began
+    path = problem.solution()
+    if path is None:
+        return PathSearch(outcome="nothing found")
+    return PathSearch(
+        outcome="path", path=path, first_path=path, cost=path.length_mm, first_path_s=first_path_s
+    )
+
+
+def _outcome(search: Search) -> str:
+    stated = str(getattr(search, "outcome", "running"))
+    if stated != "running":
+        return stated
+    return "nothing found" if search.path is None else "path"

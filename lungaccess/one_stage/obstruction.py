@@ -1,0 +1,88 @@
+"""What stands in the way of a needle, in words and as plain values."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, OUTSIDE, VESSEL
+from anatomy.typed import Float
+from stages.needle import Obstruction
+
+NAMES = ((VESSEL, "a vessel"), (FISSURE, "a fissure"), (OUTSIDE, "the outside of the lung"))
+LIMITS = {
+    "angle": "lies too far aside of straight ahead for the limit of the angle from the start",
+    "turn": "lies too far aside of straight ahead for the limit of all turning",
+    "length": "is farther than the needle is long",
+}
+
+
+def structure_in_words(label: int) -> str:
+    """Return the structure that a voxel label stands for, with the branch of an airway."""
+    if label & AIRWAY:
+        branch = (label >> BRANCH_SHIFT) - 1
+        return "an airway" if branch < 0 else f"the airway (branch {branch})"
+    return next((name for bit, name in NAMES if label & bit), "nothing")
+
+
+def point_in_words(lps_mm: Float) -> str:
+    """Return a point in both frames, since a reader may have either at hand."""
+    x, y, z = (float(v) for v in lps_mm)
+    return f"LPS ({x:.1f}, {y:.1f}, {z:.1f}) = RAS ({-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}) mm"
+
+
+def reason_in_words(found: Obstruction) -> str:
+    """Return in a few words what is blocked, by what, and by how much."""
+    if found.place == "reach":
+        if found.limit != "radius":
+            return f"target out of reach: it {LIMITS[found.limit]}"
+        if found.radius_mm is None:
+            return "target out of reach, whatever the radius of curvature"
+        # Rounded down, so that the radius named does reach it.
+        return f"target out of reach of this radius: needs R <= {math.floor(10.0 * found.radius_mm) / 10.0:.1f} mm"
+    what = {"start": "start blocked", "target": "target blocked"}.get(found.place, "path blocked")
+    return (
+        f"{what} by {structure_in_words(found.label)}: "
+        f"{found.distance_mm:.2f} mm away, needs {found.needed_mm:.2f} mm"
+    )
+
+
+def obstruction_rows(found: Obstruction, proved: bool) -> list[tuple[str, str]]:
+    """Return what a table says of an obstruction, the reason first."""
+    rows = [("reason", reason_in_words(found))]
+    if found.place == "reach":
+        direction = f"{math.degrees(found.direction_rad):.1f} deg off straight ahead"
+        rows.append(("target seen from the start", f"{found.straight_mm:.1f} mm away, {direction}"))
+    elif found.place == "path":
+        rows.append(("where", f"the tightest place of the easiest path tried, {_place(found)}"))
+    else:
+        rows.append(("where", _place(found)))
+    rows.append(("proved", "yes: no path exists" if proved else "no: a path may exist"))
+    return rows
+
+
+def _place(found: Obstruction) -> str:
+    along = "" if found.inserted_mm is None else f"{found.inserted_mm:.1f} mm along the needle, "
+    return f"{along}at {point_in_words(found.point_lps)}"
+
+
+def obstruction_record(found: Obstruction, proved: bool) -> dict[str, Any]:
+    """Return plain JSON values: points in both frames, mm, angles in rad."""
+    x, y, z = (float(v) for v in found.point_lps)
+    branch = (found.label >> BRANCH_SHIFT) - 1
+    return {
+        "what": found.place,
+        "reason": reason_in_words(found),
+        "proved": proved,
+        "structure": structure_in_words(found.label) if found.label else None,
+        "branch": branch if found.label & AIRWAY and branch >= 0 else None,
+        "point_lps_mm": [x, y, z],
+        "point_ras_mm": [-x, -y, z],
+        "inserted_mm": found.inserted_mm,
+        "distance_mm": found.distance_mm,
+        "needed_distance_mm": found.needed_mm,
+        "limit": found.limit or None,
+        "needed_radius_mm": found.radius_mm,
+        "target_direction_rad": found.direction_rad,
+        "target_distance_mm": found.straight_mm,
+    }

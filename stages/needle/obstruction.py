@@ -1,0 +1,218 @@
+"""Why a query has no path: what stands in the way, where, and by how much."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
+from stages.needle.kernels import obstruction as kernels
+from stages.needle.kernels.connections import length_ahead, seen_from
+from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import exact_gap
+from stages.needle.query import Query
+
+TRIALS = 256
+"""Paths that are tried for the easiest one: some milliseconds."""
+SAME_SHARE = 1e-6
+"""A radius is found to this share of itself, and limits may be exceeded by it through rounding."""
+NEAR_MM = 1e-3
+"""Targets outside the workspace by less are not ruled out by it, for the sake of rounding."""
+
+
+@frozen_record
+class Obstruction:
+    """What stands in the way of a needle.
+
+    Parameters
+    ----------
+    place : str
+        "reach": the target lies outside the needle's workspace, whatever the obstacles.  "start": every path
+        is blocked at the beginning.  "target": no needle may end there.  "path": both are free.
+    proved : bool
+        Whether this alone proves that there is no path.
+    label : int
+        Of the obstacle voxel that is too near; 0 for "reach".
+    point_lps : (3,) float64, LPS mm
+        The blocked point of the needle's axis: for "path", the tightest place of the easiest path that was
+        tried; for "reach", the target.
+    inserted_mm : float or None
+        Length of the needle there, where it is known.
+    distance_mm, needed_mm : float or None
+        From that voxel; None for "reach".
+    limit : str
+        For "reach": "radius", "angle", "turn" or "length".
+    radius_mm : float or None
+        For "reach": the largest radius of curvature that would reach the target; None if none does.
+    direction_rad, straight_mm : float
+        Direction of the target off straight ahead, and its distance from the start.
+    """
+
+    place: str
+    proved: bool
+    label: int
+    point_lps: Float
+    inserted_mm: float | None = None
+    distance_mm: float | None = None
+    needed_mm: float | None = None
+    limit: str = ""
+    radius_mm: float | None = None
+    direction_rad: float
+    straight_mm: float
+
+
+def find_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
+    """Return what rules out all paths at once by reach, at the start or at the target; None if nothing does.
+
+    Only a target out of reach may be so without proof: with a goal tolerance, or wide limits of turning.
+
+    """
+    return _reach(environment, query) or blocked_end(environment, query)
+
+
+def blocked_end(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
+    """Return what proves that no path leaves the start or none ends at the target; None if nothing does.
+
+    An environment whose paths are looked up instead of proved has no such proof.
+    """
+    if environment.limits.lookup_step_mm > 0.0:
+        return None
+    return _start(environment, query) or _target(environment, query)
+
+
+def easiest_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
+    """Return the tightest place of the easiest of some paths, none of which needs to be clear; None without."""
+    found = np.zeros(kernels.FOUND_SIZE)
+    label, tried = kernels.easiest_trial(
+        environment.obstacles, environment.limits, _pose(query), query.inserted_mm, query.branch, query.goal,
+        TRIALS, np.zeros(1, dtype=np.uint64), np.zeros(kernels.FOUND_SIZE), found,
+    )  # fmt: skip
+    return _found("path", False, label, found, query) if tried and label else None
+
+
+def _pose(query: Query) -> tuple[float, ...]:
+    frame = query.lps_from_start
+    return tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+
+
+def _seen(query: Query) -> tuple[float, float]:
+    rho, h = seen_from(_pose(query), query.goal)
+    return float(rho), float(h)
+
+
+def _found(place: str, proved: bool, label: int, found: Float, query: Query) -> Obstruction:
+    rho, h = _seen(query)
+    return Obstruction(
+        place=place,
+        proved=proved,
+        label=int(label),
+        point_lps=found[: kernels.INSERTED].copy(),
+        inserted_mm=float(found[kernels.INSERTED]) if place != "target" else None,
+        distance_mm=float(found[kernels.DISTANCE]),
+        needed_mm=float(found[kernels.NEEDED]),
+        direction_rad=math.atan2(rho, h),
+        straight_mm=math.hypot(rho, h),
+    )
+
+
+def _left(limits: Limits, query: Query) -> Limits:
+    """Return the limits less what is behind the start.
+
+    The angle counts from the reference: where that is another direction, nothing is taken from the angle.
+    """
+    return limits._replace(
+        max_length_mm=limits.max_length_mm - query.inserted_mm,
+        max_turn_rad=limits.max_turn_rad - query.turned_rad,
+        max_angle_rad=limits.max_angle_rad if query.reference is None else math.pi,
+    )
+
+
+def _reach(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
+    """Tell whether the target lies outside the workspace, and which limit keeps it there."""
+    limits = _left(environment.limits, query)
+    rho, h = _seen(query)
+    far = math.hypot(rho, h)
+    tolerance = environment.goal_tolerance_mm
+    if far <= tolerance or _reaches(rho, h, limits):
+        return None
+    free = limits._replace(max_length_mm=math.inf)
+    if far - tolerance > limits.max_length_mm or _reaches(rho, h, free):
+        limit = "length"
+    elif math.atan2(rho, h) > limits.max_angle_rad:
+        limit = "angle"
+    elif math.atan2(rho, h) > limits.max_turn_rad:
+        limit = "turn"
+    else:
+        limit = "radius"
+    return Obstruction(
+        place="reach",
+        proved=_rules_out(rho, h, tolerance, limit, limits),
+        label=0,
+        point_lps=np.array(query.target),
+        limit=limit,
+        radius_mm=_largest_radius(rho, h, limits) if limit == "radius" else None,
+        direction_rad=math.atan2(rho, h),
+        straight_mm=far,
+    )
+
+
+def _rules_out(rho: float, h: float, tolerance_mm: float, limit: str, limits: Limits) -> bool:
+    """Tell whether it is proved that no path ends within the tolerance of a target outside the workspace.
+
+    That holds for targets farther than the needle is long; for those that lie in the torus of tightest
+    circles by more than the tolerance, if paths turn by 180 degrees at most; and without a tolerance where
+    the workspace is exact: see "Workspace" in docs/explanation/proofs.md.
+    """
+    if math.hypot(rho, h) - tolerance_mm > limits.max_length_mm:
+        return True
+    radius = 1.0 / limits.kappa
+    inside = radius - math.hypot(radius - rho, h) > tolerance_mm + NEAR_MM
+    if limit == "radius" and inside and limits.max_turn_rad <= math.pi * (1.0 + SAME_SHARE):
+        return True
+    return tolerance_mm == 0.0 and limits.max_angle_rad <= 0.5 * math.pi * (1.0 + SAME_SHARE)
+
+
+def _reaches(rho: float, h: float, limits: Limits) -> bool:
+    length = length_ahead(rho, h, limits, limits.max_angle_rad, limits.max_turn_rad)
+    return length < math.inf and bool(length <= limits.max_length_mm)
+
+
+def _largest_radius(rho: float, h: float, limits: Limits) -> float | None:
+    """Return the largest radius of curvature with which a target is reached, rounded down; None if none."""
+    low, high = 1.0, 1.0 / limits.kappa
+    if not _reaches(rho, h, limits._replace(kappa=1.0 / low)):
+        return None
+    while high - low > SAME_SHARE * high:
+        middle = 0.5 * (low + high)
+        if _reaches(rho, h, limits._replace(kappa=1.0 / middle)):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _start(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
+    rho, h = _seen(query)
+    longest = math.hypot(rho, h) - environment.goal_tolerance_mm
+    found = np.zeros(kernels.FOUND_SIZE)
+    label = kernels.blocked_start(
+        environment.obstacles, environment.limits, _pose(query), query.inserted_mm, longest, query.branch, found
+    )  # fmt: skip
+    return _found("start", True, label, found, query) if label else None
+
+
+def _target(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
+    """Tell whether every point at which a path may end is too near to an obstacle."""
+    rho, h = _seen(query)
+    if math.hypot(rho, h) - environment.goal_tolerance_mm < environment.limits.exempt_mm - query.inserted_mm:
+        return None
+    x, y, z = query.goal
+    beyond = environment.limits.exempt_mm
+    _gap, label, distance, needed = exact_gap(environment.obstacles, environment.limits, beyond, x, y, z, -1)
+    if distance + environment.goal_tolerance_mm >= needed - kernels.SPARE_MM:
+        return None
+    found = np.array([x, y, z, math.nan, distance, needed])
+    return _found("target", True, label, found, query)

@@ -201,10 +201,10 @@ def plan_needle(
 
 
 def pierced_branches(lung: Lung, point: Float, near_mm: float) -> tuple[int, ...]:
-    """Return the airway branch within `WALL_MM` of a point `(3,)` LPS mm that is nearest to it, and its company.
+    """Return the airway branches that a needle at a point `(3,)` LPS mm has pierced, the nearest first.
 
-    Near a junction the tree draws the line between branches, not the anatomy: those that meet the nearest
-    one and come within `near_mm` of the point are pierced with it.
+    The nearest lies within `WALL_MM`.  Near a junction the tree draws the line between branches, not the
+    anatomy: those that meet the nearest one and come within `near_mm` of the point are pierced with it.
     """
     x, y, z = (float(c) for c in point)
     _distance, label = exact_distance(lung.labels, lung.geometry, x, y, z, AIRWAY, -1, WALL_MM)

@@ -1,4 +1,4 @@
-"""One search for a needle path, by our planners or those of OMPL, with what stands in the way if there is none."""
+"""One search for a needle path, by our planners or those of OMPL, and what stands in the way of it."""
 
 from __future__ import annotations
 

@@ -39,7 +39,8 @@ def reason_in_words(found: Obstruction) -> str:
         if found.radius_mm is None:
             return "target out of reach, whatever the radius of curvature"
         # Rounded down, so that the radius named does reach it.
-        return f"target out of reach of this radius: needs R <= {math.floor(10.0 * found.radius_mm) / 10.0:.1f} mm"
+        radius_mm = math.floor(10.0 * found.radius_mm) / 10.0
+        return f"target out of reach of this radius: needs R <= {radius_mm:.1f} mm"
     what = {"start": "start blocked", "target": "target blocked"}.get(found.place, "path blocked")
     return (
         f"{what} by {structure_in_words(found.label)}: "

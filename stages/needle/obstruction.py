@@ -84,7 +84,7 @@ def blocked_end(environment: NeedleEnvironment, query: Query) -> Obstruction | N
 
 
 def easiest_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
-    """Return the tightest place of the easiest of some paths, none of which needs to be clear; None without."""
+    """Return the tightest place of the easiest of some trial paths; None if there is none or it is free."""
     found = np.zeros(kernels.FOUND_SIZE)
     label, tried = kernels.easiest_trial(
         environment.obstacles, environment.limits, _pose(query), query.inserted_mm, query.branch, query.goal,
@@ -199,7 +199,8 @@ def _start(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     longest = math.hypot(rho, h) - environment.goal_tolerance_mm
     found = np.zeros(kernels.FOUND_SIZE)
     label = kernels.blocked_start(
-        environment.obstacles, environment.limits, _pose(query), query.inserted_mm, longest, query.branch, found
+        environment.obstacles, environment.limits, _pose(query), query.inserted_mm, longest, query.branch,
+        found,
     )  # fmt: skip
     return _found("start", True, label, found, query) if label else None
 

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy.errors import SettingsError
-from anatomy.typed import Float, Int
+from anatomy.typed import Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
 from stages.needle.infeasibility.kernels import reachability_pruning as pruning

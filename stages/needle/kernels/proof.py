@@ -22,7 +22,7 @@ PROBE_SPACING_MM = 1.5
 """Before the proof, arcs are looked at in points at most so far apart: most obstacles are met there."""
 
 WALL_ZONE_MM = 1.0
-"""The wall of a bronchus of some generations is thinner: so much needle is spent on piercing it, as of a tube."""
+"""Needle that is spent on piercing the wall, as of a tube: more than the wall of a small bronchus."""
 
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)

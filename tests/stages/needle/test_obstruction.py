@@ -102,7 +102,8 @@ def test_start_target_and_path_are_told_apart() -> None:
     beside = (np.abs(X[..., 0] + 2.2) < 0.3) & (np.abs(X[..., 1]) < 9.0) & (np.abs(X[..., 2] + 7.0) < 1.0)
     wall = np.abs(X[..., 2] - 2.0) < 0.3
     for expected, labels in (
-        ("start", scene(block=beside)), ("target", scene(block=ball)), ("path", scene(block=wall)), ("", scene()),
+        ("start", scene(block=beside)), ("target", scene(block=ball)), ("path", scene(block=wall)),
+        ("", scene()),
     ):  # fmt: skip
         environment = at_wall(labels)
         query = Query(lps_from_start=start(40.0), target=aim, branch=0)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 
+from anatomy.kernel_clock import working_s
 from anatomy.records import frozen_record
 from stages.needle import (
     PLANNERS,
@@ -68,7 +68,7 @@ def search_path(
     seed: int = 0,
     iterations: int | None = None,
     time_s: float | None = None,
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[], float] = working_s,
     portion: int = SLICE,
     until_first: bool = False,
 ) -> PathSearch:
@@ -81,7 +81,7 @@ def search_path(
     iterations, time_s : optional
         The search ends by whichever comes first, or by itself.
     clock : callable
-        Returns seconds: of the wall, or of this process.
+        Returns seconds: of the wall without compilation of kernels, or of this process.
     portion : int
         Iterations between two looks at the clock.
     until_first : bool

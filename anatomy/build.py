@@ -21,7 +21,7 @@ from anatomy.typed import Array, Mask, UInt16
 
 Progress = Callable[[str], None]
 
-FORMAT = 3
+FORMAT = 4
 """Version of the processing: raise it when the same images give another lung."""
 
 PAD_VOXELS = 2
@@ -38,14 +38,13 @@ def lung_key(sources: Mapping[str, str]) -> str:
 
 
 class WorkingBox:
-    """The box of the lungs and airways plus a border, and how to cut images to it."""
+    """The box of some tissue, such as lungs and airways, plus a border, and how to cut images to it."""
 
-    def __init__(self, images: PatientImages) -> None:
-        tissue = images.lung.array | images.lumen.array
+    def __init__(self, tissue: Mask, grid: Grid) -> None:
         low, high = bounds(tissue)
         self._start = low - PAD_VOXELS
         self._stop = high + PAD_VOXELS
-        self.grid: Grid = images.grid.crop(self._start, self._stop)
+        self.grid: Grid = grid.crop(self._start, self._stop)
 
     def cut(self, array: Array) -> Array:
         """Copy the part of `array` in the box; 0 beyond the image."""
@@ -92,11 +91,11 @@ def build_lung(
     tell("airway tree")
     tree = tree_from_mask(images.lumen)
     tell("labels")
-    box = WorkingBox(images)
+    box = WorkingBox(images.lung.array | images.lumen.array, images.grid)
     labels = keep("labels", _labels(images, box, tree, warnings))
     fields: dict[str, DistanceField] = {}
     geometry = corner_geometry(box.grid)
-    for name, corners in _field_arrays(labels, box.grid, images.fissures is not None, tell):
+    for name, corners in field_arrays(labels, box.grid, images.fissures is not None, tell):
         stored = keep(name, corners)
         fields[name] = DistanceField(name=name, corners=stored, geometry=geometry)
     return Lung(
@@ -110,8 +109,11 @@ def build_lung(
         tree=tree,
         nodules=_cut_volume(images.nodules, box, "nodules", keep),
         cost=_cut_volume(images.cost, box, "cost", keep),
+        lobes=_cut_volume(images.lobes, box, "lobes", keep),
         starts=images.starts,
         targets_lps=images.targets_lps,
+        start_names=images.start_names,
+        target_names=images.target_names,
         breath_hold=images.breath_hold,
         sources=images.sources,
         warnings=tuple(warnings),
@@ -145,7 +147,7 @@ def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: 
         inside |= box.cut(images.nodules.array)
     labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
     labels[~inside] = structures.OUTSIDE
-    _close_border(labels)
+    close_border(labels)
     labels[_septum(lung, airway, box.grid, warnings)] |= structures.OUTSIDE
     labels[vessels] |= structures.VESSEL
     if images.fissures is not None:
@@ -155,7 +157,7 @@ def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: 
     return labels
 
 
-def _close_border(labels: UInt16) -> None:
+def close_border(labels: UInt16) -> None:
     """Make the outermost voxels OUTSIDE: a vessel or nodule may run on beyond the grid."""
     for axis in range(3):
         layers = np.moveaxis(labels, axis, 0)
@@ -198,7 +200,7 @@ def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, g
     labels[lumen] |= structures.LUMEN
 
 
-def _field_arrays(
+def field_arrays(
     labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress
 ) -> Iterator[tuple[str, UInt16]]:
     """Yield the clearance fields one after the other; the unions are minima of the parts."""

@@ -2,90 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cached_property
-from types import MappingProxyType
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from anatomy import structures
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError, GridMismatchError
-from anatomy.fields import DistanceField, corner_geometry
-from anatomy.grid import Grid, Volume, read_only
-from anatomy.kernels import field as kernel
+from anatomy.fields import DistanceField
+from anatomy.grid import Volume
+from anatomy.lobes import LOBES
+from anatomy.organ import Organ
 from anatomy.records import frozen_record
-from anatomy.typed import Float, Labels
+from anatomy.typed import Float
 
-if TYPE_CHECKING:
-    from anatomy.meshes import SurfaceMesh
+NEAREST_LOBE_MM = 10.0
+"""A place in no lobe, such as a bronchus or vessel, is named after a lobe that is as near as this."""
 
 
 @frozen_record
-class Lung:
-    """The anatomy of one patient, in LPS mm, immutable.
+class Lung(Organ):
+    """The lungs of one patient with their airways, in LPS mm, immutable.
 
     Parameters
     ----------
-    name, kind : str
-        The patient, and the kind of folder it was read from.
-    key : str
-        Hash of the content of the inputs and of the way they were processed.
-    grid : Grid
-        The working grid: the box of the lungs and airways, at least one voxel wider all around.
-    labels : (ni, nj, nk) uint16, Fortran-contiguous
-        Structures and airway branch of every voxel, see `anatomy.structures`.
-    fields : mapping of str to DistanceField
-        Clearance to "airway", "vessel", "pleura", "fissure" (if any), and to the nearest of them:
-        "obstacle" without fissures, "obstacle_fissure" with them.
     lumen_depth : DistanceField
         Distance from a point in the lumen to the nearest voxel that is not lumen; 0 outside.
     tree : AirwayTree
-    nodules, cost : Volume or None
-        Nodule mask; cost map in [0, 1] or infinite.  Both on `grid`.
-    starts, targets_lps : tuple of arrays
-        Poses `lps_from_tip` (4, 4) and points (3,) that came with the patient.
-    breath_hold : str or None
-        In which breath-hold the image was taken, if stated.
-    sources : mapping of str to str
-        SHA-256 of every input file.
-    warnings : tuple of str
-        What was assumed or repaired on the way in.
-
-    Raises
-    ------
-    GridMismatchError
-        If the labels or a field do not fit the grid.
+    lobes : Volume or None
+        uint8 numbers of `anatomy.lobes.LOBES` on `grid`, if the patient came with lobes.
     """
 
-    name: str
-    kind: str
-    key: str
-    grid: Grid
-    labels: Labels
-    fields: Mapping[str, DistanceField]
     lumen_depth: DistanceField
     tree: AirwayTree
-    nodules: Volume | None
-    cost: Volume | None
-    starts: tuple[Float, ...]
-    targets_lps: tuple[Float, ...]
-    breath_hold: str | None
-    sources: Mapping[str, str]
-    warnings: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        corners = tuple(n + 1 for n in self.grid.shape)
-        wrong = [name for name, field in self.fields.items() if field.corners.shape != corners]
-        if self.labels.shape != self.grid.shape or wrong:
-            raise GridMismatchError(
-                f"The grid does not fit the {wrong[0] + ' field' if wrong else 'labels'} of {self.name}",
-                expected=f"labels of the shape {self.grid.shape}, fields of {corners}",
-            )
-        object.__setattr__(self, "labels", read_only(np.asarray(self.labels)))
-        object.__setattr__(self, "fields", MappingProxyType(dict(self.fields)))
-        object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
+    lobes: Volume | None = None
 
     def _repr_html_(self) -> str:
         """Return the lung as HTML: what it is, its tree, and the warnings that came with it."""
@@ -105,86 +51,18 @@ class Lung:
         facts = table(rows, f"Lung of {self.name}") + bullets("Warnings", self.warnings)
         return side_by_side(facts, self.tree.drawing())
 
-    @property
-    def has_fissures(self) -> bool:
-        """Whether a fissure mask came with the patient."""
-        return "fissure" in self.fields
-
-    @cached_property
-    def geometry(self) -> Float:
-        """The `(3, 6)` array that maps LPS mm to voxel corners, for kernels."""
-        return corner_geometry(self.grid)
-
-    def obstacle_field(self, *, with_fissures: bool) -> DistanceField:
-        """Return the clearance to everything forbidden."""
-        return self.fields["obstacle_fissure" if with_fissures and self.has_fissures else "obstacle"]
-
-    def mask(self, name: str) -> Volume:
-        """Return a structure as a bool volume: airway, lumen, vessel, outside, fissure or nodule."""
-        if name == "nodule":
-            if self.nodules is None:
-                raise AnatomyError(
-                    f"Patient {self.name} has no nodule mask", remedy="Name a target point instead"
-                )
-            return self.nodules
-        if name not in structures.BITS:
-            raise AnatomyError(
-                f"There is no structure {name!r}", expected=f"one of {', '.join(structures.BITS)}, nodule"
-            )
-        return Volume(grid=self.grid, array=(self.labels & structures.BITS[name]) != 0)
-
-    def surface(self, name: str) -> SurfaceMesh:
-        """Return the mesh of the faces of the voxels of a structure (see `mask`), made anew at each call."""
-        from anatomy.meshes import box_surface
-
-        mask = self.mask(name)
-        return box_surface(mask.array, mask.grid)
-
-    def label_at(self, point_lps: Float) -> int:
-        """Return the label of the voxel that holds a point; OUTSIDE beyond the grid."""
-        x, y, z = (float(c) for c in point_lps)
-        return int(kernel.label_at(self.labels, self.geometry, x, y, z))
-
-    def exact_clearance_mm(
-        self, points_lps: Float, bits: int, *, cap_mm: float, exempt_branch: int = -1
-    ) -> Float:
-        """Return exact distances in mm to the nearest voxel with any of `bits`, at most `cap_mm`.
-
-        Parameters
-        ----------
-        points_lps : (N, 3) float64, LPS mm
-        bits : int
-            Structures of `anatomy.structures` to measure to.
-        cap_mm : float
-            Search radius; the cost grows with its third power.
-        exempt_branch : int
-            Airway voxels of this branch are passed over; -1 for none.
-        """
-        points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
-        out = np.zeros(len(points))
-        kernel.exact_at(self.labels, self.geometry, points, bits, exempt_branch, float(cap_mm), out)
-        return out
-
-    def least_clearance_mm(
-        self, points_lps: Float, field: str, bits: int, *, cap_mm: float, exempt_branch: int = -1
-    ) -> float:
-        """Return the least of the distances of points to structures: exact below a cap, else a lower bound.
-
-        Parameters
-        ----------
-        points_lps : (N, 3) float64, LPS mm
-            At least one.
-        field : str
-            The distance field of the structures.
-        bits, cap_mm, exempt_branch
-            As in `exact_clearance_mm`.
-        """
-        points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
-        bounds = self.fields[field].lower_bound_mm(points)
-        order = np.argsort(bounds, kind="stable")
-        if bounds[order[0]] >= cap_mm:
-            return float(bounds[order[0]])
-        least = kernel.least_exact(
-            self.labels, self.geometry, points, order, bounds, bits, exempt_branch, float(cap_mm)
-        )
-        return float(least)
+    def lobe_at(self, point_lps: Float) -> str:
+        """Return the name of the lobe that holds a point `(3,)` LPS mm or is near it; "" if not known."""
+        if self.lobes is None:
+            return ""
+        reach = np.ceil(NEAREST_LOBE_MM / self.grid.spacing_mm).astype(np.int64)
+        centre = np.floor(self.grid.ijk(point_lps) + 0.5).astype(np.int64)
+        low = np.clip(centre - reach, 0, self.grid.shape)
+        high = np.clip(centre + reach + 1, 0, self.grid.shape)
+        window = self.lobes.array[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+        voxels = np.argwhere(window)
+        if not len(voxels):
+            return ""
+        distance = np.linalg.norm(self.grid.lps(voxels + low) - point_lps, axis=1)
+        nearest = int(np.argmin(distance))
+        return LOBES[int(window[tuple(voxels[nearest])])] if distance[nearest] <= NEAREST_LOBE_MM else ""

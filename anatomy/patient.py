@@ -30,12 +30,16 @@ class PatientImages:
         Bool masks: the airway lumen, the union of arteries and veins, both lungs filled.
     wall, fissures, nodules : Volume or None
         Bool masks; None when the patient has none.
+    lobes : Volume or None
+        uint8 numbers of `anatomy.lobes.LOBES`; 0 is no lobe.
     cost : Volume or None
         float32 cost of passing a voxel, in [0, 1], or infinity where passing is forbidden.
     starts : tuple of (4, 4) float64
         Poses `lps_from_tip` of needle starts, +z in the direction of insertion, LPS mm.
     targets_lps : tuple of (3,) float64
         Target points, LPS mm.
+    start_names, target_names : tuple of str
+        How users name them; "start1", "target1", ... if not given.
     breath_hold : str or None
         In which state of breathing the image was taken, if that is stated.
     sources : mapping of str to str
@@ -60,9 +64,12 @@ class PatientImages:
     wall: Volume | None = None
     fissures: Volume | None = None
     nodules: Volume | None = None
+    lobes: Volume | None = None
     cost: Volume | None = None
     starts: tuple[Float, ...] = ()
     targets_lps: tuple[Float, ...] = ()
+    start_names: tuple[str, ...] = ()
+    target_names: tuple[str, ...] = ()
     breath_hold: str | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
@@ -70,11 +77,16 @@ class PatientImages:
     def __post_init__(self) -> None:
         for role in MASKS:
             _require_mask(getattr(self, role), role, self.grid)
+        if self.lobes is not None:
+            self.grid.require_same(self.lobes.grid, "the lobes")
         if self.cost is not None:
             _require_cost(self.cost, self.grid)
         object.__setattr__(self, "starts", tuple(read_only(np.array(p, float)) for p in self.starts))
         points = tuple(read_only(np.array(p, float)) for p in self.targets_lps)
         object.__setattr__(self, "targets_lps", points)
+        for what, given in (("start", self.starts), ("target", self.targets_lps)):
+            names = getattr(self, f"{what}_names") or tuple(f"{what}{n + 1}" for n in range(len(given)))
+            object.__setattr__(self, f"{what}_names", names)
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
 

@@ -14,13 +14,13 @@ from anatomy.io.compressed import require_intact
 from anatomy.io.files import atomic_write, require_file, unreadable
 from anatomy.io.frames import LPS_FROM, Frame
 from anatomy.io.itk_headers import metaimage_payload, nrrd_labels, read_nrrd_header, stated_frame
-from anatomy.io.nifti import read_nifti, read_nifti_header, read_nifti_mask, require_numbers
+from anatomy.io.nifti import begins_as_nifti, read_nifti, read_nifti_header, read_nifti_mask, require_numbers
 from anatomy.io.nifti_header import right_handed_grid
 
 if TYPE_CHECKING:
     import SimpleITK
 
-NIFTI, NRRD, METAIMAGE = (".nii.gz", ".nii"), (".seg.nrrd", ".nrrd"), (".mha", ".mhd")
+NIFTI, NRRD, METAIMAGE = (".nii.gz", ".nii", ".gz"), (".seg.nrrd", ".nrrd"), (".mha", ".mhd")
 T = TypeVar("T")
 
 SUFFIXES = NIFTI + NRRD + METAIMAGE
@@ -39,12 +39,35 @@ def image_stem(path: str | Path) -> str:
     return name[: len(name) - len(suffix)]
 
 
+def images_in(folder: Path) -> list[Path]:
+    """Return the image files of a folder by name; a bare .gz counts if a NIfTI image is in it."""
+    files = sorted(path for path in folder.iterdir() if path.is_file() and image_suffix(path))
+    return [path for path in files if image_suffix(path) != ".gz" or begins_as_nifti(path)]
+
+
+def read_grid(path: str | Path, *, frame: Frame | None = None) -> Grid:
+    """Read the grid of an image from its header alone; parameters and errors as `read_volume`."""
+    path = require_file(path)
+    if _suffix(path) in NIFTI:
+        return _guard(path, read_nifti_header, path, frame).grid
+    import SimpleITK
+
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(path))
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError as error:
+        raise unreadable(path, RuntimeError(_last_line(error))) from error
+    _require_three_dimensions(path, reader.GetDimension(), reader.GetNumberOfComponents())
+    return _itk_grid(reader, path, frame)[0]
+
+
 def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
     """Read an image in its own type of voxel.
 
     Parameters
     ----------
-    path : path of a .nii, .nii.gz, .nrrd, .seg.nrrd, .mha or .mhd file
+    path : path of a .nii, .nii.gz (or .gz), .nrrd, .seg.nrrd, .mha or .mhd file
     frame : "ras" or "lps", optional
         The frame to assume if, and only if, the file states none.
 
@@ -161,7 +184,7 @@ def _suffix(path: Path) -> str:
         raise FileError(
             f"{path} is of an unknown kind",
             expected="an image ending in " + ", ".join(SUFFIXES),
-            remedy="Convert the image, for instance with 3D Slicer",
+            remedy="Convert the image to NIfTI (.nii.gz) with the program that wrote it",
         )
     return suffix
 
@@ -181,13 +204,17 @@ def _read_itk(path: Path) -> SimpleITK.Image:
         image = SimpleITK.ReadImage(str(path))
     except RuntimeError as error:
         raise unreadable(path, RuntimeError(_last_line(error))) from error
-    if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
+    _require_three_dimensions(path, image.GetDimension(), image.GetNumberOfComponentsPerPixel())
+    return image
+
+
+def _require_three_dimensions(path: Path, dimensions: int, components: int) -> None:
+    if (dimensions, components) != (3, 1):
         raise FileError(
             f"{path} is not one image of three dimensions with one number a voxel",
             expected="one three-dimensional image",
             remedy="Export overlapping segments to separate files, or merge them into one label map",
         )
-    return image
 
 
 def _require_intact_payload(path: Path) -> None:
@@ -202,7 +229,9 @@ def _require_intact_payload(path: Path) -> None:
             require_intact(*payload)
 
 
-def _itk_grid(image: SimpleITK.Image, path: Path, frame: Frame | None) -> tuple[Grid, bool]:
+def _itk_grid(
+    image: SimpleITK.Image | SimpleITK.ImageFileReader, path: Path, frame: Frame | None
+) -> tuple[Grid, bool]:
     matrix = np.eye(4)
     matrix[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
     matrix[:3, 3] = image.GetOrigin()

@@ -1,98 +1,171 @@
-"""Many mask files of one patient read side by side onto one grid."""
+"""Many mask files of one patient, each placed on one grid by its own header."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os.path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from os.path import commonpath
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from anatomy.errors import AnatomyError
-from anatomy.grid import Grid, Volume
+from anatomy.grid import Grid
 from anatomy.io.files import sha256
 from anatomy.io.frames import Frame
-from anatomy.io.images import read_mask, read_volume
+from anatomy.io.images import read_grid, read_mask, read_volume
 from anatomy.io.nifti import require_numbers
-from anatomy.patient import PatientImages
+from anatomy.io.placement import Placed, covers_same_voxels, place, union_grid
+from anatomy.io.placement_words import moved, placement
 from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Array, Mask
+from anatomy.typed import Array, Mask, UInt8
 
 _READERS = 2  # decompression releases the interpreter; more threads only raise the peak of memory
-_REQUIRED = ("lumen", "vessels", "lung")
-_MAY_BE_EMPTY = ("fissures", "nodules")
+SOLID = ("wall", "vessels", "fissures", "hepatic-vein", "portal-vein", "hepatic-artery")
+"""Obstacles: none of their voxels may be lost where they are put on another grid."""
+EXTENT = ("lumen", "lung", "lobes")
+"""Roles whose files decide how far the common grid reaches."""
 
 
 @frozen_value
 class MaskSource:
-    """A file that makes up (a part of) the mask `role`, one of `anatomy.patient.MASKS`.
+    """A file that makes up (a part of) the mask `role`, one of `anatomy.patient.MASKS` or "lobes".
 
-    Of the file count the voxels of the labels, or, if there are none, all but zero.
+    Of the file count the voxels of the labels, or, if there are none, all but zero.  `lobe` is the number of
+    the lobe for the role "lobes".
     """
 
     role: str
     path: Path
     labels: tuple[int, ...] = ()
+    lobe: int = 0
 
 
 @frozen_record
 class MaskSet:
-    """The masks by role, the file names each came from, and the SHA-256 of every file.
+    """The masks by role, the files each came from, the SHA-256 of every file, and how files were placed.
 
-    Files in different folders are named from their common folder on.
+    Files in different folders are named from their common folder on.  `lobes` are numbers of
+    `anatomy.lobes.LOBES`, if there are lobes; their own role is "lobes" in `files` alone.
     """
 
     grid: Grid
     masks: Mapping[str, Mask]
     files: Mapping[str, tuple[str, ...]]
     sources: Mapping[str, str]
+    lobes: UInt8 | None = None
+    statements: tuple[str, ...] = ()
 
 
-def read_masks(sources: Sequence[MaskSource], frame: Frame | None = None) -> MaskSet:
-    """Read all files, each once, and unite the parts of every role.
+def read_masks(
+    sources: Sequence[MaskSource], frame: Frame | None = None, *, extent: Sequence[str] = EXTENT
+) -> MaskSet:
+    """Read all files, each once, and unite the parts of every role on one grid.
+
+    The grid is that of the first file, of the lumen if there is one, continued as far as the files of the
+    roles in `extent` reach.  A file on another grid is placed by its own header, and a statement says how.
 
     Raises
     ------
     AnatomyError, FileError, FrameError
-        As `read_mask`.
-    GridMismatchError
-        If a file lies on another grid than the first; it is named.
+        As `read_mask`; or if a file of the lungs or lumen lies far from the others.
     """
     paths = list(dict.fromkeys(source.path for source in sources))
-    folder = commonpath([path.parent for path in paths]) if paths else ""
-    masks: dict[str, Mask] = {}
+    if not paths:
+        raise AnatomyError("No mask was given", expected="masks of airway, vessels and lung")
+    grids = {path: read_grid(path, frame=frame) for path in paths}
+    basis = next((source.path for source in sources if source.role == "lumen"), paths[0])
+    reaching = dict.fromkeys(source.path for source in sources if source.role in extent)
+    grid = union_grid(grids[basis], [(path.name, grids[path]) for path in reaching])
+    gathered = _Gathered(grid, basis.name, grids[basis])
+    folder = os.path.commonpath([os.path.abspath(path.parent) for path in paths])
     hashes: dict[str, str] = {}
-    grid: Grid | None = None
     with ThreadPoolExecutor(_READERS) as pool:
         read = pool.map(lambda path: _read_file(path, sources, frame), paths)
         for path, (file_grid, parts, digest) in zip(paths, read, strict=True):
-            grid = grid or file_grid
-            grid.require_same(file_grid, path.name)
-            hashes[path.relative_to(folder).as_posix()] = digest
-            for role, mask in parts.items():
-                _unite(masks, role, mask)
-    if grid is None:
-        raise AnatomyError("No mask was given", expected="masks of airway, vessels and lung")
-    return MaskSet(grid=grid, masks=masks, files=_files_by_role(sources), sources=hashes)
+            hashes[Path(os.path.relpath(os.path.abspath(path), folder)).as_posix()] = digest
+            gathered.add(path.name, file_grid, parts)
+    return MaskSet(
+        grid=grid,
+        masks=gathered.masks,
+        files=_files_by_role(sources),
+        sources=hashes,
+        lobes=gathered.lobes,
+        statements=tuple(gathered.finish()),
+    )
+
+
+class _Gathered:
+    """The masks of the files read so far, on one grid."""
+
+    def __init__(self, grid: Grid, basis: str, basis_grid: Grid) -> None:
+        self._grid, self._basis, self._basis_grid = grid, basis, basis_grid
+        self._later: list[Callable[[Mask | None], str]] = []
+        self._statements: list[str] = []
+        self.masks: dict[str, Mask] = {}
+        self.lobes: UInt8 | None = None
+
+    def add(self, name: str, grid: Grid, parts: list[tuple[MaskSource, Mask]]) -> None:
+        for source, mask in parts:
+            on_grid = mask if self._grid.is_close(grid) else self._placed(name, source.role, grid, mask)
+            if source.role != "lobes":
+                _unite(self.masks, source.role, on_grid)
+                continue
+            if self.lobes is None:
+                self.lobes = np.zeros(self._grid.shape, dtype=np.uint8, order="F")
+            self.lobes[on_grid & (self.lobes == 0)] = source.lobe
+
+    def _placed(self, name: str, role: str, grid: Grid, mask: Mask) -> Mask:
+        solid = role in SOLID
+        found = place(mask, grid, self._grid, solid=solid)
+        if covers_same_voxels(grid, self._basis_grid):
+            return np.asarray(found.array)
+        if grid.shape == self._basis_grid.shape:
+            self._state_move(name, grid, mask, found)
+        else:
+            self._statements.append(placement(name, role, mask, grid, self._grid, found))
+        return np.asarray(found.array)
+
+    def _state_move(self, name: str, grid: Grid, mask: Mask, found: Placed) -> None:
+        """Remember to say, once the lungs are known, how much of a file lies in them by its header."""
+        by_index = place(mask, self._basis_grid, self._grid).array
+        self._later.append(
+            lambda lung: moved(
+                name,
+                self._basis,
+                grid.lps(np.zeros(3)) - self._basis_grid.lps(np.zeros(3)),
+                found,
+                share_by_header=_share(found.array, lung),
+                share_by_index=_share(by_index, lung),
+            )
+        )
+
+    def finish(self) -> Iterable[str]:
+        """Yield how files were placed."""
+        lung = self.masks.get("lung")
+        if lung is None and self.lobes is not None:
+            lung = self.lobes > 0
+        yield from self._statements
+        yield from (later(lung) for later in self._later)
+
+
+def _share(mask: Array, lung: Mask | None) -> float | None:
+    count = np.count_nonzero(mask)
+    return None if lung is None or not count else float(np.count_nonzero(mask & lung)) / count
 
 
 def _read_file(
     path: Path, sources: Sequence[MaskSource], frame: Frame | None
-) -> tuple[Grid, dict[str, Mask], str]:
-    masks: dict[str, Mask] = {}
+) -> tuple[Grid, list[tuple[MaskSource, Mask]], str]:
     sources = [source for source in sources if source.path == path]
     if not any(source.labels for source in sources):
         volume = read_mask(path, frame=frame)
-        for source in sources:
-            masks[source.role] = volume.array
+        parts = [(source, volume.array) for source in sources]
     else:
         volume = read_volume(path, frame=frame)
         require_numbers(volume.array, path)
-        for source in sources:
-            _unite(masks, source.role, select(volume.array, source.labels))
-    return volume.grid, masks, sha256(path)
+        parts = [(source, select(volume.array, source.labels)) for source in sources]
+    return volume.grid, parts, sha256(path)
 
 
 def select(values: Array, labels: tuple[int, ...]) -> Mask:
@@ -119,69 +192,3 @@ def _files_by_role(sources: Sequence[MaskSource]) -> dict[str, tuple[str, ...]]:
     for source in sources:
         names.setdefault(source.role, []).append(source.path.name)
     return {role: tuple(files) for role, files in names.items()}
-
-
-def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any) -> PatientImages:
-    """Make the `PatientImages` of masks that were read, after checking that none is missing or empty.
-
-    Parameters
-    ----------
-    masks : MaskSet
-    name, kind : str
-        As in `PatientImages`.
-    where : Path
-        The patient's folder, for messages.
-    others
-        Further fields of `PatientImages`; `warnings` and `sources` are added to.
-
-    Raises
-    ------
-    AnatomyError
-        If lumen, vessels or lung is missing, or a mask is empty.  An empty mask of fissures or nodules
-        only causes a warning.
-    """
-    missing = [role for role in _REQUIRED if role not in masks.masks]
-    if missing:
-        raise AnatomyError(
-            f"{where} holds no mask of: {', '.join(missing)}",
-            expected="masks of the airway lumen, the vessels and the lung",
-            remedy="docs/reference/patients.md lists the file names that are understood",
-        )
-    volumes: dict[str, Any] = {}
-    warnings = list(others.pop("warnings", ()))
-    for role, mask in masks.masks.items():
-        if mask.any():
-            volumes[role] = Volume(grid=masks.grid, array=mask)
-        else:
-            warnings.append(_empty(role, masks.files[role]))
-    return PatientImages(
-        name=name,
-        kind=kind,
-        grid=masks.grid,
-        sources={**masks.sources, **others.pop("sources", {})},
-        warnings=tuple(warnings),
-        **volumes,
-        **others,
-    )
-
-
-def _empty(role: str, files: tuple[str, ...]) -> str:
-    if role in _MAY_BE_EMPTY:
-        return f"The mask of {role} ({', '.join(files)}) is empty; it is taken as absent"
-    raise AnatomyError(
-        f"The mask of {role} is empty ({', '.join(files)})",
-        expected="at least one voxel that is not zero",
-        remedy="Segment the structure again, or remove the file if the structure is unknown",
-    )
-
-
-def require_cost(volume: Volume, grid: Grid, path: Path) -> Volume:
-    """Return a cost map as float32 on the grid of the masks.
-
-    Raises
-    ------
-    GridMismatchError
-        If it lies on another grid.
-    """
-    grid.require_same(volume.grid, path.name)
-    return Volume(grid=grid, array=volume.array.astype(np.float32))

@@ -1,78 +1,205 @@
-"""Folders of the UNC Med-RAD collection: masks in NIfTI, poses and points as text in RAS."""
+"""Lungs of the UNC Med-RAD collection, and the starts and targets of its folders, which are RAS text."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
-from anatomy.errors import FrameError
+import numpy as np
+
+from anatomy.errors import AnatomyError, FileError, FrameError
 from anatomy.grid import Grid
+from anatomy.io.assembly import LUNG_ROLES, assemble, describe_yourself
 from anatomy.io.files import sha256
 from anatomy.io.frames import Frame, read_points, read_pose
-from anatomy.io.masks import MaskSource, assemble, read_masks
+from anatomy.io.masks import MaskSource, read_masks
+from anatomy.io.near_names import by_name, looks_like, plain
+from anatomy.lobes import lobe_named
 from anatomy.patient import PatientImages
+from anatomy.records import frozen_record
+from anatomy.typed import Float
 
-_ROLES = {
-    "bronchialTree": "lumen",
-    "vessels": "vessels",
-    "pleuralBoundary": "lung",
-    "fissures": "fissures",
-    "nodule": "nodules",
+LUNG_FILES: Mapping[str, tuple[str, ...]] = {
+    "lumen": ("bronchialTree", "airway", "airways", "bronchi", "airwayTree"),
+    "vessels": ("vessels", "vessel", "bloodVessels"),
+    "lung": ("pleuralBoundary", "lungs", "lung"),
+    "fissures": ("fissures", "fissure"),
 }
-_ENDINGS = (".nii.gz", ".nii")
+"""Names of the files of a lung by role, that of the collection first; the case of letters is the same."""
+_BRAIN = ("brain", "ventricles", "globipallidi", "globipaladii")
 _FRAME_ON_DISK: Frame = "ras"
 
 
+@frozen_record
+class TextPoses:
+    """Starts `(4, 4)` and targets `(3,)`, LPS mm, with the names of their files, and the SHA-256 of these."""
+
+    starts: tuple[Float, ...]
+    start_names: tuple[str, ...]
+    targets_lps: tuple[Float, ...]
+    target_names: tuple[str, ...]
+    sources: Mapping[str, str]
+
+
 def is_med_rad(folder: Path) -> bool:
-    """Tell whether a folder holds a Med-RAD patient."""
-    return _file(folder, "bronchialTree") is not None
+    """Tell whether a folder holds a lung of Med-RAD: a bronchial tree, and vessels, lungs or lobes."""
+    roles = {source.role for source in lung_sources(folder)}
+    return "lumen" in roles and len(roles) > 1
+
+
+def require_no_brain(folder: Path) -> None:
+    """Refuse a brain of Med-RAD in words.
+
+    Raises
+    ------
+    FileError
+        If the folder is one.
+    """
+    found = [name for name in _BRAIN if name in by_name(folder)]
+    if "brain" in found and (len(found) > 1 or "vessels" in by_name(folder)):
+        raise FileError(
+            f"{folder} is a brain of Med-RAD ({', '.join(found)}): brains are not planned for",
+            expected="a lung or a liver",
+            remedy="Of Med-RAD, the folders of Lungs and Liver are understood",
+        )
 
 
 def load_med_rad(folder: Path) -> PatientImages:
-    """Read a Med-RAD patient.
+    """Read a lung of Med-RAD.
 
-    `pleuralBoundary` is, despite its name, a filled mask of both lungs.  The collection does not tell
-    the airway wall from the lumen, and does not state the breath hold.
+    `pleuralBoundary` is, despite its name, a filled mask of both lungs; the respiratory part has lobes
+    instead.  The collection does not tell the airway wall from the lumen, and does not state the breath hold.
 
     Raises
     ------
     FrameError
         If a start or target lies outside the images: its numbers are not RAS, or of another patient.
     """
-    found = [(_file(folder, stem), role) for stem, role in _ROLES.items()]
-    masks = read_masks([MaskSource(role=role, path=path) for path, role in found if path is not None])
-    start_files = sorted(folder.glob("start*.txt"), key=_natural)
-    target_files = sorted(folder.glob("target*.txt"), key=_natural)
-    starts = tuple(read_pose(path, _FRAME_ON_DISK) for path in start_files)
-    targets = tuple(point for path in target_files for point in read_points(path, _FRAME_ON_DISK))
-    for what, points in (("start", [pose[:3, 3] for pose in starts]), ("target", targets)):
-        for point in points:
-            _require_inside(masks.grid, point, what, folder)
+    sources = lung_sources(folder)
+    require_roles(folder, sources)
+    masks = read_masks(sources)
+    texts = text_poses(folder, masks.grid)
     return assemble(
         masks,
-        name=folder.name,
+        name=folder.resolve().name,
         kind="med-rad",
         where=folder,
+        starts=texts.starts,
+        start_names=texts.start_names,
+        targets_lps=texts.targets_lps,
+        target_names=texts.target_names,
+        sources=texts.sources,
+    )
+
+
+def lung_sources(folder: Path) -> list[MaskSource]:
+    """Return the masks of a lung that a folder holds by the names of Med-RAD."""
+    images = by_name(folder)
+    sources = [
+        MaskSource(role="lobes", path=path, lobe=lobe_named(name))
+        for name, path in images.items()
+        if lobe_named(name)
+    ]
+    for role, names in LUNG_FILES.items():
+        path = next((images[plain(name)] for name in names if plain(name) in images), None)
+        path = _of_a_case(images) if path is None and role == "lumen" else path
+        if path is not None:
+            sources.append(MaskSource(role=role, path=path))
+    return [*sources, *numbered_nodules(images)]
+
+
+def _of_a_case(images: Mapping[str, Path]) -> Path | None:
+    """Return the one bronchial tree whose name begins or ends with that of its case."""
+    holding = [path for stem, path in images.items() if "bronchialtree" in stem]
+    return holding[0] if len(holding) == 1 else None
+
+
+def numbered_nodules(images: Mapping[str, Path]) -> list[MaskSource]:
+    """Return the masks called nodule, nodules, tumour, nodule1, nodule2 and so on."""
+    found = [path for stem, path in images.items() if re.fullmatch(r"(nodule|tumou?r)s?\d*", stem)]
+    return [MaskSource(role="nodules", path=path) for path in found]
+
+
+def text_poses(folder: Path, grid: Grid) -> TextPoses:
+    """Read the files whose names end in `start1` and the like as poses, and `target` and the like as points.
+
+    A name that holds both, such as `target1_start2.txt`, is a start.
+
+    Raises
+    ------
+    FileError
+        If a file holds no pose or point.
+    FrameError
+        If a position lies outside `grid`.
+    """
+    texts = sorted(folder.glob("*.[tT][xX][tT]"), key=_natural)
+    start_files = [path for path in texts if re.search(r"start_?\d*$", path.stem.lower())]
+    target_files = [path for path in texts if re.fullmatch(r"targets?_?\d*", path.stem.lower())]
+    starts = tuple(read_pose(path, _FRAME_ON_DISK) for path in start_files)
+    points = [(path.stem, read_points(path, _FRAME_ON_DISK)) for path in target_files]
+    targets = [
+        (stem if len(of_file) == 1 else f"{stem}.{n + 1}", point)
+        for stem, of_file in points
+        for n, point in enumerate(of_file)
+    ]
+    for what, places in (("start", [pose[:3, 3] for pose in starts]), ("target", [p for _, p in targets])):
+        for place in places:
+            _require_inside(grid, place, what, folder)
+    return TextPoses(
         starts=starts,
-        targets_lps=targets,
+        start_names=tuple(path.stem for path in start_files),
+        targets_lps=tuple(point for _, point in targets),
+        target_names=tuple(name for name, _ in targets),
         sources={path.name: sha256(path) for path in (*start_files, *target_files)},
     )
 
 
-def _file(folder: Path, stem: str) -> Path | None:
-    candidates = (folder / (stem + ending) for ending in _ENDINGS)
-    return next((path for path in candidates if path.is_file()), None)
+def _natural(path: Path) -> tuple[list[int], str]:
+    return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.name
 
 
-def _natural(path: Path) -> tuple[int, str]:
-    digits = re.search(r"\d+", path.stem)
-    return (int(digits[0]) if digits else 0, path.name)
+def require_roles(folder: Path, sources: list[MaskSource]) -> None:
+    """Refuse a folder that lacks a mask, and say which file is missing and which one looks like it.
+
+    Raises
+    ------
+    AnatomyError
+        If lumen, vessels, or lungs and lobes are missing.
+    """
+    found = {"lung" if source.role == "lobes" else source.role for source in sources}
+    missing = [role for role in LUNG_ROLES if role not in found]
+    if missing:
+        words = " and ".join(LUNG_ROLES[role] for role in missing)
+        files = ", ".join(f"{LUNG_FILES[role][0]}.nii.gz ({what})" for role, what in LUNG_ROLES.items())
+        raise AnatomyError(
+            f"{folder} holds some masks of lungs, but no mask of {words}. "
+            f"{missing_files(folder, missing, sources)}",
+            expected=f"{files}; instead of pleuralBoundary also the lobes LUL, LLL, RUL, RML, RLL",
+            remedy=describe_yourself(),
+        )
 
 
-def _require_inside(grid: Grid, point: object, what: str, folder: Path) -> None:
-    if not grid.contains(point).all():  # type: ignore[arg-type]
+def missing_files(folder: Path, missing: list[str], sources: list[MaskSource]) -> str:
+    """Say of each missing role which image of the folder looks like it, and what else is there."""
+    used = {source.path for source in sources}
+    unused = {name: path for name, path in by_name(folder).items() if path not in used}
+    sentences = []
+    for role in missing:
+        like = looks_like(LUNG_FILES[role], unused)
+        if like is not None:
+            sentences.append(f"{like.name} looks like {LUNG_FILES[role][0]}.nii.gz")
+    there = ", ".join(path.name for path in unused.values())
+    return "; ".join([*sentences, f"images of unknown name: {there or 'none'}"])
+
+
+def _require_inside(grid: Grid, point: Float, what: str, folder: Path) -> None:
+    if not grid.contains(point).all():
+        flipped = point * np.array([-1.0, -1.0, 1.0])
+        hint = "; taken as LPS it would lie inside" if grid.contains(flipped).all() else ""
+        place = ", ".join(f"{x:.1f}" for x in point)
         raise FrameError(
-            f"A {what} of {folder} lies outside the images, at LPS {point}",
+            f"A {what} of {folder} lies outside the images, at LPS ({place}) mm{hint}",
             expected="positions in RAS mm inside the images",
             remedy="Check the frame of the text files, and that they belong to this patient",
         )

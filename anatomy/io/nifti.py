@@ -11,10 +11,19 @@ from anatomy.errors import AnatomyError, FileError
 from anatomy.grid import Volume
 from anatomy.io.compressed import pieces
 from anatomy.io.frames import Frame
-from anatomy.io.nifti_header import NiftiHeader, data_offset, parse_header
+from anatomy.io.nifti_header import NiftiHeader, data_offset, is_header, parse_header
 from anatomy.typed import Array
 
 _HEADER_BYTES = 540
+
+
+def begins_as_nifti(path: Path) -> bool:
+    """Tell whether a file, compressed or not, begins with a NIfTI header, whatever its name."""
+    try:
+        start = next(pieces(path), b"")
+    except (FileError, OSError):
+        return False
+    return len(start) >= _HEADER_BYTES and is_header(start)
 
 
 def read_nifti_header(path: Path, frame: Frame | None = None) -> NiftiHeader:

@@ -72,6 +72,12 @@ class NiftiHeader:
         return (self.slope, self.intercept) != (1.0, 0.0)
 
 
+def is_header(start: bytes) -> bool:
+    """Tell whether bytes begin with the header of a single-file NIfTI image."""
+    sizes = {struct.unpack_from(order + "i", start)[0] for order in "<>"}
+    return bool(sizes & _LAYOUTS.keys()) and (start[344:347] == b"n+1" or start[4:7] == b"n+2")
+
+
 def data_offset(start: bytes, path: Path) -> int:
     """Return where the voxels begin, from the first 540 bytes of a file."""
     return int(_fields(start, path)["vox_offset"][0])

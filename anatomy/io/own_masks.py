@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from anatomy.errors import AnatomyError, SettingsError
-from anatomy.io.files import read_text, require_file, sha256
+from anatomy.errors import AnatomyError, FileError, SettingsError
+from anatomy.io.assembly import assemble, require_cost
+from anatomy.io.files import read_text, sha256
 from anatomy.io.frames import Frame, parse_point
-from anatomy.io.images import read_volume
+from anatomy.io.images import image_stem, image_suffix, read_volume
 from anatomy.io.label_names import stored_names
-from anatomy.io.masks import MaskSource, assemble, read_masks, require_cost
+from anatomy.io.masks import MaskSource, read_masks
+from anatomy.lobes import LOBES, lobe_named
 from anatomy.patient import PatientImages
 from anatomy.settings import parse, quantity, settings
+from anatomy.suggestion import did_you_mean
 
 DESCRIPTION = "patient.toml"
 _ROLES = {
@@ -40,7 +44,12 @@ class PatientFile:
 
     lumen: Annotated[_Files, _key("Airway lumen")]
     vessels: Annotated[_Files, _key("Arteries and veins")]
-    lung: Annotated[_Files, _key("Both lungs, filled")]
+    lung: Annotated[
+        _Files, _key("Both lungs, filled; or their lobes, if files or labels are named after them")
+    ] = ()
+    lobes: Annotated[Mapping[str, _Files], _key("Files by the name of their lobe")] = Field(
+        default_factory=dict
+    )
     wall: Annotated[_Files, _key("Airway wall")] = ()
     fissures: Annotated[_Files, _key("Fissures between lobes")] = ()
     nodule: Annotated[_Files, _key("Nodules")] = ()
@@ -76,8 +85,8 @@ def load_own_masks(description: Path) -> PatientImages:
     hashes = {description.name: sha256(description)}
     cost = None
     if keys.cost:
-        cost_path = require_file(folder / keys.cost)
-        cost = require_cost(read_volume(cost_path, frame=frame), masks.grid, cost_path)
+        cost_path = _named_file(folder, keys.cost)
+        cost = require_cost(read_volume(cost_path, frame=frame), masks.grid)
         hashes[keys.cost] = sha256(cost_path)
     return assemble(
         masks,
@@ -127,22 +136,40 @@ def _read_description(path: Path) -> PatientFile:
         return parse(PatientFile, content, path.name)
     except SettingsError as error:
         raise SettingsError(
-            error.found, expected=error.expected, remedy="docs/reference/patients.md explains every key"
+            error.found,
+            expected=error.expected,
+            remedy=f"Keys of a patient.toml are {', '.join(PatientFile.__dataclass_fields__)}; "
+            "lumen, vessels, and lung or lobes are needed",
         ) from error
 
 
 def _sources(keys: PatientFile, folder: Path) -> Iterator[MaskSource]:
     for key, role in _ROLES.items():
-        entries = getattr(keys, key)
-        for entry in (entries,) if isinstance(entries, str) else entries:
+        for entry in _entries(getattr(keys, key)):
             yield _source(role, entry, folder)
+    for name, files in keys.lobes.items():
+        lobe = lobe_named(name)
+        if not lobe:
+            raise SettingsError(
+                f"patient.toml names a lobe {name!r}",
+                expected=f"one of {', '.join(LOBES.values())}",
+                remedy='Write for instance: lobes = { "right upper" = "RUL.nii", "left lower" = "LLL.nii" }',
+            )
+        for entry in _entries(files):
+            yield replace(_source("lobes", entry, folder), lobe=lobe)
+
+
+def _entries(files: _Files) -> tuple[str, ...]:
+    return (files,) if isinstance(files, str) else files
 
 
 def _source(role: str, entry: str, folder: Path) -> MaskSource:
+    """Return a mask source; a part of the lungs that is named after a lobe is that lobe."""
     name, separator, label = entry.rpartition("#")
     if not separator or (folder / entry).is_file():
-        return MaskSource(role=role, path=require_file(folder / entry))
-    path = require_file(folder / name)
+        path = _named_file(folder, entry)
+        return _or_lobe(MaskSource(role=role, path=path), image_stem(path))
+    path = _named_file(folder, name)
     if label.isdigit():
         return MaskSource(role=role, path=path, labels=(int(label),))
     names = stored_names(path)
@@ -153,4 +180,24 @@ def _source(role: str, entry: str, folder: Path) -> MaskSource:
             expected=f"one of {sorted(names.values())}" if names else "a file that names its labels",
             remedy=f"Write the label's value instead, as in {name}#1",
         )
-    return MaskSource(role=role, path=path, labels=values)
+    return _or_lobe(MaskSource(role=role, path=path, labels=values), label)
+
+
+def _or_lobe(source: MaskSource, name: str) -> MaskSource:
+    lobe = lobe_named(name) if source.role == "lung" else 0
+    return replace(source, role="lobes", lobe=lobe) if lobe else source
+
+
+def _named_file(folder: Path, name: str) -> Path:
+    """Return a file that the description names; if it is not there, say which file looks like it."""
+    path = folder / name
+    if path.is_file():
+        return path
+    there = (
+        [other.name for other in path.parent.iterdir() if image_suffix(other)] if path.parent.is_dir() else []
+    )
+    raise FileError(
+        f"{DESCRIPTION} in {folder} names {name}, which is not there",
+        expected="an existing file; names are relative to the folder of the patient.toml, or absolute",
+        remedy=did_you_mean(path.name, there) or f"Images there: {', '.join(sorted(there)) or 'none'}",
+    )

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 from anatomy.errors import FileError
-from anatomy.io.images import image_suffix
-from anatomy.io.med_rad import is_med_rad, load_med_rad
+from anatomy.io.assembly import describe_yourself
+from anatomy.io.ct_cases import cases_in, require_no_ct_case
+from anatomy.io.images import image_suffix, images_in
+from anatomy.io.liver import is_liver
+from anatomy.io.med_rad import is_med_rad, load_med_rad, lung_sources, require_no_brain, require_roles
 from anatomy.io.own_masks import DESCRIPTION, load_own_masks
-from anatomy.io.totalsegmentator import is_totalsegmentator, load_totalsegmentator
+from anatomy.io.totalsegmentator import has_lobes, is_totalsegmentator, load_totalsegmentator
 from anatomy.patient import PatientImages
+
+_SHOWN = 12
+"""So many names of a long list are shown."""
 
 
 def load_patient(path: str | Path) -> PatientImages:
-    """Read a patient from disk.
+    """Read a patient's lungs from disk.
 
     Parameters
     ----------
     path : str or Path
-        A folder with a `patient.toml`, a Med-RAD folder, a folder with output of TotalSegmentator; or a
+        A folder with a `patient.toml`, a lung of Med-RAD, a folder with output of TotalSegmentator; or a
         `.toml` file, or a label map of TotalSegmentator with the lobes beside it.
 
     Returns
@@ -30,11 +38,10 @@ def load_patient(path: str | Path) -> PatientImages:
     AnatomyError
         If a mask is missing, empty, or holds NaN.
     FileError
-        If the path is of none of these kinds, or a file is damaged.
+        If the path is of none of these kinds, or a file is damaged.  The message names what the folder looks
+        like: a liver, a case without masks of vessels, the folder of a data set and its cases.
     FrameError
-        If a file states no frame, or one whose axes are not perpendicular.
-    GridMismatchError
-        If the masks do not share one voxel grid.
+        If a file states no frame, or one whose axes are not perpendicular, or lies far from the others.
     SettingsError
         If a `patient.toml` is wrong.
 
@@ -45,19 +52,87 @@ def load_patient(path: str | Path) -> PatientImages:
     anatomy.errors.FileError: There is no patient at nowhere. ...
     """
     path = Path(path)
-    if path.is_file() and path.suffix == ".toml":
+    if path.is_file():
+        return _load_file(path)
+    if not path.is_dir():
+        raise FileError(
+            f"There is no patient at {path}", expected="an existing folder or file", remedy="Check the path"
+        )
+    if (path / DESCRIPTION).is_file():
+        return load_own_masks(path / DESCRIPTION)
+    if is_med_rad(path):
+        return load_med_rad(path)
+    if is_totalsegmentator(path):
+        return load_totalsegmentator(path)
+    _refuse(path)
+
+
+def _load_file(path: Path) -> PatientImages:
+    if path.suffix == ".toml":
         return load_own_masks(path)
-    if path.is_file() and image_suffix(path):
+    require_no_ct_case(path)
+    if image_suffix(path):
         return load_totalsegmentator(path.parent, label_map=path)
-    if path.is_dir():
-        if (path / DESCRIPTION).is_file():
-            return load_own_masks(path / DESCRIPTION)
-        if is_med_rad(path):
-            return load_med_rad(path)
-        if is_totalsegmentator(path):
-            return load_totalsegmentator(path)
     raise FileError(
-        f"There is no patient at {path}" if not path.exists() else f"{path} is no patient of a known kind",
-        expected="a folder with patient.toml, a Med-RAD folder, or output of TotalSegmentator's lung_vessels",
-        remedy="docs/reference/patients.md describes the three kinds of folders",
+        f"{path} is no patient",
+        expected="a folder, a patient.toml, or a label map of TotalSegmentator",
+        remedy="Name the folder that holds the masks",
     )
+
+
+def _refuse(folder: Path) -> NoReturn:
+    """Raise an error that says what a folder is that is no patient, or nearly one."""
+    if is_liver(folder):
+        raise FileError(
+            f"{folder} is a liver of Med-RAD: without airways no bronchoscope can be planned for it",
+            expected="a lung",
+            remedy="For a liver there are `lungaccess info`, `lungaccess needle` and `lungaccess route`, "
+            "which takes --lumen portal-vein, hepatic-vein or hepatic-artery",
+        )
+    require_no_brain(folder)
+    require_no_ct_case(folder)
+    if lung_sources(folder):
+        if has_lobes(folder):
+            _refuse_lobes_alone(folder)
+        require_roles(folder, lung_sources(folder))
+    within = patients_in(folder)
+    if within:
+        shown = ", ".join(str(path.relative_to(folder)) for path in within[:_SHOWN])
+        rest = f" and {len(within) - _SHOWN} more" if len(within) > _SHOWN else ""
+        raise FileError(
+            f"{folder} is not one patient, it holds {len(within)}: {shown}{rest}",
+            expected="one of them",
+            remedy=f"Name one, such as {within[0]}",
+        )
+    images = [path.name for path in images_in(folder)]
+    there = ", ".join(images[:_SHOWN]) or "no image at all"
+    raise FileError(
+        f"{folder} is no patient of a known kind: it holds {there}",
+        expected="a folder of Med-RAD (bronchialTree, vessels, pleuralBoundary), output of TotalSegmentator "
+        "(task lung_vessels), a case of AeroPath or ATM'22, or a folder with a patient.toml",
+        remedy=describe_yourself(),
+    )
+
+
+def _refuse_lobes_alone(folder: Path) -> NoReturn:
+    raise FileError(
+        f"{folder} holds lobes of TotalSegmentator, but neither airways nor vessels",
+        expected="output of the tasks total and lung_vessels in one folder",
+        remedy=f"Run TotalSegmentator -i CT.nii.gz -o {folder} --task lung_vessels",
+    )
+
+
+def patients_in(folder: Path) -> list[Path]:
+    """Return the patients, of any kind, that lie one or two folders below, or the cases of a data set."""
+    cases = cases_in(folder)
+    if cases:
+        return cases
+    known: tuple[Callable[[Path], bool], ...] = (is_med_rad, is_liver, is_totalsegmentator)
+    below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    found: list[Path] = []
+    for path in below:
+        if (path / DESCRIPTION).is_file() or any(kind(path) for kind in known):
+            found.append(path)
+        else:
+            found += cases_in(path)
+    return found

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
+from anatomy.io.assembly import assemble
 from anatomy.io.files import sha256
-from anatomy.io.images import image_stem, image_suffix
+from anatomy.io.images import image_stem, images_in
 from anatomy.io.label_names import label_values, published_names, stored_names
-from anatomy.io.masks import MaskSet, MaskSource, assemble, read_masks
-from anatomy.morphology import grown_by_one
+from anatomy.io.lungs import fill_lung
+from anatomy.io.masks import MaskSource, read_masks
+from anatomy.lobes import lobe_named
 from anatomy.patient import PatientImages
-from anatomy.typed import Mask
 
 ROLES: Mapping[str, str] = {
     "lung_airways": "lumen",
@@ -23,11 +22,11 @@ ROLES: Mapping[str, str] = {
     "lung_arteries": "vessels",
     "lung_veins": "vessels",
     "lung_vessels": "vessels",
-    "lung_upper_lobe_left": "lung",
-    "lung_lower_lobe_left": "lung",
-    "lung_upper_lobe_right": "lung",
-    "lung_middle_lobe_right": "lung",
-    "lung_lower_lobe_right": "lung",
+    "lung_upper_lobe_left": "lobes",
+    "lung_lower_lobe_left": "lobes",
+    "lung_upper_lobe_right": "lobes",
+    "lung_middle_lobe_right": "lobes",
+    "lung_lower_lobe_right": "lobes",
     "lung_left": "lung",
     "lung_right": "lung",
     "lung": "lung",
@@ -38,10 +37,15 @@ _AIRWAY_NAMES = ("lung_airways", "lung_trachea_bronchia")
 
 def is_totalsegmentator(folder: Path) -> bool:
     """Tell whether a folder holds output of the task lung_vessels."""
-    images = _images(folder)
+    images = images_in(folder)
     if {image_stem(path) for path in images} & {*_AIRWAY_NAMES, "lung_vessels"}:
         return True
     return any(set(_AIRWAY_NAMES) & set(stored_names(path).values()) for path in images)
+
+
+def has_lobes(folder: Path) -> bool:
+    """Tell whether a folder holds lobes by TotalSegmentator's names."""
+    return any(ROLES.get(image_stem(path)) == "lobes" for path in images_in(folder))
 
 
 def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> PatientImages:
@@ -66,7 +70,7 @@ def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> Patien
     sidecars = [path for path in folder.glob("*.json") if path.is_file()]
     return assemble(
         filled,
-        name=folder.name,
+        name=folder.resolve().name,
         kind="totalsegmentator",
         where=folder,
         warnings=tuple(statements),
@@ -81,18 +85,15 @@ def mask_sources(folder: Path, label_map: Path | None = None) -> tuple[list[Mask
     """
     sources: list[MaskSource] = []
     statements: list[str] = []
-    for path in _images(folder):
+    for path in images_in(folder):
         if path == label_map or image_stem(path) == "lung_vessels" or image_stem(path) not in ROLES:
             names, statement = _label_names(path, must_have=path == label_map)
             sources += _named_sources(path, names)
             statements += statement
         else:
-            sources.append(MaskSource(role=ROLES[image_stem(path)], path=path))
+            stem = image_stem(path)
+            sources.append(MaskSource(role=ROLES[stem], path=path, lobe=_lobe(stem)))
     return sources, statements
-
-
-def _images(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_file() and image_suffix(path))
 
 
 def _label_names(path: Path, *, must_have: bool) -> tuple[dict[int, str], list[str]]:
@@ -111,40 +112,16 @@ def _label_names(path: Path, *, must_have: bool) -> tuple[dict[int, str], list[s
 
 
 def _named_sources(path: Path, names: Mapping[int, str]) -> list[MaskSource]:
-    labels_of_role: dict[str, list[int]] = {}
+    values_of: dict[tuple[str, int], list[int]] = {}
     for value, name in names.items():
         if name in ROLES and value != 0:
-            labels_of_role.setdefault(ROLES[name], []).append(value)
+            values_of.setdefault((ROLES[name], _lobe(name)), []).append(value)
     return [
-        MaskSource(role=role, path=path, labels=tuple(sorted(values)))
-        for role, values in labels_of_role.items()
+        MaskSource(role=role, path=path, labels=tuple(sorted(values)), lobe=lobe)
+        for (role, lobe), values in values_of.items()
     ]
 
 
-def fill_lung(masks: MaskSet) -> MaskSet:
-    """Count airways and vessels, and the rim between them and a lobe, as lung.
-
-    The lobes leave out the larger bronchi and vessels, and two networks do not agree on a border to the
-    voxel.  All that is added is airway or vessel, hence an obstacle, or lies in a gap of at most two voxels
-    between one of them and a lobe, so that the mediastinum does not become passable.
-    """
-    roles = [masks.masks[role] for role in ("lumen", "wall", "vessels") if role in masks.masks]
-    if "lung" not in masks.masks or not masks.masks["lung"].any() or not roles:
-        return masks
-    lobes = masks.masks["lung"]
-    tubes: Mask = np.logical_or.reduce(roles)
-    lung: Mask = lobes | tubes
-    box = _box(lung)
-    closed = ~grown_by_one(~grown_by_one(lung[box]))
-    lung[box] |= closed & grown_by_one(tubes[box]) & grown_by_one(grown_by_one(lobes[box]))
-    return MaskSet(
-        grid=masks.grid, masks={**masks.masks, "lung": lung}, files=masks.files, sources=masks.sources
-    )
-
-
-def _box(mask: Mask) -> tuple[slice, ...]:
-    """Return the box around all voxels of a mask, two voxels wider on every side."""
-    along_jk = np.any(mask, axis=0)
-    lines = np.any(mask, axis=(1, 2)), np.any(along_jk, axis=1), np.any(along_jk, axis=0)
-    hits = [np.flatnonzero(line) for line in lines]
-    return tuple(slice(max(0, int(hit[0]) - 2), int(hit[-1]) + 3) for hit in hits)
+def _lobe(name: str) -> int:
+    """Return the number of the lobe of a structure, 0 for any other."""
+    return lobe_named(name) if ROLES[name] == "lobes" else 0

@@ -76,8 +76,7 @@ def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
     if not folder.is_dir():
         raise FileError(f"There is no folder {folder}", expected="a folder with output of TotalSegmentator")
     sources, _ = mask_sources(folder)
-    masks = read_masks(sources).masks if sources else {}
-    roles = {source.role for source in sources}
+    roles = {"lung" if source.role == "lobes" else source.role for source in sources}
     # The task total knows the trachea alone; only the task lung_vessels shows the airways.
     if not roles & {"wall", "vessels"}:
         roles.discard("lumen")
@@ -87,9 +86,12 @@ def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
             expected="output of the tasks lung_vessels or total, such as lung_vessels.nii.gz",
             remedy="Run its task lung_vessels, or give masks one by one: --airway, --vessels, --lungs",
         )
-    on = read_masks(sources).grid
+    read = read_masks(sources)
+    masks = dict(read.masks)
+    if read.lobes is not None:
+        masks["lung"] = (read.lobes > 0) | masks.get("lung", False)
     return {
-        image: onto_grid(Volume(grid=on, array=masks[role]), grid, f"{role} of {folder.name}")
+        image: onto_grid(Volume(grid=read.grid, array=masks[role]), grid, f"{role} of {folder.name}")
         for role, image in _ROLES.items()
         if role in roles
     }

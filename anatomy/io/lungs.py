@@ -1,0 +1,86 @@
+"""Lungs made of lobes: their union, the rims at airways and vessels, the fissures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy.io.masks import MaskSet
+from anatomy.lobes import LOBES, fissures_between, grown_into, main_pieces
+from anatomy.morphology import grown_by_one
+from anatomy.typed import Mask, UInt8
+
+
+def with_lobes(masks: MaskSet) -> MaskSet:
+    """Make lungs and fissures of lobes, as far as they have no masks of their own.
+
+    The lungs are the union of the lobes, see `fill_lung`.  A fissure lies on both sides of every border
+    between two lobes of the same lung.  What was derived is stated.
+    """
+    if masks.lobes is None:
+        return masks
+    known = dict(masks.masks)
+    statements = list(masks.statements)
+    are_the_lungs = "lung" not in known
+    union = masks.lobes > 0 if are_the_lungs else known["lung"] | (masks.lobes > 0)
+    known = dict(fill_lung(replace(masks, masks={**known, "lung": union})).masks)
+    lobes = grown_into(_main_lobes(masks.lobes, statements), known["lung"])
+    if are_the_lungs:
+        statements += _absent(lobes)
+    if "fissures" not in known or not known["fissures"].any():
+        fissures = fissures_between(lobes)
+        if fissures.any():
+            known["fissures"] = fissures
+            statements.append(
+                f"No fissure mask: {np.count_nonzero(fissures)} voxels on both sides of the borders between "
+                "lobes of the same lung are taken as fissures."
+            )
+    return replace(masks, masks=known, lobes=lobes, statements=tuple(statements))
+
+
+def _main_lobes(lobes: UInt8, statements: list[str]) -> UInt8:
+    """Return the lobes without the pieces apart from them, which stay lung."""
+    kept = np.zeros_like(lobes)
+    for number, name in LOBES.items():
+        lobe = lobes == number
+        main = main_pieces(lobe)
+        kept[main] = number
+        stray = int(np.count_nonzero(lobe)) - int(np.count_nonzero(main))
+        if stray:
+            statements.append(
+                f"{stray} voxels of the mask of the {name} lie apart from it: they are lung, but of no lobe."
+            )
+    return kept
+
+
+def _absent(lobes: UInt8) -> list[str]:
+    absent = [name for number, name in LOBES.items() if not (lobes == number).any()]
+    return [f"There is no mask of the {name}: what lies there is not lung." for name in absent]
+
+
+def fill_lung(masks: MaskSet) -> MaskSet:
+    """Count airways and vessels, and the rim between them and a lobe, as lung.
+
+    Masks of lobes leave out the larger bronchi and vessels, and two networks do not agree on a border to the
+    voxel.  All that is added is airway or vessel, hence an obstacle, or lies in a gap of at most two voxels
+    between one of them and a lobe, so that the mediastinum does not become passable.
+    """
+    roles = [masks.masks[role] for role in ("lumen", "wall", "vessels") if role in masks.masks]
+    if "lung" not in masks.masks or not masks.masks["lung"].any() or not roles:
+        return masks
+    lobes = masks.masks["lung"]
+    tubes: Mask = np.logical_or.reduce(roles)
+    lung: Mask = lobes | tubes
+    box = _box(lung)
+    closed = ~grown_by_one(~grown_by_one(lung[box]))
+    lung[box] |= closed & grown_by_one(tubes[box]) & grown_by_one(grown_by_one(lobes[box]))
+    return replace(masks, masks={**masks.masks, "lung": lung})
+
+
+def _box(mask: Mask) -> tuple[slice, ...]:
+    """Return the box around all voxels of a mask, two voxels wider on every side."""
+    along_jk = np.any(mask, axis=0)
+    lines = np.any(mask, axis=(1, 2)), np.any(along_jk, axis=1), np.any(along_jk, axis=0)
+    hits = [np.flatnonzero(line) for line in lines]
+    return tuple(slice(max(0, int(hit[0]) - 2), int(hit[-1]) + 3) for hit in hits)

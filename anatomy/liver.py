@@ -1,0 +1,115 @@
+"""A liver as a needle sees it: the liver is where it may go, veins and artery are what it avoids."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy.build import WorkingBox, close_border, field_arrays, lung_key
+from anatomy.fields import DistanceField, corner_geometry
+from anatomy.grid import Grid, Volume
+from anatomy.organ import Organ
+from anatomy.records import frozen_record
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, OUTSIDE, VESSEL
+from anatomy.typed import Float, Int, Mask
+
+ENTRY_BRANCH = 0
+"""The branch of the labels that stands for the surface a needle pierces; a liver has no other."""
+
+
+@frozen_record
+class LiverImages:
+    """What was read from disk for one liver, on one voxel grid.
+
+    Parameters
+    ----------
+    liver, nodules : Volume
+        Bool masks; the nodules are None if there is no mask of them.
+    lumens : mapping of str to Volume
+        The vessels by name, such as "portal-vein": obstacles of a needle, and what a catheter moves in.
+    starts, targets_lps, start_names, target_names, sources, warnings
+        As in `anatomy.patient.PatientImages`.
+    """
+
+    name: str
+    kind: str
+    grid: Grid
+    liver: Volume
+    lumens: Mapping[str, Volume]
+    nodules: Volume | None
+    starts: tuple[Float, ...]
+    start_names: tuple[str, ...]
+    targets_lps: tuple[Float, ...]
+    target_names: tuple[str, ...]
+    sources: Mapping[str, str]
+    warnings: tuple[str, ...]
+
+
+def build_liver(images: LiverImages) -> Organ:
+    """Make the `Organ` of a liver.
+
+    Liver, nodules and vessels are inside, as masks of a liver leave the other two out; what is not inside is
+    an obstacle, and so are the vessels.
+    """
+    vessels: Mask = np.logical_or.reduce([volume.array for volume in images.lumens.values()])
+    inside = images.liver.array | vessels
+    if images.nodules is not None:
+        inside |= images.nodules.array
+    box = WorkingBox(inside, images.grid)
+    labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
+    labels[~box.cut(inside)] = OUTSIDE
+    close_border(labels)
+    labels[box.cut(vessels)] |= VESSEL
+    geometry = corner_geometry(box.grid)
+    fields = {
+        name: DistanceField(name=name, corners=corners, geometry=geometry)
+        for name, corners in field_arrays(labels, box.grid, False, lambda _step: None)
+    }
+    nodules = images.nodules
+    return Organ(
+        name=images.name,
+        kind=images.kind,
+        key=lung_key(images.sources),
+        grid=box.grid,
+        labels=labels,
+        fields=fields,
+        nodules=None if nodules is None else Volume(grid=box.grid, array=box.cut(nodules.array)),
+        cost=None,
+        starts=images.starts,
+        targets_lps=images.targets_lps,
+        start_names=images.start_names,
+        target_names=images.target_names,
+        breath_hold=None,
+        sources=images.sources,
+        warnings=images.warnings,
+    )
+
+
+def with_entry(organ: Organ, start_lps: Float, radius_mm: float) -> Organ:
+    """Return an organ whose surface near a start counts as a wall that the needle pierces there.
+
+    What is outside within `radius_mm` of the start `(3,)` LPS mm gets the labels of an airway branch,
+    `ENTRY_BRANCH`, so that it is exempt for the first millimetres of a needle and an obstacle after them.
+    """
+    low = np.floor(organ.grid.ijk(start_lps) - radius_mm / organ.grid.spacing_mm).astype(np.int64)
+    high = np.ceil(organ.grid.ijk(start_lps) + radius_mm / organ.grid.spacing_mm).astype(np.int64) + 1
+    low, high = np.maximum(low, 0), np.minimum(high, organ.grid.shape)
+    voxels = np.argwhere(np.ones(np.maximum(high - low, 0), dtype=bool)) + low
+    near = voxels[_box_distance_mm(organ.grid, voxels, start_lps) <= radius_mm]
+    at = tuple(near[(organ.labels[tuple(near.T)] & OUTSIDE) != 0].T)
+    labels = organ.labels.copy(order="F")
+    labels[at] = (labels[at] & ~np.uint16(OUTSIDE)) | AIRWAY | ((ENTRY_BRANCH + 1) << BRANCH_SHIFT)
+    corners = dict(field_arrays(labels, organ.grid, False, lambda _step: None))
+    fields = {
+        name: DistanceField(name=name, corners=corners[name], geometry=field.geometry)
+        for name, field in organ.fields.items()
+    }
+    return replace(organ, labels=labels, fields=fields)
+
+
+def _box_distance_mm(grid: Grid, voxels: Int, point: Float) -> Float:
+    """Return the distance of a point to voxels as solid boxes, `(N,)` mm."""
+    away = np.maximum(np.abs(voxels - grid.ijk(point)) - 0.5, 0.0) * grid.spacing_mm
+    return np.asarray(np.linalg.norm(away, axis=1))

@@ -1,0 +1,113 @@
+"""The five lobes: their numbers and names, and the fissures that lie between them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from anatomy.morphology import bounds, window
+from anatomy.typed import Mask, UInt8
+
+RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
+LOBES: Mapping[int, str] = MappingProxyType(
+    {
+        RIGHT_UPPER: "right upper lobe",
+        RIGHT_MIDDLE: "right middle lobe",
+        RIGHT_LOWER: "right lower lobe",
+        LEFT_UPPER: "left upper lobe",
+        LEFT_LOWER: "left lower lobe",
+    }
+)
+"""Number of a lobe in a volume of lobes, and its name; 0 is no lobe."""
+
+GAP_VOXELS = 2
+"""Masks of two lobes may leave so many voxels between them to neither: a fissure as drawn by hand."""
+MAIN_PIECE_SHARE = 0.1
+"""A piece of a lobe's mask with less than this share of it is a slip of the pen, not a part of the lobe."""
+
+_SHORT = {"rul": RIGHT_UPPER, "rml": RIGHT_MIDDLE, "rll": RIGHT_LOWER, "lul": LEFT_UPPER, "lll": LEFT_LOWER}
+_LEVELS = {"upper": "upper", "superior": "upper", "middle": "middle", "lower": "lower", "inferior": "lower"}
+_WORDS = re.compile(r"left|right|upper|superior|middle|lower|inferior|lobe|lung")
+
+
+def lobe_named(name: str) -> int:
+    """Return the number of the lobe that a file or label is named after; 0 if it is none.
+
+    Examples
+    --------
+    >>> [lobe_named(name) for name in ("RUL", "lung_upper_lobe_left", "RightLowerLobe", "lung")]
+    [1, 4, 3, 0]
+    """
+    plain = re.sub(r"[^a-z0-9]", "", name.lower())
+    if plain in _SHORT:
+        return _SHORT[plain]
+    words = _WORDS.findall(plain)
+    sides = [word for word in words if word in ("left", "right")]
+    levels = [_LEVELS[word] for word in words if word in _LEVELS]
+    if "".join(words) != plain or len(sides) != 1 or len(levels) != 1:
+        return 0
+    meant = f"{sides[0]} {levels[0]} lobe"
+    return next((number for number, lobe in LOBES.items() if lobe == meant), 0)
+
+
+def main_pieces(mask: Mask) -> Mask:
+    """Return a lobe without the small pieces that lie apart from it."""
+    from scipy import ndimage
+
+    box = window(*bounds(mask))
+    pieces, count = ndimage.label(mask[box], np.ones((3, 3, 3)))
+    kept = np.zeros(mask.shape, dtype=np.bool_, order="F")
+    if count:
+        sizes = np.bincount(pieces.ravel())
+        sizes[0] = 0
+        kept[box] = (sizes >= MAIN_PIECE_SHARE * sizes.sum())[pieces]
+    return kept
+
+
+def grown_into(lobes: UInt8, lung: Mask) -> UInt8:
+    """Give voxels of the lung that are in no lobe, but within `GAP_VOXELS` of one, to it."""
+    low, high = bounds(lobes, GAP_VOXELS)
+    box = window(low, high)
+    grown = np.array(lobes, order="F")
+    inner, tissue = grown[box], lung[box]
+    for _ in range(GAP_VOXELS):
+        nearby = inner.copy(order="F")
+        for axis in range(3):
+            lower = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
+            upper = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
+            before = nearby.copy(order="F")
+            np.maximum(nearby[lower], before[upper], out=nearby[lower])
+            np.maximum(nearby[upper], before[lower], out=nearby[upper])
+        free = tissue & (inner == 0)
+        inner[free] = nearby[free]
+    return grown
+
+
+def fissures_between(lobes: UInt8) -> Mask:
+    """Mark the voxels on both sides of every border between two lobes of the same lung.
+
+    No chain of face neighbours passes from lobe to lobe without entering the fissure.
+
+    Parameters
+    ----------
+    lobes : (ni, nj, nk) uint8
+        Numbers of `LOBES`, 0 elsewhere.
+
+    Returns
+    -------
+    (ni, nj, nk) bool
+    """
+    fissures = np.zeros(lobes.shape, dtype=np.bool_, order="F")
+    box = window(*bounds(lobes))
+    inner, out = lobes[box], fissures[box]
+    for axis in range(3):
+        behind = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
+        ahead = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
+        a, b = inner[behind], inner[ahead]
+        meet = (a != b) & (a > 0) & (b > 0) & ((a <= RIGHT_LOWER) == (b <= RIGHT_LOWER))
+        out[behind] |= meet
+        out[ahead] |= meet
+    return fissures

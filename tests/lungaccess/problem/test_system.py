@@ -37,7 +37,7 @@ def test_preset_is_valid_sourced_and_survives_a_round_trip(name: str) -> None:
 
 @pytest.mark.parametrize("name", preset_names())
 def test_sources_of_presets_are_in_the_bibliography(name: str) -> None:
-    bibliography = (PRESETS.parents[1] / "docs" / "bibliography.md").read_text(encoding="utf-8")
+    bibliography = (PRESETS.parents[1] / "docs" / "reference" / "bibliography.md").read_text(encoding="utf-8")
     keys = {part.split("]")[0] for source in load_system(name).sources for part in source.split("[")[1:]}
     assert keys
     assert not {key for key in keys if f"[{key}]" not in bibliography}
@@ -125,14 +125,14 @@ def test_fingerprint_depends_on_every_number_and_nothing_else() -> None:
 
 
 def test_example_of_the_documentation_works(tmp_path: Path) -> None:
-    page = (PRESETS.parents[1] / "docs" / "devices.md").read_text(encoding="utf-8")
+    page = (PRESETS.parents[1] / "docs" / "how_to" / "devices.md").read_text(encoding="utf-8")
     example = page.split("```toml\n")[1].split("```")[0]
     system = load_system(write(tmp_path, example))
     assert system.needle.min_radius_of_curvature_mm == pytest.approx(100.0)
 
 
 def test_documentation_names_every_key() -> None:
-    page = (PRESETS.parents[1] / "docs" / "devices.md").read_text(encoding="utf-8")
+    page = (PRESETS.parents[1] / "docs" / "reference" / "devices.md").read_text(encoding="utf-8")
 
     def keys(mapping: dict[str, object]) -> set[str]:
         nested = (keys(value) for value in mapping.values() if isinstance(value, dict))

@@ -790,7 +790,7 @@ def test_the_search_tree_is_written_and_read_again(problem: NeedleProblem, tmp_p
 def test_the_example_of_the_documentation_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = Path(ompl_planner.__file__).parents[3] / "docs" / "ompl.md"
+    page = Path(ompl_planner.__file__).parents[3] / "docs" / "explanation" / "ompl.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
     from anatomy.errors import LungaccessError
     from anatomy.lung import Lung
+    from lungaccess.appraisal import Appraisal, appraise
     from lungaccess.checking import CheckReport, check
     from lungaccess.coupled import (
         Alternative,

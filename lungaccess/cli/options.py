@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget
+    from lungaccess.risk import ErrorModel
 
     ObjectiveText = str
 else:
@@ -129,6 +130,23 @@ class SystemOptions:
         from lungaccess.problem.system import load_system
 
         return load_system(self.system, fissures_allowed=self.allow_fissures)
+
+
+@Parameter(name="*")
+@frozen_value
+class ErrorOptions:
+    """How large the errors of devices and target are assumed to be."""
+
+    errors: Annotated[
+        Path | None,
+        Parameter(help="TOML file of the error model; the default one, all of it assumed, if not given."),
+    ] = None
+
+    def load(self) -> ErrorModel:
+        """Return the error model."""
+        from lungaccess.risk import ErrorModel, load_errors
+
+        return ErrorModel() if self.errors is None else load_errors(self.errors)
 
 
 @Parameter(name="*")

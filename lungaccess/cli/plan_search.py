@@ -15,15 +15,18 @@ from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.checking import CheckReport
+    from lungaccess.appraisal import Appraisal
     from lungaccess.coupled import ProgressEvent
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
     from lungaccess.report import CostPoint
+    from lungaccess.risk import ErrorModel
 
 PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
 """The plan, saved as soon as there is one and again when there is a better one; how its cost fell."""
+SUMMARY_FILE = "summary.json"
+"""What `--json` prints: headline, limits, costs.  The plan's own file states only the plan."""
 PICTURES = ("overview.png", "tree.png", "cost_over_time.png")
 """Pictures of a found plan, unless the user wants none."""
 
@@ -77,6 +80,7 @@ class PlanRequest:
     system: System
     target: StatedTarget
     search: SearchOptions
+    errors: ErrorModel
     out: Path
     output: PatientOptions
     pictures: bool = True
@@ -84,7 +88,7 @@ class PlanRequest:
     @property
     def files(self) -> tuple[str, ...]:
         """Names of the files that a found plan leaves in the folder."""
-        return (PLAN_FILE, HISTORY_FILE, *(PICTURES if self.pictures else ()))
+        return (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *(PICTURES if self.pictures else ()))
 
 
 def run_search(
@@ -142,10 +146,10 @@ def run_search(
 
 
 def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
-    """Search, check, show the plan and what the check says, draw it, and return the exit code.
+    """Search, appraise, show headline, limits and plan, draw it, and return the exit code.
 
     What is known is saved and shown before anything slower begins: the first plan, then the best one with its
-    check, then the pictures.
+    check and its chance of success, then the pictures.
 
     Raises
     ------
@@ -154,43 +158,55 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     """
     target, search = request.target.resolve(lung), request.search
     found, history = run_search(lung, target, request, SearchDisplay(search.time_s, search.iterations))
-    from lungaccess.checking import check  # After the search: the first plan does not wait for it.
+    from lungaccess.appraisal import appraise  # After the search: the first plan does not wait for it.
 
-    with progress("checking the plan"):
-        report = check(found, lung, system=request.system, target_lps=target.lps_mm)
+    with progress("checking the plan and estimating its chance"):
+        appraisal = appraise(
+            found, lung, errors=request.errors, system=request.system, target_lps=target.lps_mm
+        )
+    record = plan_tables.plan_record(found, lung, appraisal, request.out, request.files)
+    write_summary(record, request.out / SUMMARY_FILE)
     if not request.output.json:
-        show_plan(found, report, lung)
-    write_history(found, history, lung, request)
+        show_plan(found, lung, appraisal)
+    write_history(found, history, lung, appraisal, request)
     if request.output.json:
-        terminal.show_json(plan_tables.plan_record(found, report, request.out, request.files))
+        terminal.show_json(record)
     else:
         terminal.say(f"Written to {request.out}: {', '.join(request.files)}")
-    return ExitCode.of(report.accepted)
+    return ExitCode.of(appraisal.accepted)
 
 
-def show_plan(plan: Plan, report: CheckReport, lung: Lung) -> None:
-    """Print what the check says of a plan, then the plan."""
-    terminal.show_verdict(report.accepted)
-    if not report.accepted:
-        terminal.show(plan_tables.check_tables(report, refusals_only=True))
-    terminal.show(plan_tables.plan_tables(plan))
+def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal) -> None:
+    """Print headline and limits of a plan, then the plan."""
+    plan_tables.show_appraisal(appraisal)
+    terminal.show(plan_tables.plan_tables(plan, lung))
     terminal.show_warnings(lung.warnings)
 
 
-def write_history(plan: Plan, history: list[CostPoint], lung: Lung, request: PlanRequest) -> None:
+def write_summary(record: dict[str, Any], path: Path) -> None:
+    """Write what `--json` prints to a file, all or nothing."""
+    from anatomy.io.files import atomic_write
+
+    with atomic_write(path) as temporary:
+        temporary.write_text(terminal.json_text(record), encoding="utf-8", newline="\n")
+
+
+def write_history(
+    plan: Plan, history: list[CostPoint], lung: Lung, appraisal: Appraisal, request: PlanRequest
+) -> None:
     """Write how the cost fell, and the pictures if they are wanted."""
     from lungaccess.report import cost_over_time_csv
 
     cost_over_time_csv(history, request.out / HISTORY_FILE)
     if request.pictures:
         with progress("drawing the plan"):
-            draw_plan(plan, history, lung, request.out)
+            draw_plan(plan, history, lung, appraisal, request.out)
 
 
-def draw_plan(plan: Plan, history: list[CostPoint], lung: Lung, out: Path) -> None:
+def draw_plan(plan: Plan, history: list[CostPoint], lung: Lung, appraisal: Appraisal, out: Path) -> None:
     """Write the pictures of a plan and of its search into a folder."""
     from lungaccess.report import cost_over_time_png, overview_png, tree_png
 
-    overview_png(plan, lung, out / "overview.png")
+    overview_png(plan, lung, out / "overview.png", appraisal)
     tree_png(lung, out / "tree.png")
     cost_over_time_png(history, out / "cost_over_time.png", Objective.of(plan.objective).words)

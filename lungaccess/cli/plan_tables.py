@@ -6,29 +6,41 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.panel import Panel
 from rich.table import Table
 
+from anatomy.words import plural
+from lungaccess.appraisal.grade import Grade
 from lungaccess.cli import terminal
 from stages.needle import Objective
 
 if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.appraisal import Appraisal, Headline
     from lungaccess.checking import CheckReport, Finding
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
 
 
-def plan_record(plan: Plan, report: CheckReport, folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
+GRADE_STYLES = {Grade.GOOD: "green", Grade.FAIR: "yellow", Grade.UNKNOWN: "yellow", Grade.POOR: "red"}
+
+
+def plan_record(
+    plan: Plan, lung: Lung, appraisal: Appraisal, folder: Path, files: tuple[str, ...]
+) -> dict[str, Any]:
     """Return what a command that planned found and wrote; lengths in mm, times in s."""
+    from lungaccess.plans.costs import known_costs
+
     return {
         "found": True,
-        "accepted": report.accepted,
-        "refusals": [each.to_mapping() for each in report.refusals],
+        **appraisal.to_mapping(),
+        "refusals": [each.to_mapping() for each in appraisal.check.refusals],
         "folder": str(folder),
         "files": list(files),
         "digest": plan.digest,
         "objective": plan.objective,
         "cost": plan.cost,
-        "costs": dict(plan.costs),
+        "costs": known_costs(plan.costs, has_map=lung.cost is not None),
         "clearance_mm": {device: dict(values) for device, values in plan.clearance_mm.items()},
         "iterations": plan.iterations,
         "timing": dict(plan.timing),
@@ -46,19 +58,16 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
     }
 
 
-def plan_tables(plan: Plan) -> list[Table]:
-    """Return the stages of a plan, each distance beside the distance it must keep, and the costs."""
-    from lungaccess.plans.costs import costs_in_words
+def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
+    """Return the stages of a plan and its costs."""
+    from lungaccess.plans.costs import costs_in_words, known_costs
 
     return [
         terminal.table("The three stages", ("stage", "what to do"), _stage_rows(plan)),
         terminal.table(
-            "Least distances (axis to structure)", ("device", "structure", "mm", "at least"), _distances(plan)
-        ),
-        terminal.table(
             f"Costs of the needle (made small: {Objective.of(plan.objective).words})",
             ("cost", "value"),
-            costs_in_words(plan.costs),
+            costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None)),
         ),
     ]
 
@@ -69,36 +78,52 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
         (
             "scope",
             f"advance {scope.length_from_carina_mm:.1f} mm beyond the carina, to generation "
-            f"{scope.generation} (lumen radius to spare {scope.min_lumen_margin_mm:.2f} mm)",
+            f"{scope.generation}",
         ),
         (
             "tubes",
             f"turn to {np.degrees(tube.rotation_rad):.1f}°, outer tube {tube.outer_insertion_mm:.1f} mm, "
-            f"inner tube {tube.inner_insertion_mm:.1f} mm beyond the scope; through the wall at "
-            f"{np.degrees(tube.exit.wall_angle_rad):.0f}°",
+            f"inner tube {tube.inner_insertion_mm:.1f} mm beyond the scope; through the wall of branch "
+            f"{tube.exit.branch}",
         ),
         (
             "needle",
-            f"steer {needle.length_mm:.1f} mm in {len(needle.arcs)} arc(s), at most "
+            f"steer {needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}, at most "
             f"{np.degrees(needle.max_angle_from_start_rad):.1f}° from its start",
         ),
     ]
 
 
-def _distances(plan: Plan) -> list[terminal.Row]:
-    """Return each distance and the least one allowed; a fissure that may be crossed has none."""
-    return [
-        (
-            device,
-            structure,
-            f"{value:.2f}",
-            ""
-            if structure == "fissure" and not plan.fissures_are_obstacles
-            else f"{plan.least_required_clearance_mm(device):.2f}",
-        )
-        for device in ("tube", "needle")
-        for structure, value in plan.clearance_mm[device].items()
+def show_appraisal(appraisal: Appraisal) -> None:
+    """Print the headline, then the limits, and what the check refuses, if anything."""
+    show_headline(appraisal.headline)
+    if not appraisal.accepted:
+        terminal.show(check_tables(appraisal.check, refusals_only=True))
+    if appraisal.limits:
+        terminal.show([limits_table(appraisal)])
+
+
+def show_headline(headline: Headline) -> None:
+    """Print the headline in a panel whose colour, mark and title follow the worse of its two parts."""
+    style = GRADE_STYLES[headline.grade]
+    lines = [f"[bold {style}]{headline.grade.mark}[/] [bold]{terminal.escaped(headline.text)}[/]"]
+    lines += [f"[dim]{terminal.escaped(each)}[/]" for each in headline.details]
+    title = f"[bold {style}]{headline.verdict}[/]"
+    terminal.console.print(Panel("\n".join(lines), title=title, title_align="left", border_style=style))
+
+
+def limits_table(appraisal: Appraisal) -> Table:
+    """Return the limits that the plan comes nearest to; broken ones come first."""
+    from lungaccess.appraisal import LIMITS_TITLE, SHOWN_LIMITS
+
+    rows = [
+        (each.what, each.found_words, each.bound_words, each.used_words if each.ok else "BROKEN")
+        for each in appraisal.limits[:SHOWN_LIMITS]
     ]
+    made = terminal.table(LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows)
+    made.caption = f"`lungaccess check PLAN PATIENT --all` lists all {len(appraisal.check.findings)} findings"
+    made.caption_justify = "left"
+    return made
 
 
 def check_tables(report: CheckReport, *, refusals_only: bool = False) -> list[Table]:

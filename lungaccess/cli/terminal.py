@@ -45,8 +45,13 @@ def give_up_output() -> None:
 
 
 def show_json(value: object) -> None:
-    """Print plain values as JSON on standard output, also for quiet commands; null for what is not finite."""
-    console.file.write(json.dumps(_finite(value), indent=2, allow_nan=False) + "\n")
+    """Print plain values as JSON on standard output, also for quiet commands; see `json_text`."""
+    console.file.write(json_text(value))
+
+
+def json_text(value: object) -> str:
+    """Return plain values as JSON; null for what is not finite."""
+    return json.dumps(_finite(value), indent=2, allow_nan=False) + "\n"
 
 
 def _finite(value: object) -> object:
@@ -70,14 +75,6 @@ def show_warnings(warnings: Iterable[str]) -> None:
     text = escaped("\n".join(f"- {warning}" for warning in warnings))
     if text:
         console.print(Panel(text, title="warnings", title_align="left", border_style="yellow"))
-
-
-def show_verdict(accepted: bool) -> None:
-    """Print the verdict of the independent check."""
-    if accepted:
-        console.print("[bold green]The independent check accepts the plan.[/]")
-    else:
-        console.print("[bold red]The independent check refuses the plan.[/]")
 
 
 def table(title: str, headings: Iterable[str], rows: Iterable[Row]) -> Table:

@@ -15,6 +15,7 @@ from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float
 from lungaccess.one_stage.needle_search import OMPL_PLANNERS, search_path
 from lungaccess.one_stage.obstruction import obstruction_record
+from lungaccess.plans.costs import known_costs
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import (
@@ -92,6 +93,11 @@ class NeedleAnswer:
             path_costs(self.environment.obstacles, self.environment.cost_map, self.path)
         )
 
+    @property
+    def known_costs(self) -> dict[str, float | None]:
+        """The same, None for costs of the map where there is none."""
+        return known_costs(self.costs, has_map=self.environment.cost_map is not None)
+
     def record(self) -> dict[str, Any]:
         """Return plain JSON values; poses in LPS mm, angles in rad."""
         path = self.path
@@ -112,7 +118,7 @@ class NeedleAnswer:
             "length_mm": path.length_mm,
             "max_angle_from_start_rad": path.max_angle_from_start_rad(),
             "accumulated_turn_rad": path.accumulated_turn_rad,
-            "costs": {name: float(cost) for name, cost in self.costs.items()},
+            "costs": self.known_costs,
             "lps_from_start": path.lps_from_start.tolist(),
             "arcs": [
                 {"length_mm": length, "roll_rad": roll, "curvature_per_mm": curvature}

@@ -33,10 +33,20 @@ def path_costs(lung: Lung, path: ArcPath, *, with_fissures: bool) -> dict[str, f
     return needle.path_costs(_obstacles(lung, with_fissures), lung.cost, path)
 
 
-def costs_in_words(stated: Mapping[str, float]) -> list[tuple[str, str]]:
-    """Return what people call each stated cost, with its unit, and its value; a weighted sum is one, too."""
+def known_costs(stated: Mapping[str, float], *, has_map: bool) -> dict[str, float | None]:
+    """Return stated costs, None for those of the cost map where there is no map: plans state them as 0."""
+    unknown = {term.key for term in TERMS if term.of_map and not has_map}
+    return {name: None if name in unknown else float(cost) for name, cost in stated.items()}
+
+
+def costs_in_words(known: Mapping[str, float | None]) -> list[tuple[str, str]]:
+    """Return what people call each cost, with its unit, and its value; costs that are None are left out."""
     words = {term.key: term.words_with_unit for term in TERMS}
-    return [(words.get(name) or Objective.of(name).words, f"{cost:.4g}") for name, cost in stated.items()]
+    return [
+        (words.get(name) or Objective.of(name).words, f"{cost:.4g}")
+        for name, cost in known.items()
+        if cost is not None
+    ]
 
 
 def obstacle_clearance_mm(lung: Lung, points: Float, *, with_fissures: bool) -> Float:

@@ -11,6 +11,7 @@ import numpy as np
 
 from anatomy.records import frozen_record
 from anatomy.typed import Float
+from anatomy.words import plural
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
 from lungaccess.plans.parts import Exemption, NeedlePath, ScopeRoute, TubeDeployment
@@ -110,15 +111,15 @@ class Plan(Record):
             ),
             (
                 "needle",
-                f"{needle.length_mm:.1f} mm in {len(needle.arcs)} arc(s), at most "
+                f"{needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}, at most "
                 f"{np.degrees(needle.max_angle_from_start_rad):.1f}° from its start",
             ),
         ]
         for device, distances in self.clearance_mm.items():
             words = ", ".join(f"{name} {value:.2f}" for name, value in distances.items())
             least = f"{self.least_required_clearance_mm(device):.2f}"
-            rows.append((f"{device}: distance, mm", f"{words}; at least {least}"))
-        costs = ", ".join(f"{name} {value:.4g}" for name, value in self.costs.items())
+            rows.append((f"{device}: least distance, mm", f"{words}; needs {least}"))
+        costs = ", ".join(f"{name} {value:.4g}" for name, value in self.costs.items() if value)
         return [
             *rows,
             ("costs", f"{costs}; made small: {self.objective}"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from anatomy.typed import Float
+from lungaccess.appraisal.headline import Headline
 from lungaccess.report import drawing, panels, style, zoom
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import STANDARD, View
@@ -20,18 +22,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from anatomy.lung import Lung
+    from lungaccess.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
 
 
-WIDTH_IN, HEIGHT_IN = 18.0, 11.6
+WIDTH_IN, HEIGHT_IN = 18.0, 11.9
+HEADLINE_TOP_IN = 0.47
+HEADLINE_CHARACTERS = 210
+"""So many letters of the headline's size fill the width of the picture."""
 # left, bottom, width, height of each panel, inches
 PROJECTIONS_IN = ((0.55, 6.0, 4.75, 4.7), (5.85, 6.0, 4.75, 4.7), (11.15, 6.0, 3.35, 4.7))
 EXIT_IN, NEEDLE_IN = (0.3, 0.75, 4.3, 4.3), (4.8, 0.75, 4.3, 4.3)
 CLEARANCE_IN, TEXT_IN = (9.75, 0.95, 4.75, 4.05), (14.85, 0.5, 2.95, 10.4)
 
 
-def overview_png(plan: Plan, lung: Lung, path: str | os.PathLike[str]) -> Path:
+def overview_png(
+    plan: Plan, lung: Lung, path: str | os.PathLike[str], appraisal: Appraisal | None = None
+) -> Path:
     """Draw a plan in its anatomy and write the picture to `path`.
+
+    Below the title stands the headline of the appraisal; without one it says that nothing was checked.
 
     The axial projection is seen from the feet and the coronal one from the front, as radiologists
     do: the patient's left is on the right of the picture.  Ticks are LPS mm.  The two cuts below show
@@ -47,8 +57,9 @@ def overview_png(plan: Plan, lung: Lung, path: str | os.PathLike[str]) -> Path:
     zoom.exit_zoom(style.panel(figure, EXIT_IN), plan, layers)
     zoom.needle_zoom(style.panel(figure, NEEDLE_IN), plan, layers)
     panels.clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
-    panels.text_panel(style.panel(figure, TEXT_IN), plan)
-    _heading_and_legend(figure, plan, layers)
+    panels.text_panel(style.panel(figure, TEXT_IN), plan, lung, appraisal)
+    _heading(figure, plan, appraisal)
+    _legend(figure, layers)
     return style.save_png(figure, path)
 
 
@@ -84,8 +95,18 @@ def _nodule(axes: Axes, layers: Layers, view: View) -> None:
     drawing.outline(axes, footprint, style.NODULE, 1.0)
 
 
-def _heading_and_legend(figure: Figure, plan: Plan, layers: Layers) -> None:
+def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
+    """Write the title, and the headline below it in the colour of its grade."""
     style.heading(figure, f"Three-stage plan for {plan.patient_name}", size=15)
+    headline = Headline.of(None, None) if appraisal is None else appraisal.headline
+    words = f"{headline.grade.mark} {headline.verdict}: {headline.text}"
+    figure.text(
+        0.3 / WIDTH_IN, 1 - HEADLINE_TOP_IN / HEIGHT_IN, textwrap.fill(words, HEADLINE_CHARACTERS), va="top",
+        fontsize=10, color=style.GRADES[headline.grade],
+    )  # fmt: skip
+
+
+def _legend(figure: Figure, layers: Layers) -> None:
     figure.legend(
         handles=_legend_entries(layers), loc="lower left", bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN),
         ncols=12, fontsize=9, frameon=False, handlelength=1.8, columnspacing=1.3,

@@ -8,11 +8,14 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from anatomy.typed import Float
-from lungaccess.plans.costs import costs_in_words
+from anatomy.words import plural
+from lungaccess.appraisal.limits import SHOWN_LIMITS
+from lungaccess.plans.costs import costs_in_words, known_costs
 from lungaccess.report import drawing, style
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from lungaccess.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
 
 
@@ -82,14 +85,16 @@ def _label_clearance(axes: Axes) -> None:
 Row = tuple[str, str]
 
 
-def key_numbers(plan: Plan) -> list[tuple[str, list[Row]]]:
-    """Return headed rows of a label and a value with its unit."""
-    return [
-        ("Plan", _general_rows(plan)),
-        *_stage_rows(plan),
-        ("Least distance found / required", _clearance_rows(plan)),
-        ("Cost", costs_in_words(plan.costs)),
-    ]
+def key_numbers(plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> list[tuple[str, list[Row]]]:
+    """Return headed rows of a label and a value; distances are those of the appraisal, if there is one."""
+    distances = _clearance_rows(plan) if appraisal is None else _limit_rows(appraisal)
+    return [*figures_of_plan(plan, lung), distances]
+
+
+def figures_of_plan(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
+    """Return headed rows of what the plan does and costs, without its limits."""
+    costs = costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None))
+    return [("Plan", _general_rows(plan)), *_stage_rows(plan), ("Cost", costs)]
 
 
 def _general_rows(plan: Plan) -> list[Row]:
@@ -117,24 +122,27 @@ def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
     scope_rows = [
         ("airway generation at the tip", f"{scope.generation}"),
         ("advance beyond the carina", f"{scope.length_from_carina_mm:.1f} mm"),
-        ("lumen radius to spare", f"{scope.min_lumen_margin_mm:.2f} mm"),
     ]
     tube_rows = [
         ("rotation", f"{np.degrees(tube.rotation_rad):.1f}°"),
         ("outer / inner beyond scope", insertions_mm),
-        ("angle to the wall at the exit", f"{np.degrees(tube.exit.wall_angle_rad):.0f}°"),
-        ("sideways sweep", f"{tube.lateral_sweep_mm:.2f} mm"),
+        ("pierced branch", f"{tube.exit.branch}"),
     ]
     needle_rows = [
-        ("length, arcs", f"{needle.length_mm:.1f} mm, {len(needle.arcs)}"),
+        ("length", f"{needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}"),
         ("greatest angle from start", f"{np.degrees(needle.max_angle_from_start_rad):.1f}°"),
         ("accumulated turn", f"{np.degrees(needle.accumulated_turn_rad):.1f}°"),
     ]
     return [("Scope", scope_rows), ("Tube", tube_rows), ("Needle", needle_rows)]
 
 
-def _clearance_rows(plan: Plan) -> list[Row]:
-    return [
+def _limit_rows(appraisal: Appraisal) -> tuple[str, list[Row]]:
+    rows = [(each.what, each.comparison) for each in appraisal.limits]
+    return "Nearest to a limit", rows[:SHOWN_LIMITS]
+
+
+def _clearance_rows(plan: Plan) -> tuple[str, list[Row]]:
+    return "Least distance stated by the plan / required", [
         (f"{device} to {STRUCTURES.get(name, name)}", f"{value:.2f} / {_least(plan, device, name)}")
         for device in ("tube", "needle")
         for name, value in plan.clearance_mm[device].items()
@@ -147,10 +155,10 @@ def _least(plan: Plan, device: str, structure: str) -> str:
     return f"{plan.required_clearance_mm[{'tube': 'inner_tube'}.get(device, device)]:.2f} mm"
 
 
-def text_panel(axes: Axes, plan: Plan) -> None:
+def text_panel(axes: Axes, plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> None:
     """Write the key numbers of a plan, evenly over the height of a panel."""
     axes.set_axis_off()
-    blocks = [(heading, rows) for heading, rows in key_numbers(plan) if rows]
+    blocks = [(heading, rows) for heading, rows in key_numbers(plan, lung, appraisal) if rows]
     lines = sum(len(rows) + 1.6 for _, rows in blocks)
     step = min(1.0 / lines, 0.034)
     y = 1.0

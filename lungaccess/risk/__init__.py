@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.risk.assessment import RiskReport, assess, safest
+    from lungaccess.risk.assessment import MISSES, RiskReport, assess, safest
     from lungaccess.risk.assessor import STRUCTURES, Outcomes, RiskAssessor
     from lungaccess.risk.deviations import Deviations, Draws
     from lungaccess.risk.errors import CURVATURE, UNITS, ErrorModel, load_errors

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import tomllib
+from dataclasses import replace
 from typing import Annotated
 
 from anatomy.errors import SettingsError
 from anatomy.io.files import read_text
-from anatomy.settings import impossible, parse, quantity, settings
+from anatomy.settings import impossible, parse, quantity, settings, text
 
 _REMEDY = "`lungaccess template errors` prints a complete file to start from"
 CURVATURE = "needle_curvature"
@@ -36,6 +37,8 @@ class ErrorModel:
 
     Parameters
     ----------
+    name : str
+        What the model is called where its results are shown, see `label`.
     scope_position_mm : float
         Position of the scope tip, along each axis, mm.
     scope_direction_deg : float
@@ -59,6 +62,7 @@ class ErrorModel:
         If a value is not finite, negative or absurd, or the factors are in the wrong order.
     """
 
+    name: Annotated[str, text("what the model is called where its results are shown", may_be_empty=True)] = ""
     scope_position_mm: Annotated[
         float, quantity("standard deviation of the scope tip along each axis", at_least=0.0, at_most=20.0)
     ] = 1.0
@@ -101,6 +105,27 @@ class ErrorModel:
         }
 
     @property
+    def is_default(self) -> bool:
+        """Whether all sizes are the default ones, which are assumptions."""
+        return replace(self, name="") == ErrorModel()
+
+    @property
+    def label(self) -> str:
+        """What the model is called: its name, "default" if all sizes are the default ones, else "stated"."""
+        return self.name or ("default" if self.is_default else "stated")
+
+    @property
+    def words(self) -> str:
+        """The sizes of all errors in one clause, standard deviations but for the factors of the curvature."""
+        low, high = self.curvature_factors
+        return (
+            f"scope tip {self.scope_position_mm:g} mm and {self.scope_direction_deg:g}°, "
+            f"tubes {self.tube_insertion_mm:g} mm and {self.tube_rotation_deg:g}°, "
+            f"needle {self.needle_insertion_mm:g} mm and {self.needle_roll_deg:g}°, "
+            f"its curvature {low:g} to {high:g} times the planned one, target {self.target_position_mm:g} mm"
+        )
+
+    @property
     def curvature_factors(self) -> tuple[float, float]:
         """Least and greatest factor of the needle's curvature."""
         return self.needle_curvature_low_factor, self.needle_curvature_high_factor
@@ -108,6 +133,8 @@ class ErrorModel:
 
 def load_errors(path: str | os.PathLike[str]) -> ErrorModel:
     """Read an error model from a TOML file; keys that are left out take their defaults.
+
+    The model is called what the file says in `name`, else as the file is.
 
     Raises
     ------
@@ -125,4 +152,5 @@ def load_errors(path: str | os.PathLike[str]) -> ErrorModel:
             expected="one line a key, such as scope_position_mm = 1.0",
             remedy=_REMEDY,
         ) from error
-    return parse(ErrorModel, mapping, os.fspath(path), remedy=_REMEDY)
+    named = {"name": os.path.basename(path), **mapping}
+    return parse(ErrorModel, named, os.fspath(path), remedy=_REMEDY)

@@ -24,6 +24,7 @@ FACADES = (
     "anatomy.segmentation",
     "anatomy.tree",
     "lungaccess",
+    "lungaccess.appraisal",
     "lungaccess.checking",
     "lungaccess.coupled",
     "lungaccess.one_stage",

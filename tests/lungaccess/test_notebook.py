@@ -89,12 +89,7 @@ def test_the_drawing_of_a_tree_has_every_branch_and_left_on_the_right(small_lung
 
 def test_a_plan_shows_every_stage(toy_plan: Plan) -> None:
     shown = parsed(toy_plan)
-    for words in (
-        "53.0 mm beyond the carina",
-        "30.0 mm in 3 arc(s)",
-        "vessel 1.60",
-        "inverse_clearance 12.34",
-    ):
+    for words in ("53.0 mm beyond the carina", "30.0 mm in 3 arcs", "vessel 1.60", "inverse_clearance 12.34"):
         assert words in shown.text
     coronal, axial = drawings(toy_plan._repr_html_())
     for svg, column in ((coronal, 2), (axial, 1)):

@@ -12,6 +12,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative
 from lungaccess.cli.options import (
+    ErrorOptions,
     ObjectiveText,
     PatientFolder,
     PatientOptions,
@@ -23,11 +24,17 @@ from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
 if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.appraisal import Appraisal
     from lungaccess.coupled import Alternative
 
-COLUMNS = (
-    "plan", "branch", "scope at", "clearance, mm", "pleura, mm", "in tissue, mm", "1/clearance", "map", "best"
-)  # fmt: skip
+COLUMNS = ("plan", "succeeds", "branch", "gen.", "clear", "pleura", "tissue", "1/clear", "map", "best")
+NOTE = (
+    "succeeds: of 100; gen.: generation of the scope's tip; clear, pleura: least distance of tubes and "
+    "needle from any obstacle and from the pleura, mm, as the plan states it; tissue: way in tissue, mm; "
+    "1/clear: integral of 1/clearance; best: no other plan is better in one of the columns from clear on and "
+    "as good in the others"
+)
 
 
 def alternatives(
@@ -43,16 +50,17 @@ def alternatives(
     objective: Annotated[
         ObjectiveText, Parameter(help="By what the cheapest come first, as for `plan`.")
     ] = "inverse-clearance",
+    errors: ErrorOptions = ErrorOptions(),
     out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on.")] = Path(
         "lungaccess-alternatives"
     ),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show plans to one target that differ, check each, and write them; those no other beats are marked."""
-    from lungaccess.checking import check
+    from lungaccess.appraisal import Appraiser
     from lungaccess.coupled import alternatives as find_alternatives
 
-    stated, weighed = target.stated(), Objective.of(objective)
+    stated, weighed, model = target.stated(), Objective.of(objective), errors.load()
     require_writable_folder(out)
     device = system.load()
     lung = output.load(patient)
@@ -62,48 +70,76 @@ def alternatives(
         found = find_alternatives(
             lung, device, aim, objective=weighed, count=count, separation_mm=separation, atlas=atlas
         )
-    accepted = []
+    appraiser, appraisals = Appraiser(lung, model), []
     with progress("checking") as shown:
         for number, each in enumerate(found, start=1):
             each.plan.save(out / f"plan-{number:02d}.json")
-            accepted.append(check(each.plan, lung).accepted)
+            appraisals.append(appraiser.appraise(each.plan, device, target_lps=aim.lps_mm))
             shown.share(number / len(found))
-    refused = accepted.count(False)
+    refused = sum(not each.accepted for each in appraisals)
     if output.json:
-        terminal.show_json(_records(found, accepted, out))
+        terminal.show_json(_records(found, appraisals, out, lung.cost is not None))
         return ExitCode.of(not refused)
-    terminal.show([terminal.table(f"Plans to the target in {lung.name}", COLUMNS, _rows(found))])
+    _show(lung, found, appraisals)
     terminal.say(f"Written to {out}; the check refuses {refused} of {len(found)}")
     return ExitCode.of(not refused)
 
 
-def _records(found: tuple[Alternative, ...], accepted: list[bool], out: Path) -> list[dict[str, object]]:
-    """Return each plan's file, verdict and criteria as plain values."""
+def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal]) -> None:
+    """Print the headline of the plan that succeeds most often, then one row a plan."""
+    from lungaccess.cli.plan_tables import show_headline
+
+    best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
+    terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")
+    show_headline(appraisals[best].headline)
+    has_map = lung.cost is not None
+    columns = [name for name in COLUMNS if has_map or name != "map"]
+    rows = [
+        _row(number, each, appraisal, has_map)
+        for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True), start=1)
+    ]
+    terminal.show([terminal.table(f"Plans to the target in {lung.name}", columns, rows)])
+    terminal.say(NOTE)
+
+
+def _success(appraisal: Appraisal) -> float:
+    """Return the estimated chance; of a refused plan less than of any other."""
+    success = appraisal.headline.success
+    return -1.0 if success is None else success.value
+
+
+def _records(
+    found: tuple[Alternative, ...], appraisals: list[Appraisal], out: Path, has_map: bool
+) -> list[dict[str, object]]:
+    """Return each plan's file, appraisal and criteria as plain values."""
+    from lungaccess.plans.costs import known_costs
+
     return [
         {
             "plan": str(out / f"plan-{number:02d}.json"),
-            "accepted": verdict,
+            **appraisal.to_mapping(),
             "no_other_beats_it": bool(each.on_front),
             "branch": int(each.plan.tube.exit.branch),
             "generation": int(each.plan.scope.generation),
-            "criteria": {name: float(value) for name, value in each.criteria.items()},
+            "criteria": known_costs(each.criteria, has_map=has_map),
         }
-        for number, (each, verdict) in enumerate(zip(found, accepted, strict=True), start=1)
+        for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True), start=1)
     ]
 
 
-def _rows(found: tuple[Alternative, ...]) -> list[tuple[str, ...]]:
-    return [
-        (
-            f"{number:02d}",
-            str(each.plan.tube.exit.branch),
-            f"generation {each.plan.scope.generation}",
-            f"{each.criteria['clearance_mm']:.2f}",
-            f"{each.criteria['pleura_mm']:.2f}",
-            f"{each.criteria['length_in_tissue_mm']:.1f}",
-            f"{each.criteria['inverse_clearance']:.2f}",
-            f"{each.criteria['cost_map']:.2f}",
-            "yes" if each.on_front else "",
-        )
-        for number, each in enumerate(found, start=1)
-    ]
+def _row(number: int, each: Alternative, appraisal: Appraisal, has_map: bool) -> tuple[str, ...]:
+    from lungaccess.appraisal.headline import of_hundred
+
+    success = appraisal.headline.success
+    return (
+        f"{number:02d}",
+        "refused" if success is None else of_hundred(success.value),
+        str(each.plan.tube.exit.branch),
+        str(each.plan.scope.generation),
+        f"{each.criteria['clearance_mm']:.2f}",
+        f"{each.criteria['pleura_mm']:.2f}",
+        f"{each.criteria['length_in_tissue_mm']:.1f}",
+        f"{each.criteria['inverse_clearance']:.2f}",
+        *([f"{each.criteria['cost_map']:.2f}"] if has_map else []),
+        "yes" if each.on_front else "",
+    )

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOfPlan, PatientOptions
+from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions
 
 
 def check(
@@ -20,20 +20,25 @@ def check(
         str | None,
         Parameter(help="Check against this preset or TOML file instead of the devices stated in the plan."),
     ] = None,
+    errors: ErrorOptions = ErrorOptions(),
+    everything: Annotated[
+        bool, Parameter(name="--all", negative="", help="List every finding, not only the nearest limits.")
+    ] = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused."""
-    from lungaccess.checking import check as check_plan
-    from lungaccess.cli.plan_tables import check_tables
+    from lungaccess.appraisal import appraise
+    from lungaccess.cli.plan_tables import check_tables, show_appraisal
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
 
-    stored = Plan.load(plan)
+    stored, model = Plan.load(plan), errors.load()
     device = None if system is None else load_system(system)
-    report = check_plan(stored, output.load(patient, thick_slices=True), system=device)
+    appraisal = appraise(stored, output.load(patient, thick_slices=True), errors=model, system=device)
     if output.json:
-        terminal.show_json(report.to_mapping())
-        return ExitCode.of(report.accepted)
-    terminal.show(check_tables(report))
-    terminal.show_verdict(report.accepted)
-    return ExitCode.of(report.accepted)
+        terminal.show_json({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
+        return ExitCode.of(appraisal.accepted)
+    show_appraisal(appraisal)
+    if everything:
+        terminal.show(check_tables(appraisal.check))
+    return ExitCode.of(appraisal.accepted)

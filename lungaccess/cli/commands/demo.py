@@ -15,7 +15,7 @@ from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Seconds, Seed
-from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions
+from lungaccess.cli.options import ErrorOptions, PatientOptions, SearchOptions, SystemOptions
 from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, PlanRequest, plan_and_report
 from lungaccess.cli.progress import progress
 
@@ -50,7 +50,9 @@ def demo(
     if not output.json:
         terminal.show(anatomy_tables(lung)[1:3])
     target, system = stated_target(None, 1), SystemOptions().load()
-    request = PlanRequest(system=system, target=target, search=search, out=out, output=output)
+    request = PlanRequest(
+        system=system, target=target, search=search, errors=ErrorOptions().load(), out=out, output=output
+    )
     code = _first_reachable_nodule(lung, request)
     if code == ExitCode.OK:
         with progress("making the page"):

@@ -20,16 +20,21 @@ def export(
     slicer : Path
         Folder for the scene, curves, models and segmentation; drag its scene.mrml into 3D Slicer.
     """
+    from lungaccess.appraisal import DRAWS, SEED, Headline
+    from lungaccess.cli.plan_tables import show_headline
     from lungaccess.plans.plan import Plan
+    from lungaccess.risk import assess
     from lungaccess.slicer import export_slicer
 
     stored = Plan.load(plan)
     lung = output.load(patient)
     with progress("exporting") as shown:
         written = export_slicer(stored, lung, slicer, progress=shown.step)
+    accepted = written.report.accepted
     if output.json:
         terminal.show_json({"folder": str(slicer), **written.to_mapping()})
     else:
         terminal.say(f"Written to {slicer}: {', '.join(written.files)}")
-        terminal.show_verdict(written.report.accepted)
-    return ExitCode.of(written.report.accepted)
+        risk = assess(stored, lung, samples=DRAWS, seed=SEED, each_kind=False) if accepted else None
+        show_headline(Headline.of(written.report, risk))
+    return ExitCode.of(accepted)

@@ -91,6 +91,7 @@ def needle(
 def _tables(answer: NeedleAnswer) -> list[Table]:
     """Return what a needle planner found: the outcome, and the path arc by arc."""
     from lungaccess.one_stage import obstruction_rows
+    from lungaccess.plans.costs import costs_in_words
 
     words = {
         "path": "a path, proved clear",
@@ -114,7 +115,7 @@ def _tables(answer: NeedleAnswer) -> list[Table]:
         ("largest angle from the start", f"{np.degrees(path.max_angle_from_start_rad()):.1f} deg"),
         ("turning in all", f"{np.degrees(path.accumulated_turn_rad):.1f} deg"),
     ]
-    rows += [(f"cost: {name}", f"{cost:.3f}") for name, cost in answer.costs.items()]
+    rows += costs_in_words(answer.known_costs)
     arcs = [
         (
             f"{n}",

@@ -11,6 +11,7 @@ from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import (
+    ErrorOptions,
     PatientFolder,
     PatientOptions,
     SearchOptions,
@@ -28,6 +29,7 @@ def plan(
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     search: SearchOptions = SearchOptions(),
+    errors: ErrorOptions = ErrorOptions(),
     thick_slices: Annotated[
         bool,
         Parameter(help="Plan on masks from slices of more than 3 mm, which lack small airways and vessels."),
@@ -44,13 +46,13 @@ def plan(
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
 
-    stated, objective = target.stated(), Objective.of(search.objective)
+    stated, objective, model = target.stated(), Objective.of(search.objective), errors.load()
     require_writable_folder(out)
     device = system.load()
     lung = output.load(patient, thick_slices=thick_slices)
     require_map(lung, objective)
     request = PlanRequest(
-        system=device, target=stated, search=search, out=out, output=output, pictures=pictures
+        system=device, target=stated, search=search, errors=model, out=out, output=output, pictures=pictures
     )
     try:
         return plan_and_report(lung, request)

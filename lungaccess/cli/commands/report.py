@@ -11,7 +11,7 @@ from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, Seed
-from lungaccess.cli.options import PatientOfPlan, PatientOptions
+from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions
 from lungaccess.cli.plan_search import HISTORY_FILE
 from lungaccess.cli.progress import progress
 
@@ -41,6 +41,7 @@ def report(
     movie: Annotated[
         Path | None, Parameter(help="WebP file for the flight through the airway to the scope's place.")
     ] = None,
+    errors: ErrorOptions = ErrorOptions(),
     samples: Annotated[
         CountOrNone, Parameter(help="Deviated plans of the estimate of risk; 0 leaves it out.")
     ] = 2000,
@@ -58,7 +59,7 @@ def report(
     page = plan.with_name("report.html") if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)
-    stored = Plan.load(plan)
+    stored, model = Plan.load(plan), errors.load()
     lung = output.load(patient)
     image = ct if ct is not None else find_ct(patient)
     with progress("making the page"):
@@ -67,6 +68,7 @@ def report(
             ct=None if image is None else read_ct(image),
             ct_name="" if image is None else image.name,
             cost_over_time=plan.with_name(HISTORY_FILE),
+            errors=model,
             risk_samples=samples,
             risk_seed=seed,
             instructions=instructions,

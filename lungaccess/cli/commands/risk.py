@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -10,7 +9,7 @@ from cyclopts import Parameter
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Positive, Probability, Seed
-from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
+from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -23,10 +22,7 @@ def risk(
     plan: PlanFile,
     patient: PatientOfPlan,
     *,
-    errors: Annotated[
-        Path | None,
-        Parameter(help="TOML file of the error model; the default one, all of it assumed, if not given."),
-    ] = None,
+    errors: ErrorOptions = ErrorOptions(),
     samples: Annotated[Count, Parameter(help="Number of deviated plans.")] = 10_000,
     radius: Annotated[
         Positive | None,
@@ -42,9 +38,9 @@ def risk(
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it, open loop."""
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors
+    from lungaccess.risk import assess, find_tolerances
 
-    model = ErrorModel() if errors is None else load_errors(errors)
+    model = errors.load()
     stored = Plan.load(plan)
     lung = output.load(patient)
     with progress("deviating the plan"):
@@ -106,7 +102,7 @@ def _outcome_table(report: RiskReport) -> Table:
     rows += [
         (f"{100.0 * share:.0f} % end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()
     ]
-    title = f"{report.samples} deviated plans; radius: {report.radius_origin}"
+    title = f"{report.samples} deviated plans, errors `{report.model.label}`; radius: {report.radius_origin}"
     return terminal.table(title, ("", "%", "95 % interval"), rows)
 
 

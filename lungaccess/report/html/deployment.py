@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
-from lungaccess.plans.costs import obstacle_clearance_mm
+from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, arc_lengths, needle_pieces, tube_pieces
 from lungaccess.report.html.pack import Packed, pack
 from stages.needle import Objective
@@ -53,7 +53,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
         "tubes": _tubes(plan),
         "needle": _needle(plan),
         "profile": profile(plan, lung),
-        "costs": {key: float(value) for key, value in plan.costs.items()},
+        "costs": known_costs(plan.costs, has_map=lung.cost is not None),
         "objective": plan.objective,
         "objective_words": Objective.of(plan.objective).words,
     }

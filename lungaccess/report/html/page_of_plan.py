@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.records import frozen_record
+from anatomy.words import plural
+from lungaccess.appraisal import DRAWS, SEED, Appraiser
 from lungaccess.report.html import tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
 from lungaccess.report.html.document import scene_figure, write_page
@@ -20,13 +22,13 @@ from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, ct_vol
 if TYPE_CHECKING:
     from anatomy.grid import Volume
     from anatomy.lung import Lung
-    from lungaccess.checking import CheckReport
+    from lungaccess.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
+    from lungaccess.risk import ErrorModel
 
 MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
 TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
 THICKER = "; seen from afar, devices are drawn thicker than they are"
-RISK_SAMPLES, RISK_SEED = 2000, 0
 
 
 @frozen_record
@@ -43,8 +45,10 @@ class PageOptions:
         What the CT is, for people.
     cost_over_time : path or None
         CSV that `lungaccess plan` wrote beside the plan.
+    errors : ErrorModel or None
+        The errors under which the chance of success is estimated; the default ones if None.
     risk_samples, risk_seed : int
-        See `lungaccess.risk.assessment.assess`; 0 samples for none.
+        Draws of that estimate and their seed, see `lungaccess.appraisal.Appraiser`; 0 samples for none.
     instructions : bool
         Whether the scope's route is searched, with instructions turn by turn.
     """
@@ -53,8 +57,9 @@ class PageOptions:
     ct: Volume | None = None
     ct_name: str = ""
     cost_over_time: Path | None = None
-    risk_samples: int = RISK_SAMPLES
-    risk_seed: int = RISK_SEED
+    errors: ErrorModel | None = None
+    risk_samples: int = DRAWS
+    risk_seed: int = SEED
     instructions: bool = True
 
 
@@ -81,40 +86,32 @@ def plan_page(
     AnatomyError
         If the CT does not hold the plan.
     """
-    from lungaccess.checking import Checker
-    from lungaccess.risk import assess
-
     chosen = options or PageOptions()
     plans = (plan, *chosen.alternatives)
-    checker = Checker(lung)
-    verdicts = [checker.check(each) for each in plans]
-    risk = (
-        tables.risk_section(assess(plan, lung, samples=chosen.risk_samples, seed=chosen.risk_seed))
-        if chosen.risk_samples
-        else "<p>Not estimated.</p>"
-    )
+    appraiser = Appraiser(lung, chosen.errors, draws=chosen.risk_samples, seed=chosen.risk_seed)
+    appraisals = [appraiser.appraise(each, each_kind=each is plan) for each in plans]
+    first = appraisals[0]
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
-        "verdict": words.verdict(
-            verdicts[0].accepted, "accepted by the independent check", "REFUSED by the independent check"
-        ),
-        "summary": _summary(plan, lung),
+        "headline": words.headline(first.headline),
+        "limits": tables.limits_section(first),
+        "summary": _summary(plan),
         "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),
         "image_source": words.text(image_source(lung, chosen.ct_name if chosen.ct is not None else "")),
-        "plans": tables.plans_section(plans, verdicts),
-        "key_numbers": tables.key_section(plan),
-        "limits": tables.check_section(verdicts[0]),
+        "plans": tables.plans_section(plans, appraisals),
+        "key_numbers": tables.key_section(plan, lung),
+        "findings": tables.check_section(first.check),
         "instructions": tables.instructions_section(plan, lung)
         if chosen.instructions
         else "<p>Left out.</p>",
-        "risk": risk,
+        "risk": tables.risk_section(first.risk),
         "provenance": tables.provenance_section(plan, lung),
     }
-    return write_page(path, "plan.html", MODULES, page_data(plans, verdicts, lung, chosen), parts)
+    return write_page(path, "plan.html", MODULES, page_data(plans, appraisals, lung, chosen), parts)
 
 
 def page_data(
-    plans: Sequence[Plan], verdicts: Sequence[CheckReport], lung: Lung, options: PageOptions
+    plans: Sequence[Plan], appraisals: Sequence[Appraisal], lung: Lung, options: PageOptions
 ) -> dict[str, Any]:
     """Return what the scripts of the page draw, as plain JSON values."""
     near = np.concatenate([device_points(each) for each in plans])
@@ -123,8 +120,8 @@ def page_data(
         "patient": lung.name,
         "structures": structure_meshes(lung),
         "plans": [
-            {**packed_plan(each, lung, tables.plan_name(n)), "accepted": verdict.accepted}
-            for n, (each, verdict) in enumerate(zip(plans, verdicts, strict=True))
+            {**packed_plan(each, lung, tables.plan_name(n)), **appraisal.to_mapping()}
+            for n, (each, appraisal) in enumerate(zip(plans, appraisals, strict=True))
         ],
         "codes": CODES,
         "labels": label_volumes(lung, near),
@@ -150,13 +147,13 @@ def cost_history(path: Path | None) -> list[list[float]]:
     return [[float(row["elapsed_s"]), float(row["best_cost"])] for row in rows if row.get("best_cost")]
 
 
-def _summary(plan: Plan, lung: Lung) -> str:
+def _summary(plan: Plan) -> str:
     x, y, z = (float(c) for c in plan.target_lps)
     facts = (
         f"{plan.system.name}; scope to generation {plan.scope.generation}, "
         f"{plan.scope.length_from_carina_mm:.0f} mm beyond the carina; tubes "
         f"{plan.tube.outer_insertion_mm:.1f} and {plan.tube.inner_insertion_mm:.1f} mm; needle "
-        f"{plan.needle.length_mm:.1f} mm in {len(plan.needle.arcs)} arc(s); target at LPS "
+        f"{plan.needle.length_mm:.1f} mm in {plural(len(plan.needle.arcs), 'arc')}; target at LPS "
         f"{x:.1f}, {y:.1f}, {z:.1f} mm"
     )
     return words.text(facts)

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy.errors import LungaccessError
+from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
 from lungaccess.report.html import words
-from lungaccess.report.panels import key_numbers
+from lungaccess.report.panels import figures_of_plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from lungaccess.appraisal import Appraisal, Limit
     from lungaccess.checking import CheckReport
     from lungaccess.checking.findings import Finding
     from lungaccess.plans.plan import Plan
@@ -24,8 +26,27 @@ AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
 
 
+def limits_section(appraisal: Appraisal) -> str:
+    """Return the limits that the plan comes nearest to, broken ones first."""
+    rows = [
+        (words.text(each.what), each.found_words, each.bound_words, _bar(each))
+        for each in appraisal.limits[:SHOWN_LIMITS]
+    ]
+    return words.table(LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows, "nearest")
+
+
+def _bar(limit: Limit) -> str:
+    """Return how much of a limit is used, as a bar and in words."""
+    width = 100.0 * min(limit.used, 1.0)
+    said = limit.used_words if limit.ok else "BROKEN"
+    return (
+        f'<span class="bar" aria-hidden="true"><span style="width:{width:.0f}%"></span></span> '
+        f"{words.text(said) if limit.ok else words.verdict(False, no=said)}"
+    )
+
+
 def check_section(report: CheckReport) -> str:
-    """Return the limits of the devices, tightest first in each stage, and folded what else was looked at."""
+    """Return all findings of the check, folded: limits, comparisons of statements, and what has no limit."""
     limits = [f for f in report.findings if f.margin is not None and not _compares_record(f)]
     record = [f for f in report.findings if f.margin is not None and _compares_record(f)]
     others = [f for f in report.findings if f.margin is None]
@@ -37,7 +58,7 @@ def check_section(report: CheckReport) -> str:
     return "".join(
         [
             _refusals(report),
-            *shown,
+            _folded(f"{len(limits)} limits of devices and tolerances", "".join(shown)),
             _folded(f"{len(record)} comparisons of what the plan states with what the check recomputed",
                     _limits("Stated and recomputed", record)),
             _folded(f"{len(others)} findings without a limit", unlimited),
@@ -56,7 +77,9 @@ def _folded(summary: str, content: str) -> str:
 
 def _refusals(report: CheckReport) -> str:
     if report.accepted:
-        return f"<p>{words.verdict(True, 'accepted')}: all {len(report.findings)} findings are ok.</p>"
+        return (
+            f"<p>The independent check accepts the geometry: all {len(report.findings)} findings are ok.</p>"
+        )
     items = "".join(f"<li>{words.text(finding)}</li>" for finding in report.refusals)
     return f"<p>{words.verdict(False)}: do not use this plan.</p><ul>{items}</ul>"
 
@@ -91,28 +114,26 @@ def _value(finding: Finding) -> str:
     return f"{words.number(finding.value)} {words.text(finding.unit)}" if finding.value is not None else "–"
 
 
-def plans_section(plans: Sequence[Plan], verdicts: Sequence[CheckReport]) -> str:
-    """Return a table that compares plans."""
-    from lungaccess.coupled import criteria
-
+def plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> str:
+    """Return a table that compares plans, each with its chance of success."""
     rows = []
-    for number, (plan, verdict) in enumerate(zip(plans, verdicts, strict=True)):
-        values = criteria(plan)
+    for number, (plan, appraisal) in enumerate(zip(plans, appraisals, strict=True)):
+        headline, tightest = appraisal.headline, appraisal.limits[:1]
         rows.append(
             (
                 words.text(plan_name(number)),
+                words.grade(headline.grade, headline.chance_words),
+                words.text(headline.failures[0][0] if headline.failures else "–"),
+                words.text(f"geometry {headline.geometry}"),
+                words.text(tightest[0].words if tightest else "–"),
                 words.text(plan.tube.exit.branch),
                 words.text(plan.scope.generation),
-                words.number(values["clearance_mm"]),
-                words.number(values["pleura_mm"]),
-                words.number(values["length_in_tissue_mm"]),
-                words.number(values["inverse_clearance"], 4),
-                words.verdict(verdict.accepted, "accepted"),
+                words.number(plan.costs["inverse_clearance"], 4),
             )
         )
     headings = (
-        "plan", "branch pierced", "generation of the scope's tip", "least clearance, mm",
-        "from the pleura, mm", "in tissue, mm", "integral of 1/clearance", "check",
+        "plan", "succeeds", "fails most often because it", "check", "nearest limit", "branch pierced",
+        "generation of the scope's tip", "integral of 1/clearance",
     )  # fmt: skip
     return words.table("Plans to this target", headings, rows)
 
@@ -122,9 +143,9 @@ def plan_name(number: int) -> str:
     return "The plan" if number == 0 else f"Alternative {number}"
 
 
-def key_section(plan: Plan) -> str:
-    """Return the key numbers of a plan."""
-    return "".join(words.pairs(heading, rows) for heading, rows in key_numbers(plan) if rows)
+def key_section(plan: Plan, lung: Lung) -> str:
+    """Return the key numbers of a plan but for its limits, which stand at the top of the page."""
+    return "".join(words.pairs(heading, rows) for heading, rows in figures_of_plan(plan, lung))
 
 
 def instructions_section(plan: Plan, lung: Lung) -> str:
@@ -150,8 +171,10 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     return f"{steps}<p>{words.text(end)}</p><p class='note'>{words.text(note)}</p>"
 
 
-def risk_section(report: RiskReport) -> str:
-    """Return how likely the plan succeeds if the devices deviate from it."""
+def risk_section(report: RiskReport | None) -> str:
+    """Return how likely the plan succeeds if the devices deviate from it, or that it was not estimated."""
+    if report is None:
+        return "<p>Not estimated.</p>"
     rows = [("reaches the goal and touches nothing forbidden", _share(report.succeeds))]
     rows.append((f"ends within {report.radius_mm:.1f} mm of the target", _share(report.reaches)))
     rows += [
@@ -164,8 +187,9 @@ def risk_section(report: RiskReport) -> str:
     ]
     alone = [(name, _share(share)) for name, share in report.alone.items()]
     note = (
-        f"{report.samples} deviated plans, seed {report.seed}, open loop, default error model: all of its "
-        f"sizes are assumed. Radius of the goal: {report.radius_origin}. The range is the 95 % interval."
+        f"{report.samples} deviated plans, seed {report.seed}, open loop, errors `{report.model.label}`: "
+        f"{report.model.words}{', all of them assumed' if report.model.is_default else ''}. Radius of the "
+        f"goal: {report.radius_origin}. The range is the 95 % interval."
     )
     return (
         f"<p class='note'>{words.text(note)}</p>"

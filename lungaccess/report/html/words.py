@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from html import escape
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lungaccess.appraisal import Grade, Headline
 
 Cell = str
 
@@ -55,3 +59,17 @@ def steps(items: Iterable[str]) -> str:
 def verdict(ok: bool, yes: str = "ok", no: str = "REFUSED") -> str:
     """Return a word with a mark, so that it does not depend on its colour."""
     return f'<span class="good">✓ {text(yes)}</span>' if ok else f'<span class="bad">✗ {text(no)}</span>'
+
+
+def headline(said: Headline) -> str:
+    """Return a headline as a paragraph whose colour and mark follow the worse of its two parts."""
+    details = "".join(f"<p class='note'>{text(each)}</p>" for each in said.details)
+    return (
+        f'<div class="headline grade-{said.grade.key}"><p><span class="mark">{said.grade.mark}</span> '
+        f"<strong>{text(said.verdict.capitalize())}.</strong> {text(said.text)}</p>{details}</div>"
+    )
+
+
+def grade(which: Grade, said: str) -> str:
+    """Return words with the mark and the colour of a grade."""
+    return f'<span class="grade-{which.key}">{which.mark} {text(said)}</span>'

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,15 +16,22 @@ import pytest
 
 import lungaccess as la
 from anatomy.errors import AnatomyError, FrameError
-from lungaccess.checking import CheckReport, Finding
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import DEFAULT_BUDGET_S, DEFAULT_SYSTEM
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from tests.lungaccess.appraisals import appraise_as_told, make_risk
 from tests.lungaccess.loading import load_with
 
-WRITTEN = {"plan.json", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv"}
+WRITTEN = {
+    "plan.json",
+    "summary.json",
+    "overview.png",
+    "tree.png",
+    "cost_over_time.png",
+    "cost_over_time.csv",
+}
 
 pytestmark = pytest.mark.usefixtures("wide_terminal")
 
@@ -49,7 +55,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
             replace(toy_plan, timing={"planning_s": 0.4}),
         ]
     }
-    seen["accepted"] = True
+    seen.update(accepted=True, risk=make_risk(60))
 
     def search(lung: Any, system: Any, target: Any, **options: Any) -> Iterator[Plan]:
         seen.update(options, system=system, target=target)
@@ -64,19 +70,6 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
                 "No plan", reasons={"the tube comes too near a vessel": 12}, advice="A thinner scope"
             )
 
-    def judge(plan: Plan, lung: Any, system: Any = None, target_lps: Any = None) -> Any:
-        seen["judged_with"] = system
-        bad = Finding(
-            name="needle.clearance.vessel",
-            ok=seen["accepted"],
-            value=0.4,
-            limit=1.0,
-            side="at least",
-            unit="mm",
-            detail="why",
-        )
-        return CheckReport(accepted=seen["accepted"], findings=(bad,))
-
     load_with(monkeypatch, lambda *_, **__: toy_lung)
     monkeypatch.setattr("lungaccess.coupled.open_atlas", lambda *_, **__: None)
     monkeypatch.setattr("lungaccess.coupled.plan", search)
@@ -84,7 +77,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         "lungaccess.problem.target.StatedTarget.resolve",
         lambda stated, lung: SimpleNamespace(named=stated.origin, lps_mm=toy_plan.target_lps),
     )
-    monkeypatch.setattr(import_module("lungaccess.checking"), "check", judge)
+    appraise_as_told(monkeypatch, seen)
     return seen
 
 
@@ -155,7 +148,8 @@ def test_an_accepted_plan_writes_everything_and_exits_0(
         costs = [row["best_cost"] for row in csv.DictReader(file)]
     assert costs == ["", "20.0", "20.0", "12.34"]
     text = capsys.readouterr().out
-    assert "accepts" in text and "53.0 mm beyond the carina" in text
+    assert text.index("Geometry proved and checked. Estimated to succeed in 3 of 100") < text.index("53.0 mm")
+    assert "likely to fail" in text and "3 arcs," in text and "cost map" not in text
     assert "[made by hand]" in text
 
 
@@ -166,7 +160,7 @@ def test_a_refused_plan_exits_1_and_says_why(
     toy_commands["accepted"] = False
     assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == ExitCode.NEGATIVE
     text = capsys.readouterr().out
-    assert "refuses" in text and "needle.clearance.vessel" in text
+    assert "do not use" in text and "needle.clearance.vessel" in text and "Estimated" not in text
 
 
 def test_no_plan_exits_1_with_counted_reasons(

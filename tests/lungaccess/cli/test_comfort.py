@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +31,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import STEP_SHARES, OutputOptions
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, preset_names
+from tests.lungaccess.appraisals import appraise_as_told, make_risk
 from tests.lungaccess.loading import load_with
 
 HEAVY = (
@@ -142,14 +142,16 @@ def test_a_plan_as_json_says_what_the_check_says(
     monkeypatch.setattr("lungaccess.problem.target.StatedTarget.resolve", lambda *_: target)
     for name in ("overview_png", "tree_png", "cost_over_time_png"):
         monkeypatch.setattr(f"lungaccess.report.{name}", lambda *_: None)
-    report = SimpleNamespace(accepted=True, refusals=())
-    monkeypatch.setattr(import_module("lungaccess.checking"), "check", lambda *_, **__: report)
+    appraise_as_told(monkeypatch, {"accepted": True, "risk": make_risk(1900)})
     monkeypatch.setattr(plan_search, "run_search", lambda *_: (toy_plan, []))
     words = ["plan", "toy", "--nodule", "--json", "--out", str(tmp_path)]
     assert cli.main(words) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)
     assert said["found"] and said["accepted"] and said["digest"] == toy_plan.digest
-    assert said["costs"] == dict(toy_plan.costs) and "plan.json" in said["files"]
+    assert said["cost"] == toy_plan.cost and said["costs"]["length_mm"] == toy_plan.costs["length_mm"]
+    assert said["costs"]["cost_map"] is None and "plan.json" in said["files"]
+    assert said["headline"]["grade"] == "good" and said["headline"]["success"]["probability"] == 0.95
+    assert json.loads((tmp_path / "summary.json").read_text()) == said
 
     def fail(*_: Any) -> None:
         raise NoPlan("No way", reasons={"too near a vessel": 3}, advice="A thinner scope")

@@ -15,9 +15,11 @@ from hypothesis import strategies as st
 from anatomy.errors import FileError
 from anatomy.grid import Grid, Volume
 from lungaccess import report
+from lungaccess.appraisal import Appraisal, limits_of
 from lungaccess.report import views
 from lungaccess.report.layers import Layers
 from lungaccess.report.panels import key_numbers
+from tests.lungaccess.appraisals import make_check, make_risk
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -144,13 +146,22 @@ def test_the_tree_is_drawn(toy_lung: Any, tmp_path: Path) -> None:
     assert _size(report.tree_png(toy_lung, tmp_path / "tree.png")) > (1500, 500)
 
 
-def test_the_key_numbers_state_target_in_both_frames_and_every_distance(toy_plan: Any) -> None:
-    rows = {label: value for _, block in key_numbers(toy_plan) for label, value in block}
+def test_the_key_numbers_state_target_in_both_frames_and_every_distance(toy_plan: Any, toy_lung: Any) -> None:
+    rows = {label: value for _, block in key_numbers(toy_plan, toy_lung) for label, value in block}
     x, y, z = toy_plan.target_lps
     assert rows["target, LPS mm"] == f"{x:.1f}, {y:.1f}, {z:.1f}"
     assert rows["target, RAS mm"] == f"{-x:.1f}, {-y:.1f}, {z:.1f}"
     assert rows["needle to vessel"] == "1.60 / 1.00 mm"
     assert rows["needle to outside of the lung"] == "7.00 / 1.00 mm"
+    assert not any("cost map" in label for label in rows)
+
+
+def test_the_key_numbers_of_an_appraised_plan_are_those_of_its_check(toy_plan: Any, toy_lung: Any) -> None:
+    report = make_check(accepted=True)
+    made = Appraisal(check=report, risk=make_risk(10), limits=limits_of(report.findings, toy_plan))
+    rows = {label: value for _, block in key_numbers(toy_plan, toy_lung, made) for label, value in block}
+    assert rows["needle to vessel"] == "2.60 mm ≥ 1.00"
+    assert "1.60" not in str(rows)
 
 
 def _history() -> list[report.CostPoint]:

@@ -157,7 +157,7 @@ def test_names_cannot_become_markup(plans: tuple[Plan, ...], small_lung: Lung, t
     written = page_of_plan.plan_page(named, small_lung, tmp_path / "evil.html", options)
     text = written.read_text()
     assert "<script>alert" not in text
-    assert "REFUSED by the independent check" in text
+    assert "Geometry refused by the independent check" in text and "grade-poor" in text
     assert not elements(written).open
     assert "<" not in pack.script_text({evil: [evil]})
 
@@ -282,8 +282,6 @@ def test_tables_show_each_finding_once(plans: tuple[Plan, ...], small_lung: Lung
         assert html.count(f'<th scope="row">{finding.name}</th>') == sum(
             other.name == finding.name for other in report.findings
         )
-    for name in ("needle.clearance.vessel", "needle.curvature", "tube.sweep.limit", "scope.fits"):
-        assert html.index(f">{name}<") < html.index("<details>")
     refused = la.check(replace(plans[0], lung_key="other"), small_lung)
     assert words.verdict(False) in tables.check_section(refused)
 
@@ -467,7 +465,7 @@ def test_text_stands_out_in_light_and_dark() -> None:
     schemes = [dict(re.findall(r"--(\w+): (#\w{6})", part)) for part in style.split("@media", 2)[:2]]
     assert len(schemes) == 2
     for scheme in schemes:
-        for ink in ("ink", "faint", "accent", "good", "bad"):
+        for ink in ("ink", "faint", "accent", "good", "fair", "bad"):
             for paper in ("paper", "card"):
                 assert contrast(scheme[ink], scheme[paper]) >= 4.5, (ink, paper)
 

@@ -1,0 +1,15 @@
+"""What is said first of a plan: verdict of the check, chance of success, and how near its limits are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.appraisal.appraiser import DRAWS, SEED, Appraisal, Appraiser, appraise
+    from lungaccess.appraisal.grade import Grade, grade_of_chance
+    from lungaccess.appraisal.headline import Geometry, Headline
+    from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

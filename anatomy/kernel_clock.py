@@ -62,10 +62,10 @@ class _Names(event.Listener):  # type: ignore[misc]
 
 
 @contextmanager
-def told_of_compilations(tell: Callable[[str | None], None]) -> Iterator[None]:
+def watching_compilations(tell: Callable[[str | None], None]) -> Iterator[None]:
     """Call `tell` within the block with the name of each kernel that has to be compiled, and None after it.
 
-    A kernel that is loaded from disk is not told of.
+    A kernel that is loaded from disk is not reported.
     """
     listener = _Names(tell)
     event.register("numba:compile", listener)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import field
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -50,6 +52,8 @@ class Organ:
         SHA-256 of every input file.
     warnings : tuple of str
         What was assumed or repaired on the way in.
+    folder : Path or None
+        Where it is stored; None for one in memory alone, as a changed copy of a stored one is.
 
     Raises
     ------
@@ -72,10 +76,11 @@ class Organ:
     breath_hold: str | None
     sources: Mapping[str, str]
     warnings: tuple[str, ...]
+    folder: Path | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         corners = tuple(n + 1 for n in self.grid.shape)
-        wrong = [name for name, field in self.fields.items() if field.corners.shape != corners]
+        wrong = [name for name, each in self.fields.items() if each.corners.shape != corners]
         if self.labels.shape != self.grid.shape or wrong:
             raise GridMismatchError(
                 f"The grid does not fit the {wrong[0] + ' field' if wrong else 'labels'} of {self.name}",

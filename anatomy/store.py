@@ -196,7 +196,7 @@ def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
     lumen = DistanceField(
         name="lumen_depth", corners=array("lumen_depth"), geometry=np.array(meta["lumen_geometry"])
     )
-    return Lung(
+    lung = Lung(
         name=meta["name"],
         kind=meta["kind"],
         key=meta["key"],
@@ -216,6 +216,8 @@ def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
         sources=meta["sources"],
         warnings=tuple(meta["warnings"]),
     )
+    object.__setattr__(lung, "folder", folder)
+    return lung
 
 
 def _mapped(folder: Path, name: str) -> Array:

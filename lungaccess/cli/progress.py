@@ -70,10 +70,10 @@ class _Shown:
     """Whether this process has said that kernels are compiled."""
 
     def __enter__(self) -> Self:
-        from anatomy.kernel_clock import told_of_compilations
+        from anatomy.kernel_clock import watching_compilations
 
         self._interrupted_words: str | None = None
-        self._compilations = told_of_compilations(self._compiling)
+        self._compilations = watching_compilations(self._compiling)
         self._compilations.__enter__()
         self._progress.start()
         return self

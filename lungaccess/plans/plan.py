@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import field
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -134,7 +135,14 @@ class Plan(Record):
 
     def curves(self, step_mm: float = STEP_MM) -> DeviceCurves:
         """Return the three devices as curves; the poses of tubes and needle are at most `step_mm` apart."""
+        if step_mm == STEP_MM:
+            return self._curves
         return device_curves(self.scope, self.tube, self.needle, self.system, step_mm)
+
+    @cached_property
+    def _curves(self) -> DeviceCurves:
+        """Return the curves at the usual step, which every picture asks for."""
+        return device_curves(self.scope, self.tube, self.needle, self.system)
 
     @property
     def cost(self) -> float:

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.kept import kept
 from anatomy.records import frozen_record
-from anatomy.typed import Array, Bool, Float
-from lungaccess.report.views import View
+from anatomy.structures import BITS, OUTSIDE
+from anatomy.typed import Array, Bool, Float, Int
+from lungaccess.report.pack import Packed, pack, unpack
+from lungaccess.report.views import STANDARD, View
 
 if TYPE_CHECKING:
     from anatomy.grid import Grid, Volume
     from anatomy.lung import Lung
 
 
+PROJECTIONS_VERSION = 1
+SEEN_THROUGH = ("lung", "fissure", "vessel", "airway", "lumen", "nodule")
+"""The masks that pictures show from a standard view, or count."""
 LUNG_POINTS = 3_000_000
 """A mask of more voxels is thinned out evenly: the picture has fewer pixels."""
 
@@ -32,30 +38,37 @@ class Footprint:
 
 
 class Layers:
-    """The masks of one patient, each fetched and unfolded into points only once."""
+    """The masks of one patient, seen through and cut."""
 
     def __init__(self, lung: Lung) -> None:
         self._lung = lung
         self._points: dict[str, tuple[Float, int]] = {}
-        self._masks: dict[str, Array | None] = {}
 
-    @property
-    def grid(self) -> Grid:
-        """The grid of all masks."""
-        return self._lung.grid
+    @cached_property
+    def _projections(self) -> dict[str, Any]:
+        """Return voxels of each structure and, by structure and view, its footprints; kept with the lung."""
+        return dict(kept(self._lung, "projections", PROJECTIONS_VERSION, self._project))
 
-    def mask(self, name: str) -> Array | None:
+    def _project(self) -> dict[str, Any]:
+        """Make what `_projections` returns, mask by mask, so that only one is in memory."""
+        made: dict[str, Any] = {"voxels": {}, "footprints": {}}
+        for name in SEEN_THROUGH:
+            mask = self._mask(name)
+            made["voxels"][name] = 0 if mask is None else int(np.count_nonzero(mask))
+            seen: dict[str, Packed] = {}
+            made["footprints"][name] = seen
+            if mask is not None and made["voxels"][name]:
+                points, stride = _unfold(mask, self._lung.grid)
+                seen |= {view.name: _counted(points, stride, view, self._lung.grid) for view in STANDARD}
+        return made
+
+    def _mask(self, name: str) -> Array | None:
         """Return a bool mask `[i, j, k]`, or None where the patient has none.
 
         `name` is one of `Lung.mask`, or "lung" for what is not outside.
         """
-        if name not in self._masks:
-            self._masks[name] = self._fetch(name)
-        return self._masks[name]
-
-    def _fetch(self, name: str) -> Array | None:
         lung = self._lung
-        if name == "fissure" and not lung.has_fissures:
+        if not self.has(name):
             return None
         if name == "nodule":
             return _array(lung.nodules)
@@ -63,47 +76,53 @@ class Layers:
             return ~np.asarray(_array(lung.mask("outside")), dtype=np.bool_)
         return _array(lung.mask(name))
 
-    def count(self, name: str) -> int:
-        """Return the number of voxels of a mask; 0 where the patient has none."""
-        mask = self.mask(name)
-        return 0 if mask is None else int(np.count_nonzero(mask))
+    def has(self, name: str) -> bool:
+        """Tell whether a mask of fissures, or of nodules, came with the patient; the others always do."""
+        if name == "nodule":
+            return self._lung.nodules is not None
+        return name != "fissure" or self._lung.has_fissures
 
-    def points(self, name: str) -> tuple[Float, int]:
-        """Return voxel centres `(n, 3)`, LPS mm, and how many voxels each stands for along an axis."""
-        if name not in self._points:
-            mask = self.mask(name)
-            if mask is None:
-                self._points[name] = np.zeros((0, 3)), 1
-            else:
-                self._points[name] = _unfold(mask, self.grid)
-        return self._points[name]
+    def count(self, name: str) -> int:
+        """Return the number of voxels of a mask of `SEEN_THROUGH`; 0 where the patient has none."""
+        return int(self._projections["voxels"][name])
 
     def footprint(self, name: str, view: View) -> Footprint | None:
-        """Sum a mask along a view; None where there is nothing to see."""
-        points, stride = self.points(name)
-        if len(points) == 0:
+        """Sum a mask of `SEEN_THROUGH` along a standard view; None where there is nothing to see."""
+        found = self._projections["footprints"][name].get(view.name)
+        if found is None:
             return None
-        directions = np.abs(self.grid.lps_from_ijk[:3, :3]) * stride
-        pixel_u = float(np.abs(view.right) @ directions.sum(axis=1))
-        pixel_v = float(np.abs(view.up) @ directions.sum(axis=1))
-        return _thickness(view.project(points), pixel_u, pixel_v, self._voxel_mm3 * stride**3)
+        count = unpack(found["count"]).astype(np.float64)
+        left, right, bottom, top = (float(each) for each in found["extent_mm"])
+        return Footprint(thickness_mm=count * found["mm_per_point"], extent_mm=(left, right, bottom, top))
 
-    @cached_property
-    def _voxel_mm3(self) -> float:
-        return self.grid.voxel_volume_mm3
-
-    def cut(self, name: str, lps: Float) -> Bool:
-        """Tell which points `(..., 3)` lie in a mask (nearest voxel; beyond the grid: in "outside" only)."""
-        mask = self.mask(name)
-        found = np.zeros(lps.shape[:-1], dtype=np.bool_)
-        if mask is None:
-            return found
-        inside = self.grid.contains(lps)
-        ijk = np.floor(self.grid.ijk(lps[inside]) + 0.5).astype(np.int64)
-        found[inside] = mask[ijk[:, 0], ijk[:, 1], ijk[:, 2]]
-        if name == "outside":
-            found[~inside] = True
+    def labels(self, lps: Float) -> Int:
+        """Return the label of the voxel of each point `(..., 3)`; OUTSIDE alone beyond the grid."""
+        found = np.full(lps.shape[:-1], OUTSIDE, dtype=np.int64)
+        inside, ijk = self._voxels(lps)
+        found[inside] = self._lung.labels[ijk]
         return found
+
+    def cut(self, name: str, lps: Float, labels: Int | None = None) -> Bool:
+        """Tell which points `(..., 3)` lie in a mask (nearest voxel; beyond the grid: in "outside" only).
+
+        Whoever asks for several structures gives the `labels` of the points as well.
+        """
+        if name == "nodule":
+            found = np.zeros(lps.shape[:-1], dtype=np.bool_)
+            inside, ijk = self._voxels(lps)
+            if self._lung.nodules is not None:
+                found[inside] = self._lung.nodules.array[ijk]
+            return found
+        there = self.labels(lps) if labels is None else labels
+        held = (there & OUTSIDE) == 0 if name == "lung" else (there & BITS[name]) != 0
+        return np.asarray(held)
+
+    def _voxels(self, lps: Float) -> tuple[Bool, tuple[Int, ...]]:
+        """Return which points lie in the grid, and the indices of their voxels."""
+        places = np.moveaxis(np.floor(self._lung.grid.ijk(lps) + 0.5).astype(np.int64), -1, 0)
+        ins = [(place >= 0) & (place < n) for place, n in zip(places, self._lung.grid.shape, strict=True)]
+        inside = ins[0] & ins[1] & ins[2]
+        return inside, tuple(place[inside] for place in places)
 
 
 def _array(volume: Volume | None) -> Array | None:
@@ -117,15 +136,18 @@ def _unfold(mask: Array, grid: Grid) -> tuple[Float, int]:
     return grid.lps(np.argwhere(thin) * stride), stride
 
 
-def _thickness(uv: Float, pixel_u: float, pixel_v: float, mm3_per_point: float) -> Footprint:
-    """Count points per pixel and turn the count into millimetres of depth."""
-    low = uv.min(axis=0) - 2.5 * np.array([pixel_u, pixel_v])
-    column = np.floor((uv[:, 0] - low[0]) / pixel_u).astype(np.int64)
-    row = np.floor((uv[:, 1] - low[1]) / pixel_v).astype(np.int64)
+def _counted(points: Float, stride: int, view: View, grid: Grid) -> Packed:
+    """Count points per pixel, and state by what the count is to be multiplied for millimetres of depth."""
+    directions = np.abs(grid.lps_from_ijk[:3, :3]) * stride
+    pixel = np.array([float(np.abs(side) @ directions.sum(axis=1)) for side in (view.right, view.up)])
+    uv = view.project(points)
+    low = uv.min(axis=0) - 2.5 * pixel
+    column, row = np.floor((uv - low) / pixel).astype(np.int64).T
     columns, rows = int(column.max()) + 3, int(row.max()) + 3
     count = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
-    extent = (low[0], low[0] + columns * pixel_u, low[1], low[1] + rows * pixel_v)
-    return Footprint(
-        thickness_mm=np.asarray(count * mm3_per_point / (pixel_u * pixel_v), dtype=np.float64),
-        extent_mm=(float(extent[0]), float(extent[1]), float(extent[2]), float(extent[3])),
-    )
+    high = low + np.array([columns, rows]) * pixel
+    return {
+        "count": pack(count, "i4"),
+        "mm_per_point": float(grid.voxel_volume_mm3 * stride**3 / pixel.prod()),
+        "extent_mm": [float(each) for each in (low[0], high[0], low[1], high[1])],
+    }

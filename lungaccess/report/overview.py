@@ -122,12 +122,12 @@ def _legend_entries(layers: Layers) -> list[Line2D | Patch]:
         Line2D([], [], ls="none", marker="D", mfc="white", mec=style.INK, label="exit"),
         Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2, label="target"),
     ]
-    if layers.mask("nodule") is not None:
+    if layers.has("nodule"):
         entries.append(Patch(color=style.NODULE, alpha=0.6, label="nodule"))
     entries.append(Patch(facecolor=style.LUMEN, edgecolor=style.AIRWAY, label="airway lumen"))
     if layers.count("airway") > layers.count("lumen"):
         entries.append(Patch(color=style.AIRWAY, label="airway wall"))
     entries += [Patch(color=style.VESSEL, label="vessel"), Patch(color="#C9C9C9", label="outside the lung")]
-    if layers.mask("fissure") is not None:
+    if layers.has("fissure"):
         entries.append(Patch(color=style.FISSURE, alpha=0.6, label="fissure"))
     return entries

@@ -8,10 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from anatomy.typed import Float
-from anatomy.words import plural
-from lungaccess.appraisal.limits import SHOWN_LIMITS
-from lungaccess.plans.costs import costs_in_words, known_costs
 from lungaccess.report import drawing, style
+from lungaccess.report.key_numbers import key_numbers
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -25,7 +23,6 @@ CURVES = {
     "pleura": ("pleura", "#5F5F5F", "-."),
     "fissure": ("fissure", style.FISSURE, ":"),
 }
-STRUCTURES = {"airway": "airway wall", "outside": "outside of the lung"}
 LEAST_TOP_MM, MOST_TOP_MM = 4.0, 15.0
 """Least and greatest upper end of the clearance axis, so that what is near and required fills it."""
 
@@ -80,79 +77,6 @@ def _label_clearance(axes: Axes) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, loc="upper right", framealpha=0.92, ncols=2, borderpad=0.5, handlelength=2.4)
-
-
-Row = tuple[str, str]
-
-
-def key_numbers(plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> list[tuple[str, list[Row]]]:
-    """Return headed rows of a label and a value; distances are those of the appraisal, if there is one."""
-    distances = _clearance_rows(plan) if appraisal is None else _limit_rows(appraisal)
-    return [*figures_of_plan(plan, lung), distances]
-
-
-def figures_of_plan(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
-    """Return headed rows of what the plan does and costs, without its limits."""
-    costs = costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None))
-    return [("Plan", _general_rows(plan)), *_stage_rows(plan), ("Cost", costs)]
-
-
-def _general_rows(plan: Plan) -> list[Row]:
-    x, y, z = (float(c) for c in plan.target_lps)
-    return [
-        ("patient", plan.patient_name),
-        ("system", plan.system.name),
-        ("target, LPS mm", f"{x:.1f}, {y:.1f}, {z:.1f}"),
-        ("target, RAS mm", f"{-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}"),
-        ("fissures", _fissures(plan)),
-        ("breath hold", plan.breath_hold or "not stated"),
-        ("method, seed", f"{plan.method}, {plan.seed}"),
-    ]
-
-
-def _fissures(plan: Plan) -> str:
-    if plan.fissures_are_obstacles:
-        return "are obstacles"
-    return "may be crossed" if plan.system.fissures_allowed else "not known"
-
-
-def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
-    scope, tube, needle = plan.scope, plan.tube, plan.needle
-    insertions_mm = f"{tube.outer_insertion_mm:.1f} / {tube.inner_insertion_mm:.1f} mm"
-    scope_rows = [
-        ("airway generation at the tip", f"{scope.generation}"),
-        ("advance beyond the carina", f"{scope.length_from_carina_mm:.1f} mm"),
-    ]
-    tube_rows = [
-        ("rotation", f"{np.degrees(tube.rotation_rad):.1f}°"),
-        ("outer / inner beyond scope", insertions_mm),
-        ("pierced branch", f"{tube.exit.branch}"),
-    ]
-    needle_rows = [
-        ("length", f"{needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}"),
-        ("greatest angle from start", f"{np.degrees(needle.max_angle_from_start_rad):.1f}°"),
-        ("accumulated turn", f"{np.degrees(needle.accumulated_turn_rad):.1f}°"),
-    ]
-    return [("Scope", scope_rows), ("Tube", tube_rows), ("Needle", needle_rows)]
-
-
-def _limit_rows(appraisal: Appraisal) -> tuple[str, list[Row]]:
-    rows = [(each.what, each.comparison) for each in appraisal.limits]
-    return "Nearest to a limit", rows[:SHOWN_LIMITS]
-
-
-def _clearance_rows(plan: Plan) -> tuple[str, list[Row]]:
-    return "Least distance stated by the plan / required", [
-        (f"{device} to {STRUCTURES.get(name, name)}", f"{value:.2f} / {_least(plan, device, name)}")
-        for device in ("tube", "needle")
-        for name, value in plan.clearance_mm[device].items()
-    ]
-
-
-def _least(plan: Plan, device: str, structure: str) -> str:
-    if structure == "fissure" and not plan.fissures_are_obstacles:
-        return "allowed"
-    return f"{plan.required_clearance_mm[{'tube': 'inner_tube'}.get(device, device)]:.2f} mm"
 
 
 def text_panel(axes: Axes, plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> None:

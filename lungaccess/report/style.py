@@ -34,6 +34,8 @@ GRADES = {Grade.GOOD: "#00704A", Grade.FAIR: "#8A5A00", Grade.UNKNOWN: "#8A5A00"
 
 DPI = 130
 """Pixels per inch at which the smallest letters stay sharp on a screen."""
+PNG_LEVEL = 3
+"""Of the compression from 0 to 9: half the time of the usual 6, and files a tenth larger."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -64,5 +66,11 @@ def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """
     target = Path(path)
     with atomic_write(target) as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": "lungaccess"})
+        figure.savefig(
+            temporary,
+            format="png",
+            dpi=DPI,
+            metadata={"Software": "lungaccess"},
+            pil_kwargs={"compress_level": PNG_LEVEL},
+        )
     return target

@@ -67,7 +67,7 @@ def plane_view(lps: Float, name: str) -> View:
     patient's left stays on the right side of the picture wherever it can.
     """
     centred = lps - lps.mean(axis=0)
-    _, spread, axes = np.linalg.svd(centred, full_matrices=True)
+    _, spread, axes = np.linalg.svd(centred, full_matrices=len(lps) < 3)
     if len(lps) < 3 or spread[1] < 0.02 * spread[0]:
         normal = _normal_beside(axes[0])
     else:

@@ -103,11 +103,12 @@ def _paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:
     depth = float(through @ view.towards_viewer) * view.towards_viewer
     lps = depth + u[None, :, None] * view.right + v[:, None, None] * view.up
     image = np.ones((len(v), len(u), 3))
+    labels = layers.labels(lps)
     for name, colour in PAINT:
         if name == "vessel":
             beside = np.any([layers.cut(name, lps + d * view.towards_viewer) for d in SLAB_MM], axis=0)
             image[beside] = 0.65 * image[beside] + 0.35 * np.array(to_rgb(colour))
-        image[layers.cut(name, lps)] = to_rgb(colour)
+        image[layers.cut(name, lps, labels)] = to_rgb(colour)
     axes.imshow(image, extent=(left, right, bottom, top), origin="lower", aspect="auto", zorder=0)
     nodule = layers.cut("nodule", lps)
     if nodule.any():

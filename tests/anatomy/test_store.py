@@ -57,6 +57,8 @@ def _require_same(a: Any, b: Any, where: str = "lung") -> None:
     if is_dataclass(a):
         assert type(a) is type(b), where
         for field in dataclass_fields(a):
+            if field.name == "folder":  # Where a lung is stored is no part of what it is.
+                continue
             _require_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
     elif isinstance(a, np.ndarray):
         assert isinstance(b, np.ndarray) and a.dtype == b.dtype, where

@@ -13,6 +13,7 @@ import pytest
 from scipy import ndimage
 
 from anatomy.grid import Grid, Volume
+from anatomy.structures import BITS
 from lungaccess.cli import terminal
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
@@ -73,6 +74,9 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         "fissure": (sheet & lung) if fissures else np.zeros(shape, dtype=bool),
     }
     ball = np.linalg.norm(points - TARGET_LPS, axis=-1) < 5
+    labels = np.zeros(shape, dtype=np.uint16)
+    for name, mask in masks.items():
+        labels[mask] |= np.uint16(BITS[name])
     fields = {
         name: _Field(grid, masks[key])
         for name, key in {"airway": "airway", "vessel": "vessel", "pleura": "outside"}.items()
@@ -81,6 +85,8 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         name="Toy",
         kind="toy",
         key="0" * 64,
+        folder=None,
+        labels=labels,
         grid=grid,
         cost=None,
         has_fissures=fissures,

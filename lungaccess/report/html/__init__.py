@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from lungaccess.report.html.movie import bronchoscopy_webp
-from lungaccess.report.html.page_of_plan import PageOptions, plan_page
-from lungaccess.report.html.page_of_reach import reach_page
+from typing import TYPE_CHECKING
 
-__all__ = ["PageOptions", "bronchoscopy_webp", "plan_page", "reach_page"]
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.report.html.movie import bronchoscopy_webp
+    from lungaccess.report.html.page_of_plan import PageOptions, plan_page
+    from lungaccess.report.html.page_of_reach import reach_page
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

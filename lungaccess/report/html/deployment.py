@@ -10,7 +10,7 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, arc_lengths, needle_pieces, tube_pieces
-from lungaccess.report.html.pack import Packed, pack
+from lungaccess.report.pack import Packed, pack
 from stages.needle import Objective
 from stages.tube import centreline
 

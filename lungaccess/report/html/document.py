@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from anatomy.io.files import atomic_write
-from lungaccess.report.html.pack import script_text
+from lungaccess.report.pack import script_text
 
 SHARED_MODULES = (
     "decode.js", "vectors.js", "shaders.js", "solids.js", "scene.js", "orbit.js", "slices.js",

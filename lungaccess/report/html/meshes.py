@@ -9,7 +9,7 @@ import numpy as np
 from anatomy.grid import Volume
 from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
-from lungaccess.report.html.pack import Packed, pack
+from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

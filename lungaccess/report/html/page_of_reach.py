@@ -13,8 +13,8 @@ from anatomy.grid import Volume
 from lungaccess.report.html import words
 from lungaccess.report.html.document import scene_figure, write_page
 from lungaccess.report.html.meshes import Look, packed_surface, structure_meshes
-from lungaccess.report.html.pack import Packed, pack
 from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, label_volumes
+from lungaccess.report.pack import Packed, pack
 from lungaccess.report.reach import CLEARANCE_MM, COLOURS, fullest_point
 
 if TYPE_CHECKING:

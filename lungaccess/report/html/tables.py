@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.errors import LungaccessError
 from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
 from lungaccess.report.html import words
-from lungaccess.report.panels import figures_of_plan
+from lungaccess.report.key_numbers import figures_of_plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

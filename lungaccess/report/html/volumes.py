@@ -12,7 +12,7 @@ from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
 from anatomy.typed import Array, Float, UInt8
-from lungaccess.report.html.pack import Packed, pack
+from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import itertools
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,11 +16,13 @@ from hypothesis import strategies as st
 
 from anatomy.errors import FileError
 from anatomy.grid import Grid, Volume
+from anatomy.store import open_lung
 from lungaccess import report
 from lungaccess.appraisal import Appraisal, limits_of
 from lungaccess.report import views
-from lungaccess.report.layers import Layers
-from lungaccess.report.panels import key_numbers
+from lungaccess.report.key_numbers import key_numbers
+from lungaccess.report.layers import Footprint, Layers
+from tests.anatomy.toys import toy as anatomy_toy
 from tests.lungaccess.appraisals import make_check, make_risk
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -92,7 +96,14 @@ def test_a_footprint_does_not_depend_on_the_order_of_the_voxel_axes() -> None:
 
 
 def _only_nodule(grid: Grid, array: np.ndarray) -> Any:
-    return SimpleNamespace(grid=grid, nodules=Volume(grid=grid, array=array))
+    nothing = Volume(grid=grid, array=np.zeros(array.shape, dtype=np.bool_))
+    return SimpleNamespace(
+        grid=grid,
+        folder=None,
+        has_fissures=False,
+        nodules=Volume(grid=grid, array=array),
+        mask=lambda _name: nothing,
+    )
 
 
 def test_the_thickness_of_a_box_is_its_depth() -> None:
@@ -126,6 +137,24 @@ def test_a_cut_beyond_the_image_is_outside(toy_lung: Any) -> None:
     layers = Layers(toy_lung)
     assert layers.cut("outside", far).tolist() == [True, False]
     assert layers.cut("lung", far).tolist() == [False, True]
+
+
+def test_kept_projections_are_those_of_the_masks(tmp_path: Path) -> None:
+    lung = open_lung({"lung.nii.gz": "a" * 64}, anatomy_toy, cache=tmp_path)
+    for _ in range(2):  # The second time they come from the cache.
+        for name, view in itertools.product(("lung", "vessel", "airway"), views.STANDARD):
+            stored, made = (Layers(each).footprint(name, view) for each in (lung, replace(lung)))
+            assert stored is not None and made is not None and stored.extent_mm == made.extent_mm
+            np.testing.assert_array_equal(stored.thickness_mm, made.thickness_mm)
+            volume = made.thickness_mm.sum() * _pixel_area(made)
+            mask = ~lung.mask("outside").array if name == "lung" else lung.mask(name).array
+            assert volume == pytest.approx(np.count_nonzero(mask) * lung.grid.voxel_volume_mm3)
+    assert lung.folder is not None and (lung.folder / "projections.json").is_file()
+
+
+def _pixel_area(footprint: Footprint) -> float:
+    left, right, bottom, top = footprint.extent_mm
+    return (right - left) * (top - bottom) / footprint.thickness_mm.size
 
 
 # Files -------------------------------------------------------------------------------------------

@@ -1,0 +1,47 @@
+"""What follows from a lung alone and is slow to make, such as its projections: kept beside its stored arrays.
+
+A lung that is not stored keeps nothing.  What is kept is made anew if it is missing, damaged or of another
+version, and goes when the lung goes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from anatomy.errors import FileError
+from anatomy.io.files import atomic_write
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+
+def kept(lung: Lung, name: str, version: int, make: Callable[[], Any]) -> Any:
+    """Return plain JSON values that follow from a lung: those kept with it, else those that `make` returns.
+
+    Parameters
+    ----------
+    name : str
+        What they are; the file is named after it.
+    version : int
+        To be raised when `make` returns something else for the same lung.
+    make : callable
+        Returns the values; they should say the same after they were written as JSON and read again.
+    """
+    if lung.folder is None:
+        return make()
+    path = lung.folder / f"{name}.json"
+    try:
+        stored = json.loads(path.read_text(encoding="ascii"))
+        if stored["version"] == version:
+            return stored["values"]
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    values = make()
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps({"version": version, "values": values}), encoding="ascii")
+    except FileError:
+        pass  # A cache that cannot be written, or a lung that another process has just removed.
+    return values

@@ -56,7 +56,7 @@ def _is_a_file(words: list[str]) -> bool:
 @pages
 def test_every_block_is_of_a_known_kind(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    assert text.count("\n```") % 2 == 0
+    assert text.count("\n```") % 2 == 0 and not re.search(r"^[ \t]+```", text, re.MULTILINE)
     for block in blocks(page):
         assert block.kind in RUN + SHOWN, block.text
 

@@ -1,0 +1,130 @@
+"""Make output and pictures of the tutorial anew: `python -m docs.make_first_steps`; they are stored with the page.
+
+Each command of `docs/tutorials/first_steps.md` is run in an empty folder; what it prints replaces the `text`
+block behind it, of which `<!-- output: N lines -->` keeps the first N lines. Chromium and chromedriver draw the
+pictures of the report page.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import matplotlib
+from PIL import Image
+
+from tests.lungaccess.report.browser import Browser
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "tutorials" / "first_steps.md"
+IMAGES = ROOT / "docs" / "images"
+WIDTH_PX, COLOURS = 1100, 128
+"""Wide enough to read on a page, small enough to be stored."""
+STEP = re.compile(
+    r"(```console\n(?P<command>[^\n]+)\n```\n\n)<!-- output: (?P<lines>\d+) lines -->\n```text\n.*?```",
+    re.DOTALL,
+)
+DRAWN = {
+    "segmentation": "patient/segmentation.png",
+    "tree": "info/tree.png",
+    "overview": "plan/overview.png",
+    "cost": "plan/cost_over_time.png",
+}
+"""Pictures that the commands write."""
+SECTIONS = {
+    "page": "h-scene",
+    "slices": "h-slices",
+    "charts": "h-charts",
+    "limits": "h-limits",
+    "risk": "h-risk",
+}
+"""Headings of the sections of the report page that are shown."""
+BOX = """const box = document.getElementById(arguments[0]).closest('section').getBoundingClientRect();
+return {x: box.x + scrollX, y: box.y + scrollY, width: box.width, height: Math.min(box.height, 900), scale: 1}"""
+
+
+def output_of(command: str, folder: Path) -> str:
+    """Return what a command prints, without what stands on standard error."""
+    code = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
+    words = [sys.executable, "-c", code, *shlex.split(command)[1:]]
+    settings = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "COLUMNS": "100",
+        "LUNGACCESS_CACHE": str(folder / "cache"),
+    }
+    done = subprocess.run(words, cwd=folder, env=settings, stdout=subprocess.PIPE, text=True, check=True)
+    return "\n".join(line.rstrip() for line in done.stdout.rstrip().splitlines())
+
+
+def run_commands(text: str, folder: Path) -> str:
+    """Run the commands of a page; return the page with what they print."""
+
+    def step(match: re.Match[str]) -> str:
+        lines = output_of(match["command"], folder).splitlines()
+        kept = int(match["lines"])
+        shown = "\n".join([*lines[:kept], "..."] if len(lines) > kept else lines)
+        return f"{match[1]}<!-- output: {kept} lines -->\n```text\n{shown}\n```"
+
+    return STEP.sub(step, text)
+
+
+def store(picture: Path, name: str) -> None:
+    """Write a picture small, with few colours."""
+    image = Image.open(picture).convert("RGB")
+    image.thumbnail((WIDTH_PX, 2 * WIDTH_PX))
+    image.quantize(COLOURS).save(IMAGES / f"first-steps-{name}.png", optimize=True)
+
+
+def draw_ct(file: Path, out: Path) -> None:
+    """Draw an axial and a coronal slice of a CT through its middle, in a window for lungs."""
+    from matplotlib import pyplot as plt
+
+    from anatomy.io.images import read_volume
+
+    volume = read_volume(file)
+    ni, nj, nk = volume.array.shape
+    figure, axes = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
+    for ax, plane, title in (
+        (axes[0], volume.array[:, :, int(0.55 * nk)].T, "axial, seen from the feet"),
+        (axes[1], volume.array[:, nj // 2, ::-1].T, "coronal, seen from the front"),
+    ):
+        ax.imshow(plane, cmap="gray", vmin=-1350, vmax=150)
+        ax.set(title=title, xticks=[], yticks=[])
+    figure.savefig(out, dpi=120)
+    plt.close(figure)
+
+
+def photograph(page: Path, folder: Path) -> None:
+    """Store pictures of the sections of a report page, with the needle half-way."""
+    with Browser(1200, 1000) as window:
+        window.open(page)
+        window.run("window.lungaccessReport.set(0.9)")
+        window.frame()
+        for name, heading in SECTIONS.items():
+            clip = window.run(BOX, heading)
+            shot = window.command("Page.captureScreenshot", {"clip": clip, "captureBeyondViewport": True})
+            (folder / f"{name}.png").write_bytes(base64.b64decode(shot["data"]))
+            store(folder / f"{name}.png", name)
+
+
+def make() -> None:
+    """Bring page and pictures up to date."""
+    matplotlib.use("agg")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        PAGE.write_text(run_commands(PAGE.read_text(encoding="utf-8"), folder), encoding="utf-8")
+        draw_ct(folder / "phantom" / "ct.nii.gz", folder / "ct.png")
+        store(folder / "ct.png", "ct")
+        for picture, file in DRAWN.items():
+            store(folder / file, picture)
+        photograph(folder / "plan" / "report.html", folder)
+
+
+if __name__ == "__main__":
+    make()

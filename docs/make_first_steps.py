@@ -1,8 +1,8 @@
-"""Make output and pictures of the tutorial anew: `python -m docs.make_first_steps`; they are stored with the page.
+"""Make output and pictures of the tutorial anew, which are stored: `python -m docs.make_first_steps`.
 
-Each command of `docs/tutorials/first_steps.md` is run in an empty folder; what it prints replaces the `text`
-block behind it, of which `<!-- output: N lines -->` keeps the first N lines. Chromium and chromedriver draw the
-pictures of the report page.
+Each command of `docs/tutorials/first_steps.md` is run in an empty folder; what it prints replaces the
+`text` block behind it, of which `<!-- output: N lines -->` keeps the first N lines. Chromium and
+chromedriver draw the pictures of the report page.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-import matplotlib
+import numpy as np
 from PIL import Image
 
+from anatomy.io import read_volume
 from tests.lungaccess.report.browser import Browser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,6 +27,8 @@ PAGE = ROOT / "docs" / "tutorials" / "first_steps.md"
 IMAGES = ROOT / "docs" / "images"
 WIDTH_PX, COLOURS = 1100, 128
 """Wide enough to read on a page, small enough to be stored."""
+LEAST_HU, GREATEST_HU = -1350.0, 150.0
+"""The usual window for lungs."""
 STEP = re.compile(
     r"(```console\n(?P<command>[^\n]+)\n```\n\n)<!-- output: (?P<lines>\d+) lines -->\n```text\n.*?```",
     re.DOTALL,
@@ -45,8 +48,8 @@ SECTIONS = {
     "risk": "h-risk",
 }
 """Headings of the sections of the report page that are shown."""
-BOX = """const box = document.getElementById(arguments[0]).closest('section').getBoundingClientRect();
-return {x: box.x + scrollX, y: box.y + scrollY, width: box.width, height: Math.min(box.height, 900), scale: 1}"""
+BOX = """const at = document.getElementById(arguments[0]).closest('section').getBoundingClientRect();
+return {x: at.x + scrollX, y: at.y + scrollY, width: at.width, height: Math.min(at.height, 900), scale: 1}"""
 
 
 def output_of(command: str, folder: Path) -> str:
@@ -82,22 +85,14 @@ def store(picture: Path, name: str) -> None:
 
 
 def draw_ct(file: Path, out: Path) -> None:
-    """Draw an axial and a coronal slice of a CT through its middle, in a window for lungs."""
-    from matplotlib import pyplot as plt
-
-    from anatomy.io.images import read_volume
-
-    volume = read_volume(file)
-    ni, nj, nk = volume.array.shape
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
-    for ax, plane, title in (
-        (axes[0], volume.array[:, :, int(0.55 * nk)].T, "axial, seen from the feet"),
-        (axes[1], volume.array[:, nj // 2, ::-1].T, "coronal, seen from the front"),
-    ):
-        ax.imshow(plane, cmap="gray", vmin=-1350, vmax=150)
-        ax.set(title=title, xticks=[], yticks=[])
-    figure.savefig(out, dpi=120)
-    plt.close(figure)
+    """Draw an axial and a coronal slice of a CT of cubic voxels, in a window for lungs."""
+    volume = read_volume(file).array
+    _ni, nj, nk = volume.shape
+    axial, coronal = volume[:, :, int(0.55 * nk)].T, volume[:, nj // 2, ::-1].T
+    below = np.full((coronal.shape[0] - axial.shape[0], axial.shape[1]), LEAST_HU)
+    both = np.hstack([np.vstack([axial, below]), coronal])
+    grey = 255.0 * (np.clip(both, LEAST_HU, GREATEST_HU) - LEAST_HU) / (GREATEST_HU - LEAST_HU)
+    Image.fromarray(grey.astype(np.uint8)).resize((2 * both.shape[1], 2 * both.shape[0])).save(out)
 
 
 def photograph(page: Path, folder: Path) -> None:
@@ -115,7 +110,6 @@ def photograph(page: Path, folder: Path) -> None:
 
 def make() -> None:
     """Bring page and pictures up to date."""
-    matplotlib.use("agg")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         PAGE.write_text(run_commands(PAGE.read_text(encoding="utf-8"), folder), encoding="utf-8")

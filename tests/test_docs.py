@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import re
 import tomllib
@@ -9,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+import lungaccess as la
+from anatomy.facade import public_names
 from anatomy.io.own_masks import PatientFile
 from anatomy.settings import parse
 from lungaccess.cli.app import app
@@ -98,3 +102,19 @@ def test_python_compiles(page: Path) -> None:
     for block in blocks(page):
         if block.kind == "python":
             compile(block.text, str(page), "exec")
+
+
+def test_the_page_of_the_api_has_every_name_with_its_signature() -> None:
+    """Names of arguments and their defaults, in their order, as Python has them."""
+    text = (ROOT / "docs" / "reference" / "python_api.md").read_text(encoding="utf-8")
+    written = dict(re.findall(r"^- `la\.(\w+)(.*?)`$", text, re.MULTILINE))
+    assert set(written) == set(public_names(la.__file__))
+    for name, signature in written.items():
+        if signature:
+            actual = inspect.signature(getattr(la, name)).parameters.values()
+            words = ast.parse(f"def f{signature}: ...").body[0].args  # type: ignore[attr-defined]
+            assert [each.arg for each in (*words.args, *words.kwonlyargs)] == [
+                each.name for each in actual if each.kind is not each.VAR_KEYWORD
+            ]
+            defaults = [ast.literal_eval(each) for each in (*words.defaults, *words.kw_defaults) if each]
+            assert defaults == [each.default for each in actual if each.default is not each.empty]

@@ -17,13 +17,13 @@ class _KernelTime(event.Listener):  # type: ignore[misc]
     """Adds up the time in which this process gets kernels; one inside another counts once."""
 
     def __init__(self) -> None:
-        self.total_s = 0.0
-        self._depth, self._began = 0, 0.0
+        self.total_s, self.total_cpu_s = 0.0, 0.0
+        self._depth, self._began, self._began_cpu = 0, 0.0, 0.0
 
     def on_start(self, event: event.Event) -> None:
         """Begin an interval, unless one has begun."""
         if self._depth == 0:
-            self._began = time.perf_counter()
+            self._began, self._began_cpu = time.perf_counter(), time.process_time()
         self._depth += 1
 
     def on_end(self, event: event.Event) -> None:
@@ -31,6 +31,7 @@ class _KernelTime(event.Listener):  # type: ignore[misc]
         self._depth -= 1
         if self._depth == 0:
             self.total_s += time.perf_counter() - self._began
+            self.total_cpu_s += time.process_time() - self._began_cpu
 
 
 _kernel_time = _KernelTime()
@@ -40,6 +41,11 @@ event.register("numba:compiler_lock", _kernel_time)
 def working_s() -> float:
     """Return seconds from an unknown start, without those in which kernels were compiled or loaded."""
     return time.perf_counter() - _kernel_time.total_s
+
+
+def working_cpu_s() -> float:
+    """Return seconds of this process's processor time, without those in which kernels were made or loaded."""
+    return time.process_time() - _kernel_time.total_cpu_s
 
 
 class _Names(event.Listener):  # type: ignore[misc]

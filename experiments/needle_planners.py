@@ -22,14 +22,13 @@ from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from experiments.support.anatomies import data_folder, require_data
 from experiments.support.needle.queries import (
-    Obstacles,
     Query,
     Validator,
     easy_queries,
+    environment_of,
     generated_queries,
     hard_queries,
     load_obstacles,
-    obstacles_of,
 )
 from experiments.support.needle.runs import (
     MARKS_S,
@@ -43,6 +42,7 @@ from experiments.support.needle.runs import (
     solved_by_other,
 )
 from experiments.support.results import Result, setting_of, study_parser, write_result
+from lungaccess.benchmark import UncObstacles, unc_obstacles
 from lungaccess.report import style
 from stages.needle.search.planners import PLANNERS
 
@@ -62,7 +62,7 @@ def problems(query_set: str, every: int, seed: int) -> Iterator[Problem]:
     """Make the environment of each query, one patient in memory at a time."""
     if data_folder() is None:
         images = make_phantom(seed=3, size="small").images
-        obstacles = obstacles_of(images)
+        obstacles = unc_obstacles(images)
         for query in generated_queries(obstacles, build_lung(images).tree, GENERATED // every, seed):
             yield _problem(obstacles, query)
         return
@@ -75,8 +75,8 @@ def problems(query_set: str, every: int, seed: int) -> Iterator[Problem]:
         yield _problem(obstacles, query)
 
 
-def _problem(obstacles: Obstacles, query: Query) -> Problem:
-    environment = obstacles.environment(query)
+def _problem(obstacles: UncObstacles, query: Query) -> Problem:
+    environment = environment_of(obstacles, query)
     return query, environment, Validator(environment, query)
 
 

@@ -16,6 +16,7 @@ from anatomy.errors import AnatomyError, FileError, LungaccessError
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.commands.advise import advise
 from lungaccess.cli.commands.alternatives import alternatives
+from lungaccess.cli.commands.benchmark import benchmark
 from lungaccess.cli.commands.certify import certify
 from lungaccess.cli.commands.check import check
 from lungaccess.cli.commands.demo import demo
@@ -84,6 +85,7 @@ for _command in (
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__))
 app.command(study)
+app.command(benchmark)
 
 
 # Cyclopts would end the process by itself.

@@ -32,6 +32,7 @@ EXAMPLES = MappingProxyType(
         "study show": "lungaccess study show results.db",
         "study export": "lungaccess study export results.db --csv tables",
         "study compare": "lungaccess study compare results.db results.db",
+        "benchmark med-rad": "lungaccess benchmark med-rad PATIENT --seeds 1 --budget 0.2 --out runs.csv",
         "doctor": "lungaccess doctor",
         "completion": "lungaccess completion bash",
     }

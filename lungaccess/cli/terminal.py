@@ -26,6 +26,9 @@ class _Console(Console):
         raise BrokenPipeError
 
 
+WIDEST = 400
+"""Characters that the widest table may take on a line."""
+
 console = _Console()
 error_console = _Console(stderr=True)
 progress_console = _Console(stderr=True)
@@ -112,6 +115,19 @@ def show(tables: Iterable[Table]) -> None:
     """Print tables with a blank line after each."""
     for made in tables:
         console.print(made)
+        console.print()
+
+
+def show_wide(tables: Iterable[Table]) -> None:
+    """Print tables of many columns as wide as they are: a terminal breaks their lines, a pager scrolls."""
+    width = console.width
+    for made in tables:
+        natural = console.measure(made, options=console.options.update(max_width=WIDEST)).maximum
+        try:
+            console.width = max(natural, width)
+            console.print(made)
+        finally:
+            console.width = width
         console.print()
 
 

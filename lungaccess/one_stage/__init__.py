@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.one_stage.needle import NeedleAnswer, begins_at_wall, pierced_branches, plan_needle
+    from lungaccess.one_stage.needle import (
+        NeedleAnswer,
+        NeedleQuestion,
+        begins_at_wall,
+        needle_question,
+        pierced_branches,
+        plan_needle,
+    )
     from lungaccess.one_stage.needle_search import OMPL_PLANNERS, OMPL_TOLERANCE_MM, PathSearch, search_path
     from lungaccess.one_stage.obstruction import (
         obstruction_record,

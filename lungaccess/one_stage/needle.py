@@ -181,6 +181,47 @@ def plan_needle(
             expected="a pose inside the lung",
             remedy="Check the frame of its numbers: RAS or LPS",
         )
+    asked = needle_question(lung, system, lps_from_start, target.lps_mm)
+    found = search_path(
+        asked.environment,
+        asked.query,
+        planner,
+        objective=weighed,
+        seed=seed,
+        iterations=iterations,
+        time_s=time_s,
+    )
+    return NeedleAnswer(
+        outcome=found.outcome,
+        path=found.path,
+        cost=found.cost,
+        branches=asked.branches,
+        at_wall=asked.at_wall,
+        obstruction=found.obstruction,
+        environment=asked.environment,
+        objective=weighed,
+        first_path_s=found.first_path_s,
+    )
+
+
+@frozen_record
+class NeedleQuestion:
+    """A start and a target in a lung as the needle stage takes them; see `NeedleAnswer`."""
+
+    environment: NeedleEnvironment
+    query: Query
+    branches: tuple[int, ...]
+    at_wall: bool
+
+
+def needle_question(lung: Lung, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
+    """Ask for a path of a system's needle, with its margins, and the exemption that its start has.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+    target_lps : (3,) float64, LPS mm
+    """
     environment = needle_environment(
         lung, system.needle, system.margins, with_fissures=not system.fissures_allowed
     )
@@ -189,21 +230,8 @@ def plan_needle(
     at_wall = begins_at_wall(lung, point, system.needle.radius_mm)
     if at_wall:
         environment = begun_at_wall(environment, point, branches)
-    query = Query(lps_from_start=lps_from_start, target=target.lps_mm, branch=[*branches, -1][0])
-    found = search_path(
-        environment, query, planner, objective=weighed, seed=seed, iterations=iterations, time_s=time_s
-    )
-    return NeedleAnswer(
-        outcome=found.outcome,
-        path=found.path,
-        cost=found.cost,
-        branches=branches,
-        at_wall=at_wall,
-        obstruction=found.obstruction,
-        environment=environment,
-        objective=weighed,
-        first_path_s=found.first_path_s,
-    )
+    query = Query(lps_from_start=lps_from_start, target=target_lps, branch=[*branches, -1][0])
+    return NeedleQuestion(environment=environment, query=query, branches=branches, at_wall=at_wall)
 
 
 def pierced_branches(lung: Lung, point: Float, near_mm: float) -> tuple[int, ...]:

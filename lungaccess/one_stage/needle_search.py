@@ -65,7 +65,7 @@ def search_path(
     planner: str,
     *,
     objective: Objective = SHORTEST,
-    seed: int = 0,
+    seed: int | None = 0,
     iterations: int | None = None,
     time_s: float | None = None,
     clock: Callable[[], float] = working_s,
@@ -78,6 +78,8 @@ def search_path(
     ----------
     planner : str
         One of `stages.needle.search.planners.PLANNERS` or of `OMPL_PLANNERS`; those end by time alone.
+    seed : int or None
+        OMPL can be seeded once in a process; without a seed, its planners draw anew at each call.
     iterations, time_s : optional
         The search ends by whichever comes first, or by itself.
     clock : callable
@@ -93,7 +95,7 @@ def search_path(
     if planner in OMPL_PLANNERS:
         found = _by_ompl(environment, query, planner, seed, time_s or 0.0, clock)
     else:
-        search = PLANNERS[planner](environment, query, seed, objective)
+        search = PLANNERS[planner](environment, query, seed or 0, objective)
         found = _advance(search, iterations, time_s, clock, portion, until_first)
     if found.path is not None:
         return found
@@ -133,14 +135,15 @@ def _by_ompl(
     environment: NeedleEnvironment,
     query: Query,
     planner: str,
-    seed: int,
+    seed: int | None,
     time_s: float,
     clock: Callable[[], float],
 ) -> PathSearch:
     """Let a planner of OMPL search; its cost is the length of the path."""
     from stages.needle.ompl import NeedleProblem, seed_ompl
 
-    seed_ompl(seed + 1)
+    if seed is not None:
+        seed_ompl(seed + 1)
     problem = NeedleProblem(environment)
     problem.setup.setPlanner(problem.planners()[planner](problem.si))
     problem.pose(query, goal_tolerance_mm=max(OMPL_TOLERANCE_MM, environment.goal_tolerance_mm))

@@ -90,7 +90,9 @@ def easiest_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruc
         environment.obstacles, environment.limits, _pose(query), query.inserted_mm, query.branch, query.goal,
         TRIALS, np.zeros(1, dtype=np.uint64), np.zeros(kernels.FOUND_SIZE), found,
     )  # fmt: skip
-    return _found("path", False, label, found, query) if tried and label else None
+    if not tried or not label or found[kernels.DISTANCE] >= found[kernels.NEEDED]:
+        return None
+    return _found("path", False, label, found, query)
 
 
 def _pose(query: Query) -> tuple[float, ...]:
@@ -162,7 +164,8 @@ def _reach(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
 def _rules_out(rho: float, h: float, tolerance_mm: float, limit: str, limits: Limits) -> bool:
     """Tell whether it is proved that no path ends within the tolerance of a target outside the workspace.
 
-    That holds for targets farther than the needle is long; for those that lie in the torus of tightest
+    That holds for targets farther than the needle is long; for those behind the start, if paths never turn
+    back; for those that lie in the torus of tightest
     circles by more than the tolerance, if paths turn by 180 degrees at most; and without a tolerance where
     the workspace is exact: see "Workspace" in docs/explanation/proofs.md.
     """
@@ -171,6 +174,8 @@ def _rules_out(rho: float, h: float, tolerance_mm: float, limit: str, limits: Li
     radius = 1.0 / limits.kappa
     inside = radius - math.hypot(radius - rho, h) > tolerance_mm + NEAR_MM
     if limit == "radius" and inside and limits.max_turn_rad <= math.pi * (1.0 + SAME_SHARE):
+        return True
+    if h < -tolerance_mm - NEAR_MM and min(limits.max_angle_rad, limits.max_turn_rad) <= 0.5 * math.pi:
         return True
     return tolerance_mm == 0.0 and limits.max_angle_rad <= 0.5 * math.pi * (1.0 + SAME_SHARE)
 

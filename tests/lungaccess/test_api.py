@@ -25,6 +25,7 @@ FACADES = (
     "anatomy.tree",
     "lungaccess",
     "lungaccess.appraisal",
+    "lungaccess.benchmark",
     "lungaccess.checking",
     "lungaccess.coupled",
     "lungaccess.one_stage",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.support.needle.queries import Obstacles, Validator, hard_queries, load_obstacles
+from experiments.support.needle.queries import Validator, environment_of, hard_queries, load_obstacles
+from lungaccess.benchmark import UncObstacles
 from stages.needle import query as needle_query
 from stages.needle.search.planners import PLANNERS
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES
@@ -17,7 +18,7 @@ class SharedQueries:
     def __init__(self, data: Path) -> None:
         found = {query.name: query for query in hard_queries(data / "needle")}
         self._queries = [found[name] for name in SHARED_QUERIES]
-        self._obstacles: dict[int, Obstacles] = {
+        self._obstacles: dict[int, UncObstacles] = {
             number: load_obstacles(data / "med-rad" / f"Patient{number}")
             for number in sorted({query.patient for query in self._queries})
         }
@@ -26,7 +27,7 @@ class SharedQueries:
         """Plan for each query by length, and walk each path again against all obstacle voxels."""
         out = []
         for query in self._queries:
-            environment = self._obstacles[query.patient].environment(query)
+            environment = environment_of(self._obstacles[query.patient], query)
             asked = needle_query.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
             search = PLANNERS[planner](environment, asked, 0)
             search.advance(NEEDLE_ITERATIONS)

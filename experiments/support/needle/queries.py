@@ -1,7 +1,6 @@
 """Recorded needle queries on Med-RAD patients: their obstacles, poses, and the results of another planner.
 
-Obstacles are the masks as they are: airway, vessels and everything outside the lungs.  A point is free if
-every obstacle voxel's centre is at least the needle's radius and half a voxel diagonal away.
+Their rules are those of `lungaccess.benchmark.unc_rules`.
 """
 
 from __future__ import annotations
@@ -18,28 +17,20 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.fields import CENTRES
-from anatomy.grid import Grid
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.io.med_rad import load_med_rad
-from anatomy.patient import PatientImages
 from anatomy.records import frozen_record
-from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
-from anatomy.typed import Float, Labels
+from anatomy.structures import OBSTACLES
+from anatomy.typed import Float
+from lungaccess.benchmark import UNC_GOAL_TOLERANCE_MM, UncObstacles, unc_needle, unc_obstacles
 from stages.needle.device import Needle
-from stages.needle.environment import NeedleEnvironment, environment_of_labels
+from stages.needle.environment import NeedleEnvironment
 from stages.needle.path import ArcPath
 
-NEEDLE_DIAMETER_MM = 2.0
-"""Of the recorded queries."""
-GOAL_TOLERANCE_MM = 1.0
-"""Of the recorded queries."""
-MAX_LENGTH_MM = 150.0
-"""Of the recorded queries."""
+MAX_TURN_DEG = 180.0
+"""The recorded hard queries limit the angle from the start alone."""
 RECHECK_MM = 0.02
 """A tenth of a voxel or less: no obstacle is stepped over."""
-BORDER_MM = 30.0
-"""Obstacles are cut out so far around a query; a path that leaves this box is too long."""
 GENERATED_RADII_MM = (50.0, 121.0)
 """The two radii of curvature of the recorded queries."""
 GENERATED_MM = (20.0, 50.0)
@@ -85,62 +76,19 @@ class Query:
     @property
     def needle(self) -> Needle:
         """The needle of the query."""
-        return Needle(
-            diameter_mm=NEEDLE_DIAMETER_MM,
-            max_curvature_per_mm=1.0 / self.radius_mm,
-            max_length_mm=MAX_LENGTH_MM,
-            max_angle_from_start_deg=90.0,
-        )
+        return unc_needle(self.radius_mm, max_accumulated_turn_deg=MAX_TURN_DEG)
 
 
-@frozen_record
-class Obstacles:
-    """The label volume of one patient, and the distance that a needle's axis keeps from voxel centres."""
-
-    labels: Labels
-    grid: Grid
-
-    @property
-    def required_mm(self) -> float:
-        """Radius and half a voxel diagonal."""
-        return 0.5 * NEEDLE_DIAMETER_MM + 0.5 * float(np.linalg.norm(self.grid.spacing_mm))
-
-    def environment(self, query: Query) -> NeedleEnvironment:
-        """Return the labels in a box about start and target, less the exempt ball, as an environment."""
-        ends = np.stack([query.lps_from_start[:3, 3], query.target_lps])
-        border = BORDER_MM + 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
-        corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
-        ijk = self.grid.ijk((ends[:, None] + border * corners).reshape(-1, 3))
-        low = np.maximum(np.floor(ijk.min(axis=0)).astype(int), 0)
-        high = np.minimum(np.ceil(ijk.max(axis=0)).astype(int) + 1, self.grid.shape)
-        labels = self.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].copy(order="F")
-        grid = self.grid.crop(low, high)
-        if query.exempt_mm > 0.0:
-            centres = grid.lps(np.argwhere(labels & OBSTACLES).astype(float))
-            near = np.linalg.norm(centres - ends[0], axis=1) <= query.exempt_mm
-            labels[tuple(np.argwhere(labels & OBSTACLES)[near].T)] = 0
-        return environment_of_labels(
-            labels,
-            grid,
-            query.needle,
-            required_clearance_mm=self.required_mm,
-            obstacles_as=CENTRES,
-            goal_tolerance_mm=GOAL_TOLERANCE_MM,
-        )
+def environment_of(obstacles: UncObstacles, query: Query) -> NeedleEnvironment:
+    """Return a query among the obstacles of its patient."""
+    return obstacles.environment(
+        query.needle, query.lps_from_start, query.target_lps, exempt_mm=query.exempt_mm
+    )
 
 
-def load_obstacles(folder: Path) -> Obstacles:
+def load_obstacles(folder: Path) -> UncObstacles:
     """Read the masks of a Med-RAD patient."""
-    return obstacles_of(load_med_rad(folder))
-
-
-def obstacles_of(images: PatientImages) -> Obstacles:
-    """Label the masks of a patient."""
-    labels = np.zeros(images.grid.shape, dtype=np.uint16, order="F")
-    labels[images.lumen.array] |= AIRWAY
-    labels[images.vessels.array] |= VESSEL
-    labels[~images.lung.array] |= OUTSIDE
-    return Obstacles(labels=labels, grid=images.grid)
+    return unc_obstacles(load_med_rad(folder))
 
 
 def hard_queries(folder: Path) -> list[Query]:
@@ -185,7 +133,7 @@ def easy_queries(folder: Path, patients: Path) -> list[Query]:
     return queries
 
 
-def generated_queries(obstacles: Obstacles, tree: AirwayTree, count: int, seed: int) -> list[Query]:
+def generated_queries(obstacles: UncObstacles, tree: AirwayTree, count: int, seed: int) -> list[Query]:
     """Draw queries of patient 0: from the ends of airways, to free points ahead; half of each radius.
 
     Parameters
@@ -219,7 +167,7 @@ def generated_queries(obstacles: Obstacles, tree: AirwayTree, count: int, seed: 
     return queries
 
 
-def _has_clearance(obstacles: Obstacles, target: Float) -> bool:
+def _has_clearance(obstacles: UncObstacles, target: Float) -> bool:
     low = np.floor(obstacles.grid.ijk(target)).astype(int) - AROUND_VOXELS
     high = low + 2 * AROUND_VOXELS + 2
     if (low < 0).any() or (high > obstacles.grid.shape).any():
@@ -260,7 +208,7 @@ class Validator:
             out.append(f"{self._environment.required_clearance_mm - clearance:.4f} mm too near")
         if not self._environment.grid.contains(points).all():
             out.append("leaves the box")
-        if np.linalg.norm(points[-1] - query.target_lps) > GOAL_TOLERANCE_MM + 1e-9:
+        if np.linalg.norm(points[-1] - query.target_lps) > UNC_GOAL_TOLERANCE_MM + 1e-9:
             out.append("ends off the target")
         if not np.array_equal(path.lps_from_start, query.lps_from_start):
             out.append("starts elsewhere")

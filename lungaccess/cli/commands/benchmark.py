@@ -1,0 +1,183 @@
+"""The commands `lungaccess benchmark ...`: published queries run with several planners."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from anatomy.errors import LungaccessError, SettingsError
+from anatomy.suggestion import did_you_mean
+from lungaccess.cli import terminal
+from lungaccess.cli.examples import epilogue
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Count
+from lungaccess.cli.options import PatientOptions, SystemOptions
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from anatomy.patient import PatientImages
+    from lungaccess.benchmark import BenchmarkRow
+    from lungaccess.benchmark.posing import Pose
+    from lungaccess.problem.system import System
+
+Rules = Literal["ours", "unc"]
+UNC_RADII_MM = "50,100,121"
+"""The radii of the peer's recorded runs."""
+DEFAULT_PLANNERS = "rrt,optimal,resolution,decide,control.RRT"
+
+benchmark = App(
+    name="benchmark",
+    help="Run published queries with several planners.",
+    help_epilogue=epilogue("benchmark med-rad"),
+)
+
+
+@benchmark.command(name="med-rad", help_epilogue=epilogue("benchmark med-rad"))
+def med_rad(
+    folder: Path,
+    *,
+    rules: Rules = "ours",
+    planners: str = DEFAULT_PLANNERS,
+    radius: str | None = None,
+    seeds: Annotated[Count, Parameter(name="--seeds")] = 3,
+    budget: float = 1.0,
+    peer: Path | None = None,
+    out: Path | None = None,
+    system: SystemOptions = SystemOptions(),
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
+    """Plan the needle from each published start to each published target; exit code 1 if none is reached.
+
+    Parameters
+    ----------
+    folder : Path
+        A patient, or a folder of patients.
+    rules : str
+        ours: proved clearance of the system's needle, with the exemption at the airway wall. unc: a needle of
+        2 mm that keeps from voxel centres, obstacles within 3 mm of the start ignored, 1 mm goal tolerance.
+    planners : str
+        Names separated by commas: rrt, optimal, resolution, decide; of OMPL control.RRT, control.EST,
+        control.KPIECE1.
+    radius : str
+        Least radii of curvature in mm, separated by commas; if not given, that of the system, or 50,100,121
+        by the rules of unc.
+    seeds : int
+        Runs of each planner that draws at random.
+    budget : float
+        Processor time of a run in seconds.
+    peer : Path
+        JSON file of another planner's recorded results, shown beside.
+    out : Path
+        File for all runs: .csv or .json.
+    """
+    from lungaccess.benchmark import read_peer, summary_rows, write_rows
+    from lungaccess.benchmark.export import require_table_file
+
+    names = _planners(planners)
+    if not 0.0 < budget < float("inf"):
+        raise SettingsError(f"--budget is {budget:g} s", expected="a finite time above 0")
+    device = system.load()
+    radii = _radii(radius, rules, device)
+    recorded = None if peer is None else read_peer(peer)
+    if out is not None:
+        require_table_file(out)
+    rows = list(_rows(folder, rules, device, radii, names, range(seeds), budget, output))
+    if out is not None:
+        write_rows(rows, out)
+    headings, lines = summary_rows(rows, recorded)
+    if output.json:
+        terminal.show_json(
+            {
+                "rules": rules,
+                "system": device.name if rules == "ours" else None,
+                "budget_cpu_s": budget,
+                "queries": [dict(zip(headings, line, strict=True)) for line in lines],
+            }
+        )
+    else:
+        shown = f"by the rules of {rules}" + (f", {device.name}" if rules == "ours" else "")
+        terminal.show_wide([terminal.table(f"Published needle queries {shown}", headings, lines)])
+        if out is not None:
+            terminal.say(f"All runs are in {out}")
+    return ExitCode.of(any(row.solved for row in rows))
+
+
+def _rows(
+    folder: Path,
+    rules: Rules,
+    device: System,
+    radii: tuple[float, ...],
+    planners: tuple[str, ...],
+    seeds: range,
+    budget_s: float,
+    output: PatientOptions,
+) -> Iterator[BenchmarkRow]:
+    """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
+    from lungaccess.benchmark import BenchmarkRow, patients_of, published_queries, run_query
+    from lungaccess.benchmark.published import why_no_query
+
+    for path in patients_of(folder):
+        try:
+            pose, patient = _posing(path, rules, device, output)
+        except LungaccessError as error:
+            yield BenchmarkRow(patient=path.name, reason=f"not read: {error.found}")
+            continue
+        if why_no_query(patient):
+            yield BenchmarkRow(patient=path.name, reason=why_no_query(patient))
+        asked = [(query, mm) for query in published_queries(patient, path.name) for mm in radii]
+        with progress(f"{path.name}: {len(asked)} queries") as shown:
+            for number, (query, mm) in enumerate(asked):
+                shown.step(f"{path.name}, start {query.start}, R = {mm:g} mm", number / len(asked))
+                yield from run_query(*pose(query, mm), query, mm, planners, seeds, budget_s)
+
+
+def _posing(
+    path: Path, rules: Rules, device: System, output: PatientOptions
+) -> tuple[Pose, Lung | PatientImages]:
+    """Return what makes environments of a patient by the rules, and the patient."""
+    from lungaccess.benchmark import posed_by_unc, posed_in_lung
+
+    if rules == "ours":
+        lung = output.load(path)
+        return posed_in_lung(lung, device), lung
+    from anatomy.io.patients import load_patient
+
+    with progress(f"reading {path}"):
+        images = load_patient(path)
+    return posed_by_unc(images), images
+
+
+def _planners(text: str) -> tuple[str, ...]:
+    from lungaccess.one_stage import OMPL_PLANNERS
+    from stages.needle import PLANNERS
+
+    known = (*PLANNERS, *OMPL_PLANNERS)
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
+        if name not in known:
+            raise SettingsError(
+                f"There is no needle planner {name!r}",
+                expected=f"names separated by commas, of {', '.join(known)}",
+                remedy=did_you_mean(name, known),
+            )
+    if not names:
+        raise SettingsError("--planners names no planner", expected=", ".join(known))
+    return names
+
+
+def _radii(text: str | None, rules: Rules, device: System) -> tuple[float, ...]:
+    if text is None and rules == "ours":
+        return (device.needle.min_radius_of_curvature_mm,)
+    try:
+        radii = tuple(float(part) for part in (text or UNC_RADII_MM).split(","))
+    except ValueError:
+        radii = ()
+    if not radii or not all(5.0 <= mm < float("inf") for mm in radii):
+        raise SettingsError(
+            f"--radius is {text!r}", expected="radii of 5 mm or more, separated by commas, such as 50,121"
+        )
+    return radii

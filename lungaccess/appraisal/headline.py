@@ -107,7 +107,7 @@ class Headline:
 
     def _geometry(self) -> str:
         if self.geometry == Geometry.REFUSED:
-            return f"Geometry refused by the independent check ({plural(self.refusals, 'finding')})."
+            return f"Refused by the independent check ({plural(self.refusals, 'finding')})."
         return f"Geometry {self.geometry}."
 
     def _chance(self) -> str:
@@ -116,7 +116,7 @@ class Headline:
         low, high = self.risk.succeeds.interval
         words = (
             f"Estimated to succeed in {of_hundred(self.risk.succeeds.value)} of 100 (95 % interval "
-            f"{of_hundred(low)} to {of_hundred(high, up=True)}) under the errors of `{self.risk.model.label}`"
+            f"{of_hundred(low)} to {of_hundred(high, up=True)}) under the errors of '{self.risk.model.label}'"
         )
         failures = " and ".join(
             f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in self.failures
@@ -139,9 +139,9 @@ class Headline:
             return ()
         model, label = self.risk.model, self.risk.model.label
         source = (
-            f"All sizes of `{label}` are assumptions: {model.words}."
+            f"All sizes of '{label}' are assumptions: {model.words}."
             if model.is_default
-            else f"Errors of `{label}`: {model.words}. A size that it does not state is an assumption."
+            else f"Errors of '{label}': {model.words}. A size that it does not state is an assumption."
         )
         return (
             f"{plural(self.risk.samples, 'draw')}, seed {self.risk.seed}; the devices are not corrected on "

@@ -97,8 +97,8 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
 def show_appraisal(appraisal: Appraisal) -> None:
     """Print the headline, then the limits, and what the check refuses, if anything."""
     show_headline(appraisal.headline)
-    if not appraisal.accepted:
-        terminal.show(check_tables(appraisal.check, refusals_only=True))
+    for finding in appraisal.check.refusals:
+        terminal.say(f"{finding}")
     if appraisal.limits:
         terminal.show([limits_table(appraisal)])
 
@@ -121,16 +121,17 @@ def limits_table(appraisal: Appraisal) -> Table:
         for each in appraisal.limits[:SHOWN_LIMITS]
     ]
     made = terminal.table(LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows)
-    made.caption = f"`lungaccess check PLAN PATIENT --all` lists all {len(appraisal.check.findings)} findings"
+    made.caption = "`lungaccess check PLAN PATIENT --all` lists every finding."
     made.caption_justify = "left"
     return made
 
 
-def check_tables(report: CheckReport, *, refusals_only: bool = False) -> list[Table]:
-    """Return the findings of an independent check by stage, all of them or those that are not ok."""
-    shown = [finding for finding in report.findings if not (refusals_only and finding.ok)]
-    stages = dict.fromkeys(finding.stage for finding in shown)
-    return [_findings_table(stage, [each for each in shown if each.stage == stage]) for stage in stages]
+def check_tables(report: CheckReport) -> list[Table]:
+    """Return all findings of an independent check by stage."""
+    stages = dict.fromkeys(finding.stage for finding in report.findings)
+    return [
+        _findings_table(stage, [each for each in report.findings if each.stage == stage]) for stage in stages
+    ]
 
 
 def _findings_table(stage: str, findings: list[Finding]) -> Table:

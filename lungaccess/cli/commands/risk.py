@@ -102,7 +102,9 @@ def _outcome_table(report: RiskReport) -> Table:
     rows += [
         (f"{100.0 * share:.0f} % end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()
     ]
-    title = f"{report.samples} deviated plans, errors `{report.model.label}`; radius: {report.radius_origin}"
+    title = (
+        f"{report.samples} deviated plans, errors of '{report.model.label}'; radius: {report.radius_origin}"
+    )
     return terminal.table(title, ("", "%", "95 % interval"), rows)
 
 

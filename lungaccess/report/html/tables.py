@@ -187,7 +187,7 @@ def risk_section(report: RiskReport | None) -> str:
     ]
     alone = [(name, _share(share)) for name, share in report.alone.items()]
     note = (
-        f"{report.samples} deviated plans, seed {report.seed}, open loop, errors `{report.model.label}`: "
+        f"{report.samples} deviated plans, seed {report.seed}, open loop, errors of '{report.model.label}': "
         f"{report.model.words}{', all of them assumed' if report.model.is_default else ''}. Radius of the "
         f"goal: {report.radius_origin}. The range is the 95 % interval."
     )

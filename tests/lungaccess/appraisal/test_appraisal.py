@@ -57,7 +57,7 @@ def test_a_good_plan_is_good_news() -> None:
     assert (headline.grade, headline.verdict) == (Grade.GOOD, "likely to succeed")
     assert headline.text == (
         "Geometry proved and checked. Estimated to succeed in 100 of 100 (95 % interval 99.8 to 100) under "
-        "the errors of `default`; no draw failed."
+        "the errors of 'default'; no draw failed."
     )
 
 
@@ -76,9 +76,7 @@ def test_a_risky_plan_says_what_fails_before_its_geometry_reassures() -> None:
 def test_a_refused_plan_has_no_chance() -> None:
     headline = Headline.of(make_check(False), None)
     assert (headline.grade, headline.verdict) == (Grade.POOR, "refused: do not use")
-    assert headline.text == (
-        "Geometry refused by the independent check (1 finding). Chance of success not estimated."
-    )
+    assert headline.text == ("Refused by the independent check (1 finding). Chance of success not estimated.")
     assert headline.to_mapping()["success"] is None
 
 
@@ -90,12 +88,12 @@ def test_what_was_not_looked_at_is_never_good() -> None:
 
 def test_the_model_is_named_and_its_sizes_are_stated(tmp_path: Path) -> None:
     default = Headline.of(make_check(True), make_risk(5)).details
-    assert any("All sizes of `default` are assumptions: scope tip 1 mm and 2°" in each for each in default)
+    assert any("All sizes of 'default' are assumptions: scope tip 1 mm and 2°" in each for each in default)
     (tmp_path / "measured.toml").write_text("scope_position_mm = 0.25\n")
     of_file = load_errors(tmp_path / "measured.toml")
     assert of_file.label == "measured.toml"
     details = Headline.of(make_check(True), make_risk(5, model=of_file)).details
-    assert any(each.startswith("Errors of `measured.toml`: scope tip 0.25 mm") for each in details)
+    assert any(each.startswith("Errors of 'measured.toml': scope tip 0.25 mm") for each in details)
     (tmp_path / "named.toml").write_text('name = "expiration"\nscope_position_mm = 0.25\n')
     assert load_errors(tmp_path / "named.toml").label == "expiration"
     assert ErrorModel(scope_position_mm=0.25).label == "stated"

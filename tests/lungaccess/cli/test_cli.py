@@ -262,7 +262,12 @@ def test_check_shows_value_limit_and_margin(
     words = ["check", str(tmp_path / "plan.json"), "toy"]
     toy_commands["accepted"] = False
     assert cli.main(words) == ExitCode.NEGATIVE
-    row = next(line for line in capsys.readouterr().out.splitlines() if "needle.clearance.vessel" in line)
+    said = capsys.readouterr().out.splitlines()
+    assert "REFUSED needle.clearance.vessel 0.4 mm (at least 1, margin -0.6): why" in said
+    (row,) = [line for line in said if "needle to vessel" in line]
+    assert " ".join(row.split()) == "needle to vessel 0.40 mm at least 1.00 mm BROKEN"
+    assert cli.main([*words, "--all"]) == ExitCode.NEGATIVE
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith(" refused")]
     assert " ".join(row.split()) == "refused needle.clearance.vessel 0.4 mm at least 1 -0.6 why"
     assert cli.main([*words, "--json"]) == ExitCode.NEGATIVE
     (finding,) = json.loads(capsys.readouterr().out)["findings"]

@@ -97,20 +97,25 @@ class RiskAssessor:
     def outcomes(self, deviations: Deviations) -> Outcomes:
         """Follow deviated plans through all three stages."""
         starts, pieces = deviated_starts(self.plan, deviations), deviated_pieces(self.plan, deviations)
-        touched, ends = np.zeros(deviations.count, dtype=np.int64), np.zeros((deviations.count, 3))
+        touched, ends = self._followed(starts, pieces, enough=0)
+        targets = self.plan.target_lps + deviations.target_mm
+        return Outcomes(touched=touched, miss_mm=np.linalg.norm(ends - targets, axis=1))
+
+    def _followed(self, starts: Float, pieces: Float, *, enough: int) -> tuple[Int, Float]:
+        """Return what chains touch `(N,)` and where they end `(N, 3)`; see `kernel.follow`."""
+        touched, ends = np.zeros(len(starts), dtype=np.int64), np.zeros((len(starts), 3))
         exempt_mm = float(self.plan.exemption.needle_length_mm)
 
         def follow(part: slice) -> None:
             kernel.follow(
                 self._obstacles, self._depth, self._mediastinal, starts[part], pieces[part], TUBE_PIECES,
-                exempt_mm, touched[part], ends[part],
+                exempt_mm, enough, touched[part], ends[part],
             )  # fmt: skip
 
-        bounds = np.linspace(0, deviations.count, THREADS + 1).astype(int)
+        bounds = np.linspace(0, len(starts), THREADS + 1).astype(int)
         with ThreadPoolExecutor(THREADS) as pool:
             list(pool.map(follow, (slice(a, b) for a, b in zip(bounds, bounds[1:], strict=False))))
-        targets = self.plan.target_lps + deviations.target_mm
-        return Outcomes(touched=touched, miss_mm=np.linalg.norm(ends - targets, axis=1))
+        return touched, ends
 
     def succeeded(self, outcomes: Outcomes) -> Bool:
         """Tell which `(N,)` end within the radius, leave the airway and touch nothing forbidden."""
@@ -118,12 +123,25 @@ class RiskAssessor:
             (outcomes.miss_mm <= self.radius_mm) & ((outcomes.touched & self._forbidden_flags) == 0)
         )
 
+    def successes(self, deviations: Deviations) -> Bool:
+        """Tell which `(N,)` of deviated plans succeed, as `succeeded` does of their outcomes.
+
+        Those that miss the goal are not followed, and the others only up to the first forbidden touch.
+        """
+        starts, pieces = deviated_starts(self.plan, deviations), deviated_pieces(self.plan, deviations)
+        ends = np.zeros((deviations.count, 3))
+        kernel.find_ends(starts, pieces, ends)
+        targets = self.plan.target_lps + deviations.target_mm
+        done = np.asarray(np.linalg.norm(ends - targets, axis=1) <= self.radius_mm)
+        touched, _ends = self._followed(starts[done], pieces[done], enough=self._forbidden_flags)
+        done[done] = (touched & self._forbidden_flags) == 0
+        return done
+
     def success(
         self, draws: Draws, sizes: Mapping[str, float], factors: tuple[float, float] = (1.0, 1.0)
     ) -> Share:
         """Return the share of successes under errors of given sizes, see `Draws.scaled`."""
-        done = self.succeeded(self.outcomes(draws.scaled(sizes, factors)))
-        return share_of(done)
+        return share_of(self.successes(draws.scaled(sizes, factors)))
 
 
 def goal_radius(lung: Lung, plan: Plan) -> tuple[float, str]:

@@ -175,7 +175,7 @@ def _unfailing(
     """Return the size up to which no step of a ladder fails in any direction, refined once."""
 
     def first_failure(sizes: Float) -> int:
-        done = assessor.succeeded(assessor.outcomes(made(sizes, directions)))
+        done = assessor.successes(made(sizes, directions))
         failed = ~done.reshape(len(sizes), len(directions)).all(axis=1)
         return int(np.argmax(failed)) if failed.any() else len(sizes)
 

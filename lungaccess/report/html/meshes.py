@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy.grid import Volume
+from anatomy.kept import kept
 from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
 from lungaccess.report.pack import Packed, pack
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
 
 
+SURFACES_VERSION = 1
 STEPS = 65535
 SMOOTHINGS = 6
 SHRINK, GROW = 0.5, -0.53
@@ -77,7 +79,11 @@ LOOKS = (
 
 
 def structure_meshes(lung: Lung) -> list[Packed]:
-    """Return the surfaces of a patient's structures for a page; those it lacks are left out."""
+    """Return the surfaces of a patient's structures for a page, kept with it; those it lacks are left out."""
+    return list(kept(lung, "surfaces", SURFACES_VERSION, lambda: _structure_meshes(lung)))
+
+
+def _structure_meshes(lung: Lung) -> list[Packed]:
     found = []
     for look in LOOKS:
         volume = structure(lung, look.key)

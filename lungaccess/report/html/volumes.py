@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
+from anatomy.kept import kept
+from anatomy.morphology import window
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
-from anatomy.typed import Array, Float, UInt8
+from anatomy.typed import Array, Float, Int, UInt8
 from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 
 CODES = {"outside": 0, "lung": 1, "airway wall": 2, "lumen": 3, "vessel": 4, "fissure": 5, "nodule": 6}
+LABELS_VERSION = 1
 COARSE_VOXELS, FINE_VOXELS = 3_000_000, 3_000_000
 """Voxels at most of the coarse and the fine volume, so that the page stays small."""
 LEAST_COARSE_MM = 1.5
@@ -51,9 +54,13 @@ def read_ct(path: Path) -> Volume:
     return read_dicom(path) if path.is_dir() else read_volume(path)
 
 
-def label_codes(lung: Lung) -> Volume:
-    """Return one of `CODES` for every voxel of a lung: of several structures the last of the list."""
-    labels = lung.labels
+def label_codes(lung: Lung, low: ArrayLike, high: ArrayLike) -> Volume:
+    """Return one of `CODES` for the voxels from `low` to before `high`, `(3,)` each.
+
+    Of several structures a voxel has the code of the last of the list.
+    """
+    box = window(np.asarray(low), np.asarray(high))
+    labels = lung.labels[box]
     codes = np.full(labels.shape, CODES["lung"], dtype=np.uint8, order="F")
     for bit, name in (
         (OUTSIDE, "outside"),
@@ -64,14 +71,27 @@ def label_codes(lung: Lung) -> Volume:
     ):
         codes[(labels & bit) != 0] = CODES[name]
     if lung.nodules is not None:
-        codes[lung.nodules.array & (codes == CODES["lung"])] = CODES["nodule"]
-    return Volume(grid=lung.grid, array=codes)
+        codes[lung.nodules.array[box] & (codes == CODES["lung"])] = CODES["nodule"]
+    return Volume(grid=lung.grid.crop(low, high), array=codes)
 
 
 def label_volumes(lung: Lung, device_lps: Float) -> list[Packed]:
-    """Return the structures, coarse and fine, for a page."""
-    codes = label_codes(lung)
-    return [_packed(grid, resampled(codes, grid, 0, 0)) for grid in page_grids(lung.grid, device_lps)]
+    """Return the structures, coarse and fine, for a page; the coarse ones are kept with the lung."""
+    coarse, fine = page_grids(lung.grid, device_lps)
+    shape = np.array(lung.grid.shape)
+    corners = np.stack(np.meshgrid(*[(0, n - 1) for n in fine.shape], indexing="ij"), axis=-1).reshape(-1, 3)
+    places = np.floor(lung.grid.ijk(fine.lps(corners))).astype(np.int64)
+    low = np.clip(places.min(axis=0) - 2, 0, shape - 1)
+    high = np.clip(places.max(axis=0) + 4, low + 1, shape)
+    return [
+        kept(lung, "labels", LABELS_VERSION, lambda: _labels_on(lung, coarse, np.zeros(3, np.int64), shape)),
+        _labels_on(lung, fine, low, high),
+    ]
+
+
+def _labels_on(lung: Lung, grid: Grid, low: Int, high: Int) -> Packed:
+    """Return the structures on another grid, from the voxels from `low` to before `high`."""
+    return _packed(grid, resampled(label_codes(lung, low, high), grid, 0, 0))
 
 
 def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:

@@ -84,7 +84,17 @@ def _in_lumen(obstacles, depth, x, y, z):
 
 
 @inner_kernel
-def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm):
+def _bend(pose, nx, ny, nz, roll, kappa):
+    """Return curvature and normal of an arc that begins with a roll from the normal `(nx, ny, nz)`."""
+    c, s = math.cos(roll), math.sin(roll)
+    bx = pose[4] * nz - pose[5] * ny
+    by = pose[5] * nx - pose[3] * nz
+    bz = pose[3] * ny - pose[4] * nx
+    return kappa, c * nx + s * bx, c * ny + s * by, c * nz + s * bz
+
+
+@inner_kernel
+def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enough):
     """Follow one chain; return what it touches and the point where it ends."""
     clearance, _labels, geometry, bits = obstacles
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
@@ -97,15 +107,11 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm):
     tube_mm = pieces[:n_tube, LENGTH].sum()
     for p in range(pieces.shape[0]):
         length, roll, kappa, radius = pieces[p]
-        c, s = math.cos(roll), math.sin(roll)
-        bx = pose[4] * nz - pose[5] * ny
-        by = pose[5] * nx - pose[3] * nz
-        bz = pose[3] * ny - pose[4] * nx
-        bend = (kappa, c * nx + s * bx, c * ny + s * by, c * nz + s * bz)
+        bend = _bend(pose, nx, ny, nz, roll, kappa)
         if p == n_tube and pierced == IN_LUMEN:
             touched |= STAYS_INSIDE
         at = 0.0
-        while not touched & STAYS_INSIDE and touched & bits != bits:
+        while not touched & (STAYS_INSIDE | enough) and touched & bits != bits:
             x, y, z = point_on_arc(pose, bend, at)
             if pierced == IN_LUMEN:
                 step, here = _in_lumen(obstacles, depth, x, y, z)
@@ -138,7 +144,7 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm):
 
 
 @numba.njit(cache=True, nogil=True)
-def follow(obstacles, depth, mediastinal, starts, pieces, n_tube, exempt_mm, touched, ends):
+def follow(obstacles, depth, mediastinal, starts, pieces, n_tube, exempt_mm, enough, touched, ends):
     """Follow N deviated plans, and note what each touches and where it ends.
 
     A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
@@ -159,14 +165,35 @@ def follow(obstacles, depth, mediastinal, starts, pieces, n_tube, exempt_mm, tou
     pieces : (N, P, 4) float64
     n_tube : int
     exempt_mm : float
+    enough : int
+        Flags of which one ends the search for more; 0 to find all that is touched.
     touched : (N,) int64
         Receives the bits of the structures touched, with STAYS_INSIDE where the chain was not judged.
     ends : (N, 3) float64, LPS mm
         Receives the last points.
     """
     for n in range(starts.shape[0]):
-        found, x, y, z = _follow(obstacles, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm)
+        found, x, y, z = _follow(
+            obstacles, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm, enough
+        )
         touched[n] = found
         ends[n, 0] = x
         ends[n, 1] = y
         ends[n, 2] = z
+
+
+@numba.njit(cache=True, nogil=True)
+def find_ends(starts, pieces, ends):
+    """Note where N deviated plans end, as `follow` does; see there for the parameters."""
+    for n in range(starts.shape[0]):
+        start = starts[n]
+        pose = (start[0], start[1], start[2], start[3], start[4], start[5])
+        nx, ny, nz = start[6], start[7], start[8]
+        for p in range(pieces.shape[1]):
+            length, roll, kappa, _radius = pieces[n, p]
+            bend = _bend(pose, nx, ny, nz, roll, kappa)
+            nx, ny, nz = normal_on_arc(pose, bend, length)
+            pose = pose_on_arc(pose, bend, length)
+        ends[n, 0] = pose[0]
+        ends[n, 1] = pose[1]
+        ends[n, 2] = pose[2]

@@ -13,6 +13,7 @@ from anatomy.fields import DistanceField, corner_geometry, distance_field
 from anatomy.grid import Grid, Volume, freeze_arrays, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
+from anatomy.morphology import voxels_of
 from anatomy.records import frozen_record
 from anatomy.structures import OUTSIDE
 from anatomy.typed import Float, Int32, Labels
@@ -149,7 +150,7 @@ def lumen_of_mask(mask: Volume, root_lps: ArrayLike) -> Lumen:
 
 
 def _lumen(mask: Volume, root_lps: ArrayLike, depth: DistanceField | None) -> Lumen:
-    voxels = np.argwhere(mask.array)
+    voxels = voxels_of(mask.array)
     if not len(voxels):
         raise AnatomyError("The airway lumen is empty", expected="at least one voxel of lumen")
     low = voxels.min(axis=0) - 1

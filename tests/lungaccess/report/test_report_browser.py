@@ -174,7 +174,7 @@ def test_left_is_left_in_the_slices(page: browser.Browser, small_lung: Lung) -> 
     assert state["slice_edges"]["sagittal"] == ["A", "P", "H", "F"]
     assert state["view"]["edges"] == ["R", "L", "F", "H"]
     centre = np.array(state["tip_lps"])
-    codes = volumes.label_codes(small_lung)
+    codes = volumes.label_codes(small_lung, (0, 0, 0), small_lung.grid.shape)
     lumen = codes.grid.lps(np.argwhere(codes.array == volumes.CODES["lumen"]))
     compared, told_apart = 0, np.zeros(2)
     for name, (across, down, normal) in {

@@ -26,17 +26,8 @@ from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.curves import arc_lengths
 from lungaccess.plans.plan import Plan
-from lungaccess.report.html import (
-    deployment,
-    document,
-    meshes,
-    movie,
-    pack,
-    page_of_plan,
-    tables,
-    volumes,
-    words,
-)
+from lungaccess.report import pack
+from lungaccess.report.html import deployment, document, meshes, movie, page_of_plan, tables, volumes, words
 from lungaccess.report.html.page_of_reach import STEPS_PER_MM, packed_map
 from tests.lungaccess.report.pages import SIZE_LIMIT, make_plans, make_reach, plan_file, reach_file
 
@@ -339,7 +330,7 @@ def voxels(packed: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_label_volumes_agree_with_the_labels(data: dict[str, Any], small_lung: Lung) -> None:
-    codes = volumes.label_codes(small_lung)
+    codes = volumes.label_codes(small_lung, (0, 0, 0), small_lung.grid.shape)
     rng = np.random.default_rng(0)
     coarse, fine = data["labels"]
     assert fine["spacing_mm"] <= coarse["spacing_mm"]

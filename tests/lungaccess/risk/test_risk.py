@@ -241,6 +241,19 @@ def test_larger_errors_are_riskier(assessor: RiskAssessor) -> None:
     assert shares[3] < 0.2
 
 
+@pytest.mark.parametrize("radius_mm", [0.5, 3.0, 30.0])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 5.0])
+def test_successes_are_those_of_the_outcomes(
+    plan: Plan, small_lung: Lung, radius_mm: float, scale: float
+) -> None:
+    """Whoever asks for successes alone is told the same, though less is looked at."""
+    model, there = ErrorModel(), RiskAssessor(plan, small_lung, radius_mm=radius_mm)
+    sizes = {name: scale * size for name, size in model.sizes.items()}
+    deviations = Draws(400, there.n_arcs, 3).scaled(sizes, model.curvature_factors)
+    expected = there.succeeded(there.outcomes(deviations))
+    np.testing.assert_array_equal(there.successes(deviations), expected)
+
+
 def test_interval_of_wilson_1927() -> None:
     for count, samples in ((0, 10), (10, 10), (3, 10), (500, 1000), (1, 10_000)):
         truth = binomtest(count, samples).proportion_ci(method="wilson")

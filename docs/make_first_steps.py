@@ -41,15 +41,17 @@ DRAWN = {
 }
 """Pictures that the commands write."""
 SECTIONS = {
-    "page": "h-scene",
-    "slices": "h-slices",
-    "charts": "h-charts",
-    "limits": "h-limits",
-    "risk": "h-risk",
+    "headline": "header",
+    "page": "section:has(#h-scene)",
+    "slices": "section:has(#h-slices)",
+    "charts": "section:has(#h-charts)",
+    "risk": "section:has(#h-risk)",
 }
-"""Headings of the sections of the report page that are shown."""
-BOX = """const at = document.getElementById(arguments[0]).closest('section').getBoundingClientRect();
+"""Parts of the report page that are shown."""
+BOX = """const at = document.querySelector(arguments[0]).getBoundingClientRect();
 return {x: at.x + scrollX, y: at.y + scrollY, width: at.width, height: Math.min(at.height, 900), scale: 1}"""
+LET_GO = "document.querySelector('.player').style.position = 'static'"
+"""The bar of the slider would lie over the pictures."""
 
 
 def output_of(command: str, folder: Path) -> str:
@@ -99,10 +101,11 @@ def photograph(page: Path, folder: Path) -> None:
     """Store pictures of the sections of a report page, with the needle half-way."""
     with Browser(1200, 1000) as window:
         window.open(page)
+        window.run(LET_GO)
         window.run("window.lungaccessReport.set(0.9)")
         window.frame()
-        for name, heading in SECTIONS.items():
-            clip = window.run(BOX, heading)
+        for name, part in SECTIONS.items():
+            clip = window.run(BOX, part)
             shot = window.command("Page.captureScreenshot", {"clip": clip, "captureBeyondViewport": True})
             (folder / f"{name}.png").write_bytes(base64.b64decode(shot["data"]))
             store(folder / f"{name}.png", name)

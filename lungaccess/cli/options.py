@@ -38,6 +38,8 @@ PatientFolder = Annotated[
 PlanFile = Annotated[Path, Parameter(help="The plan.json.")]
 PatientOfPlan = Annotated[Path, Parameter(help="Folder of the patient it was made for.")]
 DEFAULT_SYSTEM = "lung-default"
+AUTO = "auto"
+"""Stands for the least invasive preset that reaches the target."""
 DEFAULT_BUDGET_S = 10.0
 """Long enough that the best cost of most targets has settled, short enough to wait for."""
 
@@ -119,17 +121,41 @@ class SystemOptions:
     """With which devices."""
 
     system: Annotated[
-        str, Parameter(help="Name of a preset (see `lungaccess presets`) or path of a TOML file.")
+        str,
+        Parameter(
+            help="Name of a preset (see `lungaccess presets`), path of a TOML file, or auto: the least "
+            "invasive preset that reaches the target (`plan` and `alternatives` only)."
+        ),
     ] = DEFAULT_SYSTEM
     allow_fissures: Annotated[
         bool | None, Parameter(help="Whether fissures may be crossed; as the system says if not given.")
     ] = None
 
     def load(self) -> System:
-        """Return the system, with its rule about fissures replaced if the user states one."""
+        """Return the system, with its rule about fissures replaced if the user states one.
+
+        Raises
+        ------
+        SettingsError
+            If it is to be chosen, or cannot be read.
+        """
         from lungaccess.problem.system import load_system
 
+        if self.system == AUTO:
+            raise SettingsError(
+                f"This command does not choose a system (--system {AUTO})",
+                expected="the name of a preset or the path of a .toml file",
+                remedy=f"`lungaccess plan --system {AUTO}` says which preset reaches a target",
+            )
         return load_system(self.system, fissures_allowed=self.allow_fissures)
+
+    def candidates(self) -> tuple[System, ...]:
+        """Return the systems to try, the least invasive first: one, or all presets if it is to be chosen."""
+        from lungaccess.problem.preset_order import presets_by_invasiveness
+
+        if self.system == AUTO:
+            return presets_by_invasiveness(fissures_allowed=self.allow_fissures)
+        return (self.load(),)
 
 
 @Parameter(name="*")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -16,7 +17,7 @@ from stages.needle import Objective
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.appraisal import Appraisal
-    from lungaccess.coupled import ProgressEvent
+    from lungaccess.coupled import Atlas, ProgressEvent
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
@@ -75,9 +76,9 @@ class CostHistory:
 
 @frozen_value
 class PlanRequest:
-    """What to plan, and the folder for the files."""
+    """What to plan and where to; of several systems the least invasive that reaches the target is chosen."""
 
-    system: System
+    systems: tuple[System, ...]
     target: StatedTarget
     search: SearchOptions
     errors: ErrorModel
@@ -104,33 +105,13 @@ def run_search(
     lungaccess.plans.no_plan.NoPlan
         If no plan was found.
     """
-    from lungaccess.coupled import atlas_event, open_atlas, plan
     from lungaccess.plans.no_plan import NoPlan
 
-    history, search, system = CostHistory(display), request.search, request.system
+    history = CostHistory(display)
     best: Plan | None = None
     with display:
-        atlas = open_atlas(
-            lung,
-            system,
-            cache=request.output.cache,
-            progress=lambda share: history.on_progress(atlas_event(share)),
-        )
-        plans = plan(
-            lung,
-            system,
-            target,
-            objective=search.objective,
-            method=search.method,
-            seed=search.seed,
-            iterations=search.iterations,
-            time_s=search.time_s,
-            atlas=atlas,
-            processes=search.processes,
-            on_progress=history.on_progress,
-        )
         try:
-            for found in plans:
+            for found in _plans(lung, target, request, history):
                 first, best = best is None, found
                 if first:
                     found.save(request.out / PLAN_FILE)
@@ -143,6 +124,32 @@ def run_search(
         raise NoPlan("The search ended without a plan", reasons={}, advice="Give it more time")
     best.save(request.out / PLAN_FILE)
     return best, history.points
+
+
+def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Plan]:
+    """Return better and better plans with the request's system, or with the one that is chosen of several."""
+    from lungaccess.coupled import atlas_event, open_atlas, plan, plan_with_presets
+
+    def atlas_of(system: System) -> Atlas:
+        def told(share: float) -> None:
+            history.on_progress(atlas_event(share))
+
+        return open_atlas(lung, system, cache=request.output.cache, progress=told)
+
+    search = request.search
+    options: dict[str, Any] = {
+        "objective": search.objective,
+        "method": search.method,
+        "seed": search.seed,
+        "iterations": search.iterations,
+        "time_s": search.time_s,
+        "processes": search.processes,
+        "on_progress": history.on_progress,
+    }
+    if len(request.systems) > 1:
+        return plan_with_presets(lung, target, systems=request.systems, atlas_of=atlas_of, **options)
+    system = request.systems[0]
+    return plan(lung, system, target, atlas=atlas_of(system), counterfactuals=False, **options)
 
 
 def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
@@ -162,7 +169,11 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
 
     with progress("checking the plan and estimating its chance"):
         appraisal = appraise(
-            found, lung, errors=request.errors, system=request.system, target_lps=target.lps_mm
+            found,
+            lung,
+            errors=request.errors,
+            system=system_of(found, request.systems),
+            target_lps=target.lps_mm,
         )
     record = plan_tables.plan_record(found, lung, appraisal, request.out, request.files)
     write_summary(record, request.out / SUMMARY_FILE)
@@ -176,9 +187,16 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     return ExitCode.of(appraisal.accepted)
 
 
+def system_of(plan: Plan, systems: Sequence[System]) -> System:
+    """Return the one of several systems by whose name a plan goes; the first if there is none."""
+    return {each.name: each for each in systems}.get(plan.system.name, systems[0])
+
+
 def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal) -> None:
     """Print headline and limits of a plan, then the plan."""
     plan_tables.show_appraisal(appraisal)
+    if plan.system_choice:
+        terminal.say(" ".join(plan.system_choice))
     terminal.show(plan_tables.plan_tables(plan, lung))
     terminal.show_warnings(lung.warnings)
 

@@ -41,6 +41,8 @@ def plan_record(
         "objective": plan.objective,
         "cost": plan.cost,
         "costs": known_costs(plan.costs, has_map=lung.cost is not None),
+        "system": plan.system.name,
+        "system_choice": list(plan.system_choice),
         "clearance_mm": {device: dict(values) for device, values in plan.clearance_mm.items()},
         "iterations": plan.iterations,
         "timing": dict(plan.timing),
@@ -55,6 +57,7 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
         "why": failure.found,
         "reasons": dict(failure.reasons),
         "advice": failure.advice,
+        "attempts": dict(failure.attempts),
     }
 
 

@@ -156,10 +156,17 @@ def error_record(error: LungaccessError) -> dict[str, object]:
 def show_no_plan(failure: NoPlan) -> None:
     """Print why no plan was found: the counted reasons, and what would help."""
     console.print(Panel(escaped(failure.found), title="no plan", title_align="left", border_style="yellow"))
+    show_reasons(failure)
+    if failure.advice:
+        console.print(f"\n[bold]What would help:[/] {escaped(failure.advice)}")
+
+
+def show_reasons(failure: NoPlan) -> None:
+    """Print the counted reasons, and why each of several systems failed."""
+    if failure.attempts:
+        console.print(table("Systems that were tried", ("system", "outcome"), failure.attempts.items()))
     rows = [(reason, f"{count}") for reason, count in failure.reasons.items() if count]
     if rows:
         console.print(
             table("What was looked at, and what was ruled out", ("stage and reason", "count"), rows)
         )
-    if failure.advice:
-        console.print(f"\n[bold]What would help:[/] {escaped(failure.advice)}")

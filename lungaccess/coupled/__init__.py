@@ -20,7 +20,13 @@ if TYPE_CHECKING:
     from lungaccess.coupled.explanation import explain
     from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
     from lungaccess.coupled.planner import METHODS, ProgressEvent, atlas_event, plan
-    from lungaccess.coupled.presets import Attempt, choice_in_words, first_attempt, plan_with_presets
+    from lungaccess.coupled.presets import (
+        Attempt,
+        choice_in_words,
+        first_attempt,
+        none_reaches,
+        plan_with_presets,
+    )
     from lungaccess.coupled.search.atlas_search import AtlasSearch
     from lungaccess.coupled.search.base import Incumbent, ParallelSearch, PlanSearch, Step, evaluated_step
     from lungaccess.coupled.search.direct_arcs import DirectArcs

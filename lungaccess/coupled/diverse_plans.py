@@ -56,6 +56,7 @@ def alternatives(
     count: int = COUNT,
     separation_mm: float = SEPARATION_MM,
     atlas: Atlas | None = None,
+    counterfactuals: bool = True,
 ) -> tuple[Alternative, ...]:
     """Return a diverse plan set: the needles of every two of its plans are separated by `separation_mm`.
 
@@ -65,7 +66,7 @@ def alternatives(
 
     Parameters
     ----------
-    lung, system, target, atlas
+    lung, system, target, atlas, counterfactuals
         See `lungaccess.coupled.planner.plan`.
     objective : str or Objective
         What "cheap" means; see there, too.
@@ -96,7 +97,7 @@ def alternatives(
     arcs = DirectArcs(task, atlas)
     chosen = list(separated_candidates(arcs, count, separation_mm))
     if not chosen:
-        raise explain(task, atlas, arcs.evaluator.blocked, 0)
+        raise explain(task, atlas, arcs.evaluator.blocked, 0, counterfactuals=counterfactuals)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
     plans = [assemble(task, atlas.sites, each, iteration=0, timing=timing) for each in chosen]
     return with_front(plans)

@@ -124,7 +124,7 @@ def plan_with_presets(
             return
         failed.append(attempt)
         left_s = max(left_s - (time.perf_counter() - began), 0.0)
-    raise _none_reaches(failed)
+    raise none_reaches(failed)
 
 
 def first_attempt(plans: Iterator[Plan], system: System, checker: Checker) -> Attempt:
@@ -147,7 +147,8 @@ def choice_in_words(failed: Sequence[Attempt], chosen: System, systems: Sequence
     )
 
 
-def _none_reaches(failed: Sequence[Attempt]) -> NoPlan:
+def none_reaches(failed: Sequence[Attempt]) -> NoPlan:
+    """Return the `NoPlan` of several systems that all failed."""
     names = ", ".join(attempt.system.name for attempt in failed)
     return NoPlan(
         f"No plan to the target with any of {len(failed)} systems ({names})",

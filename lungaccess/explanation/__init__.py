@@ -13,5 +13,6 @@ if TYPE_CHECKING:
     from lungaccess.explanation.neighbours import Neighbour, ReachedShare
     from lungaccess.explanation.record import explanation_record, save_explanation
     from lungaccess.explanation.starts import FAILS, StartMap
+    from lungaccess.explanation.words import Section, place, sections
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -96,11 +96,13 @@ class BlockedArc:
     shortfall_mm: float
     structure: Structure
 
-    def __str__(self) -> str:
-        return (
-            f"an arc of {self.length_mm:.1f} mm reaches the target but has {self.shortfall_mm:.2f} mm less "
-            f"than the required {self.required_mm:.2f} mm over {self.blocked_mm:.1f} mm: {self.structure}"
-        )
+    @property
+    def violation(self) -> str:
+        """By how much it violates the required clearance, in words."""
+        of = f"{self.blocked_mm:.1f} of its {self.length_mm:.1f} mm are nearer than {self.required_mm:.2f} mm"
+        if self.shortfall_mm >= self.required_mm:
+            return f"{of}; it passes through"
+        return f"{of}; {self.shortfall_mm:.2f} mm are lacking at the worst place"
 
 
 @frozen_record
@@ -124,7 +126,9 @@ class ArcBeyondLimits:
     most_length_mm: float
     most_turn_deg: float
 
-    def __str__(self) -> str:
+    @property
+    def needs(self) -> str:
+        """What it needs beyond the limits, in words."""
         needs = [
             (self.radius_mm < self.least_radius_mm, "a radius of curvature", self.radius_mm,
              f"at least {self.least_radius_mm:.0f} mm", "mm"),
@@ -138,7 +142,7 @@ class ArcBeyondLimits:
             for exceeded, what, value, limit, unit in needs
             if exceeded
         )
-        return f"the arc that exceeds the needle's limits least needs {words}"
+        return f"needs {words}"
 
 
 def look_along(arcs: DirectArcs) -> tuple[tuple[Blocking, ...], BlockedArc | None]:

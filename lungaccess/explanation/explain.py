@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from anatomy.lung import Lung
@@ -59,7 +59,6 @@ def explain_no_plan(
     seed: int = 0,
     time_s: float | None = DEFAULT_TIME_S,
     atlas_of: AtlasOf | None = None,
-    attempts: tuple[Attempt, ...] = (),
     on_part: Callable[[str], None] | None = None,
 ) -> Explanation:
     """Return what can be learned from a search that found no plan.
@@ -79,15 +78,13 @@ def explain_no_plan(
         No part begins after so many seconds, and long ones end; None for no limit.
     atlas_of : callable, optional
         Returns the atlas of a system, and tells a function the share of it made; `build_atlas` if None.
-    attempts : tuple of Attempt
-        Systems that were tried already: they are not tried again.
     on_part : callable, optional
         Told the name of each part as it begins.
     """
     own = atlas or build_atlas(lung, system)
     task = Task(lung=lung, system=system, target=target, objective=Objective.of(objective), seed=seed)
     made = Explainer(task, own, time_s, atlas_of or _built(lung), on_part or (lambda _name: None))
-    return made.explanation(failure, attempts)
+    return made.explanation(failure)
 
 
 def _built(lung: Lung) -> AtlasOf:
@@ -119,25 +116,25 @@ class Explainer:
         self._parts: list[Part] = []
         self._found: dict[str, Any] = {}
 
-    def explanation(self, failure: NoPlan, attempts: tuple[Attempt, ...]) -> Explanation:
+    def explanation(self, failure: NoPlan) -> Explanation:
         """Do all parts for which there is time, the most useful first."""
         others = presets_by_invasiveness(fissures_allowed=self._fissures_allowed())
-        known = {self._task.system.name, *(attempt.system.name for attempt in attempts)}
-        untried = [each for each in others if each.name not in known]
-        tried = list(attempts)
-        self._what_blocks()
-        self._neighbour()
-        for share_atlas in (True, False):
-            for system in [each for each in untried if self._shares_atlas(each) == share_atlas]:
-                with self._part(f"preset {system.name}"):
-                    tried.append(self._attempt(system))
-            if share_atlas:
-                self._changes("change of the needle", lambda: needle_changes(self._task, self._atlas))
-                self._shares()
-        self._changes(
-            "change of the bronchoscope", lambda: scope_changes(self._task, self._atlas, self._alive_share)
-        )
-        self._proof()
+        untried = [each for each in others if each.name != self._task.system.name]
+        tried: list[Attempt] = []
+        self._part("what blocks the direct arcs", self._what_blocks)
+        self._part("map of the starts", self._starts)
+        if self._task.with_fissures:
+            self._part("crossing a fissure", self._through_fissures)
+        self._part("nearest point that is reached", self._neighbour)
+        for shares_atlas in (True, False):
+            for system in untried:
+                if self._shares_atlas(system) == shares_atlas:
+                    self._part(f"preset {system.name}", partial(self._attempt, system, tried))
+            if shares_atlas:
+                self._part("change of the needle", self._needle_changes)
+                self._part("share of the surroundings that is reached", self._shares)
+        self._part("change of the bronchoscope", self._scope_changes)
+        self._part("proof that the target is unreachable", self._proof)
         done = {attempt.system.name for attempt in tried}
         order = {each.name: n for n, each in enumerate(least_invasive_first([a.system for a in tried]))}
         changes = self._found.pop("changes", [])
@@ -159,13 +156,12 @@ class Explainer:
         """Return the rule about fissures that the presets take over: only if it is not their own."""
         return True if self._task.system.fissures_allowed else None
 
-    @contextmanager
-    def _part(self, name: str) -> Iterator[None]:
+    def _part(self, name: str, do: Callable[[], None]) -> None:
         """Do a part, unless the time is up before or during it."""
         self._on_part(name)
         try:
             self._alive()
-            yield
+            do()
         except OutOfTime:
             self._parts.append(Part(name=name, outcome=NOT_TRIED, why=TIME_IS_UP))
         else:
@@ -179,33 +175,30 @@ class Explainer:
         self._alive()
 
     def _what_blocks(self) -> None:
-        with self._part("what blocks the direct arcs"):
-            blocking, arc = look_along(self._arcs)
-            self._found |= {"blocking": blocking, "blocked_arc": arc}
-            if arc is None:
-                self._found["arc_beyond_limits"] = arc_beyond_limits(self._arcs)
-        with self._part("map of the starts"):
-            self._found["starts"] = map_starts(self._arcs)
-        if self._task.with_fissures:
-            with self._part("crossing a fissure"):
-                self._found["through_fissures"] = self._reached_through_fissures()
+        blocking, arc = look_along(self._arcs)
+        self._found |= {"blocking": blocking, "blocked_arc": arc}
+        if arc is None:
+            self._found["arc_beyond_limits"] = arc_beyond_limits(self._arcs)
 
-    def _reached_through_fissures(self) -> bool:
-        """Tell whether a direct arc from the same deployments is clear if fissures are no obstacles."""
+    def _starts(self) -> None:
+        self._found["starts"] = map_starts(self._arcs)
+
+    def _through_fissures(self) -> None:
+        """Try the direct arcs from the same deployments with fissures that are no obstacles."""
         lung, system = self._task.lung, self._task.system
         environment = needle_environment(lung, system.needle, system.margins, with_fissures=False)
-        return bool((self._arcs.blockers(self._arcs.in_workspace, environment)[0] == 0).any())
+        blockers = self._arcs.blockers(self._arcs.in_workspace, environment)[0]
+        self._found["through_fissures"] = bool((blockers == 0).any())
 
     def _neighbour(self) -> None:
-        with self._part("nearest point that is reached"):
-            found = Surroundings(self._arcs).nearest(self._alive) if self._atlas.deployments.count else None
+        if self._atlas.deployments.count:
+            found = Surroundings(self._arcs).nearest(self._alive)
             if found is not None and self._checker.check(found.plan, self._task.system).accepted:
                 self._found["neighbour"] = found
 
     def _shares(self) -> None:
-        with self._part("share of the surroundings that is reached"):
-            shares = Surroundings(self._arcs).shares(self._alive) if self._atlas.deployments.count else ()
-            self._found["shares"] = tuple(shares)
+        if self._atlas.deployments.count:
+            self._found["shares"] = tuple(Surroundings(self._arcs).shares(self._alive))
 
     def _shares_atlas(self, system: System) -> bool:
         own = self._task.system
@@ -213,7 +206,7 @@ class Explainer:
             own.scope, own.tubes, own.margins, own.fissures_allowed
         )  # fmt: skip
 
-    def _attempt(self, system: System) -> Attempt:
+    def _attempt(self, system: System, tried: list[Attempt]) -> None:
         task = self._task
         if self._shares_atlas(system):
             atlas = replace(self._atlas, system=system)
@@ -223,26 +216,33 @@ class Explainer:
             task.lung, system, task.target, objective=task.objective, seed=task.seed, iterations=ITERATIONS,
             atlas=atlas, counterfactuals=False,
         )  # fmt: skip
-        return first_attempt(plans, system, self._checker)
+        tried.append(first_attempt(plans, system, self._checker))
 
-    def _changes(self, name: str, found: Callable[[], Iterator[Counterfactual]]) -> None:
-        with self._part(name):
-            if not self._atlas.deployments.count:
-                return
-            for change in found():
-                accepted = self._checker.check(change.plan, change.plan.system).accepted
-                self._found.setdefault("changes", []).append(Change(change=change, accepted=accepted))
-                self._alive()
+    def _needle_changes(self) -> None:
+        self._keep(needle_changes(self._task, self._atlas))
+
+    def _scope_changes(self) -> None:
+        self._keep(scope_changes(self._task, self._atlas, self._alive_share))
+
+    def _keep(self, found: Iterator[Counterfactual]) -> None:
+        """Check changes and keep them, each as soon as it is found."""
+        if not self._atlas.deployments.count:
+            return
+        for change in found:
+            accepted = self._checker.check(change.plan, change.plan.system).accepted
+            self._found.setdefault("changes", []).append(Change(change=change, accepted=accepted))
+            self._alive()
 
     def _proof(self) -> None:
-        with self._part("proof that the target is unreachable"):
-            task = self._task
-            if len(self._arcs.in_workspace):
-                # What a deployment of the atlas has in its workspace cannot be proved to be in none.
-                self._found["verdict"] = ReachVerdict(proved=False, boxes=0)
-                return
-            proof = UnreachableProof(task.lung, task.system, with_fissures=task.with_fissures)
-            self._alive()
-            self._found["verdict"] = proof.prove(
-                task.target.lps_mm, most_boxes=PROOF_BOXES, progress=self._alive_share
-            )
+        task = self._task
+        if len(self._arcs.in_workspace):
+            # What a deployment of the atlas has in its workspace cannot be proved to be in none.
+            self._found["verdict"] = ReachVerdict(proved=False, boxes=0)
+            return
+        proof = UnreachableProof(
+            task.lung, task.system, with_fissures=task.with_fissures, between=self._alive
+        )
+        self._alive()
+        self._found["verdict"] = proof.prove(
+            task.target.lps_mm, most_boxes=PROOF_BOXES, progress=self._alive_share
+        )

@@ -98,7 +98,20 @@ class Explanation:
     @property
     def headline(self) -> str:
         """One sentence: that there is no plan, the main reason, and the preset that would do."""
-        return f"No plan found with {self.system.name}: {self.failure.main_reason}; {self._way_on}"
+        name, attempts = self.system.name, self.failure.attempts
+        if not attempts:
+            return f"No plan found with {name}: {self.failure.main_reason}; {self._way_on}"
+        why = attempts.get(name, "").removeprefix("no plan: ")
+        return f"No plan found with any of {len(attempts)} systems; with {name}: {why}"
+
+    @property
+    def advice(self) -> str:
+        """What would reach the target, in one sentence; empty if nothing that was tried does."""
+        names = [attempt.system.name for attempt in self.attempts if attempt.succeeded]
+        changes = [str(each.change) for each in self.changes if each.accepted]
+        fissures = ["crossing a fissure (--allow-fissures)"] if self.through_fissures else []
+        helps = [*(f"--system {name}" for name in names), *changes, *fissures]
+        return f"It is reached with {', or with '.join(helps)}" if helps else ""
 
     @property
     def _way_on(self) -> str:
@@ -116,7 +129,7 @@ class Explanation:
     def plans(self) -> Mapping[str, Plan]:
         """The plans that came about, by the names of their files: each is one that the check accepts."""
         found = {
-            f"plan-{attempt.system.name}.json": attempt.plan
+            f"plan-{_file_stem(attempt.system.name)}.json": attempt.plan
             for attempt in self.attempts
             if attempt.succeeded and attempt.plan is not None
         }
@@ -133,3 +146,8 @@ class Explanation:
     def not_tried(self) -> tuple[Part, ...]:
         """The parts that were not done: nothing follows from them."""
         return tuple(part for part in self.parts if part.outcome == NOT_TRIED)
+
+
+def _file_stem(name: str) -> str:
+    """Return a name without what the name of a file may not hold."""
+    return "".join(c if c.isalnum() or c in "-_" else "-" for c in name)

@@ -41,12 +41,14 @@ def explanation_record(explanation: Explanation) -> Record:
         "found": False,
         "accepted": False,
         "headline": e.headline,
+        "advice": e.advice,
         "why": e.failure.found,
         "patient": e.patient_name,
         "system": e.system.name,
         "fissures_are_obstacles": e.with_fissures,
         "target": {**point(e.target.lps_mm), "origin": e.target.origin},
         "reasons": dict(e.failure.reasons),
+        "attempts": dict(e.failure.attempts),
         "starts": None if e.starts is None else dict(e.starts.counts),
         "blocking": [_blocking(each) for each in e.blocking],
         "nearest_miss": {
@@ -74,7 +76,8 @@ def point(lps_mm: Float) -> Record:
     return {"lps_mm": [float(c) for c in lps_mm], "ras_mm": [float(c) for c in ras]}
 
 
-def _file(plan: Plan | None, plans: Mapping[str, Plan]) -> str | None:
+def file_of(plan: object, plans: Mapping[str, Plan]) -> str | None:
+    """Return the name of the file of a plan, None if it has none."""
     return next((name for name, each in plans.items() if each is plan), None)
 
 
@@ -127,7 +130,7 @@ def _neighbour(neighbour: Neighbour | None, plans: Mapping[str, Plan]) -> Record
     return {
         **point(neighbour.plan.target_lps),
         "from_target_mm": neighbour.from_target_mm,
-        "plan": _file(neighbour.plan, plans),
+        "plan": file_of(neighbour.plan, plans),
     }
 
 
@@ -137,7 +140,7 @@ def _attempt(attempt: Attempt, plans: Mapping[str, Plan]) -> Record:
         "tried": True,
         "reaches": attempt.succeeded,
         "why": attempt.why,
-        "plan": _file(attempt.plan, plans),
+        "plan": file_of(attempt.plan, plans),
     }
 
 
@@ -148,7 +151,7 @@ def _change(change: Change, plans: Mapping[str, Plan]) -> Record:
         "present_mm": change.change.present,
         "needed_mm": change.change.needed,
         "accepted": change.accepted,
-        "plan": _file(change.change.plan, plans),
+        "plan": file_of(change.change.plan, plans),
     }
 
 

@@ -64,9 +64,16 @@ class UnreachableProof:
     leave an airway outside the mediastinum, keep clear of vessels and pleura from there on, and sweep little,
     and a needle from their tip reaches the target.  That needle heeds no obstacle, but its tip and the
     target must lie in the same free region.
+
+    Parameters
+    ----------
+    between : callable, optional
+        Called between the steps of the preparation, which takes some ten seconds; it may raise to end it.
     """
 
-    def __init__(self, lung: Lung, system: System, *, with_fissures: bool) -> None:
+    def __init__(
+        self, lung: Lung, system: System, *, with_fissures: bool, between: Callable[[], None] = lambda: None
+    ) -> None:
         self._lung = lung
         self._tubes = tube_constants(system.tubes, system.margins)
         self._limits = needle_environment(
@@ -75,14 +82,17 @@ class UnreachableProof:
         longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
         greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)
+        between()
         spacing_mm = lung.grid.spacing_mm
         hazards = VESSEL | OUTSIDE | (FISSURE if with_fissures else 0)
         self._hazard_bits = hazards
         leaving = _may_be_left(lung)
-        self._masks = tuple(
-            distance_corners(mask, spacing_mm)
-            for mask in ((lung.labels & LUMEN) != 0, leaving, (lung.labels & hazards) != 0)
-        )
+        masks = []
+        for mask in ((lung.labels & LUMEN) != 0, leaving, (lung.labels & hazards) != 0):
+            between()
+            masks.append(distance_corners(mask, spacing_mm))
+        self._masks = tuple(masks)
+        between()
         # Corners are rounded down, and between them a bound lacks at most half a diagonal of a voxel.
         self._loss_mm = 0.5 * float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
         self._free = _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)

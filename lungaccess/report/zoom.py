@@ -69,7 +69,7 @@ def _cut_panel(
     """Paint the cut through a point, then the devices, and show all of `shown`."""
     uv = view.project(shown)
     drawing.fit(axes, uv.min(axis=0) - margin_mm, uv.max(axis=0) + margin_mm)
-    _paint_cut(axes, layers, view, through)
+    paint_cut(axes, layers, view, through)
     draw_devices_true_to_width(axes, plan, view)
     drawing.target_mark(axes, view.project(np.asarray(plan.target_lps)))
     drawing.dress(axes, view, ticks=False)
@@ -95,7 +95,7 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     axes.set_ylim(limits[1])
 
 
-def _paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:
+def paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:
     """Colour each pixel by the structure it lies in; vessels just beside the plane show faintly."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     u = np.linspace(left, right, PIXELS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +22,7 @@ from lungaccess.cli.options import (
     TargetOptions,
     require_map,
 )
+from lungaccess.cli.plan_search import system_of
 from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.appraisal import Appraisal
     from lungaccess.coupled import Alternative
+    from lungaccess.problem.system import System
 
 COLUMNS = ("plan", "succeeds", "branch", "gen.", "clear", "pleura", "tissue", "1/clear", "map", "best")
 NOTE = (
@@ -62,27 +66,55 @@ def alternatives(
 
     stated, weighed, model = target.stated(), Objective.of(objective), errors.load()
     require_writable_folder(out)
-    device = system.load()
+    systems = system.candidates()
     lung = output.load(patient)
     require_map(lung, weighed)
-    aim, atlas = stated.resolve(lung), output.open_atlas(lung, device)
-    with progress("searching"):
-        found = find_alternatives(
-            lung, device, aim, objective=weighed, count=count, separation_mm=separation, atlas=atlas
-        )
+    aim = stated.resolve(lung)
+
+    def search(device: System) -> tuple[Alternative, ...]:
+        atlas = output.open_atlas(lung, device)
+        with progress("searching"):
+            return find_alternatives(
+                lung, device, aim, objective=weighed, count=count, separation_mm=separation, atlas=atlas,
+                counterfactuals=len(systems) == 1,
+            )  # fmt: skip
+
+    found = search(systems[0]) if len(systems) == 1 else _of_the_least_invasive(systems, search)
+    chosen = system_of(found[0].plan, systems)
     appraiser, appraisals = Appraiser(lung, model), []
     with progress("checking") as shown:
         for number, each in enumerate(found, start=1):
             each.plan.save(out / f"plan-{number:02d}.json")
-            appraisals.append(appraiser.appraise(each.plan, device, target_lps=aim.lps_mm))
+            appraisals.append(appraiser.appraise(each.plan, chosen, target_lps=aim.lps_mm))
             shown.share(number / len(found))
     refused = sum(not each.accepted for each in appraisals)
     if output.json:
         terminal.show_json(_records(found, appraisals, out, lung.cost is not None))
         return ExitCode.of(not refused)
     _show(lung, found, appraisals)
+    if found[0].plan.system_choice:
+        terminal.say(" ".join(found[0].plan.system_choice))
     terminal.say(f"Written to {out}; the check refuses {refused} of {len(found)}")
     return ExitCode.of(not refused)
+
+
+def _of_the_least_invasive(
+    systems: Sequence[System], search: Callable[[System], tuple[Alternative, ...]]
+) -> tuple[Alternative, ...]:
+    """Return the plans of the first system that has some, each with the reasons of the choice."""
+    from lungaccess.coupled import Attempt, choice_in_words, none_reaches
+    from lungaccess.plans.no_plan import NoPlan
+
+    failed: list[Attempt] = []
+    for system in systems:
+        try:
+            found = search(system)
+        except NoPlan as failure:
+            failed.append(Attempt(system=system, failure=failure))
+            continue
+        choice = choice_in_words(failed, system, systems)
+        return tuple(replace(each, plan=replace(each.plan, system_choice=choice)) for each in found)
+    raise none_reaches(failed)
 
 
 def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal]) -> None:

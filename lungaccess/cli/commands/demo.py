@@ -49,9 +49,9 @@ def demo(
         lung = demo_lung(seed, output.cache, shown.step)
     if not output.json:
         terminal.show(anatomy_tables(lung)[1:3])
-    target, system = stated_target(None, 1), SystemOptions().load()
+    target, systems = stated_target(None, 1), SystemOptions().candidates()
     request = PlanRequest(
-        system=system, target=target, search=search, errors=ErrorOptions().load(), out=out, output=output
+        systems=systems, target=target, search=search, errors=ErrorOptions().load(), out=out, output=output
     )
     code = _first_reachable_nodule(lung, request)
     if code == ExitCode.OK:

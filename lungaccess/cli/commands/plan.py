@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import NotNegative
 from lungaccess.cli.options import (
     ErrorOptions,
     PatientFolder,
@@ -40,24 +41,37 @@ def plan(
     pictures: Annotated[
         bool, Parameter(help="Whether overview.png, tree.png and cost_over_time.png are drawn.")
     ] = True,
+    explain_time: Annotated[
+        NotNegative | None,
+        Parameter(
+            help="Seconds for what is learned where there is no plan: the nearest miss, what blocks, which "
+            "preset or change of device would do, what is proved; 10 if not given, 0 to leave it out."
+        ),
+    ] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
+    from lungaccess.cli.no_plan_output import explain_and_report
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
 
     stated, objective, model = target.stated(), Objective.of(search.objective), errors.load()
     require_writable_folder(out)
-    device = system.load()
+    systems = system.candidates()
     lung = output.load(patient, thick_slices=thick_slices)
     require_map(lung, objective)
     request = PlanRequest(
-        system=device, target=stated, search=search, errors=model, out=out, output=output, pictures=pictures
+        systems=systems, target=stated, search=search, errors=model, out=out, output=output, pictures=pictures
     )
     try:
         return plan_and_report(lung, request)
     except NoPlan as failure:
-        if not output.json:
+        if explain_time != 0.0:
+            record = explain_and_report(lung, request, failure, explain_time)
+        elif output.json:
+            record = no_plan_record(failure)
+        else:
             raise
-        terminal.show_json(no_plan_record(failure))
+        if output.json:
+            terminal.show_json(record)
         return ExitCode.NEGATIVE

@@ -1,4 +1,4 @@
-"""Report pages: one HTML file each, complete in itself, for a plan or for a reachability map."""
+"""Report pages: one HTML file each, complete in itself, for a plan, no plan, or a reachability map."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.report.html.movie import bronchoscopy_webp
+    from lungaccess.report.html.page_of_no_plan import no_plan_page
     from lungaccess.report.html.page_of_plan import PageOptions, plan_page
     from lungaccess.report.html.page_of_reach import reach_page
 

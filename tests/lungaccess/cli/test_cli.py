@@ -167,7 +167,8 @@ def test_no_plan_exits_1_with_counted_reasons(
     toy_commands: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     toy_commands["plans"] = []
-    assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == ExitCode.NEGATIVE
+    words = ["plan", "toy", "--nodule", "--explain-time", "0", "--out", str(tmp_path)]
+    assert cli.main(words) == ExitCode.NEGATIVE
     text = capsys.readouterr().out
     assert "12" in text and "near a vessel" in text and "A thinner scope" in text
     assert not (tmp_path / "plan.json").exists()

@@ -157,13 +157,14 @@ def test_a_plan_as_json_says_what_the_check_says(
         raise NoPlan("No way", reasons={"too near a vessel": 3}, advice="A thinner scope")
 
     monkeypatch.setattr(plan_search, "run_search", fail)
-    assert cli.main(words) == ExitCode.NEGATIVE
+    assert cli.main([*words, "--explain-time", "0"]) == ExitCode.NEGATIVE
     assert json.loads(capsys.readouterr().out) == {
         "found": False,
         "accepted": False,
         "why": "No way",
         "reasons": {"too near a vessel": 3},
         "advice": "A thinner scope",
+        "attempts": {},
     }
 
 

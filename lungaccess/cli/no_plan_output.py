@@ -1,0 +1,94 @@
+"""What a command leaves where there is no plan: tables, no_plan.json, a picture, a page, plans of others."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.panel import Panel
+
+from lungaccess.cli import terminal
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from anatomy.lung import Lung
+    from lungaccess.cli.plan_search import PlanRequest
+    from lungaccess.coupled import Atlas
+    from lungaccess.explanation import Explanation
+    from lungaccess.plans.no_plan import NoPlan
+    from lungaccess.problem.system import System
+
+PICTURE, PAGE = "no_plan.png", "no_plan.html"
+STALE = "plan.json in this folder is from another run: it is no answer to this one"
+
+
+def explain_and_report(
+    lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float | None
+) -> dict[str, Any]:
+    """Explain a `NoPlan`, write and show what was learned, and return it as plain values.
+
+    Parameters
+    ----------
+    time_s : float or None
+        Time for the explanation; the default of `explain_no_plan` if None.
+    """
+    from lungaccess.explanation import explanation_record, save_explanation
+
+    explanation = _explained(lung, request, failure, time_s)
+    written = save_explanation(explanation, request.out)
+    if not request.output.json:
+        show_explanation(explanation)
+    if request.pictures:
+        written = (*written, *_drawn(lung, request, explanation))
+    record = explanation_record(explanation)
+    record |= {"folder": str(request.out), "files": list(written)}
+    if not request.output.json:
+        terminal.say(f"Written to {request.out}: {', '.join(written)}")
+        if (request.out / "plan.json").exists():
+            terminal.say(STALE)
+    return record
+
+
+def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float | None) -> Explanation:
+    from lungaccess.coupled import open_atlas
+    from lungaccess.explanation import DEFAULT_TIME_S, explain_no_plan
+
+    def atlas_of(system: System, told: Callable[[float], None]) -> Atlas:
+        return open_atlas(lung, system, cache=request.output.cache, progress=told)
+
+    system = request.systems[0]
+    with progress("no plan: looking for what would help") as shown:
+        return explain_no_plan(
+            lung,
+            system,
+            request.target.resolve(lung),
+            failure,
+            atlas=atlas_of(system, shown.share),
+            objective=request.search.objective,
+            seed=request.search.seed,
+            time_s=DEFAULT_TIME_S if time_s is None else time_s,
+            atlas_of=atlas_of,
+            on_part=shown.step,
+        )
+
+
+def _drawn(lung: Lung, request: PlanRequest, explanation: Explanation) -> tuple[str, ...]:
+    from lungaccess.report import no_plan_png
+    from lungaccess.report.html import no_plan_page
+
+    with progress("drawing why there is no plan"):
+        no_plan_png(explanation, lung, request.out / PICTURE)
+    with progress("making the page"):
+        no_plan_page(explanation, lung, request.out / PAGE)
+    return PICTURE, PAGE
+
+
+def show_explanation(explanation: Explanation) -> None:
+    """Print the headline, then what was learned, the most useful first, then the counted reasons."""
+    from lungaccess.explanation import sections
+
+    words = terminal.escaped(explanation.headline)
+    terminal.console.print(Panel(words, title="no plan", title_align="left", border_style="yellow"))
+    terminal.show(terminal.table(each.title, each.headings, each.rows) for each in sections(explanation))
+    terminal.show_reasons(explanation.failure)

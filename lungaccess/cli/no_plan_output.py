@@ -54,8 +54,8 @@ def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float 
     from lungaccess.coupled import open_atlas
     from lungaccess.explanation import DEFAULT_TIME_S, explain_no_plan
 
-    def atlas_of(system: System, told: Callable[[float], None]) -> Atlas:
-        return open_atlas(lung, system, cache=request.output.cache, progress=told)
+    def atlas_of(system: System, on_share: Callable[[float], None]) -> Atlas:
+        return open_atlas(lung, system, cache=request.output.cache, progress=on_share)
 
     system = request.systems[0]
     with progress("no plan: looking for what would help") as shown:

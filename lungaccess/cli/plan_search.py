@@ -131,10 +131,10 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
     from lungaccess.coupled import atlas_event, open_atlas, plan, plan_with_presets
 
     def atlas_of(system: System) -> Atlas:
-        def told(share: float) -> None:
+        def on_share(share: float) -> None:
             history.on_progress(atlas_event(share))
 
-        return open_atlas(lung, system, cache=request.output.cache, progress=told)
+        return open_atlas(lung, system, cache=request.output.cache, progress=on_share)
 
     search = request.search
     options: dict[str, Any] = {

@@ -217,9 +217,10 @@ def arc_beyond_limits(arcs: DirectArcs) -> ArcBeyondLimits | None:
     )
 
 
-def side_of(lung: Lung, point: Float) -> str:
-    """Return the side of the carina on which a point (3,) LPS mm lies."""
-    return "in the left lung" if point[0] > lung.tree.carina_lps[0] else "in the right lung"
+def region_of(lung: Lung, point: Float) -> str:
+    """Return the lobe that holds a point (3,) LPS mm, or the side of the carina where lobes are not known."""
+    side = "left lung" if point[0] > lung.tree.carina_lps[0] else "right lung"
+    return lung.lobe_at(point) or side
 
 
 def _evenly(entries: Int) -> Int:
@@ -256,7 +257,7 @@ def _blockings(arcs: DirectArcs, found: Float, labels: Int) -> Iterator[Blocking
 
 def _structure(arcs: DirectArcs, point: Float, label: int) -> Structure:
     lung = arcs.task.lung
-    kind, name = blocker_name(label), side_of(lung, point)
+    kind, name = blocker_name(label), f"in the {region_of(lung, point)}"
     branch = (label >> BRANCH_SHIFT) - 1
     if kind == "an airway" and label & AIRWAY and branch >= 0:
         name = f"(branch {branch}, generation {int(lung.tree.generation[branch])}) {name}"

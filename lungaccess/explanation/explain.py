@@ -10,6 +10,7 @@ from typing import Any
 
 from anatomy.lung import Lung
 from lungaccess.checking import Checker
+from lungaccess.appraisal import DRAWS, SEED
 from lungaccess.coupled import (
     Atlas,
     Attempt,
@@ -26,11 +27,13 @@ from lungaccess.explanation.explanation import DONE, NOT_TRIED, Change, Explanat
 from lungaccess.explanation.neighbours import Surroundings
 from lungaccess.explanation.starts import map_starts
 from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.reachability import ReachVerdict, UnreachableProof
+from lungaccess.risk import Share, assess
 from stages.needle import Objective, needle_environment
 
 DEFAULT_TIME_S = 10.0
@@ -138,7 +141,7 @@ class Explainer:
         done = {attempt.system.name for attempt in tried}
         order = {each.name: n for n, each in enumerate(least_invasive_first([a.system for a in tried]))}
         changes = self._found.pop("changes", [])
-        return Explanation(
+        made = Explanation(
             patient_name=self._task.lung.name,
             system=self._task.system,
             target=self._task.target,
@@ -148,9 +151,13 @@ class Explainer:
             untried=tuple(each.name for each in untried if each.name not in done),
             changes=tuple(sorted(changes, key=lambda each: each.change.relative_change)),
             parts=tuple(self._parts),
-            time_s=time.perf_counter() - self._began,
             **self._found,
         )
+        chances = {name: self._chance(each) for name, each in made.plans.items()}
+        return replace(made, chances=chances, time_s=time.perf_counter() - self._began)
+
+    def _chance(self, plan: Plan) -> Share:
+        return assess(plan, self._task.lung, samples=DRAWS, seed=SEED).succeeds
 
     def _fissures_allowed(self) -> bool | None:
         """Return the rule about fissures that the presets take over: only if it is not their own."""

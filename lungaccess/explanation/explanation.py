@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 from anatomy.records import frozen_record, frozen_value
 from lungaccess.coupled import Attempt, Counterfactual
@@ -14,6 +15,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.reachability import ReachVerdict
+from lungaccess.risk import Share
 
 DONE, NOT_TRIED = "done", "not tried"
 
@@ -68,6 +70,9 @@ class Explanation:
         none.
     shares : tuple of ReachedShare
         How much of the surroundings is reached.
+    chances : mapping of str to Share
+        How many of the simulated procedures succeed with each of `plans`, by the names of their files, under
+        the default errors.
     verdict : ReachVerdict or None
         Whether the target is proved unreachable.
     parts : tuple of Part
@@ -91,6 +96,7 @@ class Explanation:
     changes: tuple[Change, ...] = ()
     through_fissures: bool | None = None
     shares: tuple[ReachedShare, ...] = ()
+    chances: Mapping[str, Share] = MappingProxyType({})
     verdict: ReachVerdict | None = None
     parts: tuple[Part, ...] = ()
     time_s: float = 0.0

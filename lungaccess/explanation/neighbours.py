@@ -11,6 +11,7 @@ from anatomy.records import frozen_record
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
 from lungaccess.coupled import DirectArcs, plan
+from lungaccess.explanation.blocking import region_of
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
@@ -126,11 +127,10 @@ class Surroundings:
             return None
 
     def shares(self, alive: Callable[[], None]) -> Iterator[ReachedShare]:
-        """Yield how many random points around the target, then of its side of the lung, are reached."""
+        """Yield how many random points around the target, then of its lobe or lung, are reached."""
         lung, target = self._task.lung, self._task.target.lps_mm
         rng = np.random.Generator(np.random.PCG64(ORDER_SEED))
-        left = bool(target[0] > lung.tree.carina_lps[0])
-        side = "left lung" if left else "right lung"
+        region = region_of(lung, target)
 
         def around() -> Float:
             offset = rng.uniform(-1.0, 1.0, 3)
@@ -138,16 +138,16 @@ class Surroundings:
 
         def anywhere() -> Float:
             point = lung.grid.lps(rng.uniform(-0.5, np.array(lung.grid.shape) - 0.5))
-            return point if (point[0] > lung.tree.carina_lps[0]) == left else np.full(3, np.nan)
+            return point if self._free(point) and region_of(lung, point) == region else np.full(3, np.nan)
 
-        for region, draw in ((f"within {AROUND_MM:g} mm of the target", around), (side, anywhere)):
+        for name, draw in ((f"within {AROUND_MM:g} mm of the target", around), (region, anywhere)):
             points = _drawn(self._free, draw)
             reached = 0
             for point in points:
                 alive()
                 reached += self.reached(point)
             if points:
-                yield ReachedShare(region=region, share=Share(count=reached, samples=len(points)))
+                yield ReachedShare(region=name, share=Share(count=reached, samples=len(points)))
 
     def _free(self, point: Float) -> bool:
         task = self._task

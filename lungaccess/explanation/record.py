@@ -15,6 +15,7 @@ from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blockin
 from lungaccess.explanation.explanation import Change, Explanation
 from lungaccess.explanation.neighbours import Neighbour, ReachedShare
 from lungaccess.plans.plan import Plan
+from lungaccess.risk import Share
 
 Record = dict[str, Any]
 FILE = "no_plan.json"
@@ -65,6 +66,7 @@ def explanation_record(explanation: Explanation) -> Record:
         "reached_shares": [_share(each) for each in e.shares],
         "proved_unreachable": None if e.verdict is None else e.verdict.proved,
         "parts": [{"part": part.name, "outcome": part.outcome, "why": part.why} for part in e.parts],
+        "chances_under_default_errors": {name: _chance(share) for name, share in e.chances.items()},
         "files": list(plans),
         "explain_s": e.time_s,
     }
@@ -132,6 +134,10 @@ def _neighbour(neighbour: Neighbour | None, plans: Mapping[str, Plan]) -> Record
         "from_target_mm": neighbour.from_target_mm,
         "plan": file_of(neighbour.plan, plans),
     }
+
+
+def _chance(share: Share) -> Record:
+    return {"succeeds": share.value, "interval": list(share.interval), "procedures": share.samples}
 
 
 def _attempt(attempt: Attempt, plans: Mapping[str, Plan]) -> Record:

@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any
 
 from anatomy.lung import Lung
-from lungaccess.checking import Checker
 from lungaccess.appraisal import DRAWS, SEED
+from lungaccess.checking import Checker
 from lungaccess.coupled import (
     Atlas,
     Attempt,

@@ -14,8 +14,8 @@ from lungaccess.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.report.html import words
 from lungaccess.report.html.document import scene_figure, write_page
 from lungaccess.report.html.meshes import structure_meshes
-from lungaccess.report.pack import Packed, pack
 from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, label_volumes
+from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

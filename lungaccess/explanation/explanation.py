@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
+from dataclasses import field
 
 from anatomy.records import frozen_record, frozen_value
 from lungaccess.coupled import Attempt, Counterfactual
@@ -96,7 +96,7 @@ class Explanation:
     changes: tuple[Change, ...] = ()
     through_fissures: bool | None = None
     shares: tuple[ReachedShare, ...] = ()
-    chances: Mapping[str, Share] = MappingProxyType({})
+    chances: Mapping[str, Share] = field(default_factory=dict)
     verdict: ReachVerdict | None = None
     parts: tuple[Part, ...] = ()
     time_s: float = 0.0

@@ -18,6 +18,8 @@ LUMENS: Mapping[str, str] = {
     "hepatic-artery": "hepaticArtery",
 }
 """What users call the vessels of a liver, and the names of their files."""
+THICK_MM = 3.0
+"""Slices farther apart than this miss vessels as wide as a needle."""
 
 
 def is_liver(folder: Path) -> bool:
@@ -63,5 +65,14 @@ def load_liver(folder: Path) -> LiverImages:
         targets_lps=texts.targets_lps,
         target_names=texts.target_names,
         sources={**masks.sources, **texts.sources},
-        warnings=(*masks.statements, *empty),
+        warnings=(*_thick(float(masks.grid.spacing_mm.max())), *masks.statements, *empty),
+    )
+
+
+def _thick(spacing_mm: float) -> tuple[str, ...]:
+    if spacing_mm <= THICK_MM:
+        return ()
+    return (
+        f"The slices are {spacing_mm:.1f} mm apart: thin vessels are missing, so that a path that looks free "
+        "may not be.",
     )

@@ -44,13 +44,11 @@ def placement(name: str, role: str, mask: Mask, grid: Grid, target: Grid, found:
         )
     low, high = box_in(target, grid)
     low, high = np.rint(np.maximum(low, 0)), np.rint(np.minimum(high, target.shape))
-    sentences = [
-        f"{name} has a grid of its own ({grid.describe()}) and was placed by its header: it covers "
-        f"{_times(high - low)} of the {_times(target.shape)} voxels, from ({_comma(low)}) on."
-    ]
+    covered = f"{_times(high - low)} of the {_times(target.shape)} voxels, from ({_comma(low)}) on"
+    sentences = [f"{name} was placed by its header: it covers {covered}."]
     if found.is_resampled:
         half = float(np.linalg.norm(grid.spacing_mm)) / 2
-        sentences.append(f"Its voxels do not coincide: borders moved by up to {half:.1f} mm.")
+        sentences.append(f"Its own grid is {grid.describe()}: borders moved by up to {half:.1f} mm.")
     if (low > 0).any() or (high < target.shape).any():
         sentences.append(f"Beyond it {_BEYOND.get(role, 'nothing is known')}.")
     faces = _touched_faces(mask)

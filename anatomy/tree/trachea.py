@@ -89,11 +89,22 @@ def follow_trunk(tree: SkeletonTree, end: int) -> Trunk:
     while True:
         radius = float(np.median(tree.depth_mm[nodes]))
         onwards = [tree.chain(nodes[-1], n) for n in tree.neighbours[nodes[-1]] if n != nodes[-2]]
-        wide = [c for c in onwards if _beyond(tree, c) >= MAIN_BRONCHUS_RATIO * radius]
+        wide = [
+            c for c in onwards if not _is_bulge(tree, c) and _beyond(tree, c) >= MAIN_BRONCHUS_RATIO * radius
+        ]
         if len(wide) != 1:
             divides = len(wide) > 1
             return Trunk(nodes=nodes, radius_mm=radius, length_mm=tree.length_mm(nodes), divides=divides)
         nodes = nodes + wide[0][1:]
+
+
+def _is_bulge(tree: SkeletonTree, nodes: list[int]) -> bool:
+    """Tell whether a branch is a dead end so near to where it begins that it is a bulge of the wall.
+
+    A trachea has one at its edges where its back wall is pressed in, as after breathing out.
+    """
+    offset = float(np.linalg.norm(tree.mm[nodes[-1]] - tree.mm[nodes[0]]))
+    return len(tree.neighbours[nodes[-1]]) == 1 and offset < BEYOND_RADII * tree.depth_mm[nodes[0]]
 
 
 def _beyond(tree: SkeletonTree, nodes: list[int]) -> float:

@@ -11,12 +11,14 @@ from lungaccess.cli import terminal
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from anatomy.organ import Organ
     from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
 
 
-def lung_record(lung: Lung) -> dict[str, Any]:
-    """Return what was understood of a patient."""
-    tree, report = lung.tree, lung.tree.report
+def organ_record(lung: Organ) -> dict[str, Any]:
+    """Return what was understood of a patient; a liver has neither tree nor lobes."""
+    from anatomy.lung import Lung
+
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
         "name": lung.name,
@@ -31,7 +33,20 @@ def lung_record(lung: Lung) -> dict[str, Any]:
         "volumes_ml": {name: count * ml for name, count in structure_voxels(lung).items()},
         "has_cost_map": lung.cost is not None,
         "starts": len(lung.starts),
+        "start_names": list(lung.start_names),
         "targets_lps": [point.tolist() for point in lung.targets_lps],
+        "target_names": list(lung.target_names),
+        **(_airways(lung) if isinstance(lung, Lung) else {}),
+        "sources": dict(lung.sources),
+        "warnings": list(lung.warnings),
+    }
+
+
+def _airways(lung: Lung) -> dict[str, Any]:
+    tree, report = lung.tree, lung.tree.report
+    ml = lung.grid.voxel_volume_mm3 / 1000.0
+    return {
+        "lobes_ml": {name: count * ml for name, count in lobe_voxels(lung).items()},
         "tree": {
             "branches": tree.n_branches,
             "carina_lps": tree.carina_lps.tolist(),
@@ -43,16 +58,29 @@ def lung_record(lung: Lung) -> dict[str, Any]:
                 for kind, each in _repairs(lung)
             ],
         },
-        "sources": dict(lung.sources),
-        "warnings": list(lung.warnings),
     }
 
 
-def structure_voxels(lung: Lung) -> dict[str, int]:
+def lobe_voxels(lung: Lung) -> dict[str, int]:
+    """Return how many voxels each lobe has; empty if the patient came without lobes."""
+    from anatomy.lobes import LOBES
+
+    if lung.lobes is None:
+        return {}
+    counts = np.bincount(lung.lobes.array.ravel(order="K"), minlength=len(LOBES) + 1)
+    return {name: int(counts[number]) for number, name in LOBES.items() if counts[number]}
+
+
+def structure_voxels(lung: Organ) -> dict[str, int]:
     """Return how many voxels each structure has that is there."""
     from anatomy import structures
+    from anatomy.lung import Lung
 
-    counts = {"inside the lung": int(np.count_nonzero((lung.labels & structures.OUTSIDE) == 0))}
+    counts = {
+        f"inside the {'lung' if isinstance(lung, Lung) else 'liver'}": int(
+            np.count_nonzero((lung.labels & structures.OUTSIDE) == 0)
+        )
+    }
     for name in ("airway", "lumen", "vessel", "fissure"):
         counts[name] = int(np.count_nonzero(lung.labels & structures.BITS[name]))
     if lung.nodules is not None:
@@ -60,11 +88,24 @@ def structure_voxels(lung: Lung) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-def anatomy_tables(lung: Lung) -> list[Table]:
+def anatomy_tables(lung: Organ) -> list[Table]:
     """Return what was understood of a patient: structures, airway tree by generation, sources."""
+    from anatomy.lung import Lung
+
     made = [
         terminal.table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
+        *(_tree_tables(lung) if isinstance(lung, Lung) else ()),
+        terminal.table("Starts and targets", ("name", "LPS, mm"), _place_rows(lung)),
+        terminal.table(
+            "Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]
+        ),
+    ]
+    return [each for each in made if each.row_count]
+
+
+def _tree_tables(lung: Lung) -> list[Table]:
+    return [
         terminal.table(
             "Airway tree",
             ("generation", "branches", "mean radius, mm", "least radius, mm", "mean length, mm"),
@@ -73,20 +114,27 @@ def anatomy_tables(lung: Lung) -> list[Table]:
         terminal.table(
             "Repairs of the airway tree", ("repair", "at LPS, mm", "length, mm"), _repair_rows(lung)
         ),
-        terminal.table(
-            "Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]
-        ),
     ]
-    return [each for each in made if each.row_count]
 
 
-def _patient_rows(lung: Lung) -> list[terminal.Row]:
-    rows: list[terminal.Row] = [
-        ("working grid", lung.grid.describe()),
+def _place_rows(lung: Organ) -> list[terminal.Row]:
+    starts = zip(lung.start_names, (pose[:3, 3] for pose in lung.starts), strict=False)
+    targets = zip(lung.target_names, lung.targets_lps, strict=False)
+    return [(name, ", ".join(f"{c:.1f}" for c in point)) for name, point in (*starts, *targets)]
+
+
+def _patient_rows(lung: Organ) -> list[terminal.Row]:
+    from anatomy.lung import Lung
+
+    rows: list[terminal.Row] = [("working grid", lung.grid.describe())]
+    if not isinstance(lung, Lung):
+        return rows
+    rows += [
         ("carina, LPS mm", ", ".join(f"{c:.1f}" for c in lung.tree.carina_lps)),
         ("breath hold", lung.breath_hold or "not stated"),
         ("fissures", "given" if lung.has_fissures else "not given"),
         ("cost map", "given" if lung.cost is not None else "not given"),
+        ("lobes", "given" if lung.lobes is not None else "not given"),
         ("start poses, targets", f"{len(lung.starts)}, {len(lung.targets_lps)}"),
     ]
     dropped = lung.tree.report.components_dropped
@@ -113,9 +161,12 @@ def _repairs(lung: Lung) -> list[tuple[str, GapBridged | LoopOpened | SpurPruned
     ]
 
 
-def _volume_rows(lung: Lung) -> list[terminal.Row]:
+def _volume_rows(lung: Organ) -> list[terminal.Row]:
+    from anatomy.lung import Lung
+
     ml = lung.grid.voxel_volume_mm3 / 1000.0
-    return [(name, f"{count * ml:.1f}", f"{count}") for name, count in structure_voxels(lung).items()]
+    counts = structure_voxels(lung) | (lobe_voxels(lung) if isinstance(lung, Lung) else {})
+    return [(name, f"{count * ml:.1f}", f"{count}") for name, count in counts.items()]
 
 
 def _generation_rows(lung: Lung) -> list[terminal.Row]:

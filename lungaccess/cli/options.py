@@ -18,6 +18,7 @@ from stages.needle import TERMS, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from anatomy.organ import Organ
     from lungaccess.coupled.atlas import Atlas
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget
@@ -76,6 +77,10 @@ class PatientOptions(OutputOptions):
         """Return a patient's lung; see `load_lung`."""
         return load_lung(patient, self.cache, thick_slices)
 
+    def load_organ(self, patient: Path, *, thick_slices: bool = False) -> Organ:
+        """Return a patient's lung, or a liver of Med-RAD; see `load_organ`."""
+        return load_organ(patient, self.cache, thick_slices)
+
     def open_atlas(self, lung: Lung, system: System) -> Atlas:
         """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
         from lungaccess.coupled import open_atlas
@@ -90,7 +95,11 @@ class TargetOptions:
     """Where to go."""
 
     target: Annotated[
-        str | None, Parameter(help="Target point in mm with its frame: ras:x,y,z or lps:x,y,z.")
+        str | None,
+        Parameter(
+            help="Target point in mm with its frame, ras:x,y,z or lps:x,y,z; or the name of a target that "
+            "came with the patient, such as target1."
+        ),
     ] = None
     nodule: Annotated[
         Whole | None,
@@ -232,6 +241,17 @@ def require_map(lung: Lung, objective: Objective) -> None:
             expected=f"a cost map among the patient's files for --objective {objective}",
             remedy="Choose inverse-clearance or length",
         )
+
+
+def load_organ(patient: Path, cache: Path | None, thick_slices: bool) -> Organ:
+    """Return a patient's lung or liver, and show what is being done meanwhile; see `load_lung`."""
+    from anatomy.io.liver import is_liver
+    from lungaccess.problem.patients import load_organ as load
+
+    if not is_liver(patient):
+        return load_lung(patient, cache, thick_slices)
+    with progress(f"reading {patient}"):
+        return load(patient)
 
 
 def load_lung(patient: Path, cache: Path | None, thick_slices: bool) -> Lung:

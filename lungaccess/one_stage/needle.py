@@ -8,9 +8,11 @@ import numpy as np
 
 from anatomy.errors import SettingsError, TargetError
 from anatomy.kernels.field import exact_distance
+from anatomy.liver import with_entry
 from anatomy.lung import Lung
+from anatomy.organ import Organ
 from anatomy.records import frozen_record
-from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
 from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float
 from lungaccess.one_stage.needle_search import OMPL_PLANNERS, search_path
@@ -129,7 +131,7 @@ class NeedleAnswer:
 
 
 def plan_needle(
-    lung: Lung,
+    lung: Organ,
     system: System,
     lps_from_start: Float,
     target: Target,
@@ -214,7 +216,7 @@ class NeedleQuestion:
     at_wall: bool
 
 
-def needle_question(lung: Lung, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
+def needle_question(lung: Organ, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
     """Ask for a path of a system's needle, with its margins, and the exemption that its start has.
 
     Parameters
@@ -222,6 +224,8 @@ def needle_question(lung: Lung, system: System, lps_from_start: Float, target_lp
     lps_from_start : (4, 4) float64
     target_lps : (3,) float64, LPS mm
     """
+    if not isinstance(lung, Lung):
+        lung = _opened(lung, system, lps_from_start[:3, 3])
     environment = needle_environment(
         lung, system.needle, system.margins, with_fissures=not system.fissures_allowed
     )
@@ -234,7 +238,15 @@ def needle_question(lung: Lung, system: System, lps_from_start: Float, target_lp
     return NeedleQuestion(environment=environment, query=query, branches=branches, at_wall=at_wall)
 
 
-def pierced_branches(lung: Lung, point: Float, near_mm: float) -> tuple[int, ...]:
+def _opened(organ: Organ, system: System, point: Float) -> Organ:
+    """Return an organ whose surface is pierced at a start, if it lies within `WALL_MM` of it."""
+    if organ.exact_clearance_mm(point, OUTSIDE, cap_mm=WALL_MM)[0] >= WALL_MM:
+        return organ
+    reach_mm = system.needle.exit_exemption_mm + system.needle.radius_mm + system.margins.total_mm
+    return with_entry(organ, point, reach_mm)
+
+
+def pierced_branches(lung: Organ, point: Float, near_mm: float) -> tuple[int, ...]:
     """Return the airway branches that a needle at a point `(3,)` LPS mm has pierced, the nearest first.
 
     The nearest lies within `WALL_MM`.  Near a junction the tree draws the line between branches, not the
@@ -247,7 +259,7 @@ def pierced_branches(lung: Lung, point: Float, near_mm: float) -> tuple[int, ...
         return ()
     around = lung.labels[lung.grid.window(point, near_mm)]
     others = np.setdiff1d((around[(around & AIRWAY) != 0] >> BRANCH_SHIFT).astype(int) - 1, [-1, branch])
-    meeting = {int(b) for b in others} & _meeting(lung, branch)
+    meeting = {int(b) for b in others} & _meeting(lung, branch) if isinstance(lung, Lung) else set()
     near = [b for b in sorted(meeting) if _distance_to_branch(lung, point, b, near_mm) < near_mm]
     return (branch, *near)
 
@@ -262,7 +274,7 @@ def _meeting(lung: Lung, branch: int) -> set[int]:
     return joined - {branch}
 
 
-def _distance_to_branch(lung: Lung, point: Float, branch: int, cap_mm: float) -> float:
+def _distance_to_branch(lung: Organ, point: Float, branch: int, cap_mm: float) -> float:
     """Return the distance in mm from a point to the airway voxels of a branch as boxes, at most `cap_mm`."""
     part = lung.grid.window(point, cap_mm)
     labels = lung.labels[part]
@@ -272,6 +284,6 @@ def _distance_to_branch(lung: Lung, point: Float, branch: int, cap_mm: float) ->
     return float(np.linalg.norm(gap, axis=1).min(initial=cap_mm))
 
 
-def begins_at_wall(lung: Lung, point: Float, radius_mm: float) -> bool:
+def begins_at_wall(lung: Organ, point: Float, radius_mm: float) -> bool:
     """Tell whether a needle of this radius at a point `(3,)` LPS mm touches the lumen of an airway."""
     return bool(lung.exact_clearance_mm(point, LUMEN, cap_mm=radius_mm)[0] < radius_mm)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from anatomy.errors import FileError, SettingsError
-from anatomy.io.frames import Frame
+from anatomy.io.frames import Frame, parse_point
+from anatomy.io.liver import LUMENS, is_liver, load_liver
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 
@@ -23,20 +26,49 @@ CURVE_SPACING_MM = 0.5
 
 @frozen_record
 class RouteSource:
-    """Where a route runs; its kind is "patient", "centreline", "mask" or "drawing"."""
+    """Where a route runs; its kind is "patient", "liver", "centreline", "mask" or "drawing".
+
+    `places` are starts and targets `(3,)` LPS mm that came with a patient, by name.
+    """
 
     name: str
     kind: str
     centreline: Centreline
+    places: Mapping[str, Float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    def place(self, text: str, needed_mm: float = 0.0) -> Float:
+        """Return a point `(3,)` LPS mm: one with its frame, or the place in the lumen nearest to a named one.
+
+        The lumen is at least `needed_mm` deep there, if it is so anywhere.
+
+        Raises
+        ------
+        FrameError
+            If the text is neither a name nor a point with its frame.
+        """
+        named = {name.lower(): point for name, point in self.places.items()}
+        if text.lower() not in named:
+            return parse_point(text)
+        fits = self.centreline.radius_mm >= needed_mm
+        nodes = self.centreline.nodes_mm[fits if fits.any() else slice(None)]
+        return np.asarray(nodes[int(np.argmin(np.linalg.norm(nodes - named[text.lower()], axis=1)))])
 
 
 def open_source(
-    path: Path, *, frame: Frame | None = None, pixel_mm: float | None = None, cache: Path | None = None
+    path: Path,
+    *,
+    lumen: str | None = None,
+    frame: Frame | None = None,
+    pixel_mm: float | None = None,
+    cache: Path | None = None,
 ) -> RouteSource:
     """Return the centreline of a patient folder, a centreline file, a mask of vessels or a drawing.
 
     Parameters
     ----------
+    lumen : str, optional
+        Which vessel of a liver, a key of `anatomy.io.liver.LUMENS`; needed for one.
     frame : str, optional
         Frame of a centreline file or mask that states none.
     pixel_mm : float, optional
@@ -47,18 +79,29 @@ def open_source(
     Raises
     ------
     SettingsError
-        If a drawing has no pixel size.
+        If a drawing has no pixel size, or a liver is given and no vessel.
     LungaccessError
         If the source cannot be read or holds no tubes.
     """
     from stages.scope.route import from_graph, from_image, from_lung, from_mask
 
     suffix = path.suffix.lower()
+    if is_liver(path):
+        return _in_liver(path, lumen)
+    if lumen is not None:
+        raise SettingsError(f"{path} is no liver, so that it has no {lumen}", remedy="Leave --lumen out")
     if path.is_dir():
         from lungaccess.problem.patients import load_patient
 
         lung = load_patient(path, cache=cache)
-        return RouteSource(name=lung.name, kind="patient", centreline=from_lung(lung))
+        return RouteSource(
+            name=lung.name,
+            kind="patient",
+            centreline=from_lung(lung),
+            places=dict(zip(lung.target_names, lung.targets_lps, strict=True))
+            | {name: pose[:3, 3] for name, pose in zip(lung.start_names, lung.starts, strict=True)},
+            warnings=lung.warnings,
+        )
     if suffix in CENTRELINE_SUFFIXES:
         from anatomy.io.centerlines import read_centerline_graph
 
@@ -73,6 +116,26 @@ def open_source(
 
     mask = read_mask(path, frame=frame)
     return RouteSource(name=path.stem, kind="mask", centreline=from_mask(mask, rounded=True))
+
+
+def _in_liver(folder: Path, lumen: str | None) -> RouteSource:
+    from stages.scope.route import from_mask
+
+    if lumen is None or lumen not in LUMENS:
+        raise SettingsError(
+            f"{folder} is a liver with {len(LUMENS)} trees of vessels",
+            expected=f"one of them: --lumen {', --lumen '.join(LUMENS)}",
+            remedy="State the vessel in which the catheter moves",
+        )
+    liver = load_liver(folder)
+    return RouteSource(
+        name=f"{liver.name}, {lumen.replace('-', ' ')}",
+        kind="liver",
+        centreline=from_mask(liver.lumens[lumen], rounded=True),
+        places=dict(zip(liver.target_names, liver.targets_lps, strict=True))
+        | {name: pose[:3, 3] for name, pose in zip(liver.start_names, liver.starts, strict=True)},
+        warnings=liver.warnings,
+    )
 
 
 def read_drawing(path: Path) -> Any:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.problem.patients import load_patient
+    from lungaccess.problem.patients import load_organ, load_patient
     from lungaccess.problem.peripheral import peripheral_targets
     from lungaccess.problem.preset_order import (
         WHY_THIS_ORDER,

@@ -1,4 +1,4 @@
-"""Load a patient from disk, prepared and cached."""
+"""Load a patient from disk, prepared and cached; or a liver, for the needle alone."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from anatomy.lung import Lung
+from anatomy.organ import Organ
 
 
 def load_patient(
@@ -42,3 +43,21 @@ def load_patient(
         cache=None if cache is None else Path(cache),
         progress=progress,
     )
+
+
+def load_organ(
+    path: str | os.PathLike[str],
+    *,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Organ:
+    """Return the liver of a Med-RAD folder, else what `load_patient` returns; parameters and errors as there.
+
+    A liver has no airways: it is enough for a needle from a given start, not for scope and tubes.
+    """
+    from anatomy.io.liver import is_liver, load_liver
+    from anatomy.liver import build_liver
+
+    if is_liver(Path(path)):
+        return build_liver(load_liver(Path(path)))
+    return load_patient(path, cache=cache, progress=progress)

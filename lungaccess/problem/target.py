@@ -6,8 +6,8 @@ import numpy as np
 
 from anatomy.errors import TargetError
 from anatomy.grid import Volume, read_only
-from anatomy.lung import Lung
 from anatomy.morphology import components
+from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
 from anatomy.typed import Float, Int
@@ -40,20 +40,27 @@ class StatedTarget:
         Number of a nodule, 1 for the largest, if there is no point.
     origin : str
         What the user wrote.
+    name : str
+        Name of a target that came with the patient, if there is neither a point nor a nodule.
     """
 
     lps_mm: Float | None
     nodule: int
     origin: str
+    name: str = ""
 
-    def resolve(self, lung: Lung) -> Target:
+    def resolve(self, lung: Organ) -> Target:
         """Return the target in a lung; see `resolve_target`."""
+        if self.name:
+            return point_target(lung, named_target(lung, self.name), origin=self.origin)
         if self.lps_mm is None:
             return nodule_target(lung, self.nodule)
         return point_target(lung, self.lps_mm, origin=self.origin)
 
-    def centre_lps(self, lung: Lung) -> Float:
+    def centre_lps(self, lung: Organ) -> Float:
         """Return the point `(3,)` LPS mm, wherever it lies, or that of the nodule."""
+        if self.name:
+            return named_target(lung, self.name)
         return nodule_target(lung, self.nodule).lps_mm if self.lps_mm is None else self.lps_mm
 
 
@@ -63,7 +70,8 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
     Parameters
     ----------
     text : str or None
-        A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm.
+        A point with its frame, ``ras:x,y,z`` or ``lps:x,y,z``, mm; or the name or number of a target that
+        came with the patient, such as ``target1``.
     nodule : int or None
         Number of a nodule.
 
@@ -82,12 +90,34 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
         )
     if text is None:
         return StatedTarget(lps_mm=None, nodule=nodule or 0, origin=f"nodule {nodule}")
+    if not set(text) & set(":,;[( "):
+        return StatedTarget(lps_mm=None, nodule=0, origin=f"published {text}", name=text)
     from anatomy.io.frames import parse_point
 
     return StatedTarget(lps_mm=parse_point(text), nodule=0, origin=f"point {text}")
 
 
-def resolve_target(lung: Lung, text: str | None = None, nodule: int | None = None) -> Target:
+def named_target(lung: Organ, name: str) -> Float:
+    """Return the point `(3,)` LPS mm of a target that came with the patient, by its name or number.
+
+    Raises
+    ------
+    TargetError
+        If there is none of this name.
+    """
+    names = [known.lower() for known in lung.target_names]
+    if name.lower() in names:
+        return lung.targets_lps[names.index(name.lower())]
+    if name.isdecimal() and 1 <= int(name) <= len(names):
+        return lung.targets_lps[int(name) - 1]
+    raise TargetError(
+        f"{lung.name} came with no target {name!r}",
+        expected=f"one of {', '.join(lung.target_names)}" if names else "a point: it came without targets",
+        remedy="A point is stated with its frame, as --target ras:-41.5,22,-110",
+    )
+
+
+def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = None) -> Target:
     """Return the target that a user names.
 
     Parameters
@@ -110,7 +140,7 @@ def resolve_target(lung: Lung, text: str | None = None, nodule: int | None = Non
     return stated_target(text, None if text is not None else nodule).resolve(lung)
 
 
-def point_target(lung: Lung, lps_mm: Float, *, origin: str = "point") -> Target:
+def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target:
     """Return a target at a point `(3,)` LPS mm.
 
     Raises
@@ -121,11 +151,11 @@ def point_target(lung: Lung, lps_mm: Float, *, origin: str = "point") -> Target:
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise TargetError(f"The target {point.tolist()} is not a point", expected="three finite mm")
-    require_free(lung, point)
+    require_free(lung, point, origin)
     return Target(lps_mm=read_only(point), origin=origin)
 
 
-def nodule_target(lung: Lung, number: int) -> Target:
+def nodule_target(lung: Organ, number: int) -> Target:
     """Return a target in the nodule `number`, counted from 1 by decreasing size.
 
     Raises
@@ -159,24 +189,54 @@ def _nodule_voxels(nodules: Volume, number: int) -> Int:
     return np.asarray(voxels[part == np.argsort(-sizes, kind="stable")[number - 1]])
 
 
-def _is_free(lung: Lung, point: Float) -> bool:
+def _is_free(lung: Organ, point: Float) -> bool:
     return lung.label_at(point) & (OUTSIDE | VESSEL | AIRWAY) == 0
 
 
-def require_free(lung: Lung, point: Float) -> None:
-    """Raise a TargetError that says where a point `(3,)` LPS mm lies, unless it is in free lung tissue."""
-    place = "LPS ({:.1f}, {:.1f}, {:.1f}) mm".format(*point)
+def require_free(lung: Organ, point: Float, origin: str = "") -> None:
+    """Raise a TargetError that says where a point `(3,)` LPS mm lies, unless it is in free lung tissue.
+
+    Where the same numbers in the other frame lie in the lung, the error says so; `origin` holds the numbers
+    as they were typed.
+    """
     label = lung.label_at(point)
     if label & OUTSIDE:
-        raise TargetError(
-            f"The target at {place} lies outside the lung",
-            expected="a point in lung tissue",
-            remedy="Check the frame: RAS and LPS differ by the signs of x and y",
-        )
+        raise _outside(lung, point, origin)
     for bit, name in ((VESSEL, "a vessel"), (AIRWAY, "an airway")):
         if label & bit:
             raise TargetError(
-                f"The target at {place} lies inside {name}",
+                f"The target at {_place(point)} lies inside {name}",
                 expected="a point in lung tissue",
                 remedy="Move the target, or remove the nodule from that mask",
             )
+
+
+def _outside(lung: Organ, point: Float, origin: str) -> TargetError:
+    """Return the error for a target outside the lung, with the frame that was meant if that is plain."""
+    flipped = point * np.array([-1.0, -1.0, 1.0])
+    where = "lung" if lung.grid.contains(point).all() else "images"
+    if lung.label_at(flipped) & OUTSIDE:
+        corners = [lung.grid.lps(np.zeros(3)), lung.grid.lps(np.array(lung.grid.shape) - 1.0)]
+        ranges = (f"{a:.0f} to {b:.0f}" for a, b in zip(np.min(corners, 0), np.max(corners, 0), strict=True))
+        return TargetError(
+            f"The target at {_place(point)} lies outside the {where}",
+            expected=f"a point in lung tissue; the box of the lungs is LPS {', '.join(ranges)} mm",
+            remedy="Read the point off the images again",
+        )
+    frame, _, numbers = origin.removeprefix("point ").partition(":")
+    other = {"ras": "lps", "lps": "ras"}.get(frame.strip().lower(), "")
+    typed = f"--target {other}:{numbers}" if other else f"the point {_place(flipped)}"
+    return TargetError(
+        f"The target at {_place(point)} lies outside the {where}"
+        + (
+            f"; in {other.upper()} the same numbers lie inside"
+            if other
+            else "; with x and y negated it lies inside"
+        ),
+        expected="a point in lung tissue, in the frame that is stated",
+        remedy=f"If that is meant, state {typed}",
+    )
+
+
+def _place(point: Float) -> str:
+    return "LPS ({:.1f}, {:.1f}, {:.1f}) mm".format(*point)

@@ -16,7 +16,7 @@ from lungaccess.report.views import STANDARD, View
 
 if TYPE_CHECKING:
     from anatomy.grid import Grid, Volume
-    from anatomy.lung import Lung
+    from anatomy.organ import Organ
 
 
 PROJECTIONS_VERSION = 1
@@ -40,7 +40,7 @@ class Footprint:
 class Layers:
     """The masks of one patient, seen through and cut."""
 
-    def __init__(self, lung: Lung) -> None:
+    def __init__(self, lung: Organ) -> None:
         self._lung = lung
         self._points: dict[str, tuple[Float, int]] = {}
 
@@ -65,7 +65,7 @@ class Layers:
     def _mask(self, name: str) -> Array | None:
         """Return a bool mask `[i, j, k]`, or None where the patient has none.
 
-        `name` is one of `Lung.mask`, or "lung" for what is not outside.
+        `name` is one of `Organ.mask`, or "lung" for what is not outside.
         """
         lung = self._lung
         if not self.has(name):

@@ -12,8 +12,8 @@ from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.fields import CENTRES, SOLID, DistanceField, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import EXACT_REACH_MM
-from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, obstacle_bits
 from anatomy.typed import Float, Int, Labels
@@ -57,7 +57,7 @@ class NeedleEnvironment:
 
 
 def needle_environment(
-    lung: Lung, needle: Needle, margins: Margins, *, with_fissures: bool, goal_tolerance_mm: float = 0.0
+    lung: Organ, needle: Needle, margins: Margins, *, with_fissures: bool, goal_tolerance_mm: float = 0.0
 ) -> NeedleEnvironment:
     """Gather what the kernels need to steer `needle` through `lung`.
 

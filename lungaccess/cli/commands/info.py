@@ -21,24 +21,31 @@ if TYPE_CHECKING:
 def info(
     patient: PatientFolder,
     *,
-    out: Annotated[Path | None, Parameter(help="Folder for tree.png, a picture of the airway tree.")] = None,
+    out: Annotated[
+        Path | None,
+        Parameter(help="Folder for tree.png, a picture of the airway tree; for a liver organ.png."),
+    ] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show what was understood of a patient: volumes, airway tree, sources and warnings."""
     if out is not None:
         require_writable_folder(out)
-    lung = output.load(patient, thick_slices=True)
+    lung = output.load_organ(patient, thick_slices=True)
     if output.json:
-        terminal.show_json(anatomy_tables.lung_record(lung))
+        terminal.show_json(anatomy_tables.organ_record(lung))
     else:
         terminal.show(anatomy_tables.anatomy_tables(lung))
         terminal.show_warnings(lung.warnings)
     if out is not None:
-        from lungaccess.report import tree_png
+        from anatomy.lung import Lung
+        from lungaccess.report import organ_png, tree_png
 
-        picture = tree_png(lung, out / "tree.png")
+        if isinstance(lung, Lung):
+            what, picture = "tree", tree_png(lung, out / "tree.png")
+        else:
+            what, picture = "organ", organ_png(lung, out / "organ.png")
         if not output.json:
-            terminal.say(f"Picture of the tree: {picture}")
+            terminal.say(f"Picture of the {what}: {picture}")
     return ExitCode.OK
 
 

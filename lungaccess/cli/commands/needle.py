@@ -24,7 +24,7 @@ from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
 if TYPE_CHECKING:
-    from anatomy.lung import Lung
+    from anatomy.organ import Organ
     from anatomy.typed import Float
     from lungaccess.one_stage import NeedleAnswer
 
@@ -37,8 +37,8 @@ def needle(
     start: Annotated[
         str,
         Parameter(
-            help="Number of a start pose that came with the patient; a plan.json, whose needle starts there; "
-            "or a text file with a 4x4 pose whose +z column is the direction of insertion."
+            help="Number or name of a start pose that came with the patient; a plan.json, whose needle "
+            "starts there; or a text file with a 4x4 pose whose +z column is the direction of insertion."
         ),
     ],
     frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
@@ -62,11 +62,12 @@ def needle(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the needle alone from a given pose, or prove that no path exists."""
+    from anatomy.lung import Lung
     from lungaccess.one_stage import plan_needle
 
     stated, weighed = target.stated(), Objective.of(objective)
     device = system.load()
-    lung = output.load(patient)
+    lung = output.load_organ(patient)
     limit_s = budget.time_s
     pose, aim = _start_pose(lung, start, frame), stated.resolve(lung)
     with progress("searching" if limit_s is None else f"searching, at most {limit_s:g} s"):
@@ -84,11 +85,11 @@ def needle(
     if output.json:
         terminal.show_json(answer.record())
     else:
-        terminal.show(_tables(answer))
+        terminal.show(_tables(answer, is_lung=isinstance(lung, Lung)))
     return ExitCode.of(answer.path is not None)
 
 
-def _tables(answer: NeedleAnswer) -> list[Table]:
+def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
     """Return what a needle planner found: the outcome, and the path arc by arc."""
     from lungaccess.one_stage import obstruction_rows
     from lungaccess.plans.costs import costs_in_words
@@ -102,7 +103,7 @@ def _tables(answer: NeedleAnswer) -> list[Table]:
     if answer.branches:
         pierced = ", ".join(f"{branch}" for branch in answer.branches)
         how = "begins at the wall of branch" if answer.at_wall else "taken to have pierced branch"
-        rows.append((how, pierced))
+        rows.append((how, pierced) if is_lung else ("enters through", "the surface of the organ"))
     path = answer.path
     if answer.obstruction is not None:
         rows += obstruction_rows(answer.obstruction, answer.proved)
@@ -131,19 +132,24 @@ def _tables(answer: NeedleAnswer) -> list[Table]:
     ]
 
 
-def _start_pose(lung: Lung, start: str, frame: Frame) -> Float:
+def _start_pose(lung: Organ, start: str, frame: Frame) -> Float:
     """Return a pose by its number among those of the patient, from a plan, or from a file of numbers."""
     from anatomy.io.frames import read_pose
     from lungaccess.plans.plan import Plan
 
     if start.endswith(".json"):
         return Plan.load(start).tube.lps_from_tip
+    names = [name.lower() for name in lung.start_names]
+    if start.lower() in names:
+        return lung.starts[names.index(start.lower())]
     if not start.isdecimal():
         return read_pose(start, frame)
     number = int(start)
     if not 1 <= number <= len(lung.starts):
         raise SettingsError(
             f"There is no start pose {number}",
-            expected=f"1 to {len(lung.starts)}" if lung.starts else "a file: the patient came with no pose",
+            expected=f"1 to {len(lung.starts)}, or {', '.join(lung.start_names)}"
+            if lung.starts
+            else "a file: the patient came with no pose",
         )
     return lung.starts[number - 1]

@@ -32,10 +32,14 @@ def route(
         str,
         Parameter(
             help="Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the "
-            "right, y down."
+            "right, y down; or the name of a target that came with the patient: the place nearest to it."
         ),
     ],
     start: Annotated[str | None, Parameter(help="Start; the widest end of the tubes if not given.")] = None,
+    lumen: Annotated[
+        Literal["hepatic-vein", "portal-vein", "hepatic-artery"] | None,
+        Parameter(help="Vessel of a liver of Med-RAD in which the device moves."),
+    ] = None,
     curvature: Annotated[Positive, Parameter(help="Largest curvature of the device, 1/mm.")],
     radius: Annotated[NotNegative, Parameter(help="Outer radius of the device, mm.")] = 0.0,
     margin: Annotated[NotNegative, Parameter(help="Gap that must remain between device and wall, mm.")] = 0.0,
@@ -65,14 +69,16 @@ def route(
         wall_margin_mm=margin,
         end_tolerance_mm=tolerance,
     )
-    end = parse_point(goal)
-    begin = None if start is None else parse_point(start)
+    for text in (goal, start or goal):
+        if ":" in text:
+            parse_point(text)
     require_writable_folder(out)
     with progress("route") as shown:
         shown.step("reading the tubes")
-        opened = open_source(source, frame=frame, pixel_mm=pixel, cache=output.cache)
+        opened = open_source(source, lumen=lumen, frame=frame, pixel_mm=pixel, cache=output.cache)
         shown.step("planning")
-        first = widest_end(opened.centreline) if begin is None else begin
+        end = opened.place(goal, limits.needed_mm)
+        first = widest_end(opened.centreline) if start is None else opened.place(start, limits.needed_mm)
         found = plan_route(
             opened.centreline, first, end, limits, repair=repair, seed=seed, require_proof=False
         )
@@ -83,6 +89,7 @@ def route(
         terminal.show_json(written)
         return ExitCode.of(found.proved)
     terminal.show([terminal.table(f"Route along {opened.name}", ("", "", "limit"), _rows(found, written))])
+    terminal.show_warnings(opened.warnings)
     terminal.say(f"Written to {out}: route.json, route.png")
     return _verdict(found)
 

@@ -169,7 +169,7 @@ def test_a_plan_as_json_says_what_the_check_says(
 
 
 def test_a_lung_as_json_agrees_with_its_tables(small_lung: Any) -> None:
-    record = json.loads(json.dumps(anatomy_tables.lung_record(small_lung), allow_nan=False))
+    record = json.loads(json.dumps(anatomy_tables.organ_record(small_lung), allow_nan=False))
     assert record["tree"]["branches"] == small_lung.tree.n_branches
     assert sum(record["tree"]["branches_by_generation"]) == small_lung.tree.n_branches
     lumen = float(small_lung.mask("lumen").array.sum()) * small_lung.grid.voxel_volume_mm3 / 1000.0

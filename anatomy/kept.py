@@ -14,10 +14,10 @@ from anatomy.errors import FileError
 from anatomy.io.files import atomic_write
 
 if TYPE_CHECKING:
-    from anatomy.lung import Lung
+    from anatomy.organ import Organ
 
 
-def kept(lung: Lung, name: str, version: int, make: Callable[[], Any]) -> Any:
+def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
     """Return plain JSON values that follow from a lung: those kept with it, else those that `make` returns.
 
     Parameters

@@ -90,7 +90,7 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
         )
     if text is None:
         return StatedTarget(lps_mm=None, nodule=nodule or 0, origin=f"nodule {nodule}")
-    if not set(text) & set(":,;[( "):
+    if text and not set(text) & set(":,;[( "):
         return StatedTarget(lps_mm=None, nodule=0, origin=f"published {text}", name=text)
     from anatomy.io.frames import parse_point
 
@@ -239,4 +239,4 @@ def _outside(lung: Organ, point: Float, origin: str) -> TargetError:
 
 
 def _place(point: Float) -> str:
-    return "LPS ({:.1f}, {:.1f}, {:.1f}) mm".format(*point)
+    return "LPS ({:.1f}, {:.1f}, {:.1f}) mm".format(*(point + 0.0))

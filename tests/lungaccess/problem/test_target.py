@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,7 +48,7 @@ def test_text_that_is_no_point_with_a_frame(lung: Lung, text: str) -> None:
     ("point", "where"),
     [
         ((-17.0, 0, 0), "outside the lung"),
-        ((500.0, 0, 0), "outside the lung"),
+        ((500.0, 0, 0), "outside the images"),
         ((10.0, 0, 1), "inside a vessel"),
         ((0.0, 10, 0), "inside an airway"),
         ((0.0, 10, 3.6), "inside an airway"),
@@ -65,9 +67,35 @@ def test_arrays_that_are_no_point(lung: Lung, point: object) -> None:
         point_target(lung, np.array(point, dtype=float))
 
 
-def test_the_frame_is_suspected_when_the_point_is_outside(lung: Lung) -> None:
-    with pytest.raises(TargetError, match="RAS and LPS"):
+@pytest.mark.parametrize(("typed", "meant"), [("lps:-17,0,0", "ras:-17,0,0"), ("ras:17, 0,0", "lps:17, 0,0")])
+def test_a_target_in_the_wrong_frame_is_told_the_other_one(lung: Lung, typed: str, meant: str) -> None:
+    with pytest.raises(TargetError, match=f"in {meant[:3].upper()} the same numbers lie inside") as caught:
+        la.resolve_target(lung, typed)
+    assert f"--target {meant}" in caught.value.remedy
+    la.resolve_target(lung, meant)
+
+
+def test_an_array_in_the_wrong_frame_is_told_so_too(lung: Lung) -> None:
+    with pytest.raises(TargetError, match="with x and y negated it lies inside") as caught:
         point_target(lung, np.array([-17.0, 0.0, 0.0]))
+    assert "LPS (17.0, 0.0, 0.0) mm" in caught.value.remedy
+
+
+def test_a_target_outside_in_both_frames_hears_where_the_lungs_are(lung: Lung) -> None:
+    with pytest.raises(TargetError, match="the box of the lungs is LPS") as caught:
+        la.resolve_target(lung, "lps:0,500,0")
+    assert "the same numbers" not in str(caught.value)
+
+
+def test_a_target_that_came_with_the_patient_has_a_name(lung: Lung) -> None:
+    point = np.array([1.0, 2.0, 3.0])
+    patient = replace(lung, targets_lps=(point,), target_names=("target1",))
+    for text in ("target1", "Target1", "1"):
+        assert la.resolve_target(patient, text).lps_mm.tolist() == point.tolist()
+    with pytest.raises(TargetError, match="came with no target 'target2'.*one of target1"):
+        la.resolve_target(patient, "target2")
+    with pytest.raises(TargetError, match="it came without targets"):
+        la.resolve_target(lung, "target1")
 
 
 def test_a_target_is_a_copy_that_cannot_be_written(lung: Lung) -> None:

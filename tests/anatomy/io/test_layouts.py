@@ -102,9 +102,14 @@ def test_a_gap_between_lobes_is_bridged_and_a_slip_of_the_pen_is_no_lobe(respira
 
 @pytest.mark.parametrize(
     "name",
-    ["BronchialTree.gz", "bronchialtree.nii.gz", "Bronchial_Tree.nii", "EXACT09_CASE18_BronchialTree_Def0.nii.gz",
-     "bronchialTree.nrrd"],
-)  # fmt: skip
+    [
+        "BronchialTree.gz",
+        "bronchialtree.nii.gz",
+        "Bronchial_Tree.nii",
+        "EXACT09_CASE18_BronchialTree_Def0.nii.gz",
+        "bronchialTree.nrrd",
+    ],
+)
 def test_a_bronchial_tree_is_known_by_any_usual_spelling(respiratory, masks, name):
     expected = load_patient(respiratory).lumen.array
     (respiratory / "BronchialTree.nii.gz").unlink()
@@ -144,12 +149,16 @@ def test_lobes_of_totalsegmentator_and_of_own_masks_mean_the_same(tmp_path, mask
             assert (getattr(patient, role).array == getattr(expected, role).array).all(), (path, role)
     (own / "patient.toml").write_text(f'lumen = "a.nii.gz"\nvessels = "v.nii.gz"\nlobes = {{ {table} }}\n')
     assert (load_patient(own).lobes.array == expected.lobes.array).all()
-    (own / "patient.toml").write_text('lumen = "a.nii.gz"\nvessels = "v.nii.gz"\nlobes = { "spleen" = "a.nii" }\n')
+    (own / "patient.toml").write_text(
+        'lumen = "a.nii.gz"\nvessels = "v.nii.gz"\nlobes = { "spleen" = "a.nii" }\n'
+    )
     with pytest.raises(LungaccessError, match="names a lobe 'spleen'"):
         load_patient(own)
 
 
-@pytest.mark.parametrize("name", ["lung", "left", "upper", "liver", "lul2", "left_right_upper_lobe", "left_middle"])
+@pytest.mark.parametrize(
+    "name", ["lung", "left", "upper", "liver", "lul2", "left_right_upper_lobe", "left_middle"]
+)
 def test_other_names_are_no_lobe(name):
     assert lobe_named(name) == 0
 
@@ -178,7 +187,9 @@ def test_absolute_and_relative_paths_may_stand_side_by_side(tmp_path, masks, mon
 def test_a_renamed_file_of_a_description_is_named(tmp_path, masks):
     write_volume(tmp_path / "airways.nii.gz", masks["lumen"])
     (tmp_path / "patient.toml").write_text('lumen = "airway.nii.gz"\nvessels = "v.nii"\nlung = "l.nii"\n')
-    with pytest.raises(FileError, match=r"airway\.nii\.gz, which is not there.*Did you mean 'airways\.nii\.gz'"):
+    with pytest.raises(
+        FileError, match=r"airway\.nii\.gz, which is not there.*Did you mean 'airways\.nii\.gz'"
+    ):
         load_patient(tmp_path)
 
 
@@ -237,7 +248,9 @@ def test_a_brain_is_refused_in_words(tmp_path, masks):
 
 def test_a_renamed_bronchial_tree_is_offered(med_rad_folder):
     (med_rad_folder / "bronchialTree.nii.gz").rename(med_rad_folder / "bronchial_tre.nii.gz")
-    with pytest.raises(AnatomyError, match=r"bronchial_tre\.nii\.gz looks like bronchialTree\.nii\.gz") as caught:
+    with pytest.raises(
+        AnatomyError, match=r"bronchial_tre\.nii\.gz looks like bronchialTree\.nii\.gz"
+    ) as caught:
         load_patient(med_rad_folder)
     assert "patient.toml" in caught.value.remedy and "docs/" not in str(caught.value)
 

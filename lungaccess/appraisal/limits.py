@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 SHOWN_LIMITS = 10
 """As many rows as a reader takes in at once; the others are in the list of findings."""
-LIMITS_TITLE = "Nearest to a limit (distances of a device's axis, which needs its radius and the margins)"
+LIMITS_TITLE = "Nearest to a limit; distances are of a device's axis, which needs radius, margins and sweep"
 
 FAR_MM = REACH_MM - 1.0
 """The check measures no farther than `REACH_MM`, less half a step: beyond this the number says nothing."""

@@ -34,6 +34,7 @@ def readme(plan: Plan, report: CheckReport, files: tuple[str, ...]) -> str:
         "",
         f"The independent check {verdict} this plan.",
         *(f"  {finding}" for finding in report.refusals),
+        "It says nothing of the chance of success, which `lungaccess risk` estimates.",
         "",
         "Research software, not a medical device. Not for the treatment of patients.",
         "",

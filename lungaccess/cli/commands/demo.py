@@ -47,8 +47,6 @@ def demo(
     require_writable_folder(out)
     with progress("making a synthetic patient") as shown:
         lung = demo_lung(seed, output.cache, shown.step)
-    if not output.json:
-        terminal.show(anatomy_tables(lung)[1:3])
     target, systems = stated_target(None, 1), SystemOptions().candidates()
     request = PlanRequest(
         systems=systems, target=target, search=search, errors=ErrorOptions().load(), out=out, output=output
@@ -58,6 +56,7 @@ def demo(
         with progress("making the page"):
             _write_page(lung, out)
         if not output.json:
+            terminal.show(anatomy_tables(lung)[1:3])
             terminal.console.print(what_to_look_at(out))
     return code
 
@@ -101,10 +100,10 @@ def _first_reachable_nodule(lung: Lung, request: PlanRequest) -> ExitCode:
 def what_to_look_at(out: Path) -> Panel:
     """Return a guide to the pictures of a plan."""
     lines = (
-        f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its",
-        "wall at the diamond, the black needle passes the vessels and ends in the green nodule.",
-        "R and L are the patient's right and left. In the two cuts, no full red or grey reaches the",
-        "dashed lines; in the graph, no curve enters the red area outside the blue one.",
+        f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its wall "
+        "at the diamond, the black needle passes the vessels and ends in the green nodule. R and L are the "
+        "patient's right and left. In the two cuts, no full red or grey reaches the dashed lines; in the "
+        "graph, no curve enters the red area outside the blue one.",
         f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
         f"{out / 'report.html'}: all of it in 3-D, playing along a slider; open it in a browser.",
     )

@@ -152,10 +152,9 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     clearances = _clearances(plan, lung, points, along <= start + plan.exemption.needle_length_mm)
     clearances["airway"][along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
     outer = plan.tube.outer_insertion_mm
-    needed = plan.required_clearance_mm
-    required = np.where(
-        along <= outer, needed["outer_tube"], np.where(along <= start, needed["inner_tube"], needed["needle"])
-    )
+    needed, sweep_mm = plan.required_clearance_mm, plan.tube.lateral_sweep_mm
+    of_tube = np.where(along <= outer, needed["outer_tube"], needed["inner_tube"]) + sweep_mm
+    required = np.where(along <= start, of_tube, needed["needle"])
     limited = [v for k, v in clearances.items() if k != "fissure" or plan.fissures_are_obstacles]
     margin = np.min(limited, axis=0) - required
     return {

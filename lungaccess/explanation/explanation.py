@@ -108,7 +108,13 @@ class Explanation:
         if not attempts:
             return f"No plan found with {name}: {self.failure.main_reason}; {self._way_on}"
         why = attempts.get(name, "").removeprefix("no plan: ")
-        return f"No plan found with any of {len(attempts)} systems; with {name}: {why}"
+        change = f"; {self._change} would reach it" if self._change else ""
+        return f"No plan found with any of {len(attempts)} systems; with {name}: {why}{change}"
+
+    @property
+    def _change(self) -> str:
+        """The smallest change of the device whose plan the check accepts."""
+        return next((str(each.change) for each in self.changes if each.accepted), "")
 
     @property
     def advice(self) -> str:
@@ -126,6 +132,8 @@ class Explanation:
             return f"{names[0]} would reach it"
         if self.verdict is not None and self.verdict.proved:
             return "this system is proved not to reach it"
+        if self._change and not self.untried:
+            return f"no other preset, but {self._change} would reach it"
         if self.untried:
             tried = f"of {len(self.attempts)} other presets tried none reaches it" if self.attempts else ""
             return f"{tried + ', ' if tried else ''}{', '.join(self.untried)} not tried"

@@ -72,8 +72,9 @@ class UnreachableProof:
     """
 
     def __init__(
-        self, lung: Lung, system: System, *, with_fissures: bool, between: Callable[[], None] = lambda: None
+        self, lung: Lung, system: System, *, with_fissures: bool, between: Callable[[], None] | None = None
     ) -> None:
+        pause = between or (lambda: None)
         self._lung = lung
         self._tubes = tube_constants(system.tubes, system.margins)
         self._limits = needle_environment(
@@ -82,17 +83,17 @@ class UnreachableProof:
         longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
         greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)
-        between()
+        pause()
         spacing_mm = lung.grid.spacing_mm
         hazards = VESSEL | OUTSIDE | (FISSURE if with_fissures else 0)
         self._hazard_bits = hazards
         leaving = _may_be_left(lung)
         masks = []
         for mask in ((lung.labels & LUMEN) != 0, leaving, (lung.labels & hazards) != 0):
-            between()
+            pause()
             masks.append(distance_corners(mask, spacing_mm))
         self._masks = tuple(masks)
-        between()
+        pause()
         # Corners are rounded down, and between them a bound lacks at most half a diagonal of a voxel.
         self._loss_mm = 0.5 * float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
         self._free = _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)

@@ -1,9 +1,20 @@
-"""Where prepared anatomies are kept."""
+"""Where prepared anatomies are kept, and how large that folder may grow."""
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
+
+from anatomy.errors import SettingsError
+
+LUNG_FILE = "lung.json"
+"""Describes a stored anatomy; its time of change is when the anatomy was last used."""
+BUILDING, REMOVED = ".building-", ".removed-"
+"""How the names of folders begin that are being filled, or emptied."""
+DEFAULT_LIMIT = "10GB"
+"""Room for some eight patients with their atlases, and what most disks can spare."""
+UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 
 def default_cache() -> Path:
@@ -13,3 +24,51 @@ def default_cache() -> Path:
         return Path(stated)
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "lungaccess"
+
+
+def cache_limit_bytes() -> int:
+    """Return how large the cache may grow: `$LUNGACCESS_CACHE_LIMIT`, such as 20GB, or `DEFAULT_LIMIT`.
+
+    Raises
+    ------
+    SettingsError
+        If the variable holds no size.
+    """
+    return parse_size(os.environ.get("LUNGACCESS_CACHE_LIMIT") or DEFAULT_LIMIT, "LUNGACCESS_CACHE_LIMIT")
+
+
+def parse_size(text: str, name: str) -> int:
+    """Return the bytes that a text such as ``2GB`` or ``500 MB`` stands for; `name` says where it stood.
+
+    Raises
+    ------
+    SettingsError
+        If it is no size.
+
+    Examples
+    --------
+    >>> parse_size("1.5GB", "--max-size")
+    1500000000
+    """
+    match = re.fullmatch(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*([A-Za-z]*)\s*", text)
+    if match is None or match[2].upper() not in UNITS:
+        raise SettingsError(
+            f"{name} is {text!r}",
+            expected="a number of bytes with the unit KB, MB, GB or TB",
+            remedy=f"Write for example {name}=2GB",
+        )
+    return int(float(match[1]) * UNITS[match[2].upper()])
+
+
+def size_in_words(size_bytes: int) -> str:
+    """Return a number of bytes for people.
+
+    Examples
+    --------
+    >>> size_in_words(1_234_567_890), size_in_words(500)
+    ('1.2 GB', '500 bytes')
+    """
+    for unit in ("TB", "GB", "MB", "KB"):
+        if size_bytes >= UNITS[unit]:
+            return f"{size_bytes / UNITS[unit]:.1f} {unit}"
+    return f"{size_bytes} bytes"

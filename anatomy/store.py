@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import shutil
-import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import fields as dataclass_fields
@@ -18,7 +17,8 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.build import FORMAT, build_lung, lung_key
-from anatomy.cache import default_cache
+from anatomy.cache import BUILDING, LUNG_FILE, cache_limit_bytes, default_cache
+from anatomy.cache_entries import make_room, note_use, remove_abandoned
 from anatomy.errors import FileError, LungaccessError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
@@ -27,9 +27,7 @@ from anatomy.patient import PatientImages
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.typed import Array, Float
 
-META = "lung.json"
-BUILDING = ".building-"
-ABANDONED_AFTER_S = 24 * 3600.0
+META = LUNG_FILE
 REPORT_RECORDS: dict[str, Any] = {
     "gaps_bridged": GapBridged,
     "spurs_pruned": SpurPruned,
@@ -69,10 +67,14 @@ def open_lung(
     folder = (cache or default_cache()) / key
     stored = _load(folder)
     if stored is not None:
+        note_use(folder / META)
         return stored
+    most_bytes = cache_limit_bytes()
     if progress:
         progress("reading images")
-    return _build_into(folder, key, read(), progress)
+    lung = _build_into(folder, key, read(), progress)
+    make_room(folder.parent, most_bytes, {"anatomy": FORMAT}, keep=(folder,))
+    return lung
 
 
 def _build_into(
@@ -85,8 +87,11 @@ def _build_into(
             np.save(work / f"{name}.npy", array)
             return _mapped(work, name)
 
-        _save_rest(build_lung(images, key=key, keep=keep, progress=progress), work)
+        built = build_lung(images, key=key, keep=keep, progress=progress)
+        _save_rest(built, work)
     lung = _load(folder)
+    if lung is None and not folder.exists():
+        return built  # Another process made room; what is mapped stays readable.
     if lung is None:
         raise FileError(f"The cached lung in {folder} cannot be read back", remedy="Delete that folder")
     return lung
@@ -113,20 +118,13 @@ def _new_folder(folder: Path) -> Iterator[Path]:
 def _make_folder(work: Path) -> None:
     try:
         work.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(work.parent)
+        remove_abandoned(work.parent)
         work.mkdir(mode=0o700)
     except OSError as error:
         raise FileError(
             f"The cache folder {work.parent} cannot be written: {error}",
             remedy="Choose another with --cache or LUNGACCESS_CACHE",
         ) from error
-
-
-def _remove_abandoned(cache: Path) -> None:
-    """Remove what builds left behind that were killed."""
-    for left in cache.glob(f"{BUILDING}*"):
-        if time.time() - left.stat().st_mtime > ABANDONED_AFTER_S:
-            shutil.rmtree(left, ignore_errors=True)
 
 
 def _publish(work: Path, folder: Path) -> None:

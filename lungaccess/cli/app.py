@@ -17,6 +17,7 @@ from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.commands.advise import advise
 from lungaccess.cli.commands.alternatives import alternatives
 from lungaccess.cli.commands.benchmark import benchmark
+from lungaccess.cli.commands.cache import cache
 from lungaccess.cli.commands.certify import certify
 from lungaccess.cli.commands.check import check
 from lungaccess.cli.commands.demo import demo
@@ -86,6 +87,7 @@ for _command in (
     app.command(_command, help_epilogue=epilogue(_command.__name__))
 app.command(study)
 app.command(benchmark)
+app.command(cache)
 
 
 # Cyclopts would end the process by itself.

@@ -33,6 +33,9 @@ EXAMPLES = MappingProxyType(
         "study export": "lungaccess study export results.db --csv tables",
         "study compare": "lungaccess study compare results.db results.db",
         "benchmark med-rad": "lungaccess benchmark med-rad PATIENT --seeds 1 --budget 0.2 --out runs.csv",
+        "cache": "lungaccess cache",
+        "cache prune": "lungaccess cache prune --older-than 30 --max-size 5GB",
+        "cache clear": "lungaccess cache clear --cache CACHE",
         "doctor": "lungaccess doctor",
         "completion": "lungaccess completion bash",
     }

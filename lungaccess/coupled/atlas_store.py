@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.cache import default_cache
+from anatomy.cache import cache_limit_bytes, default_cache
+from anatomy.cache_entries import make_room, note_use
 from anatomy.errors import FileError
 from anatomy.grid import read_only
 from anatomy.io.files import atomic_write
@@ -60,7 +61,9 @@ def open_atlas(
     path = (cache or default_cache()) / f"atlas-{_key(lung, system, resolution)}.npz"
     stored = _load(path, lung, system)
     if stored is not None:
+        note_use(path)
         return stored
+    most_bytes = cache_limit_bytes()
     atlas = build_atlas(
         lung,
         system,
@@ -70,6 +73,8 @@ def open_atlas(
         progress=progress,
     )
     _save(atlas, path)
+    keep = (path,) if lung.folder is None else (path, lung.folder)
+    make_room(path.parent, most_bytes, {"atlas": FORMAT}, keep=keep)
     return atlas
 
 
@@ -90,6 +95,7 @@ def _key(lung: Lung, system: System, resolution: dict[str, float]) -> str:
 def _save(atlas: Atlas, path: Path) -> None:
     arrays: dict[str, Any] = {}
     rest: dict[str, Any] = {"with_fissures": atlas.with_fissures, "build_s": atlas.build_s}
+    rest |= {"format": FORMAT, "name": atlas.lung.name}
     for name, part in (("sites", atlas.sites), ("deployments", atlas.deployments)):
         for field in fields(part):
             value = getattr(part, field.name)

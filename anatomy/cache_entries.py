@@ -1,0 +1,217 @@
+"""What a cache holds, and how it is kept from growing: what was used least recently goes first.
+
+Every entry is published and removed by one renaming, so a process that is killed, or that runs at the same
+time, never leaves or meets half an entry.  Files of others in the folder are not touched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from anatomy.cache import BUILDING, LUNG_FILE, REMOVED
+from anatomy.errors import FileError
+from anatomy.records import frozen_value
+
+ABANDONED_AFTER_S = 24 * 3600.0
+"""No anatomy takes so long to prepare: what is older and unfinished was left behind."""
+ATLAS_PATTERN = re.compile(r"atlas-[0-9a-f]{64}\.npz")
+KEY_PATTERN = re.compile(r"[0-9a-f]{24}")
+UNFINISHED_PATTERN = re.compile(
+    rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}-{ATLAS_PATTERN.pattern}"
+)
+SECONDS_PER_DAY = 24 * 3600.0
+
+
+@frozen_value
+class CacheEntry:
+    """Something in a cache.
+
+    Parameters
+    ----------
+    path : Path
+        A folder, or the file of an atlas.
+    kind : str
+        "anatomy", "atlas", or "unfinished" for what is being written or was left behind.
+    patient : str
+        Whose it is; empty if it does not say so.
+    size_bytes : int
+        On disk, pictures included.
+    pictures_bytes : int
+        Of that, what pictures and pages keep with an anatomy.
+    last_used : float
+        Seconds since 1970.
+    current : bool
+        False if no command reads it any more, because its format is an old one.
+    """
+
+    path: Path
+    kind: str
+    patient: str
+    size_bytes: int
+    pictures_bytes: int
+    last_used: float
+    current: bool
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether it was left behind by a process that was killed."""
+        return self.kind == "unfinished" and time.time() - self.last_used > ABANDONED_AFTER_S
+
+
+def cache_entries(cache: Path, formats: Mapping[str, int]) -> tuple[CacheEntry, ...]:
+    """Return what a cache holds, the least recently used first.
+
+    Parameters
+    ----------
+    formats : mapping of str to int
+        The present format by kind; entries of a kind that is not named count as current.
+    """
+    found = []
+    for path in list(cache.iterdir()) if cache.is_dir() else []:
+        with contextlib.suppress(OSError):  # Another process may have removed it meanwhile.
+            entry = _entry(path, formats)
+            if entry is not None:
+                found.append(entry)
+    return tuple(sorted(found, key=lambda entry: (entry.last_used, entry.path.name)))
+
+
+def _entry(path: Path, formats: Mapping[str, int]) -> CacheEntry | None:
+    """Return what a path in a cache is, None if it is nothing of ours."""
+    if UNFINISHED_PATTERN.fullmatch(path.name):
+        return _made(path, "unfinished", {}, path.stat().st_mtime, formats)
+    if KEY_PATTERN.fullmatch(path.name) and path.is_dir():
+        told = path / LUNG_FILE
+        stated: dict[str, Any] = {}
+        with contextlib.suppress(ValueError):
+            stated = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
+        used = told.stat().st_mtime if told.is_file() else path.stat().st_mtime
+        return _made(path, "anatomy", stated, used, formats)
+    if ATLAS_PATTERN.fullmatch(path.name):
+        return _made(path, "atlas", _atlas_header(path), path.stat().st_mtime, formats)
+    return None
+
+
+def _atlas_header(path: Path) -> dict[str, Any]:
+    with contextlib.suppress(ValueError, KeyError, EOFError, BadZipFile), np.load(path) as stored:
+        return dict(json.loads(str(stored["rest"])))
+    return {}
+
+
+def _made(path: Path, kind: str, stated: Any, last_used: float, formats: Mapping[str, int]) -> CacheEntry:
+    """Return an entry with its size; `stated` is what it says of itself."""
+    facts = stated if isinstance(stated, dict) else {}
+    sizes = {each.name: each.stat().st_size for each in ([path] if path.is_file() else path.iterdir())}
+    pictures = sum(size for name, size in sizes.items() if name.endswith(".json") and name != LUNG_FILE)
+    return CacheEntry(
+        path=path,
+        kind=kind,
+        patient=str(facts.get("name", "")),
+        size_bytes=sum(sizes.values()),
+        pictures_bytes=pictures,
+        last_used=last_used,
+        current=kind not in formats or facts.get("format") == formats[kind],
+    )
+
+
+def note_use(path: Path) -> None:
+    """Note that a file was used at this moment, if the cache can be written."""
+    with contextlib.suppress(OSError):
+        os.utime(path)
+
+
+def remove_entry(entry: CacheEntry) -> None:
+    """Remove an entry; one that another process has removed is no error.
+
+    Raises
+    ------
+    FileError
+        If it may not be removed.
+    """
+    try:
+        if entry.path.is_dir():
+            doomed = entry.path.with_name(f"{REMOVED}{uuid.uuid4().hex}")
+            os.replace(entry.path, doomed)
+            shutil.rmtree(doomed, ignore_errors=True)
+        else:
+            entry.path.unlink(missing_ok=True)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise FileError(
+            f"{entry.path} cannot be removed: {error.strerror or error}",
+            remedy="Change the permissions of the cache folder, or choose another one",
+        ) from error
+
+
+def overdue(
+    entries: tuple[CacheEntry, ...], *, most_bytes: int, older_than_days: float | None = None
+) -> Iterator[CacheEntry]:
+    """Yield what is to go: leftovers, old formats, what is too old, then the least recently used of the rest.
+
+    Parameters
+    ----------
+    entries : tuple of CacheEntry
+        The least recently used first.
+    most_bytes : int
+        What may stay.
+    older_than_days : float, optional
+        Time without use after which an entry goes.
+    """
+    now, stay = time.time(), []
+    for entry in entries:
+        aged = older_than_days is not None and now - entry.last_used > older_than_days * SECONDS_PER_DAY
+        if entry.kind == "unfinished":
+            if entry.abandoned:
+                yield entry
+        elif aged or not entry.current:
+            yield entry
+        else:
+            stay.append(entry)
+    size = sum(entry.size_bytes for entry in stay)
+    for entry in stay:
+        if size <= most_bytes:
+            return
+        size -= entry.size_bytes
+        yield entry
+
+
+def make_room(cache: Path, most_bytes: int, formats: Mapping[str, int], *, keep: tuple[Path, ...]) -> None:
+    """Remove what a cache may not hold any longer, after something was stored; what cannot go stays.
+
+    Parameters
+    ----------
+    most_bytes : int
+        How large the cache may be.
+    formats : mapping of str to int
+        See `cache_entries`.
+    keep : tuple of Path
+        What is in use and stays, even if it alone is larger.
+    """
+    entries = cache_entries(cache, formats)
+    if sum(entry.size_bytes for entry in entries) <= most_bytes:
+        return
+    kept_bytes = sum(entry.size_bytes for entry in entries if entry.path in keep)
+    others = tuple(entry for entry in entries if entry.path not in keep)
+    for entry in overdue(others, most_bytes=max(most_bytes - kept_bytes, 0)):
+        with contextlib.suppress(FileError):
+            remove_entry(entry)
+
+
+def remove_abandoned(cache: Path) -> None:
+    """Remove what was left behind by processes that were killed."""
+    for entry in cache_entries(cache, {}):
+        if entry.abandoned:
+            with contextlib.suppress(FileError):
+                remove_entry(entry)

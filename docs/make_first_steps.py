@@ -83,9 +83,8 @@ def store(picture: Path, name: str) -> None:
     """Write a picture small, with few colours."""
     image = Image.open(picture).convert("RGB")
     image.thumbnail((WIDTH_PX, 2 * WIDTH_PX))
-    image.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE).save(
-        IMAGES / f"first-steps-{name}.png", optimize=True
-    )
+    few = image.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE)
+    few.save(IMAGES / f"first-steps-{name}.png", optimize=True)
 
 
 def draw_ct(file: Path, out: Path) -> None:

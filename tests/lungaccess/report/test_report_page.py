@@ -22,6 +22,7 @@ from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.structures import VESSEL
+from lungaccess.appraisal import SHOWN_LIMITS
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.curves import arc_lengths
@@ -275,6 +276,31 @@ def test_tables_show_each_finding_once(plans: tuple[Plan, ...], small_lung: Lung
         )
     refused = la.check(replace(plans[0], lung_key="other"), small_lung)
     assert words.verdict(False) in tables.check_section(refused)
+
+
+def test_the_page_begins_with_headline_and_limits(
+    page: Path, plans: tuple[Plan, ...], small_lung: Lung
+) -> None:
+    """Each distance has one number: that of the check, at the top; the key numbers repeat none."""
+    header = page.read_text().split("</header>")[0]
+    said = la.appraise(plans[0], small_lung, draws=200)
+    assert words.headline(said.headline) in header
+    assert words.text(said.headline.text) in header
+    for each in said.limits[:SHOWN_LIMITS]:
+        row = f'<th scope="row">{words.text(each.what)}</th><td>{each.found_words}</td>'
+        assert row in header
+    key_numbers = tables.key_section(plans[0], small_lung)
+    for each in said.limits:
+        assert f">{words.text(each.what)}<" not in key_numbers
+    assert "cost map" not in tables.key_section(plans[0], replace(small_lung, cost=None))
+
+
+def test_every_plan_of_the_page_has_its_chance(data: dict[str, Any]) -> None:
+    for each in data["plans"]:
+        headline = each["headline"]
+        assert headline["geometry"] == "proved and checked"
+        assert 0.0 <= headline["success"]["probability"] <= 1.0
+        assert headline["draws"] == 200 and headline["errors"]["name"] == "default"
 
 
 # Surfaces and volumes ----------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from anatomy.facade import public_names
 from anatomy.io.own_masks import PatientFile
 from anatomy.settings import parse
 from lungaccess.cli.app import app
+from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.usage import with_nodule_number
 from lungaccess.one_stage import load_tubes
 from lungaccess.problem.system import load_system
@@ -122,3 +123,11 @@ def test_the_page_of_the_api_has_every_name_with_its_signature() -> None:
                 for each in actual
                 if each.default is not each.empty
             ]
+
+
+def test_the_page_of_the_command_line_has_every_command() -> None:
+    page = ROOT / "docs" / "reference" / "command_line.md"
+    first = next(block for block in blocks(page) if block.kind == "console")
+    listed = [" ".join(words) for words in first.commands]
+    names = {name.split()[0] for name in EXAMPLES}
+    assert not [name for name in sorted(names) if not any(f"lungaccess {name}" in each for each in listed)]

@@ -22,7 +22,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.app import main
 from tests.pages import PAGES, ROOT, RUN, Block, blocks, name_of
 
-MAY_SAY_NO = ("advise", "certify", "needle", "plan", "tubes")
+MAY_SAY_NO = ("advise", "benchmark", "certify", "needle", "plan", "tubes")
 """Commands that end with 1 where a device does not get there, which depends on the patient."""
 INSTEAD = {"--budget": "2", "--samples": "500", "--spacing": "15", "--iterations": "20", "--count": "3"}
 """How long the reader wants to wait, and how exact the answer has to be: less than on the pages."""

@@ -175,7 +175,9 @@ def override(values: T, changes: Mapping[str, object], where: str = "overrides")
         for parent in parents:
             step = inner.setdefault(parent, {})
             if not isinstance(step, dict):
-                raise SettingsError(f"{where}: {path} is not a setting", remedy=_REMEDY)
+                raise SettingsError(
+                    f"{where}: {path} is not a setting", remedy=_REMEDY, expected="a key of the file"
+                )
             inner = step
         inner[key] = value
     return parse(type(values), mapping, where)

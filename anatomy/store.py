@@ -93,7 +93,11 @@ def _build_into(
     if lung is None and not folder.exists():
         return built  # Another process made room; what is mapped stays readable.
     if lung is None:
-        raise FileError(f"The cached lung in {folder} cannot be read back", remedy="Delete that folder")
+        raise FileError(
+            f"The cached lung in {folder} cannot be read back",
+            remedy="Delete that folder",
+            expected="files as lungaccess wrote them",
+        )
     return lung
 
 
@@ -110,6 +114,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         raise FileError(
             f"The lung could not be stored in {folder}: {error}",
             remedy="Free some disk space (about 1.5 GB a patient) or choose another cache folder",
+            expected="a folder that may be written to, with room on the disk",
         ) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -124,6 +129,7 @@ def _make_folder(work: Path) -> None:
         raise FileError(
             f"The cache folder {work.parent} cannot be written: {error}",
             remedy="Choose another with --cache or LUNGACCESS_CACHE",
+            expected="a folder that may be written to",
         ) from error
 
 

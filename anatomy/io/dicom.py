@@ -88,7 +88,11 @@ def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]
     from pydicom.errors import InvalidDicomError
 
     if not folder.is_dir():
-        raise FileError(f"There is no folder {folder}", expected="a folder of DICOM files")
+        raise FileError(
+            f"There is no folder {folder}",
+            expected="a folder of DICOM files",
+            remedy="Check the name; the CT may also be one file (.nii.gz, .nrrd, .mha)",
+        )
     by_uid: dict[str, list[tuple[Path, FileDataset]]] = {}
     tags: list[Any] = [*_SERIES_KEYS, *_NEEDED_KEYS]
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR"):
@@ -99,7 +103,11 @@ def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]
         if "SeriesInstanceUID" in header and "Rows" in header:
             by_uid.setdefault(str(header.SeriesInstanceUID), []).append((path, header))
     if not by_uid:
-        raise FileError(f"{folder} holds no DICOM images", expected="a folder of DICOM files")
+        raise FileError(
+            f"{folder} holds no DICOM images",
+            expected="a folder of DICOM files",
+            remedy="Name the folder that holds the slices themselves, or a file (.nii.gz, .nrrd, .mha)",
+        )
     return by_uid
 
 
@@ -133,7 +141,11 @@ def _require_uniform(headers: Iterable[FileDataset], where: str) -> None:
     headers = list(headers)
     first = headers[0]
     if first.get("Modality") != "CT":
-        raise FileError(f"{where} is of modality {first.get('Modality')}", expected="CT in Hounsfield units")
+        raise FileError(
+            f"{where} is of modality {first.get('Modality')}",
+            expected="CT in Hounsfield units",
+            remedy="Choose the CT series",
+        )
     if int(first.get("NumberOfFrames") or 1) > 1:
         raise FileError(
             f"{where} keeps many slices in one file (enhanced DICOM)",
@@ -143,7 +155,11 @@ def _require_uniform(headers: Iterable[FileDataset], where: str) -> None:
     for header in headers:
         missing = [key for key in _NEEDED_KEYS if header.get(key) is None]
         if missing:
-            raise FileError(f"{where} has a slice without {', '.join(missing)}", expected="a CT series")
+            raise FileError(
+                f"{where} has a slice without {', '.join(missing)}",
+                expected="a CT series",
+                remedy="Export the CT series again, with all its tags",
+            )
         for key in _UNIFORM_KEYS:
             if header.get(key) != first.get(key):
                 raise FileError(
@@ -158,7 +174,11 @@ def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[
     first = headers[0][1]
     orientation = np.array([h.ImageOrientationPatient for _, h in headers], dtype=np.float64)
     if np.abs(orientation - orientation[0]).max() > 1e-4:
-        raise FrameError(f"{where} has slices of different orientation", expected="parallel slices")
+        raise FrameError(
+            f"{where} has slices of different orientation",
+            expected="parallel slices",
+            remedy="Choose one axial series, without scout images",
+        )
     along_i, along_j = orientation[0, :3], orientation[0, 3:]
     normal = np.cross(along_i, along_j)
     positions = np.array([h.ImagePositionPatient for _, h in headers], dtype=np.float64)
@@ -177,7 +197,11 @@ def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[
 def _slice_spacing(heights_mm: Float, where: str) -> float:
     """Return the distance of neighbouring slices; the sorted heights must be evenly spaced."""
     if len(heights_mm) < 2:
-        raise FileError(f"{where} has a single slice", expected="a volume of two or more slices")
+        raise FileError(
+            f"{where} has a single slice",
+            expected="a volume of two or more slices",
+            remedy="Choose another series, or copy all its files",
+        )
     gaps = np.diff(heights_mm)
     spacing_mm = float(np.median(gaps))
     if gaps.min() < _SPACING_TOLERANCE_MM:

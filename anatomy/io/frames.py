@@ -111,9 +111,17 @@ def _numbers(path: str | Path) -> Float:
     try:
         values = np.loadtxt(StringIO(text), dtype=np.float64, ndmin=2) if text.strip() else np.zeros((0, 3))
     except ValueError as error:
-        raise FileError(f"{path} does not hold a table of numbers: {error}") from error
+        raise FileError(
+            f"{path} does not hold a table of numbers: {error}",
+            expected="numbers apart by spaces, the same count in each line",
+            remedy="`lungaccess template pose` prints a pose that can be read",
+        ) from error
     if not np.isfinite(values).all():
-        raise FileError(f"{path} holds numbers that are not finite", expected="finite numbers in mm")
+        raise FileError(
+            f"{path} holds numbers that are not finite",
+            expected="finite numbers in mm",
+            remedy="Correct the numbers in the file",
+        )
     return values
 
 

@@ -37,14 +37,22 @@ def read_nrrd_header(path: Path) -> NrrdHeader:
         start = stream.read(_HEADER_LIMIT)
     end = re.search(rb"\r?\n\r?\n", start)
     if not start.startswith(b"NRRD") or end is None:
-        raise FileError(f"{path} does not begin with a NRRD header", expected="a complete .nrrd file")
+        raise FileError(
+            f"{path} does not begin with a NRRD header",
+            expected="a complete .nrrd file",
+            remedy="Copy or export the file again",
+        )
     lines = start[: end.start()].decode("utf-8", errors="replace").splitlines()[1:]
     pairs = [re.split(r":=|: ", line, maxsplit=1) for line in lines if not line.startswith("#")]
     keyed = [":=" in line for line in lines if not line.startswith("#")]
     fields = {p[0].lower(): p[1].strip() for p, key in zip(pairs, keyed, strict=True) if not key and p[1:]}
     keys = {p[0]: p[1] for p, key in zip(pairs, keyed, strict=True) if key}
     if "data file" in fields or "datafile" in fields:
-        raise FileError(f"{path} keeps its data in another file", expected="header and data in one file")
+        raise FileError(
+            f"{path} keeps its data in another file",
+            expected="header and data in one file",
+            remedy="Save it as .nrrd instead of .nhdr",
+        )
     return NrrdHeader(fields=fields, keys=keys, data_offset=end.end())
 
 
@@ -91,7 +99,11 @@ def metaimage_payload(path: Path) -> tuple[Path, int] | None:
         start = stream.read(_HEADER_LIMIT)
     end = re.search(rb"^ElementDataFile\s*=\s*(.*?)\s*?\r?\n", start, re.MULTILINE)
     if end is None:
-        raise FileError(f"{path} does not begin with a MetaImage header", expected="a .mha or .mhd file")
+        raise FileError(
+            f"{path} does not begin with a MetaImage header",
+            expected="a .mha or .mhd file",
+            remedy="Copy or export the file again",
+        )
     if not re.search(rb"^CompressedData\s*=\s*True", start[: end.start()], re.MULTILINE | re.IGNORECASE):
         return None
     data_file = end[1].decode("utf-8", errors="replace")

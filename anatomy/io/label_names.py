@@ -65,11 +65,19 @@ def _sidecar_names(path: Path) -> dict[int, str]:
     try:
         content: Any = json.loads(read_text(path))
     except json.JSONDecodeError as error:
-        raise FileError(f"{path} is not JSON: {error}", expected="label names and values") from error
+        raise FileError(
+            f"{path} is not JSON: {error}",
+            expected="label names and values",
+            remedy="Correct the file, or take it away if it belongs to nothing here",
+        ) from error
     if isinstance(content, Mapping) and isinstance(content.get("labels"), Mapping):
         content = content["labels"]
     if not isinstance(content, Mapping):
-        raise FileError(f"{path} is not a JSON object", expected='{"lung_airways": 1, ...}')
+        raise FileError(
+            f"{path} is not a JSON object",
+            expected='{"lung_airways": 1, ...}',
+            remedy="Correct the file, or take it away if it belongs to nothing here",
+        )
     names: dict[int, str] = {}
     for key, value in content.items():
         if isinstance(value, int) and not isinstance(value, bool):

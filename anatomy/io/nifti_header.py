@@ -106,7 +106,11 @@ def parse_header(start: bytes, path: Path, frame: Frame | None = None) -> NiftiH
     shape = _shape(fields["dim"], path)
     code = fields["datatype"][0]
     if code not in _DTYPES:
-        raise FileError(f"{path} holds voxels of the NIfTI type {code}", expected="whole or floating numbers")
+        raise FileError(
+            f"{path} holds voxels of the NIfTI type {code}",
+            expected="whole or floating numbers",
+            remedy="Save the image with another type of voxels",
+        )
     slope, intercept = fields["slope"]
     if slope == 0 or not np.isfinite([slope, intercept]).all():
         slope, intercept = 1.0, 0.0

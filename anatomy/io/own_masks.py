@@ -130,7 +130,9 @@ def _read_description(path: Path) -> PatientFile:
         content = tomllib.loads(read_text(path))
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(
-            f"{path} is not TOML: {error}", expected='lines such as lumen = "airway.nii.gz"'
+            f"{path} is not TOML: {error}",
+            expected='lines such as lumen = "airway.nii.gz"',
+            remedy="`lungaccess template patient` prints a complete file to start from",
         ) from error
     try:
         return parse(PatientFile, content, path.name)

@@ -122,6 +122,7 @@ def _given_seed(ct: CoarseCt, seed_lps: Float) -> Int:
         raise AnatomyError(
             f"The seed {np.round(seed_lps, 1).tolist()} (LPS mm) lies {found}",
             expected=f"a point in the air of the trachea, below {GROWTH_HU[-1]:.0f} HU",
+            remedy="Name a point in the middle of the trachea with --seed lps:x,y,z",
         )
     return np.array(block, dtype=np.int64)
 

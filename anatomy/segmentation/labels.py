@@ -37,7 +37,11 @@ def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
     """
     values = {float(v) for v in np.unique(volume.array)} - {0.0}
     if not values:
-        raise AnatomyError(f"{name} holds no lung", expected="voxels that are not zero")
+        raise AnatomyError(
+            f"{name} holds no lung",
+            expected="voxels that are not zero",
+            remedy="Give another mask with --lungs, or leave the option out",
+        )
     if values == {RIGHT, LEFT}:
         return volume.array == LEFT, volume.array == RIGHT
     if values <= {1, 2, 3, 4, 5} and len(values) > 2:

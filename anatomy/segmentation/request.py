@@ -74,7 +74,11 @@ class Given:
 
 def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
     if not folder.is_dir():
-        raise FileError(f"There is no folder {folder}", expected="a folder with output of TotalSegmentator")
+        raise FileError(
+            f"There is no folder {folder}",
+            expected="a folder with output of TotalSegmentator",
+            remedy="Check the name and the folder",
+        )
     sources, _ = mask_sources(folder)
     roles = {"lung" if source.role == "lobes" else source.role for source in sources}
     # The task total knows the trachea alone; only the task lung_vessels shows the airways.

@@ -14,6 +14,10 @@ LARGEST_SEED = 2**32 - 1
 """Compiled kernels take seeds of 32 bits."""
 MOST = 10**9
 """More of anything that is counted would run for years."""
+MOST_PROCESSES = 1024
+"""More than the cores of any machine that these commands run on."""
+MOST_SAMPLES = 10_000_000
+"""Their random numbers fit into memory, and shares are then known to 0.03 %."""
 FARTHEST_MM = 1e4
 """No length in a patient comes near ten metres; larger numbers are slips."""
 
@@ -59,6 +63,10 @@ Whole = Annotated[int, Parameter(converter=whole)]
 Seed = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=LARGEST_SEED))]
 Count = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST))]
 CountOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=MOST))]
+Processes = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST_PROCESSES))]
+Samples = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST_SAMPLES))]
+SamplesOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=MOST_SAMPLES))]
+Spacing = Annotated[float, Parameter(validator=Within(at_least=0.5, at_most=50.0))]
 Seconds = Annotated[float, Parameter(validator=Within(above=0.0))]
 Positive = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FARTHEST_MM))]
 NotNegative = Annotated[float, Parameter(validator=Within(at_least=0.0, at_most=FARTHEST_MM))]

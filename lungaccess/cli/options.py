@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_value
-from lungaccess.cli.numbers import Count, Seconds, Seed, Whole
+from lungaccess.cli.numbers import Count, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from stages.needle import TERMS, Objective
 
@@ -201,9 +201,17 @@ class BudgetOptions:
 
     def __post_init__(self) -> None:
         if self.budget is not None and not 0.0 < self.budget < float("inf"):
-            raise SettingsError(f"--budget is {self.budget:g} s", expected="a finite time above 0")
+            raise SettingsError(
+                f"--budget is {self.budget:g} s",
+                expected="a finite time above 0",
+                remedy="State seconds, such as --budget 10",
+            )
         if self.iterations is not None and self.iterations < 1:
-            raise SettingsError(f"--iterations is {self.iterations}", expected="at least 1")
+            raise SettingsError(
+                f"--iterations is {self.iterations}",
+                expected="at least 1",
+                remedy="State a count, such as --iterations 200",
+            )
 
     @property
     def time_s(self) -> float | None:
@@ -230,7 +238,9 @@ class SearchOptions(BudgetOptions):
             "as printed, with collisions of surface meshes, slow."
         ),
     ] = "atlas"
-    processes: Annotated[Count, Parameter(help="How many processes refine the plan at the same time.")] = 1
+    processes: Annotated[
+        Processes, Parameter(help="How many processes refine the plan at the same time.")
+    ] = 1
 
 
 def require_map(lung: Lung, objective: Objective) -> None:

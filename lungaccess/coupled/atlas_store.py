@@ -112,6 +112,7 @@ def _save(atlas: Atlas, path: Path) -> None:
         raise FileError(
             f"The atlas cannot be stored in {path.parent}: {error}",
             remedy="Choose another folder with --cache or LUNGACCESS_CACHE",
+            expected="a folder that may be written to, with room on the disk",
         ) from error
 
 

@@ -87,7 +87,9 @@ def alternatives(
     weighed = Objective.of(objective)
     if count < 1 or not separation_mm > 0.0:
         raise SettingsError(
-            f"{count} plans with a separation of {separation_mm:g} mm are asked for", expected="both above 0"
+            f"{count} plans with a separation of {separation_mm:g} mm are asked for",
+            expected="both above 0",
+            remedy="State both, such as --count 15 --separation 5",
         )
     task = Task(lung=lung, system=system, target=target, objective=weighed, method="alternatives")
     if atlas is not None:

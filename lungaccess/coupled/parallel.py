@@ -73,7 +73,11 @@ def _received(end: Connection) -> Step | None:
     try:
         step: Step | None = end.recv()
     except EOFError as reason:
-        raise AnatomyError("A process of the search has ended before its time") from reason
+        raise AnatomyError(
+            "A process of the search has ended before its time",
+            expected="processes that run until the search ends",
+            remedy="Give it more memory, or fewer processes with --processes",
+        ) from reason
     return step
 
 

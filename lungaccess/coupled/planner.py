@@ -117,7 +117,11 @@ def plan(
     """
     weighed = Objective.of(objective)
     if method not in METHODS:
-        raise SettingsError(f"There is no method {method!r}", expected=f"one of {', '.join(METHODS)}")
+        raise SettingsError(
+            f"There is no method {method!r}",
+            expected=f"one of {', '.join(METHODS)}",
+            remedy="Choose one of them",
+        )
     tell = on_progress or (lambda _event: None)
     task = Task(lung=lung, system=system, target=target, objective=weighed, method=method, seed=seed)
     if atlas is not None:
@@ -154,7 +158,9 @@ def _parallel(search: PlanSearch, method: str, processes: int) -> Iterator[Step]
 
     if not isinstance(search, ParallelSearch):
         raise SettingsError(
-            f"{processes} processes are asked for with {method}", expected="one process, or method atlas"
+            f"{processes} processes are asked for with {method}",
+            expected="one process, or method atlas",
+            remedy="Leave out --processes, or choose --method atlas",
         )
     return parallel_steps(search, processes)
 

@@ -109,7 +109,11 @@ def open_source(
         return RouteSource(name=path.stem, kind="centreline", centreline=from_graph(*graph))
     if suffix in PICTURE_SUFFIXES:
         if pixel_mm is None:
-            raise SettingsError(f"The size of a pixel of {path} is not known", remedy="Give --pixel in mm")
+            raise SettingsError(
+                f"The size of a pixel of {path} is not known",
+                remedy="Give --pixel in mm",
+                expected="its size in mm",
+            )
         drawing = from_image(read_drawing(path), pixel_mm=pixel_mm)
         return RouteSource(name=path.stem, kind="drawing", centreline=drawing)
     from anatomy.io import read_mask
@@ -154,7 +158,9 @@ def read_drawing(path: Path) -> Any:
         picture = np.asarray(imread(path, as_gray=True), dtype=np.float64)
     except (OSError, ValueError) as error:
         raise FileError(
-            f"{path} cannot be read as a picture: {error}", expected="PNG, TIFF or JPEG"
+            f"{path} cannot be read as a picture: {error}",
+            expected="PNG, TIFF or JPEG",
+            remedy="Convert the picture, or export it again",
         ) from error
     dark = picture < 0.5 * (picture.min() + picture.max())
     return ~dark if dark.mean() > 0.5 else dark

@@ -176,6 +176,7 @@ def plan_tour(
         raise TargetError(
             "No lesion can be reached: " + "; ".join(f"{n}: {why}" for n, why in left_out.items()),
             remedy="Name other lesions, or plan a tour of the scope alone with --no-require-plan",
+            expected="at least one lesion in reach",
         )
     cost = [[tissue_weight * each.distance_mm for each in of_one] for of_one in exits]
     subtree = subtree_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)

@@ -158,7 +158,11 @@ def deploy_tubes(
     """
     tubes = _tubes(device)
     if inner_mm == 0.0:
-        raise SettingsError("The inner tube stays in the scope", expected="an insertion above 0")
+        raise SettingsError(
+            "The inner tube stays in the scope",
+            expected="an insertion above 0",
+            remedy="Insert it, for instance --outer 10 --inner 40",
+        )
     angles = np.array([rotation_rad, rotation_rad + relative_rad]) + BEND_RAD
     sequence = kuntz2015(tubes, angles, outer_mm, inner_mm)
     mechanics = TubeMechanics(tubes)

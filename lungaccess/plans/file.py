@@ -52,9 +52,17 @@ def from_json(cls: type[P], text: str) -> P:
     try:
         content = json.loads(text, object_pairs_hook=_unique, parse_constant=_not_finite)
     except (json.JSONDecodeError, RecursionError) as error:
-        raise PlanFileError(f"The plan is not JSON ({error})", remedy=_REMEDY) from error
+        raise PlanFileError(
+            f"The plan is not JSON ({error})",
+            remedy=_REMEDY,
+            expected="a plan.json as `lungaccess plan` writes it",
+        ) from error
     if not isinstance(content, dict):
-        raise PlanFileError("The plan is not a JSON object", remedy=_REMEDY)
+        raise PlanFileError(
+            "The plan is not a JSON object",
+            remedy=_REMEDY,
+            expected="a plan.json as `lungaccess plan` writes it",
+        )
     if content.get("schema") != SCHEMA:
         raise PlanFileError(
             f"The plan has the schema {content.get('schema')!r}", expected=SCHEMA, remedy=_REMEDY
@@ -85,17 +93,23 @@ def load(cls: type[P], path: str | os.PathLike[str]) -> P:
         text = Path(path).read_bytes().decode("utf-8")
     except OSError as error:
         raise PlanFileError(
-            f"The plan {os.fspath(path)} cannot be read ({error.strerror})", expected="a plan.json file"
+            f"The plan {os.fspath(path)} cannot be read ({error.strerror})",
+            expected="a plan.json file",
+            remedy="Check the name; `lungaccess plan` writes plan.json into its folder",
         ) from error
     except UnicodeDecodeError as error:
-        raise PlanFileError(f"The plan {os.fspath(path)} is not text", remedy=_REMEDY) from error
+        raise PlanFileError(
+            f"The plan {os.fspath(path)} is not text",
+            remedy=_REMEDY,
+            expected="a plan.json as `lungaccess plan` writes it",
+        ) from error
     return from_json(cls, text)
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) != len(pairs):
-        raise PlanFileError("The plan states a value twice", remedy=_REMEDY)
+        raise PlanFileError("The plan states a value twice", remedy=_REMEDY, expected="each value once")
     return content
 
 
@@ -120,7 +134,7 @@ def _encode(value: Any, where: str) -> Any:
     if isinstance(value, tuple | list):
         return [_encode(inner, f"{where}[{n}]") for n, inner in enumerate(value)]
     if isinstance(value, float | np.floating) and not math.isfinite(value):
-        raise PlanFileError(f"{where} is {value}", expected="a finite number")
+        raise PlanFileError(f"{where} is {value}", expected="a finite number", remedy=_REMEDY)
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -161,7 +175,11 @@ def _record(cls: type, value: Any, where: str) -> Any:
     lacks, unknown = names - optional - content.keys(), content.keys() - names
     for problem, keys in (("lacks", lacks), ("has the unknown key", unknown)):
         if keys:
-            raise PlanFileError(f"{where} {problem} {', '.join(sorted(keys))}", remedy=_REMEDY)
+            raise PlanFileError(
+                f"{where} {problem} {', '.join(sorted(keys))}",
+                remedy=_REMEDY,
+                expected="the keys that `lungaccess plan` writes",
+            )
     present = names & content.keys()
     return cls(**{name: _decode(hints[name], content[name], f"{where}.{name}") for name in present})
 
@@ -170,7 +188,9 @@ def _system(value: Any, where: str) -> System:
     try:
         return parse(System, _is(dict, value, where), where)
     except SettingsError as error:
-        raise PlanFileError(f"The plan's system is not valid: {error}", remedy=_REMEDY) from error
+        raise PlanFileError(
+            f"The plan's system is not valid: {error}", remedy=_REMEDY, expected="a system that can be built"
+        ) from error
 
 
 def _numbers(value: Any, where: str) -> Any:
@@ -183,5 +203,7 @@ def _numbers(value: Any, where: str) -> Any:
 def _is(wanted: type, value: Any, where: str) -> Any:
     fits = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
     if not fits or isinstance(value, float) and not math.isfinite(value):
-        raise PlanFileError(f"{where} is {value!r:.60}", expected=f"a value of type {wanted.__name__}")
+        raise PlanFileError(
+            f"{where} is {value!r:.60}", expected=f"a value of type {wanted.__name__}", remedy=_REMEDY
+        )
     return value

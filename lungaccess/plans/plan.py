@@ -10,6 +10,8 @@ from typing import Self
 
 import numpy as np
 
+from anatomy.errors import PlanFileError
+from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from anatomy.words import plural
@@ -132,6 +134,15 @@ class Plan(Record):
     def least_required_clearance_mm(self, device: str) -> float:
         """Return the clearance that all of "tube" or "needle" keeps: of the tubes, that of the inner one."""
         return self.required_clearance_mm[{"tube": "inner_tube"}.get(device, device)]
+
+    def require_lung(self, lung: Lung) -> None:
+        """Raise PlanFileError unless the plan was made for a lung: the same masks, bit for bit."""
+        if self.lung_key != lung.key:
+            raise PlanFileError(
+                f"The plan was made for {self.patient_name}, whose masks differ from those of {lung.name}",
+                expected=f"masks with the key {self.lung_key[:16]}, not {lung.key[:16]}",
+                remedy="Name the folder of the patient that was planned on, or plan again on this one",
+            )
 
     def curves(self, step_mm: float = STEP_MM) -> DeviceCurves:
         """Return the three devices as curves; the poses of tubes and needle are at most `step_mm` apart."""

@@ -150,7 +150,11 @@ def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target
     """
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise TargetError(f"The target {point.tolist()} is not a point", expected="three finite mm")
+        raise TargetError(
+            f"The target {point.tolist()} is not a point",
+            expected="three finite mm",
+            remedy="State a point such as lps:-57,131,-520",
+        )
     require_free(lung, point, origin)
     return Target(lps_mm=read_only(point), origin=origin)
 
@@ -184,7 +188,9 @@ def _nodule_voxels(nodules: Volume, number: int) -> Int:
     count = len(sizes)
     if not 1 <= number <= count:
         raise TargetError(
-            f"There is no nodule {number}", expected=f"a number from 1 to {count}, 1 being the largest"
+            f"There is no nodule {number}",
+            expected=f"a number from 1 to {count}, 1 being the largest",
+            remedy="Choose one of these numbers, or name a point with --target",
         )
     return np.asarray(voxels[part == np.argsort(-sizes, kind="stable")[number - 1]])
 

@@ -176,7 +176,11 @@ def reach_grid(lung: Lung, spacing_mm: float) -> Grid:
         If the spacing is not between 0.5 and 50 mm.
     """
     if not 0.5 <= spacing_mm <= 50.0:
-        raise SettingsError(f"The spacing of the map is {spacing_mm} mm", expected="0.5 to 50 mm")
+        raise SettingsError(
+            f"The spacing of the map is {spacing_mm} mm",
+            expected="0.5 to 50 mm",
+            remedy="Choose such a spacing, for instance --spacing 3",
+        )
     axes = lung.grid.lps_from_ijk[:3, :3] / lung.grid.spacing_mm
     size = np.ceil(np.array(lung.grid.shape) * lung.grid.spacing_mm / spacing_mm - 1e-9).astype(int)
     matrix = np.eye(4)

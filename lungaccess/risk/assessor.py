@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from anatomy.errors import PlanFileError, SettingsError
+from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.morphology import components
 from anatomy.records import frozen_record
@@ -64,15 +64,12 @@ class RiskAssessor:
     """
 
     def __init__(self, plan: Plan, lung: Lung, *, radius_mm: float | None = None) -> None:
-        if plan.lung_key != lung.key:
-            raise PlanFileError(
-                f"The plan was made for {plan.patient_name}, not for {lung.name}",
-                expected=f"a plan for the lung {lung.key}, this one is for {plan.lung_key}",
-                remedy="Give the folder of the patient, with the masks that the plan was made for",
-            )
+        plan.require_lung(lung)
         if radius_mm is not None and not 0.0 < radius_mm < math.inf:
             raise SettingsError(
-                f"The radius of the goal is {radius_mm} mm", expected="a finite length above 0"
+                f"The radius of the goal is {radius_mm} mm",
+                expected="a finite length above 0",
+                remedy="Choose a radius in mm, such as 5",
             )
         if not plan.needle.arcs:
             raise SettingsError("The needle of the plan has no arc", expected="at least one arc")

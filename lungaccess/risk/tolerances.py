@@ -93,7 +93,11 @@ def find_tolerances(
         See `RiskAssessor`; also if the probability is not between 0 and 1.
     """
     if not 0.0 < probability < 1.0:
-        raise SettingsError(f"The probability is {probability}", expected="above 0 and below 1")
+        raise SettingsError(
+            f"The probability is {probability}",
+            expected="above 0 and below 1",
+            remedy="Choose a share such as 0.95",
+        )
     if samples < 1:
         raise SettingsError(f"The number of samples is {samples}", expected="at least 1")
     stated = model or ErrorModel()

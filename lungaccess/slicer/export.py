@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from anatomy.errors import PlanFileError
 from anatomy.io.centerlines import write_centerlines
 from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
@@ -84,12 +83,7 @@ def export_slicer(
     FileError
         If the folder cannot be written.
     """
-    if plan.lung_key != lung.key:
-        raise PlanFileError(
-            f"The plan was made for {plan.patient_name}, whose content differs from {lung.name}",
-            expected=f"content {plan.lung_key[:16]}, not {lung.key[:16]}",
-            remedy="Name the patient folder that was planned on",
-        )
+    plan.require_lung(lung)
     target = require_writable_folder(folder)
     tell = progress or (lambda _step, _share: None)
     tell("checking the plan", 0.0)

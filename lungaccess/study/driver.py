@@ -147,7 +147,9 @@ def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tu
         run = under_way.pop(future.key)
         if future.status in ("cancelled", "lost"):
             raise StudyError(
-                "The dask scheduler was lost", remedy="Start the study again, it goes on from what is stored"
+                "The dask scheduler was lost",
+                remedy="Start the study again, it goes on from what is stored",
+                expected="a scheduler that runs until the study ends",
             )
         yield run, result if future.status == "finished" else _failed(run, result)
         future.release()

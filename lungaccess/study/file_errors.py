@@ -30,6 +30,7 @@ def file_errors(path: Path) -> Iterator[None]:
             raise FileError(
                 f"{path} has been locked by another program for {BUSY_S:g} s",
                 remedy="Close that program and start the study again, it goes on from there",
+                expected="a file that no other program holds",
             ) from error
         if code in (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT):
             raise damaged(path, str(error)) from error

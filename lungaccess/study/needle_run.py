@@ -28,7 +28,11 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
     """
     problem = run.problem
     if not 1 <= problem.start <= len(lung.starts):
-        raise SettingsError(f"There is no start pose {problem.start}", expected=f"1 to {len(lung.starts)}")
+        raise SettingsError(
+            f"There is no start pose {problem.start}",
+            expected=f"1 to {len(lung.starts)}",
+            remedy="Correct `starts` in the study's file",
+        )
     pose = lung.starts[problem.start - 1]
     target = point_target(lung, np.array(problem.target_lps), origin=problem.origin)
     found = plan_needle(

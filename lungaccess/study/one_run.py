@@ -185,7 +185,9 @@ def _in_own_process(run: Run, cache: Path | None) -> Answer:
     done = subprocess.run(words, input=run.to_json(), capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise StudyError(
-            f"The process of a run ended with code {done.returncode}: {done.stderr.strip()[-500:]}"
+            f"The process of a run ended with code {done.returncode}: {done.stderr.strip()[-500:]}",
+            expected="a process that ends with 0",
+            remedy="Start the study again; it goes on from what is stored",
         )
     return Answer.from_mapping(json.loads(done.stdout))
 

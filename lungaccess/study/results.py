@@ -40,8 +40,12 @@ class ResultsFile:
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
         self.path = Path(path)
-        if not create and not self.path.is_file():
-            raise FileError(f"There is no file {path}", expected="a results file of `lungaccess study run`")
+        if not create and not (self.path.is_file() and self.path.stat().st_size):
+            raise FileError(
+                f"There is no file {path}, or it is empty",
+                expected="a results file of `lungaccess study run`",
+                remedy="Check the name, or run the study: lungaccess study run study.toml --out results.db",
+            )
         with file_errors(self.path):
             self._connection = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
             try:

@@ -199,7 +199,9 @@ def _stated(lung: Lung, words: str) -> tuple[Point, str]:
         return _point(parse_point(words)), f"point {words}"
     if len(rest) > 1 or not all(each.isdigit() for each in rest):
         raise LungaccessError(
-            f"{words!r} is not a target", expected="nodule, or nodule N with a whole number"
+            f"{words!r} is not a target",
+            expected="nodule, or nodule N with a whole number",
+            remedy="Correct `targets` in the study's file",
         )
     target = nodule_target(lung, int(rest[0]) if rest else 1)
     return _point(target.lps_mm), target.origin

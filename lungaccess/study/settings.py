@@ -208,9 +208,13 @@ def read_study(path: str | os.PathLike[str]) -> Study:
     try:
         content = tomllib.loads(read_text(path))
     except tomllib.TOMLDecodeError as error:
-        raise SettingsError(f"{path} is not valid TOML ({error})", remedy=_REMEDY) from error
+        raise SettingsError(
+            f"{path} is not valid TOML ({error})", remedy=_REMEDY, expected="UTF-8 text in TOML syntax"
+        ) from error
     if "folder" in content:
-        raise SettingsError(f"{path}: folder is not a setting", remedy=_REMEDY)
+        raise SettingsError(
+            f"{path}: folder is not a setting", remedy=_REMEDY, expected="the keys of a study"
+        )
     return study_of(content, path.name, str(path.parent))
 
 
@@ -235,5 +239,5 @@ def study_of(content: Mapping[str, Any], where: str = "study", folder: str = "."
 def _listed(cls: type[T], tables: object, where: str) -> tuple[T, ...]:
     """Read each table of an array of tables by itself, so that an error names the number of the table."""
     if not isinstance(tables, list) or not all(isinstance(each, Mapping) for each in tables):
-        raise SettingsError(f"{where} is not an array of tables", expected="[[...]]")
+        raise SettingsError(f"{where} is not an array of tables", expected="[[...]]", remedy=_REMEDY)
     return tuple(parse(cls, each, f"{where} {number}") for number, each in enumerate(tables, start=1))

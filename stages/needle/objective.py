@@ -114,6 +114,7 @@ class Objective:
             raise SettingsError(
                 f"The weights of an objective are {weights.tolist()}",
                 expected="weights of 0 or more, one of them more than 0",
+                remedy="State weights such as length=1,cost-map=0.5",
             )
 
     @classmethod
@@ -138,7 +139,11 @@ class Objective:
             name, equals, weight = (word.strip() for word in part.partition("="))
             term = _term(name)
             if term.weight in weights:
-                raise SettingsError(f"The objective {stated!r} names {name} twice", expected="each cost once")
+                raise SettingsError(
+                    f"The objective {stated!r} names {name} twice",
+                    expected="each cost once",
+                    remedy="Leave one of them out",
+                )
             weights[term.weight] = _number(weight, stated) if equals else 1.0
         return cls(**weights)
 
@@ -217,6 +222,7 @@ class Objective:
             raise SettingsError(
                 "The objective weighs a cost map, but the patient has none",
                 expected="a patient with a cost map, or another objective",
+                remedy="Choose inverse-clearance or length",
             )
         else:
             cost_map = read_only(np.asfortranarray(cost_map, dtype=np.float32))
@@ -225,6 +231,7 @@ class Objective:
                 raise SettingsError(
                     f"The least cost of the cost map is {least_of_map:g}",
                     expected="costs of 0 or more, some of them finite, and no NaN",
+                    remedy="Correct the cost map of the patient",
                 )
         least_rate = self.inverse_clearance / MAX_CLEARANCE_MM + self.cost_map * least_of_map + self.length
         return ObjectiveArrays(
@@ -245,7 +252,7 @@ def _term(name: str) -> Term:
     raise SettingsError(
         f"There is no objective {name!r}",
         expected=f"one of {', '.join(options)}, or a weighted sum such as length=1,cost-map=0.5",
-        remedy=did_you_mean(name, options),
+        remedy=did_you_mean(name, options) or "Choose one of them",
     )
 
 
@@ -254,7 +261,9 @@ def _number(weight: str, stated: str) -> float:
         return float(weight)
     except ValueError:
         raise SettingsError(
-            f"{weight!r} in the objective {stated!r} is not a number", expected="a weight of 0 or more"
+            f"{weight!r} in the objective {stated!r} is not a number",
+            expected="a weight of 0 or more",
+            remedy="State weights such as length=1,cost-map=0.5",
         ) from None
 
 

@@ -67,7 +67,11 @@ def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0)
         If there is none, or they do not nest.
     """
     if not tubes:
-        raise SettingsError("There is no tube", expected="one tube or more, the innermost first")
+        raise SettingsError(
+            "There is no tube",
+            expected="one tube or more, the innermost first",
+            remedy="Give the tubes, the innermost first",
+        )
     for m in range(len(tubes) - 1):
         inner, outer = tubes[m], tubes[m + 1]
         clearance = outer.inner_diameter_mm - inner.outer_diameter_mm
@@ -76,9 +80,11 @@ def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0)
                 f"Tube {m + 1} has an outer diameter of {inner.outer_diameter_mm:g} mm",
                 expected=f"less than the inner diameter of tube {m + 2}, {outer.inner_diameter_mm:g} mm, by "
                 f"{least_clearance_mm:g} mm or more",
+                remedy="Make the inner tube thinner, or list the tubes from the inside",
             )
         if inner.length_mm < outer.length_mm:
             raise SettingsError(
                 f"Tube {m + 1} is {inner.length_mm:g} mm long",
                 expected=f"at least the length of tube {m + 2}, {outer.length_mm:g} mm",
+                remedy="Make the inner tube longer, or list the tubes from the inside",
             )

@@ -263,6 +263,7 @@ def _insertions(tubes: collections.abc.Sequence[Tube], insertions_mm: ArrayLike)
         raise SettingsError(
             f"The insertions are {insertions.tolist()} mm",
             expected=f"one finite length for each of the {len(tubes)} tubes",
+            remedy="Give one insertion for each tube",
         )
     if (insertions < 0.0).any() or (np.diff(insertions) > ROUNDING_MM).any():
         raise SettingsError(
@@ -318,6 +319,7 @@ def _require_order(sequence: Sequence, tubes: collections.abc.Sequence[Tube]) ->
         raise SettingsError(
             f"The insertions of sequence {sequence.name!r} reach {tips.max(axis=0).tolist()} mm",
             expected=f"at most the lengths of the tubes, {lengths.tolist()} mm",
+            remedy="Insert less, or take longer tubes",
         )
     if (tips < -ROUNDING_MM).any() or (np.diff(tips, axis=1) > ROUNDING_MM).any():
         raise SettingsError(

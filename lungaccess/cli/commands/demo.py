@@ -94,7 +94,11 @@ def _first_reachable_nodule(lung: Lung, request: PlanRequest) -> ExitCode:
         except NoPlan as error:
             terminal.progress_console.print(f"Nodule {number} cannot be reached; trying the next one.")
             failure = error
-    raise failure or AnatomyError("The synthetic patient has no nodule", remedy="Choose another --seed")
+    raise failure or AnatomyError(
+        "The synthetic patient has no nodule",
+        remedy="Choose another --seed",
+        expected="a patient with a nodule",
+    )
 
 
 def what_to_look_at(out: Path) -> Panel:

@@ -151,5 +151,6 @@ def _start_pose(lung: Organ, start: str, frame: Frame) -> Float:
             expected=f"1 to {len(lung.starts)}, or {', '.join(lung.start_names)}"
             if lung.starts
             else "a file: the patient came with no pose",
+            remedy="Give a plan.json, or a file as `lungaccess template pose` prints one",
         )
     return lung.starts[number - 1]

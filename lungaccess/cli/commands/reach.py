@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import CountOrNone, Positive
+from lungaccess.cli.numbers import CountOrNone, Spacing
 from lungaccess.cli.options import PatientFolder, PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 
@@ -24,7 +24,7 @@ def reach(
     patient: PatientFolder,
     *,
     system: SystemOptions = SystemOptions(),
-    spacing: Annotated[Positive, Parameter(help="Side of the map's voxels, mm.")] = 3.0,
+    spacing: Annotated[Spacing, Parameter(help="Side of the map's voxels, mm.")] = 3.0,
     search: Annotated[
         CountOrNone,
         Parameter(help="Random trees for each point that no single arc reaches; 0 for single arcs only."),

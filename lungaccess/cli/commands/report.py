@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import CountOrNone, Seed
+from lungaccess.cli.numbers import CountOrNone, SamplesOrNone, Seed
 from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions
 from lungaccess.cli.plan_search import HISTORY_FILE
 from lungaccess.cli.progress import progress
@@ -43,7 +43,7 @@ def report(
     ] = None,
     errors: ErrorOptions = ErrorOptions(),
     samples: Annotated[
-        CountOrNone, Parameter(help="Deviated plans of the estimate of risk; 0 leaves it out.")
+        SamplesOrNone, Parameter(help="Deviated plans of the estimate of risk; 0 leaves it out.")
     ] = 2000,
     seed: Annotated[Seed, Parameter(help="Seed of that estimate.")] = 0,
     instructions: Annotated[
@@ -56,18 +56,19 @@ def report(
     from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page
     from lungaccess.report.html.volumes import find_ct, read_ct
 
-    page = plan.with_name("report.html") if out is None else out
+    page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)
     stored, model = Plan.load(plan), errors.load()
     lung = output.load(patient)
+    stored.require_lung(lung)
     image = ct if ct is not None else find_ct(patient)
     with progress("making the page"):
         options = PageOptions(
             alternatives=_others(stored, lung, alternatives, output) if alternatives else (),
             ct=None if image is None else read_ct(image),
             ct_name="" if image is None else image.name,
-            cost_over_time=plan.with_name(HISTORY_FILE),
+            cost_over_time=plan.parent / HISTORY_FILE,
             errors=model,
             risk_samples=samples,
             risk_seed=seed,

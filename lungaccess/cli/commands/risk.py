@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Count, Positive, Probability, Seed
+from lungaccess.cli.numbers import Positive, Probability, Samples, Seed
 from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.progress import progress
 
@@ -23,7 +23,7 @@ def risk(
     patient: PatientOfPlan,
     *,
     errors: ErrorOptions = ErrorOptions(),
-    samples: Annotated[Count, Parameter(help="Number of deviated plans.")] = 10_000,
+    samples: Annotated[Samples, Parameter(help="Number of deviated plans.")] = 10_000,
     radius: Annotated[
         Positive | None,
         Parameter(

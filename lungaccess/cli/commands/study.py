@@ -12,7 +12,7 @@ from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Count
+from lungaccess.cli.numbers import Processes
 from lungaccess.cli.options import OutputOptions, PatientOptions
 from lungaccess.cli.progress import progress
 
@@ -35,7 +35,7 @@ def run(
     *,
     out: Path = Path("results.db"),
     scheduler: str | None = None,
-    workers: Annotated[Count | None, Parameter(name="--workers")] = None,
+    workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Make the runs of a study that the results do not have yet; exit code 1 if one could not be made.
@@ -126,7 +126,11 @@ def export(
     from lungaccess.study.export import export_csv, export_parquet
 
     if csv is None and parquet is None:
-        raise SettingsError("Nothing to export to was given", expected="--csv FOLDER or --parquet FOLDER")
+        raise SettingsError(
+            "Nothing to export to was given",
+            expected="--csv FOLDER or --parquet FOLDER",
+            remedy="Add one of them",
+        )
     written = [] if csv is None else export_csv(results, csv)
     written += [] if parquet is None else export_parquet(results, parquet)
     if output.json:

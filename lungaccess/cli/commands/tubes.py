@@ -55,7 +55,11 @@ def tubes(
     from lungaccess.one_stage import deploy_tubes, load_tubes
 
     if out.suffix.lower() != ".png":
-        raise SettingsError(f"--out is {out}", expected="a file name that ends in .png")
+        raise SettingsError(
+            f"--out is {out}",
+            expected="a file name that ends in .png",
+            remedy="Choose a name such as tubes.png",
+        )
     require_writable_folder(out.parent)
     answer = deploy_tubes(
         load_tubes(system),

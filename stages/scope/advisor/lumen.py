@@ -152,7 +152,11 @@ def lumen_of_mask(mask: Volume, root_lps: ArrayLike) -> Lumen:
 def _lumen(mask: Volume, root_lps: ArrayLike, depth: DistanceField | None) -> Lumen:
     voxels = voxels_of(mask.array)
     if not len(voxels):
-        raise AnatomyError("The airway lumen is empty", expected="at least one voxel of lumen")
+        raise AnatomyError(
+            "The airway lumen is empty",
+            expected="at least one voxel of lumen",
+            remedy="Check the mask of the airway lumen",
+        )
     low = voxels.min(axis=0) - 1
     grid = mask.grid.crop(low, voxels.max(axis=0) + 2)
     inside = np.zeros(grid.shape, dtype=bool)

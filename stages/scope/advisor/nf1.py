@@ -74,6 +74,7 @@ def goal_at(
         raise TargetError(
             f"A lesion at {lesion.tolist()} with a radius of {lesion_radius_mm} mm is no sphere",
             expected="three finite mm and a finite radius, 0 or above",
+            remedy="Correct the target or the radius",
         )
     voxel, distance = lumen.nearest_voxel(lesion)
     if preferred is not None and preferred.any():

@@ -218,7 +218,11 @@ def from_mask(
     prune(skeleton, grid.spacing_mm)
     pairs = [(a, b) for a, near in enumerate(skeleton.neighbours) for b in near if a < b]
     if not pairs:
-        raise AnatomyError("The skeleton of the mask is a single point", expected="a tube longer than wide")
+        raise AnatomyError(
+            "The skeleton of the mask is a single point",
+            expected="a tube longer than wide",
+            remedy="Give a mask of vessels or airways",
+        )
     walls = _Walls(prepared.lumen, grid, CENTRES if rounded else SOLID)
     used, edges = np.unique(np.array(pairs), return_inverse=True)
     nodes = _smoothed(grid.lps(skeleton.ijk[used]), edges.reshape(-1, 2), walls)
@@ -247,6 +251,7 @@ def from_image(drawing: Bool, *, pixel_mm: float, spacing_mm: float = DEFAULT_SP
         raise AnatomyError(
             f"A drawing of the shape {picture.shape} shows no vessel",
             expected="a picture of rows and columns, true inside the vessels",
+            remedy="Draw vessels dark on white, or choose another picture",
         )
     from scipy.spatial import KDTree
     from skimage.morphology import skeletonize
@@ -261,7 +266,9 @@ def from_image(drawing: Bool, *, pixel_mm: float, spacing_mm: float = DEFAULT_SP
     edges = KDTree(ij).query_pairs(1.5, output_type="ndarray").astype(np.int64)
     if not len(edges):
         raise AnatomyError(
-            "The skeleton of the drawing is a single point", expected="vessels longer than wide"
+            "The skeleton of the drawing is a single point",
+            expected="vessels longer than wide",
+            remedy="Draw vessels as lines, or choose another picture",
         )
     middle = np.column_stack((ij, np.ones(len(ij))))
     nodes = _smoothed(grid.lps(middle), edges, walls)

@@ -114,7 +114,11 @@ def interpolate(points_mm: ArrayLike) -> Curve:
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     points = points[np.concatenate(((True,), step > 1e-6))]
     if len(points) < 2:
-        raise SettingsError("A route needs two different points", expected="start and goal apart")
+        raise SettingsError(
+            "A route needs two different points",
+            expected="start and goal apart",
+            remedy="Choose another goal or start",
+        )
     while len(points) <= DEGREE:
         middle = 0.5 * (points[:-1] + points[1:])
         points = np.vstack((np.stack((points[:-1], middle), axis=1).reshape(-1, 3), points[-1]))

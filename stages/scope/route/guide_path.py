@@ -77,7 +77,11 @@ def guide_path_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_m
     apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > SAME_PLACE_MM
     kept = np.concatenate(((True,), apart))
     if kept.sum() < 2:
-        raise SettingsError("Start and goal of the route are the same point", expected="two points apart")
+        raise SettingsError(
+            "Start and goal of the route are the same point",
+            expected="two points apart",
+            remedy="Choose another goal or start",
+        )
     if not apart[-1]:
         kept[np.flatnonzero(kept)[-1]] = False
         kept[-1] = True

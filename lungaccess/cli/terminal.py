@@ -107,8 +107,8 @@ def _is_number(text: str) -> bool:
 
 
 def escaped(text: str) -> str:
-    """Return text in which rich finds no markup."""
-    return text.replace("[", r"\[")
+    """Return text in which rich finds no markup, and odd bytes of a file name are spelled out."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8").replace("[", r"\[")
 
 
 def show(tables: Iterable[Table]) -> None:

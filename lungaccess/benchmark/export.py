@@ -19,7 +19,9 @@ def require_table_file(path: Path) -> None:
     """Raise FileError unless a path ends in .csv or .json."""
     if path.suffix not in SUFFIXES:
         raise FileError(
-            f"The results cannot be written to {path}", expected="a file that ends in .csv or .json"
+            f"The results cannot be written to {path}",
+            expected="a file that ends in .csv or .json",
+            remedy="Choose a name such as runs.csv",
         )
 
 

@@ -60,7 +60,9 @@ def patients_of(folder: Path) -> list[Path]:
 
     if not folder.is_dir():
         raise FileError(
-            f"There is no folder {folder}", expected="a folder of a patient, or a folder of such folders"
+            f"There is no folder {folder}",
+            expected="a folder of a patient, or a folder of such folders",
+            remedy="Check the name and the folder",
         )
     entries = sorted(folder.iterdir(), key=_natural)
     if any(path.is_file() and (image_suffix(path) or path.suffix == ".toml") for path in entries):
@@ -68,7 +70,9 @@ def patients_of(folder: Path) -> list[Path]:
     inner = [path for path in entries if path.is_dir()]
     if not inner:
         raise FileError(
-            f"{folder} holds neither images nor folders", expected="a patient, or a folder of patients"
+            f"{folder} holds neither images nor folders",
+            expected="a patient, or a folder of patients",
+            remedy="Name the folder that holds the masks, or the one that holds the patients",
         )
     return inner
 

@@ -6,12 +6,11 @@ import os
 from collections.abc import Mapping
 from dataclasses import field
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from anatomy.errors import PlanFileError
-from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from anatomy.words import plural
@@ -20,6 +19,9 @@ from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
 from lungaccess.plans.parts import Exemption, NeedlePath, ScopeRoute, TubeDeployment
 from lungaccess.plans.record import LEFT_OUT_IF_EMPTY, Record, shaped
 from lungaccess.problem.system import System
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
 
 
 @frozen_record

@@ -13,7 +13,7 @@ from anatomy.suggestion import did_you_mean
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Count
+from lungaccess.cli.numbers import Count, Seconds
 from lungaccess.cli.options import PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 
@@ -44,7 +44,7 @@ def med_rad(
     planners: str = DEFAULT_PLANNERS,
     radius: str | None = None,
     seeds: Annotated[Count, Parameter(name="--seeds")] = 3,
-    budget: float = 1.0,
+    budget: Seconds = 1.0,
     peer: Path | None = None,
     out: Path | None = None,
     system: SystemOptions = SystemOptions(),
@@ -78,8 +78,6 @@ def med_rad(
     from lungaccess.benchmark.export import require_table_file
 
     names = _planners(planners)
-    if not 0.0 < budget < float("inf"):
-        raise SettingsError(f"--budget is {budget:g} s", expected="a finite time above 0")
     device = system.load()
     radii = _radii(radius, rules, device)
     recorded = None if peer is None else read_peer(peer)
@@ -120,10 +118,13 @@ def _rows(
     from lungaccess.benchmark import BenchmarkRow, patients_of, published_queries, run_query
     from lungaccess.benchmark.published import why_no_query
 
-    for path in patients_of(folder):
+    paths = list(patients_of(folder))
+    for path in paths:
         try:
             pose, patient = _posing(path, rules, device, output)
         except LungaccessError as error:
+            if len(paths) == 1:
+                raise
             yield BenchmarkRow(patient=path.name, reason=f"not read: {error.found}")
             continue
         if why_no_query(patient):
@@ -162,10 +163,14 @@ def _planners(text: str) -> tuple[str, ...]:
             raise SettingsError(
                 f"There is no needle planner {name!r}",
                 expected=f"names separated by commas, of {', '.join(known)}",
-                remedy=did_you_mean(name, known),
+                remedy=did_you_mean(name, known) or "Choose some of them, such as --planners rrt,decide",
             )
     if not names:
-        raise SettingsError("--planners names no planner", expected=", ".join(known))
+        raise SettingsError(
+            "--planners names no planner",
+            expected=", ".join(known),
+            remedy="Name one or more, such as --planners rrt",
+        )
     return names
 
 
@@ -173,11 +178,13 @@ def _radii(text: str | None, rules: Rules, device: System) -> tuple[float, ...]:
     if text is None and rules == "ours":
         return (device.needle.min_radius_of_curvature_mm,)
     try:
-        radii = tuple(float(part) for part in (text or UNC_RADII_MM).split(","))
+        radii = tuple(float(part) for part in (UNC_RADII_MM if text is None else text).split(","))
     except ValueError:
         radii = ()
     if not radii or not all(5.0 <= mm < float("inf") for mm in radii):
         raise SettingsError(
-            f"--radius is {text!r}", expected="radii of 5 mm or more, separated by commas, such as 50,121"
+            f"--radius is {text!r}",
+            expected="radii of 5 mm or more, separated by commas",
+            remedy="State radii such as --radius 50,121",
         )
     return radii

@@ -19,6 +19,8 @@ WRITES = {"--out", "--slicer", "--movie", "--page", "--csv", "--parquet"}
 """Options whose path is written."""
 POINTS = {("segment", "--target"), ("segment", "--seed"), ("route", "--goal"), ("route", "--start")}
 SYSTEMS = {"--system", "--show", "--compare"}
+LISTS = ("", "no such thing", ",", "rrt,nonsense", "50,x", "nan")
+"""No lists of planners or radii."""
 ANYTHING = {"--name", "--series", "--scheduler", "--cache"}
 """Options of which no text is wrong by itself, or whose fault another machine finds."""
 BAD_POINTS = (
@@ -115,6 +117,8 @@ def bad_values(name: str, argument: Any, world: World) -> tuple[str, ...]:
         if kind is int:
             found += ["1.5", "1e3"]
         return tuple(found + (["0", "-1", "9999"] if option == "--nodule" else []))
+    if option == "--folder":
+        return tuple(file for file in world.bad_inputs if file)
     if kind is Path and option == "--errors":
         return tuple(file for file in world.bad_inputs if "empty" not in file and file != "/dev/null")
     if kind is Path:
@@ -125,6 +129,8 @@ def bad_values(name: str, argument: Any, world: World) -> tuple[str, ...]:
         return (*BAD_POINTS, *FAR_POINTS)
     if option in SYSTEMS:
         return (*world.bad_systems, *(word for word in ODD_WORDS if option != "--compare" or word))
+    if option in ("--planners", "--radius"):
+        return LISTS
     if option == "--start":
         return ("0", "77", *world.bad_inputs)
     if option == "--objective":

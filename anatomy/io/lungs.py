@@ -23,9 +23,11 @@ def with_lobes(masks: MaskSet) -> MaskSet:
     known = dict(masks.masks)
     statements = list(masks.statements)
     are_the_lungs = "lung" not in known
+    main = _main_lobes(masks.lobes, statements)
     union = masks.lobes > 0 if are_the_lungs else known["lung"] | (masks.lobes > 0)
-    known = dict(fill_lung(replace(masks, masks={**known, "lung": union})).masks)
-    lobes = grown_into(_main_lobes(masks.lobes, statements), known["lung"])
+    masks = replace(masks, masks={**known, "lung": union})
+    known = dict((fill_lung(masks) if are_the_lungs else masks).masks)
+    lobes = grown_into(main, known["lung"])
     if are_the_lungs:
         statements += _absent(lobes)
     if "fissures" not in known or not known["fissures"].any():

@@ -14,8 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.branching import Sprouts, bent_line, unit
-from anatomy.phantom.chest import LEFT_LOWER, LEFT_UPPER, LOBES, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
+from anatomy.phantom.chest import LOBES
 from anatomy.phantom.growth import STEP_MM, GrowthRule, grow, limit_turn
 from anatomy.phantom.territory import Territory
 from anatomy.records import frozen_value

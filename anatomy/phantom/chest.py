@@ -8,17 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
+from anatomy.lobes import LOBES as NAMED_LOBES
 from anatomy.records import frozen_value
 from anatomy.typed import Array
 
-RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
-LOBES = {
-    "right upper": RIGHT_UPPER,
-    "right middle": RIGHT_MIDDLE,
-    "right lower": RIGHT_LOWER,
-    "left upper": LEFT_UPPER,
-    "left lower": LEFT_LOWER,
-}
+LOBES = {name.removesuffix(" lobe"): number for number, name in NAMED_LOBES.items()}
 
 CAGE_CENTRE_Z = -95.0
 """Height below the carina at which the rib cage is widest."""

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.branching import Sprouts, smooth_line, unit
-from anatomy.phantom.chest import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.growth import STEP_MM, Clearance, GrowthRule, grow, overlap_mm
 from anatomy.phantom.territory import Territory
 from anatomy.records import frozen_record

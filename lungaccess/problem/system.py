@@ -22,6 +22,7 @@ from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes
 
 _PRESETS = "presets"
+_NEEDLES = "presets/needles"
 _REMEDY = "`lungaccess presets --show lung-default` prints a complete file to start from"
 
 
@@ -76,8 +77,20 @@ class System:
 
 def preset_names() -> tuple[str, ...]:
     """Return the names of the systems that ship with the package, sorted."""
-    folder = resources.files("lungaccess") / _PRESETS
-    return tuple(sorted(entry.name[:-5] for entry in folder.iterdir() if entry.name.endswith(".toml")))
+    return _names_in(_PRESETS)
+
+
+def needle_preset_names() -> tuple[str, ...]:
+    """Return the names of the systems that ship for the needle stage alone, sorted.
+
+    They are published needles; scope and tubes are only as large as these need.
+    """
+    return _names_in(_NEEDLES)
+
+
+def _names_in(folder: str) -> tuple[str, ...]:
+    entries = (resources.files("lungaccess") / folder).iterdir()
+    return tuple(sorted(entry.name[:-5] for entry in entries if entry.name.endswith(".toml")))
 
 
 def preset_text(name: str) -> str:
@@ -88,16 +101,18 @@ def preset_text(name: str) -> str:
     SettingsError
         If there is no such preset.
     """
-    if name not in preset_names():
-        raise _unknown(name)
-    return (resources.files("lungaccess") / _PRESETS / f"{name}.toml").read_text(encoding="utf-8")
+    for folder in (_PRESETS, _NEEDLES):
+        if name in _names_in(folder):
+            return (resources.files("lungaccess") / folder / f"{name}.toml").read_text(encoding="utf-8")
+    raise _unknown(name)
 
 
 def _unknown(given: str) -> SettingsError:
+    known = (*preset_names(), *needle_preset_names())
     return SettingsError(
         f"There is no system called {given!r}",
-        expected=f"a preset ({', '.join(preset_names())}) or the path of a .toml file",
-        remedy=did_you_mean(given, preset_names()) or _REMEDY,
+        expected=f"a preset ({', '.join(known)}) or the path of a .toml file",
+        remedy=did_you_mean(given, known) or _REMEDY,
     )
 
 
@@ -128,7 +143,7 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     1.0
     """
     given = os.fspath(name_or_path)
-    if given in preset_names():
+    if given in (*preset_names(), *needle_preset_names()):
         content = preset_text(given).encode("utf-8")
     elif isinstance(name_or_path, str) and not given.endswith(".toml"):
         raise _unknown(given)

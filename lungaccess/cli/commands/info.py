@@ -62,12 +62,13 @@ def presets(
     Its JSON holds every setting.
     """
     from anatomy.settings import to_mapping
-    from lungaccess.problem.system import load_system, preset_names, preset_text
+    from lungaccess.problem.system import load_system, needle_preset_names, preset_names, preset_text
 
     if show is not None and not output.json:
         terminal.console.file.write(preset_text(show))
         return ExitCode.OK
-    systems = {name: load_system(name) for name in (preset_names() if show is None else (show,))}
+    names = (*preset_names(), *needle_preset_names()) if show is None else (show,)
+    systems = {name: load_system(name) for name in names}
     if output.json:
         terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from anatomy.io.ct_cases import ct_case
 from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import parse_point
 from lungaccess.cli import terminal
@@ -56,7 +57,8 @@ def segment(
     Parameters
     ----------
     ct : Path
-        CT as NIfTI, NRRD or MetaImage file, or a folder of DICOM files.
+        CT as NIfTI, NRRD or MetaImage file, or a folder of DICOM files; or a case of AeroPath (its folder) or
+        ATM'22 (its file), whose own masks are then used.
     out : Path
         Patient folder to write or to bring up to date.
     nodule_contours : Path
@@ -98,6 +100,9 @@ def segment(
     for point in (target, seed):
         if point is not None:
             parse_point(point)
+    case = ct_case(ct)
+    if case is not None:
+        ct, airway, lungs, name = case.ct, airway or case.airway, lungs or case.lungs, name or case.out
     require_writable_folder(out)
     with progress(f"reading {ct}") as shown:
         volume, sources = read_ct(ct, series)

@@ -90,7 +90,7 @@ def test_every_command_has_one_style_of_json() -> None:
 def test_presets_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["presets", "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
-    assert set(found) == set(preset_names())
+    assert set(found) == {*preset_names(), *needle_preset_names()}
     assert found["lung-default"]["needle"]["diameter_mm"] == 1.0
 
 
@@ -106,7 +106,7 @@ def test_quiet_prints_json_and_errors_alone(
     code, said = run("presets")
     assert (code, said.out, said.err) == (ExitCode.OK, "", "")
     code, said = run("presets", "--json")
-    assert code == ExitCode.OK and set(json.loads(said.out)) == set(preset_names())
+    assert code == ExitCode.OK and set(json.loads(said.out)) == {*preset_names(), *needle_preset_names()}
     code, said = run("plan", "toy", "--nodule", "--system", "no-such-system")
     assert code == ExitCode.BAD_INPUT and said.out == "" and "no-such-system" in said.err
     assert cli.main(["presets"]) == ExitCode.OK

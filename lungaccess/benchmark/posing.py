@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from anatomy.lung import Lung
+from anatomy.organ import Organ
 from anatomy.patient import PatientImages
 from lungaccess.benchmark.published import PublishedQuery
 from lungaccess.benchmark.unc_rules import unc_needle, unc_obstacles
@@ -17,7 +17,7 @@ Pose = Callable[[PublishedQuery, float], tuple[NeedleEnvironment, Query]]
 """Makes the environment and the question of a published query with a needle of some radius in mm."""
 
 
-def posed_in_lung(lung: Lung, system: System) -> Pose:
+def posed_in_lung(lung: Organ, system: System) -> Pose:
     """Return what poses queries by our rules: those of `lungaccess needle` with a system."""
 
     def pose(published: PublishedQuery, radius_mm: float) -> tuple[NeedleEnvironment, Query]:

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from anatomy.errors import FileError
-from anatomy.lung import Lung
+from anatomy.organ import Organ
 from anatomy.patient import PatientImages
 from anatomy.records import frozen_record
 from anatomy.typed import Float
@@ -32,7 +32,7 @@ class PublishedQuery:
     target_lps: Float
 
 
-def published_queries(patient: PatientImages | Lung, name: str) -> list[PublishedQuery]:
+def published_queries(patient: PatientImages | Organ, name: str) -> list[PublishedQuery]:
     """Return each start of a patient with each of its targets."""
     return [
         PublishedQuery(patient=name, start=s, target=t, lps_from_start=pose, target_lps=point)
@@ -41,7 +41,7 @@ def published_queries(patient: PatientImages | Lung, name: str) -> list[Publishe
     ]
 
 
-def why_no_query(patient: PatientImages | Lung) -> str:
+def why_no_query(patient: PatientImages | Organ) -> str:
     """Return why a patient has no query; "" if it has one."""
     if not patient.starts:
         return NO_STARTS

@@ -55,8 +55,12 @@ class NeedleAnswer:
         Whether the needle begins so near to the lumen that it pierces the wall itself.
     obstruction : Obstruction or None
         What stands in the way, if there is no path.
+    lobe : str
+        Where what stands in the way lies; "" if the lobes are not known.
     environment : NeedleEnvironment
         What the planner looked at.
+    query : Query
+        What it was asked.
     objective : Objective
         What it was asked to make small; planners of OMPL look at none.
     first_path_s : float or None
@@ -69,7 +73,9 @@ class NeedleAnswer:
     branches: tuple[int, ...]
     at_wall: bool
     obstruction: Obstruction | None
+    lobe: str
     environment: NeedleEnvironment
+    query: Query
     objective: Objective
     first_path_s: float | None
 
@@ -110,7 +116,7 @@ class NeedleAnswer:
             "begins_at_the_wall": self.at_wall,
             "blocked": None
             if self.obstruction is None
-            else obstruction_record(self.obstruction, self.proved),
+            else obstruction_record(self.obstruction, self.proved, self.lobe),
             "path": None,
         }
         if path is None:
@@ -200,7 +206,11 @@ def plan_needle(
         branches=asked.branches,
         at_wall=asked.at_wall,
         obstruction=found.obstruction,
+        lobe=lung.lobe_at(found.obstruction.point_lps)
+        if found.obstruction and isinstance(lung, Lung)
+        else "",
         environment=asked.environment,
+        query=asked.query,
         objective=weighed,
         first_path_s=found.first_path_s,
     )

@@ -48,7 +48,7 @@ def reason_in_words(found: Obstruction) -> str:
     )
 
 
-def obstruction_rows(found: Obstruction, proved: bool) -> list[tuple[str, str]]:
+def obstruction_rows(found: Obstruction, proved: bool, lobe: str = "") -> list[tuple[str, str]]:
     """Return what a table says of an obstruction, the reason first."""
     rows = [("reason", reason_in_words(found))]
     if found.place == "reach":
@@ -58,6 +58,8 @@ def obstruction_rows(found: Obstruction, proved: bool) -> list[tuple[str, str]]:
         rows.append(("where", f"the tightest place of the easiest path tried, {_place(found)}"))
     else:
         rows.append(("where", _place(found)))
+    if lobe:
+        rows.append(("lobe", lobe))
     rows.append(("proved", "yes: no path exists" if proved else "no: a path may exist"))
     return rows
 
@@ -67,7 +69,7 @@ def _place(found: Obstruction) -> str:
     return f"{along}at {point_in_words(found.point_lps)}"
 
 
-def obstruction_record(found: Obstruction, proved: bool) -> dict[str, Any]:
+def obstruction_record(found: Obstruction, proved: bool, lobe: str = "") -> dict[str, Any]:
     """Return plain JSON values: points in both frames, mm, angles in rad."""
     x, y, z = (float(v) for v in found.point_lps)
     branch = (found.label >> BRANCH_SHIFT) - 1
@@ -77,8 +79,10 @@ def obstruction_record(found: Obstruction, proved: bool) -> dict[str, Any]:
         "proved": proved,
         "structure": structure_in_words(found.label) if found.label else None,
         "branch": branch if found.label & AIRWAY and branch >= 0 else None,
+        "lobe": lobe or None,
         "point_lps_mm": [x, y, z],
         "point_ras_mm": [-x, -y, z],
+        "obstacle_lps_mm": None if found.obstacle_lps is None else found.obstacle_lps.tolist(),
         "inserted_mm": found.inserted_mm,
         "distance_mm": found.distance_mm,
         "needed_distance_mm": found.needed_mm,

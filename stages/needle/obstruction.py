@@ -39,6 +39,8 @@ class Obstruction:
     point_lps : (3,) float64, LPS mm
         The blocked point of the needle's axis: for "path", the tightest place of the easiest path that was
         tried; for "reach", the target.
+    obstacle_lps : (3,) float64 or None, LPS mm
+        The nearest point of what is too near; None for "reach".
     inserted_mm : float or None
         Length of the needle there, where it is known.
     distance_mm, needed_mm : float or None
@@ -55,6 +57,7 @@ class Obstruction:
     proved: bool
     label: int
     point_lps: Float
+    obstacle_lps: Float | None = None
     inserted_mm: float | None = None
     distance_mm: float | None = None
     needed_mm: float | None = None
@@ -92,7 +95,7 @@ def easiest_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruc
     )  # fmt: skip
     if not tried or not label or found[kernels.DISTANCE] >= found[kernels.NEEDED]:
         return None
-    return _found("path", False, label, found, query)
+    return _found(environment, "path", False, label, found, query)
 
 
 def _pose(query: Query) -> tuple[float, ...]:
@@ -105,15 +108,33 @@ def _seen(query: Query) -> tuple[float, float]:
     return float(rho), float(h)
 
 
-def _found(place: str, proved: bool, label: int, found: Float, query: Query) -> Obstruction:
+def _nearest(environment: NeedleEnvironment, label: int, point: Float, distance_mm: float) -> Float | None:
+    """Return the point (3,) of a voxel with this label that is nearest to a point, at a known distance."""
+    grid = environment.grid
+    part = grid.window(point, distance_mm + float(grid.spacing_mm.max()))
+    voxels = np.argwhere(environment.obstacles.labels[part] == label)
+    if not len(voxels):
+        return None
+    voxels = voxels + np.array([axis.start for axis in part])
+    half = environment.obstacles.geometry[:, 5]
+    nearest = np.clip(grid.ijk(point), voxels - half, voxels + half)
+    at = int(np.argmin(np.linalg.norm(grid.lps(nearest) - point, axis=1)))
+    return np.asarray(grid.lps(nearest[at]))
+
+
+def _found(
+    environment: NeedleEnvironment, place: str, proved: bool, label: int, found: Float, query: Query
+) -> Obstruction:
     rho, h = _seen(query)
+    point, distance = found[: kernels.INSERTED].copy(), float(found[kernels.DISTANCE])
     return Obstruction(
         place=place,
         proved=proved,
         label=int(label),
-        point_lps=found[: kernels.INSERTED].copy(),
+        point_lps=point,
+        obstacle_lps=_nearest(environment, label, point, distance),
         inserted_mm=float(found[kernels.INSERTED]) if place != "target" else None,
-        distance_mm=float(found[kernels.DISTANCE]),
+        distance_mm=distance,
         needed_mm=float(found[kernels.NEEDED]),
         direction_rad=math.atan2(rho, h),
         straight_mm=math.hypot(rho, h),
@@ -207,7 +228,7 @@ def _start(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
         environment.obstacles, environment.limits, _pose(query), query.inserted_mm, longest, query.branch,
         found,
     )  # fmt: skip
-    return _found("start", True, label, found, query) if label else None
+    return _found(environment, "start", True, label, found, query) if label else None
 
 
 def _target(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
@@ -221,4 +242,4 @@ def _target(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     if distance + environment.goal_tolerance_mm >= needed - kernels.SPARE_MM:
         return None
     found = np.array([x, y, z, math.nan, distance, needed])
-    return _found("target", True, label, found, query)
+    return _found(environment, "target", True, label, found, query)

@@ -18,7 +18,7 @@ from lungaccess.cli.options import PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from anatomy.lung import Lung
+    from anatomy.organ import Organ
     from anatomy.patient import PatientImages
     from lungaccess.benchmark import BenchmarkRow
     from lungaccess.benchmark.posing import Pose
@@ -99,6 +99,11 @@ def med_rad(
     else:
         shown = f"by the rules of {rules}" + (f", {device.name}" if rules == "ours" else "")
         terminal.show_wide([terminal.table(f"Published needle queries {shown}", headings, lines)])
+        if recorded is not None:
+            terminal.say(
+                "The peer's columns: recorded runs by the rules of unc, on another machine. Its times do not"
+                " compare; success and length do, by equal rules. Lengths include what is left to the target."
+            )
         if out is not None:
             terminal.say(f"All runs are in {out}")
     return ExitCode.of(any(row.solved for row in rows))
@@ -138,12 +143,12 @@ def _rows(
 
 def _posing(
     path: Path, rules: Rules, device: System, output: PatientOptions
-) -> tuple[Pose, Lung | PatientImages]:
+) -> tuple[Pose, Organ | PatientImages]:
     """Return what makes environments of a patient by the rules, and the patient."""
     from lungaccess.benchmark import posed_by_unc, posed_in_lung
 
     if rules == "ours":
-        lung = output.load(path)
+        lung = output.load_organ(path)
         return posed_in_lung(lung, device), lung
     from anatomy.io.patients import load_patient
 

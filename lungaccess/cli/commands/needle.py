@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -59,11 +60,17 @@ def needle(
         ),
     ] = "length",
     budget: BudgetOptions = BudgetOptions(),
+    out: Annotated[
+        Path | None, Parameter(help="PNG file for a picture of start, path or blocked place, and target.")
+    ] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the needle alone from a given pose, or prove that no path exists."""
+    """Plan the needle alone from a given pose, or prove that no path exists and say what is blocked."""
     from anatomy.lung import Lung
     from lungaccess.one_stage import plan_needle
+
+    if out is not None and out.suffix.lower() != ".png":
+        raise SettingsError(f"--out is {out}", expected="a file name that ends in .png")
 
     stated, weighed = target.stated(), Objective.of(objective)
     device = system.load()
@@ -86,6 +93,12 @@ def needle(
         terminal.show_json(answer.record())
     else:
         terminal.show(_tables(answer, is_lung=isinstance(lung, Lung)))
+    if out is not None:
+        from lungaccess.report import needle_png
+
+        needle_png(answer, lung, out)
+        if not output.json:
+            terminal.say(f"Written to {out}")
     return ExitCode.of(answer.path is not None)
 
 
@@ -106,7 +119,7 @@ def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
         rows.append((how, pierced) if is_lung else ("enters through", "the surface of the organ"))
     path = answer.path
     if answer.obstruction is not None:
-        rows += obstruction_rows(answer.obstruction, answer.proved)
+        rows += obstruction_rows(answer.obstruction, answer.proved, answer.lobe)
     if path is None:
         return [terminal.table("needle", ("", ""), rows)]
     if answer.first_path_s is not None:

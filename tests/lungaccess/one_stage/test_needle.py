@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -195,5 +196,17 @@ def test_command(
     assert main([*command, "--start", str(start)]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "proved clear" in shown and "insert, mm" in shown
+    picture = tmp_path / "needle.png"
+    turned = np.loadtxt(start)
+    turned[:3, 1:3] *= -1.0
+    np.savetxt(tmp_path / "away.txt", turned)
+    away = [*command, "--start", str(tmp_path / "away.txt"), "--out", str(picture)]
+    assert main(away) == ExitCode.NEGATIVE
+    assert picture.stat().st_size > 20_000
+    assert "target out of reach" in " ".join(capsys.readouterr().out.split())
+    assert main([*away, "--json"]) == ExitCode.NEGATIVE
+    told = json.loads(capsys.readouterr().out)
+    assert told["no_path_is_proved"] and told["blocked"]["what"] == "reach"
+    assert main([*command, "--start", str(start), "--out", "needle.pdf"]) == ExitCode.BAD_INPUT
     assert main([*command, "--start", "99"]) == ExitCode.BAD_INPUT
     assert main([*command, "--start", str(tmp_path / "none.txt")]) == ExitCode.BAD_INPUT

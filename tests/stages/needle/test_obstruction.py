@@ -113,6 +113,9 @@ def test_start_target_and_path_are_told_apart() -> None:
             assert found is not None and found.place == expected and found.proved
             assert found.label & VESSEL
             assert found.distance_mm is not None and found.needed_mm == 1.0 > found.distance_mm
+            assert found.obstacle_lps is not None
+            measured = np.linalg.norm(found.obstacle_lps - found.point_lps)
+            assert measured == pytest.approx(found.distance_mm, abs=1e-6)
             proof.run()
             assert proof.outcome == "no path" and expected in proof.reason
             continue

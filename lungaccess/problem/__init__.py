@@ -16,7 +16,13 @@ if TYPE_CHECKING:
         least_invasive_first,
         presets_by_invasiveness,
     )
-    from lungaccess.problem.system import System, load_system, needle_preset_names, preset_names, system_fingerprint
+    from lungaccess.problem.system import (
+        System,
+        load_system,
+        needle_preset_names,
+        preset_names,
+        system_fingerprint,
+    )
     from lungaccess.problem.target import (
         StatedTarget,
         Target,

@@ -208,6 +208,16 @@ def test_an_appraisal_joins_check_and_estimate(
     json.dumps(mapping, allow_nan=False)
 
 
+def test_every_key_of_the_summary_is_documented(appraisal: Appraisal) -> None:
+    page = (Path(__file__).parents[3] / "docs/reference/command_line.md").read_text(encoding="utf-8")
+    mapping: dict[str, Any] = appraisal.to_mapping()
+    for key in mapping["headline"]:
+        assert f"`headline.{key}`" in page
+    (row,) = [line for line in page.splitlines() if line.startswith("| `limits`")]
+    for key in mapping["limits"][0]:
+        assert f"`{key}`" in row
+
+
 def test_a_plan_of_another_lung_is_refused_without_an_estimate(plan: Plan, appraiser: Appraiser) -> None:
     refused = appraiser.appraise(replace(plan, lung_key="other"))
     assert not refused.accepted and refused.risk is None

@@ -30,7 +30,7 @@ from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import STEP_SHARES, OutputOptions
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import load_system, preset_names
+from lungaccess.problem.system import load_system, needle_preset_names, preset_names
 from tests.lungaccess.appraisals import appraise_as_told, make_risk
 from tests.lungaccess.loading import load_with
 

@@ -10,7 +10,13 @@ import pytest
 
 from anatomy.errors import FileError, SettingsError
 from anatomy.settings import override, parse, to_mapping
-from lungaccess.problem.system import System, load_system, preset_names, system_fingerprint
+from lungaccess.problem.system import (
+    System,
+    load_system,
+    needle_preset_names,
+    preset_names,
+    system_fingerprint,
+)
 
 PRESETS = Path(__file__).resolve().parents[3] / "lungaccess" / "presets"
 DEFAULT = (PRESETS / "lung-default.toml").read_text(encoding="utf-8")
@@ -24,9 +30,10 @@ def write(folder: Path, content: str) -> Path:
 
 def test_presets_ship_with_the_package() -> None:
     assert preset_names() == ("flexure-needle", "lung-default", "therapeutic-scope", "ultrathin")
+    assert needle_preset_names() == ("med-rad-needle",)
 
 
-@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("name", [*preset_names(), *needle_preset_names()])
 def test_preset_is_valid_sourced_and_survives_a_round_trip(name: str) -> None:
     system = load_system(name)
     assert system.name == name
@@ -35,12 +42,18 @@ def test_preset_is_valid_sourced_and_survives_a_round_trip(name: str) -> None:
     assert parse(System, to_mapping(system), name) == system
 
 
-@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("name", [*preset_names(), *needle_preset_names()])
 def test_sources_of_presets_are_in_the_bibliography(name: str) -> None:
     bibliography = (PRESETS.parents[1] / "docs" / "reference" / "bibliography.md").read_text(encoding="utf-8")
     keys = {part.split("]")[0] for source in load_system(name).sources for part in source.split("[")[1:]}
     assert keys
     assert not {key for key in keys if f"[{key}]" not in bibliography}
+
+
+def test_the_published_needle_keeps_a_millimetre_and_bends_as_published() -> None:
+    system = load_system("med-rad-needle")
+    assert system.needle.radius_mm + system.margins.total_mm == 1.0
+    assert system.needle.min_radius_of_curvature_mm == pytest.approx(121.0, rel=1e-15)
 
 
 def test_needle_radii_of_presets() -> None:

@@ -133,11 +133,11 @@ class Explanation:
         if self.verdict is not None and self.verdict.proved:
             return "this system is proved not to reach it"
         if self._change and not self.untried:
-            return f"no other preset, but {self._change} would reach it"
+            return f"with no other preset was a plan found, but {self._change} would reach it"
         if self.untried:
-            tried = f"of {len(self.attempts)} other presets tried none reaches it" if self.attempts else ""
+            tried = ", ".join(f"no plan with {each.system.name}" for each in self.attempts)
             return f"{tried + ', ' if tried else ''}{', '.join(self.untried)} not tried"
-        return "no other preset reaches it"
+        return "with no other preset was a plan found"
 
     @property
     def plans(self) -> Mapping[str, Plan]:

@@ -54,10 +54,12 @@ class ReachedShare:
     region: str
     share: Share
 
-    def __str__(self) -> str:
+    @property
+    def words(self) -> str:
+        """The share and its interval, in words."""
         low, high = self.share.interval
         return (
-            f"{self.region}: {100.0 * self.share.value:.0f} % of {self.share.samples} random points "
+            f"{100.0 * self.share.value:.0f} % of {self.share.samples} random points "
             f"(95 % interval {100.0 * low:.0f} to {100.0 * high:.0f} %)"
         )
 

@@ -144,7 +144,7 @@ def _attempt(attempt: Attempt, plans: Mapping[str, Plan]) -> Record:
     return {
         "system": attempt.system.name,
         "tried": True,
-        "reaches": attempt.succeeded,
+        "found": attempt.succeeded,
         "why": attempt.why,
         "plan": file_of(attempt.plan, plans),
     }

@@ -42,7 +42,11 @@ def sections(explanation: Explanation) -> tuple[Section, ...]:
             headings=("starts", "count"),
             rows=() if e.starts is None else tuple((why, str(n)) for why, n in e.starts.counts.items() if n),
         ),
-        Section(title="What is reached nearby", headings=("where", "how much"), rows=tuple(_around(e))),
+        Section(
+            title="What a single arc reaches nearby",
+            headings=("where", "how much"),
+            rows=tuple((share.region, share.words) for share in e.shares),
+        ),
         Section(title="Proof", headings=("question", "answer"), rows=tuple(_proof(e))),
         Section(
             title="Not tried: nothing follows from these",
@@ -108,12 +112,6 @@ def _presets(e: Explanation) -> Iterator[Row]:
         yield attempt.system.name, attempt.why, _file(e, attempt.plan)
     for name in e.untried:
         yield name, "not tried", ""
-
-
-def _around(e: Explanation) -> Iterator[Row]:
-    for each in e.shares:
-        where, _colon, how_much = str(each).partition(": ")
-        yield where, how_much
 
 
 def _proof(e: Explanation) -> Iterator[Row]:

@@ -57,17 +57,19 @@ def presets(
     ] = None,
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
-    """List the systems that ship with lungaccess, or print one as a file to start from.
+    """List the systems that ship with lungaccess, the least invasive first, or print one to start from.
 
     Its JSON holds every setting.
     """
     from anatomy.settings import to_mapping
-    from lungaccess.problem.system import load_system, needle_preset_names, preset_names, preset_text
+    from lungaccess.problem.preset_order import presets_by_invasiveness
+    from lungaccess.problem.system import load_system, needle_preset_names, preset_text
 
     if show is not None and not output.json:
         terminal.console.file.write(preset_text(show))
         return ExitCode.OK
-    names = (*preset_names(), *needle_preset_names()) if show is None else (show,)
+    ordered = [system.name for system in presets_by_invasiveness()]
+    names = (*ordered, *needle_preset_names()) if show is None else (show,)
     systems = {name: load_system(name) for name in names}
     if output.json:
         terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
@@ -90,4 +92,4 @@ def _preset_table(systems: Mapping[str, System]) -> Table:
         for name, system in systems.items()
     ]
     headings = ("name", "scope, mm", "tubes, mm", "needle, mm", "least turning radius, mm", "what it is")
-    return terminal.table("Systems that ship with lungaccess (diameters)", headings, rows)
+    return terminal.table("Systems, the least invasive first (diameters)", headings, rows)

@@ -26,8 +26,8 @@ MAY_SAY_NO = ("advise", "benchmark", "certify", "needle", "plan", "tubes")
 """Commands that end with 1 where a device does not get there, which depends on the patient."""
 INSTEAD = {"--budget": "2", "--samples": "500", "--spacing": "15", "--iterations": "20", "--count": "3"}
 """How long the reader wants to wait, and how exact the answer has to be: less than on the pages."""
-QUICK = ("docs/explanation/tubes.md", "docs/how_to/devices.md")
-"""Pages that run within seconds; all others are slow."""
+QUICK = ("docs/explanation/tubes.md", "docs/explanation/replanning.md", "docs/explanation/ompl.md")
+"""Pages that need no patient and run within seconds; all others are slow."""
 STUDY = """
 name = "nodules"
 budget = {iterations = 1}
@@ -36,11 +36,23 @@ planner = [{name = "atlas"}]
 """
 
 
+def write_files(here: Path) -> None:
+    """Write the files that need no patient."""
+    for kind in ("errors", "tubes"):
+        assert main(["template", kind, "--out", str(here / f"{kind}.toml"), "--quiet"]) == 0
+    shutil.copy(ROOT / "examples" / "my_device.toml", here / "my-device.toml")
+    (here / "study.toml").write_text(STUDY)
+    (here / "point.txt").write_text("lps:0,0,0")
+    terminal.set_quiet(False)
+
+
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with all that the commands of the pages name."""
     here = tmp_path_factory.mktemp("pages")
+    write_files(here)
     assert main(["phantom", "--out", str(here / "PATIENT"), "--quiet"]) == 0
+    terminal.set_quiet(False)
     lung = la.load_patient(here / "PATIENT", cache=here / "cache")
     atlas = la.open_atlas(lung, la.load_system("lung-default"), cache=here / "cache")
     target = la.resolve_target(lung)
@@ -51,27 +63,30 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = ["lps:" + ",".join(f"{x:.2f}" for x in point) for point in lung.targets_lps]
     (here / "point.txt").write_text(points[0])
     (here / "lesions.txt").write_text("\n".join(points[:2]))
-    (here / "study.toml").write_text(STUDY)
-    for kind in ("errors", "tubes"):
-        assert main(["template", kind, "--out", str(here / f"{kind}.toml"), "--quiet"]) == 0
-    shutil.copy(ROOT / "examples" / "my_device.toml", here / "my-device.toml")
     (here / "ct.nii.gz").symlink_to(here / "PATIENT" / "ct.nii.gz")
     (here / "nodule.nii.gz").symlink_to(here / "PATIENT" / "nodules.nii.gz")
-    terminal.set_quiet(False)
     return here
 
 
 @pytest.fixture
-def folder(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(
+    page: Path, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
     """Return a folder of its own for a page, which is the current one."""
-    shutil.copytree(
-        prepared, tmp_path / "page", ignore=shutil.ignore_patterns("cache", "PATIENT"), symlinks=True
-    )
-    (tmp_path / "page" / "PATIENT").symlink_to(prepared / "PATIENT")
-    monkeypatch.setenv("LUNGACCESS_CACHE", str(prepared / "cache"))
+    here, cache = tmp_path / "page", tmp_path / "cache"
+    if name_of(page) in QUICK:
+        here.mkdir()
+        write_files(here)
+    else:
+        source = request.getfixturevalue("prepared")
+        left_out = shutil.ignore_patterns("cache", "PATIENT")
+        shutil.copytree(source, here, ignore=left_out, symlinks=True)
+        (here / "PATIENT").symlink_to(source / "PATIENT")
+        cache = source / "cache"
+    monkeypatch.setenv("LUNGACCESS_CACHE", str(cache))
     monkeypatch.setenv("MPLBACKEND", "agg")
-    monkeypatch.chdir(tmp_path / "page")
-    return tmp_path / "page"
+    monkeypatch.chdir(here)
+    return here
 
 
 def at_hand(words: list[str]) -> list[str]:
@@ -119,7 +134,7 @@ def run_block(block: Block, names: dict[str, object], page: Path) -> None:
     ],
 )
 def test_every_block_runs(page: Path, folder: Path) -> None:
-    names: dict[str, object] = {"__name__": "page"}
+    names: dict[str, object] = {"__name__": "__main__"}
     for block in blocks(page):
         if block.not_run is None:
             run_block(block, names, page)

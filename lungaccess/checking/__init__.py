@@ -9,5 +9,6 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.checking.checker import Checker, check
     from lungaccess.checking.findings import CheckReport, Finding
+    from lungaccess.checking.needle_alone import check_needle_alone
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

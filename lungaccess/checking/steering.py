@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,7 @@ from lungaccess.checking.poses import (
 from lungaccess.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
 from lungaccess.plans.plan import Plan
+from stages.needle.device import Needle
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -62,7 +63,7 @@ def check_needle(plan: Plan, environment: Environment, tube_end: Float | None, f
         for arc in needle.arcs
     ]
     curve = integrate(needle.lps_from_start, cut_at(pieces, plan.exemption.needle_length_mm))
-    if not _check_motion(plan, curve, found):
+    if not _check_motion(plan, pieces, curve, found):
         return
     _check_target(plan, lung, curve, found)
     _check_exemption(plan, found)
@@ -71,31 +72,41 @@ def check_needle(plan: Plan, environment: Environment, tube_end: Float | None, f
     _check_costs(plan, environment, curve, found)
 
 
-def _check_motion(plan: Plan, curve: Curve, found: Findings) -> bool:
+def _check_motion(plan: Plan, pieces: Sequence[Piece], curve: Curve, found: Findings) -> bool:
     """Curvature, length and both turning limits; tell whether the needle is as short as the device's."""
-    needle, device = plan.needle, plan.system.needle
-    curvature = [arc.curvature_per_mm for arc in needle.arcs]
+    needle = plan.needle
+    length = float(sum(arc.length_mm for arc in needle.arcs))
+    found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
+    turned, angle = _turning(curve)
+    found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
+    found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
+    return check_limits(pieces, plan.system.needle, curve, found)
+
+
+def _turning(curve: Curve) -> tuple[float, float]:
+    """Return the sum of all turning and the largest angle from the start, rad."""
+    turned = float(angle_between(curve.tangents[:-1], curve.tangents[1:]).sum())
+    return turned, float(angle_between(curve.tangents, curve.tangents[0]).max())
+
+
+def check_limits(pieces: Sequence[Piece], device: Needle, curve: Curve, found: Findings) -> bool:
+    """Record whether arcs keep the limits of a needle; tell whether it is as short as the device's."""
+    curvature = [piece.curvature_per_mm for piece in pieces]
     bound = device.max_curvature_per_mm
     detail = "tightest arc"
     found.at_most("needle.curvature", max(curvature), bound, "1/mm", detail, LIMIT_TOLERANCE * bound)
     found.at_least("needle.curvature.sign", min(curvature), 0.0, "1/mm", "a bend is turned by its roll")
-    found.at_least("needle.arc_length", min(arc.length_mm for arc in needle.arcs), 1e-9, "mm", "shortest arc")
-    length = float(sum(arc.length_mm for arc in needle.arcs))
-    found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
-    detail = "sum of the arcs"
-    fits = found.at_most(
-        "needle.length.limit", length, device.max_length_mm, "mm", detail, LENGTH_TOLERANCE_MM
-    )
-    turned = float(angle_between(curve.tangents[:-1], curve.tangents[1:]).sum())
-    found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
+    found.at_least("needle.arc_length", min(piece.length_mm for piece in pieces), 1e-9, "mm", "shortest arc")
+    turned, angle = _turning(curve)
     limit = float(np.deg2rad(device.max_accumulated_turn_deg))
     found.at_most("needle.turn.limit", turned, limit, "rad", "sum of all turning", ANGLE_TOLERANCE_RAD)
-    angle = float(angle_between(curve.tangents, curve.tangents[0]).max())
-    found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
     limit = float(np.deg2rad(device.max_angle_from_start_deg))
     detail = "largest angle from the start direction"
     found.at_most("needle.angle.limit", angle, limit, "rad", detail, ANGLE_TOLERANCE_RAD)
-    return fits
+    length, detail = float(sum(piece.length_mm for piece in pieces)), "sum of the arcs"
+    return found.at_most(
+        "needle.length.limit", length, device.max_length_mm, "mm", detail, LENGTH_TOLERANCE_MM
+    )
 
 
 def _check_target(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> None:
@@ -166,7 +177,7 @@ def _check_clearance(plan: Plan, environment: Environment, curve: Curve, found: 
     ]
     nearest: dict[str, float] = {}
     for name, select, where, needed in cases:
-        first, last = _stretch(where)
+        first, last = run_of_frames(where)
         if last - first < 1:
             continue
         nearest[name] = check_clear(
@@ -185,7 +196,7 @@ def _check_clearance(plan: Plan, environment: Environment, curve: Curve, found: 
         check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
 
 
-def _stretch(where: np.ndarray) -> tuple[int, int]:
+def run_of_frames(where: np.ndarray) -> tuple[int, int]:
     """Return first and last frame of a run of True frames; an exempt run reaches the next frame."""
     frames = np.flatnonzero(where)
     if not len(frames):

@@ -89,17 +89,31 @@ def needle(
             iterations=budget.iterations,
             time_s=limit_s,
         )
+    checked = None
+    if answer.path is not None and isinstance(lung, Lung):
+        from lungaccess.checking import check_needle_alone
+
+        checked = check_needle_alone(
+            lung, device, pose, answer.path.arcs, aim.lps_mm, branches=answer.branches, at_wall=answer.at_wall
+        )
     if output.json:
-        terminal.show_json(answer.record())
+        terminal.show_json(answer.record() | {"check": checked and checked.to_mapping()})
     else:
         terminal.show(_tables(answer, is_lung=isinstance(lung, Lung)))
+        if checked is not None:
+            verdict = "accepts" if checked.accepted else "REFUSES"
+            terminal.say(
+                "\n".join([f"The independent check {verdict} the path.", *map(str, checked.refusals)])
+            )
+        elif answer.path is not None:
+            terminal.say("The independent check reads lungs alone: this path was not checked.")
     if out is not None:
         from lungaccess.report import needle_png
 
         needle_png(answer, lung, out)
         if not output.json:
             terminal.say(f"Written to {out}")
-    return ExitCode.of(answer.path is not None)
+    return ExitCode.of(answer.path is not None and (checked is None or checked.accepted))
 
 
 def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:

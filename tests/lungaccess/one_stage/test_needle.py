@@ -14,6 +14,7 @@ from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from lungaccess.checking import check_needle_alone
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage import pierced_branches, plan_needle, reason_in_words
@@ -131,6 +132,18 @@ def test_a_needle_that_begins_at_the_wall_leaves_the_lumen(
             assert answer.obstruction is not None
             continue
         solved += 1
+        arcs, aside = answer.path.arcs, answer.path.arcs.copy()
+        how = {"branches": answer.branches, "at_wall": True}
+        report = check_needle_alone(small_lung, system, start, arcs, aim, **how)
+        assert report.accepted, str(report)
+        aside[0, 2] += 0.005
+        for wrong in (
+            check_needle_alone(small_lung, system, start, arcs, aim, branches=answer.branches),
+            check_needle_alone(small_lung, system, start, arcs, aim + 0.1, **how),
+            check_needle_alone(small_lung, system, start, arcs, aim, branches=(0,), at_wall=True),
+            check_needle_alone(small_lung, system, start, aside, aim, **how),
+        ):
+            assert not wrong.accepted
         points, lengths = answer.path.sample(0.05)
         lumen = small_lung.exact_clearance_mm(points, LUMEN, cap_mm=2.0)
         kept = np.minimum(system.needle.radius_mm, np.sin(np.radians(10.0)) * (lengths - 1.0))

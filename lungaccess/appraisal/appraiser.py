@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_value
 from lungaccess.appraisal.headline import Headline
-from lungaccess.appraisal.limits import Limit, limits_of
+from lungaccess.appraisal.limits import SHOWN_LIMITS, Limit, limits_of
 from lungaccess.checking import Checker, CheckReport
 from lungaccess.risk import ErrorModel, RiskReport, assess
 
@@ -51,6 +51,12 @@ class Appraisal:
     def accepted(self) -> bool:
         """Whether the check accepts the plan; says nothing of its chance of success."""
         return self.check.accepted
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the headline and the nearest limits."""
+        from lungaccess.appraisal.display import appraisal_html
+
+        return appraisal_html(self.headline, self.limits[:SHOWN_LIMITS])
 
     def to_mapping(self) -> dict[str, object]:
         """Return headline and limits as plain JSON values."""

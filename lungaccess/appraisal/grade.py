@@ -27,6 +27,16 @@ class Grade(IntEnum):
         return {Grade.GOOD: "✓", Grade.FAIR: "!", Grade.UNKNOWN: "?", Grade.POOR: "✗"}[self]
 
     @property
+    def colour(self) -> str:
+        """A colour for pictures and notebooks, dark enough for white paper."""
+        return {
+            Grade.GOOD: "#00704A",
+            Grade.FAIR: "#8A5A00",
+            Grade.UNKNOWN: "#8A5A00",
+            Grade.POOR: "#B00020",
+        }[self]
+
+    @property
     def key(self) -> str:
         """The grade in JSON and in style sheets."""
         return self.name.lower()

@@ -69,8 +69,10 @@ class Headline:
     def grade(self) -> Grade:
         """The worse of geometry and chance of success: accepted geometry alone is never good."""
         of_geometry = {
-            Geometry.PROVED: Grade.GOOD, Geometry.UNCHECKED: Grade.UNKNOWN, Geometry.REFUSED: Grade.POOR
-        }[self.geometry]  # fmt: skip
+            Geometry.PROVED: Grade.GOOD,
+            Geometry.UNCHECKED: Grade.UNKNOWN,
+            Geometry.REFUSED: Grade.POOR,
+        }[self.geometry]
         return max(of_geometry, grade_of_chance(self.success))
 
     @property

@@ -15,9 +15,12 @@ Row = tuple[str, ...]
 
 
 def report_html(findings: Sequence[Row], refused: Sequence[Row], *, accepted: bool) -> str:
-    """Return the verdict and the findings as HTML; the verdict is a word, not a colour alone."""
+    """Return the verdict and the findings as HTML; only a refusal has a colour.
+
+    Accepted geometry says nothing of the chance of success, so it is not shown in green.
+    """
     verdict = "accepts the plan" if accepted else f"REFUSES the plan ({len(refused)} findings)"
-    colour = "#1a7f37" if accepted else "#c00000"
+    colour = "inherit" if accepted else "#c00000"
     everything = f"<details><summary>{len(findings)} findings</summary>{_table(findings)}</details>"
     return (
         f'<div style="color:{colour}">{title(f"The independent check {verdict}")}</div>'

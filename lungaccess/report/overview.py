@@ -101,9 +101,13 @@ def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
     headline = Headline.of(None, None) if appraisal is None else appraisal.headline
     words = f"{headline.grade.mark} {headline.verdict}: {headline.text}"
     figure.text(
-        0.3 / WIDTH_IN, 1 - HEADLINE_TOP_IN / HEIGHT_IN, textwrap.fill(words, HEADLINE_CHARACTERS), va="top",
-        fontsize=10, color=style.GRADES[headline.grade],
-    )  # fmt: skip
+        0.3 / WIDTH_IN,
+        1 - HEADLINE_TOP_IN / HEIGHT_IN,
+        textwrap.fill(words, HEADLINE_CHARACTERS),
+        va="top",
+        fontsize=10,
+        color=headline.grade.colour,
+    )
 
 
 def _legend(figure: Figure, layers: Layers) -> None:

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from anatomy.io.files import atomic_write
-from lungaccess.appraisal.grade import Grade
 
 # Okabe and Ito's palette: distinct with every common colour vision, and in grey by lightness.
 SCOPE = "#0072B2"
@@ -30,7 +29,6 @@ FORBIDDEN = "#F6D5D0"
 INK = "#222222"
 FAINT_INK = "#6B6B6B"
 
-GRADES = {Grade.GOOD: "#00704A", Grade.FAIR: "#8A5A00", Grade.UNKNOWN: "#8A5A00", Grade.POOR: "#B00020"}
 
 DPI = 130
 """Pixels per inch at which the smallest letters stay sharp on a screen."""

@@ -61,7 +61,7 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
     from anatomy.settings import to_mapping
 
     return {
-        "errors": to_mapping(report.model),
+        "errors": {**to_mapping(report.model), "name": report.model.label},
         "samples": report.samples,
         "seed": report.seed,
         "radius_mm": report.radius_mm,

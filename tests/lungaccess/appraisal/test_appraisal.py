@@ -22,15 +22,25 @@ from lungaccess.checking import Finding
 from lungaccess.cli.plan_tables import GRADE_STYLES
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import words
-from lungaccess.report.style import GRADES
 from lungaccess.risk import ErrorModel, Share, load_errors
 from tests.lungaccess.appraisals import make_check, make_risk
 
 SYSTEM = la.load_system("ultrathin")
 KEYS = {
-    "text", "grade", "verdict", "geometry", "success", "most_frequent_failure", "failures", "draws", "seed",
-    "goal_radius_mm", "goal_radius_origin", "errors", "errors_are_assumed",
-}  # fmt: skip
+    "text",
+    "grade",
+    "verdict",
+    "geometry",
+    "success",
+    "most_frequent_failure",
+    "failures",
+    "draws",
+    "seed",
+    "goal_radius_mm",
+    "goal_radius_origin",
+    "errors",
+    "errors_are_assumed",
+}
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +124,7 @@ def test_nothing_is_green_unless_it_is_accepted_and_likely(
     headline = Headline.of(report, make_risk(count, draws) if estimated else None)
     good = GRADE_STYLES[headline.grade] == "green"
     assert good == ("grade-good" in words.headline(headline)) == ("✓" in words.headline(headline))
-    assert good == (GRADES[headline.grade] == GRADES[Grade.GOOD])
+    assert good == (headline.grade.colour == Grade.GOOD.colour)
     if good:
         assert checked and estimated and count / draws >= GOOD_FROM
     if headline.grade == Grade.FAIR:
@@ -206,6 +216,13 @@ def test_an_appraisal_joins_check_and_estimate(
     assert set(mapping) == {"accepted", "headline", "limits"}
     assert set(mapping["headline"]) == KEYS  # type: ignore[call-overload]
     json.dumps(mapping, allow_nan=False)
+
+
+def test_a_notebook_shows_headline_and_limits(appraisal: Appraisal) -> None:
+    shown = appraisal._repr_html_()
+    assert appraisal.headline.text.replace("'", "&#x27;") in shown
+    assert all(each.what in shown for each in appraisal.limits[:10])
+    assert (Grade.GOOD.colour in shown) == (appraisal.headline.grade == Grade.GOOD)
 
 
 def test_every_key_of_the_summary_is_documented(appraisal: Appraisal) -> None:

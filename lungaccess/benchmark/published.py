@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from anatomy.errors import FileError
@@ -33,12 +34,22 @@ class PublishedQuery:
 
 
 def published_queries(patient: PatientImages | Organ, name: str) -> list[PublishedQuery]:
-    """Return each start of a patient with each of its targets."""
+    """Return each start of a patient with each of its targets, or with that which its name states.
+
+    A start called `target2_start1` or `nodule2_start1` belongs to `target2` alone.
+    """
     return [
         PublishedQuery(patient=name, start=s, target=t, lps_from_start=pose, target_lps=point)
         for s, pose in enumerate(patient.starts, start=1)
         for t, point in enumerate(patient.targets_lps, start=1)
+        if _belong_together(patient.start_names[s - 1 : s], patient.target_names[t - 1 : t])
     ]
+
+
+def _belong_together(start: Sequence[str], target: Sequence[str]) -> bool:
+    stated = re.match(r"(?:target|nodule)(\d+)_", "".join(start).lower())
+    known = re.fullmatch(r"targets?_?(\d+)", "".join(target).lower())
+    return stated is None or known is None or stated[1] == known[1]
 
 
 def why_no_query(patient: PatientImages | Organ) -> str:

@@ -33,8 +33,7 @@ Method = Literal[
     "atlas", "kuntz2015", "kuntz2015-without-rejection", "reference", "reference-without-rejection"
 ]
 PatientFolder = Annotated[
-    Path,
-    Parameter(help="Folder of masks (Med-RAD, TotalSegmentator, or own masks with a lungaccess TOML file)."),
+    Path, Parameter(help="Folder of masks: Med-RAD, TotalSegmentator, or own masks with a patient.toml.")
 ]
 PlanFile = Annotated[Path, Parameter(help="The plan.json.")]
 PatientOfPlan = Annotated[Path, Parameter(help="Folder of the patient it was made for.")]

@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -191,3 +192,13 @@ def test_command(small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureF
     assert json.loads(capsys.readouterr().out)["rules"] == "ours"
     for wrong in (["--planners", "best"], ["--radius", "x"], ["--out", "runs.txt"], ["--budget", "-1"]):
         assert main([*command, *wrong]) == ExitCode.BAD_INPUT
+
+
+def test_a_start_that_names_its_target_is_asked_with_it_alone() -> None:
+    start, points = np.eye(4), tuple(np.full(3, float(n)) for n in (1.0, 2.0))
+    names = ("target1_start1", "nodule2_start1", "start3")
+    patient = SimpleNamespace(
+        starts=(start,) * 3, start_names=names, targets_lps=points, target_names=("target1", "target2")
+    )
+    asked = [(query.start, query.target) for query in published_queries(patient, "toy")]  # type: ignore[arg-type]
+    assert asked == [(1, 1), (2, 2), (3, 1), (3, 2)]

@@ -199,3 +199,33 @@ def test_a_real_scan_with_its_nodule(data_dir: Path, tmp_path: Path) -> None:
     assert images.nodules is not None
     assert np.linalg.norm(images.targets_lps[0] - (-57, 131, -520)) < 5.0
     assert not (images.nodules.array & images.vessels.array).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["aeropath", "atm"])
+def test_a_case_of_a_data_set_becomes_a_patient_with_its_own_masks(
+    small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureFixture[str], layout: str
+) -> None:
+    images = small_phantom.images
+    if layout == "aeropath":
+        case, ct = tmp_path / "7", tmp_path / "7" / "7_CT_HR.nii.gz"
+        airway, lungs = case / "7_CT_HR_label_airways.nii.gz", case / "7_CT_HR_label_lungs.nii.gz"
+        case.mkdir()
+        write_volume(lungs, images.lung)
+    else:
+        case = tmp_path / "labelsTr" / "ATM_007_0000.nii.gz"
+        airway, ct = case, tmp_path / "imagesTr" / "ATM_007_0000.nii.gz"
+        ct.parent.mkdir()
+        airway.parent.mkdir()
+    write_volume(ct, small_phantom.ct)
+    write_volume(airway, images.lumen)
+    assert cli.main(["info", str(case)]) == ExitCode.BAD_INPUT
+    said = _one_line(capsys.readouterr().err)
+    assert "there are no masks of vessels" in said and "lungaccess segment" in said
+    out = tmp_path / "patient"
+    assert cli.main(["segment", str(case), "--out", str(out), "--no-pictures"]) == ExitCode.OK
+    patient = load_patient(out)
+    assert (patient.lumen.array == images.lumen.array).all()
+    truth = images.lung.array
+    assert np.count_nonzero(patient.lung.array & truth) > 0.9 * np.count_nonzero(truth)
+    assert cli.main(["info", str(out), "--cache", str(tmp_path / "cache")]) == ExitCode.OK

@@ -110,6 +110,11 @@ def photograph(page: Path, folder: Path) -> None:
             shot = window.command("Page.captureScreenshot", {"clip": clip, "captureBeyondViewport": True})
             (folder / f"{name}.png").write_bytes(base64.b64decode(shot["data"]))
             store(folder / f"{name}.png", name)
+    for name, window in (("dark", Browser(1200, 800, dark=True)), ("phone", Browser(390, 844, phone=True))):
+        with window:
+            window.open(page)
+            window.screenshot(folder / f"{name}.png")
+        store(folder / f"{name}.png", name)
 
 
 def make() -> None:

@@ -119,11 +119,23 @@ class Explanation:
     @property
     def advice(self) -> str:
         """What would reach the target, in one sentence; empty if nothing that was tried does."""
-        names = [attempt.system.name for attempt in self.attempts if attempt.succeeded]
-        changes = [str(each.change) for each in self.changes if each.accepted]
-        fissures = ["crossing a fissure (--allow-fissures)"] if self.through_fissures else []
-        helps = [*(f"--system {name}" for name in names), *changes, *fissures]
+        systems = [
+            f"--system {attempt.system.name}{self._how_often(attempt.plan)}"
+            for attempt in self.attempts
+            if attempt.succeeded
+        ]
+        changes = [
+            f"{each.change}{self._how_often(each.change.plan)}" for each in self.changes if each.accepted
+        ]
+        fissures = ["crossing a fissure (--allow-fissures; not planned)"] if self.through_fissures else []
+        helps = [*systems, *changes, *fissures]
         return f"It is reached with {', or with '.join(helps)}" if helps else ""
+
+    def _how_often(self, plan: Plan | None) -> str:
+        """Say how often a plan succeeds: that it exists says too little."""
+        shares = [self.chances.get(name) for name, each in self.plans.items() if each is plan]
+        chance = shares[0] if shares else None
+        return "" if chance is None else f" (succeeds in {100.0 * chance.value:.0f} of 100)"
 
     @property
     def _way_on(self) -> str:

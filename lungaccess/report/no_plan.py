@@ -107,7 +107,7 @@ def _cut_panel(axes: Axes, explanation: Explanation, layers: Layers) -> None:
     _paths(axes, explanation, view)
     drawing.fit(axes, middle - half, middle + half)
     drawing.dress(axes, view, ticks=False)
-    drawing.title(axes, "Cut through the target, along the nearest miss")
+    drawing.title(axes, "Cut through the target; paths are projected onto it")
 
 
 def _miss(explanation: Explanation) -> Float | None:

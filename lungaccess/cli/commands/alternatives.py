@@ -79,7 +79,7 @@ def alternatives(
                 counterfactuals=len(systems) == 1,
             )  # fmt: skip
 
-    found = search(systems[0]) if len(systems) == 1 else _of_the_least_invasive(systems, search)
+    found = search(systems[0]) if len(systems) == 1 else _of_the_least_invasive(lung, systems, search)
     chosen = system_of(found[0].plan, systems)
     appraiser, appraisals = Appraiser(lung, model), []
     with progress("checking") as shown:
@@ -99,18 +99,25 @@ def alternatives(
 
 
 def _of_the_least_invasive(
-    systems: Sequence[System], search: Callable[[System], tuple[Alternative, ...]]
+    lung: Lung, systems: Sequence[System], search: Callable[[System], tuple[Alternative, ...]]
 ) -> tuple[Alternative, ...]:
-    """Return the plans of the first system that has some, each with the reasons of the choice."""
+    """Return the plans of the first system whose cheapest plan the check accepts, with the reasons."""
+    from lungaccess.checking import Checker
     from lungaccess.coupled import Attempt, choice_in_words, none_reaches
     from lungaccess.plans.no_plan import NoPlan
 
+    checker = Checker(lung)
     failed: list[Attempt] = []
     for system in systems:
         try:
             found = search(system)
         except NoPlan as failure:
             failed.append(Attempt(system=system, failure=failure))
+            continue
+        first = found[0].plan
+        attempt = Attempt(system=system, plan=first, report=checker.check(first, system))
+        if not attempt.succeeded:
+            failed.append(attempt)
             continue
         choice = choice_in_words(failed, system, systems)
         return tuple(replace(each, plan=replace(each.plan, system_choice=choice)) for each in found)

@@ -182,6 +182,12 @@ class TestFar:
             if name != "plan-nearest.json":
                 np.testing.assert_array_equal(plan.target_lps, far.target.lps_mm)
 
+    def test_no_plan_is_named_without_its_chance_of_success(self, far: Explanation) -> None:
+        assert set(far.chances) == set(far.plans)
+        helps = [each for each in far.attempts if each.succeeded]
+        helps += [each for each in far.changes if each.accepted]
+        assert far.advice.count("(succeeds in ") == len(helps)
+
     def test_the_record_is_json_and_names_the_files(self, far: Explanation, tmp_path: Path) -> None:
         written = la.save_explanation(far, tmp_path)
         assert sorted(path.name for path in tmp_path.iterdir()) == sorted(written)

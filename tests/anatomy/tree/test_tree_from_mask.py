@@ -153,6 +153,14 @@ def test_real_side_branch_is_kept_and_does_not_end_the_trachea():
     assert np.abs(hooks[:, 2] - 40.0).min() < 3.0
 
 
+def test_a_bulge_of_the_trachea_is_no_main_bronchus():
+    """As where the back wall of a trachea is pressed in: a dead end as wide as a bronchus, but short."""
+    bulge = ((0.0, 0.0, 60.0), (0.0, 16.0, 50.0), 6.0)
+    tree = tree_from_mask(tubes([*Y, bulge]))
+    assert np.linalg.norm(tree.carina_lps) < 6.0
+    assert tree.n_branches == 4 and np.bincount(tree.generation).tolist() == [1, 3]
+
+
 @pytest.mark.parametrize("gap_mm", [2.0, 4.0])
 def test_short_gap_is_bridged_and_reported(gap_mm: float):
     parts = [Y[0], Y[1], (CARINA, (-25.0, 0.0, -25.0), 6.5), ((-25, 0, -25), (-25, 0, -70), 5.0)]

@@ -7,11 +7,12 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help demo test lint format docs bench results results-quick clean
+.PHONY: help demo test first-contact lint format docs bench results results-quick clean
 
 help:
 	@echo "make demo    plan on a synthetic patient, results in demo-output/"
 	@echo "make test    lint, types and the default tests (import rules among them)"
+	@echo "make first-contact  a newcomer's tasks with an installed package, outside the checkout"
 	@echo "make lint    ruff and mypy only"
 	@echo "make format  let ruff rewrite the code"
 	@echo "make docs    build the documentation into site/"
@@ -46,6 +47,10 @@ format: $(VENV)/.installed-test
 
 test: lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# FIRST_CONTACT_ARGS=--fresh makes an environment from nothing.
+first-contact: $(VENV)/.installed-test
+	$(BIN)/python tests/first_contact/run.py $(FIRST_CONTACT_ARGS)
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs site

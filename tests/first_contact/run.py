@@ -1,0 +1,152 @@
+"""Do the tasks of tasks.toml as a newcomer would: installed package, outside the checkout, empty home.
+
+    .venv/bin/python tests/first_contact/run.py          with the libraries of this Python
+    .venv/bin/python tests/first_contact/run.py --fresh  in a virtual environment made from nothing
+
+The package is built and installed as a user would get it, so that a file that was forgotten is missed.
+Without --fresh, its compiled kernels are copied from the checkout, if they are there, and the libraries are
+those of the Python that runs this: a user's first minute of compiling is then not part of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+PACKAGES = ("anatomy", "stages", "lungaccess")
+HANGS_AFTER_S = 600.0
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the tasks are done: the folder, the environment of its processes, and its Python."""
+
+    folder: Path
+    python: Path
+    environment: dict[str, str]
+
+
+def main() -> int:
+    """Do all tasks and return 0 if each ended as written down."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.add_argument("--fresh", action="store_true", help="install everything into a new environment")
+    options.add_argument(
+        "--keep", type=Path, help="do the tasks in this folder, which must be new, and keep it"
+    )
+    asked = options.parse_args()
+    tasks = tomllib.loads((HERE / "tasks.toml").read_text(encoding="utf-8"))["task"]
+    faults = unnamed_commands(tasks)
+    with tempfile.TemporaryDirectory() as temporary:
+        home = asked.keep.resolve() if asked.keep else Path(temporary)
+        place = fresh_place(home) if asked.fresh else place_with_these_libraries(home)
+        alone = next((n for n, task in enumerate(tasks) if task.get("together")), len(tasks))
+        for task in tasks[:alone]:
+            faults += do_task(task, place)
+        with ThreadPoolExecutor(2) as pool:
+            for found in pool.map(lambda task: do_task(task, place), tasks[alone:]):
+                faults += found
+    print(f"{len(tasks)} tasks, {len(faults)} faults", flush=True)
+    return 1 if faults else 0
+
+
+def unnamed_commands(tasks: list[dict[str, Any]]) -> list[str]:
+    """Return the commands of the tasks that README.md does not name."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"lungaccess ([a-z]+)", readme))
+    runs = [shlex.split(step["run"]) for task in tasks for step in task["step"] if "run" in step]
+    used = {words[1] for words in runs if len(words) > 1 and not words[1].startswith("-")}
+    unnamed = [f"README.md does not name lungaccess {command}" for command in sorted(used - named)]
+    print("\n".join(unnamed), end="\n" if unnamed else "", flush=True)
+    return unnamed
+
+
+def fresh_place(home: Path) -> Place:
+    """Install the package with all its libraries into a new virtual environment."""
+    subprocess.run([sys.executable, "-m", "venv", str(home / "venv")], check=True)
+    python = home / "venv" / "bin" / "python"
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), f"{ROOT}[study]"], check=True)
+    return _place(home, python, {})
+
+
+def place_with_these_libraries(home: Path) -> Place:
+    """Install the package alone, beside the libraries of this Python, with kernels that are compiled."""
+    site = home / "site"
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    subprocess.run([*pip, "--target", str(site), str(ROOT)], check=True)
+    for package in PACKAGES:
+        for source in (ROOT / package).rglob("*.py"):
+            installed = site / source.relative_to(ROOT)
+            if installed.is_file() and installed.read_bytes() == source.read_bytes():
+                shutil.copystat(source, installed)
+        for compiled in (ROOT / package).rglob("*.nb[ic]"):
+            target = site / compiled.relative_to(ROOT)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(compiled, target)
+    return _place(home, Path(sys.executable), {"PYTHONPATH": str(site)}, site / "bin")
+
+
+def _place(home: Path, python: Path, more: dict[str, str], *bins: Path) -> Place:
+    for name in ("home", "work"):
+        (home / name).mkdir(parents=True)
+    path = os.pathsep.join(map(str, (*bins, python.parent, "/usr/local/bin", "/usr/bin", "/bin")))
+    plain = {"PATH": path, "HOME": str(home / "home"), "COLUMNS": "120", "LANG": "C.UTF-8"}
+    return Place(home / "work", python, plain | more)
+
+
+def do_task(task: dict[str, Any], place: Place) -> list[str]:
+    """Do the steps of a task and return what was not as written down."""
+    data = os.environ.get("LUNGACCESS_DATA", "")
+    if task.get("needs") == "data" and not Path(data, "med-rad").is_dir():
+        print(f"left out: {task['words']} (LUNGACCESS_DATA names no data)", flush=True)
+        return []
+    started, faults = time.monotonic(), []
+    for step in task["step"]:
+        faults += do_step(step, place, data)
+        if faults:
+            break
+    mark = "FAILED" if faults else "ok"
+    print("\n".join([f"{mark:>6} {time.monotonic() - started:6.1f} s  {task['words']}", *faults]), flush=True)
+    return faults
+
+
+def do_step(step: dict[str, Any], place: Place, data: str) -> list[str]:
+    """Run one command or script and compare what it did with what is expected."""
+    if "run" in step:
+        words = [word.replace("{DATA}", data) for word in shlex.split(step["run"])]
+    else:
+        words = [str(place.python), "-c", step["python"]]
+    done = subprocess.run(
+        words, cwd=place.folder, env=place.environment, capture_output=True, text=True, check=False,
+        timeout=HANGS_AFTER_S,
+    )  # fmt: skip
+    said = " ".join(re.sub(r"[│╭╮╰╯─]", " ", done.stdout + done.stderr).split())
+    faults = [
+        f"  there is no {name}" for name in step.get("files", ()) if not (place.folder / name).is_file()
+    ]
+    faults += [f"  it does not say {part!r}" for part in step.get("expect", ()) if part not in said]
+    if done.returncode not in step.get("exit", [0]):
+        faults.append(f"  exit code {done.returncode}, not {step.get('exit', [0])}")
+    if "Traceback" in done.stderr:
+        faults.append("  it ends in a traceback")
+    if faults:
+        faults = [f"  {step.get('run', 'script')}", *faults, done.stdout[-2000:], done.stderr[-2000:]]
+    return faults
+
+
+if __name__ == "__main__":
+    sys.exit(main())

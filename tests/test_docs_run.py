@@ -42,7 +42,6 @@ def write_files(here: Path) -> None:
         assert main(["template", kind, "--out", str(here / f"{kind}.toml"), "--quiet"]) == 0
     shutil.copy(ROOT / "examples" / "my_device.toml", here / "my-device.toml")
     (here / "study.toml").write_text(STUDY)
-    (here / "point.txt").write_text("lps:0,0,0")
     terminal.set_quiet(False)
 
 
@@ -61,7 +60,6 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plan.save(here / "plan" / "plan.json")
     np.savetxt(here / "pose.txt", LPS_FROM_RAS @ plan.tube.lps_from_tip)
     points = ["lps:" + ",".join(f"{x:.2f}" for x in point) for point in lung.targets_lps]
-    (here / "point.txt").write_text(points[0])
     (here / "lesions.txt").write_text("\n".join(points[:2]))
     (here / "ct.nii.gz").symlink_to(here / "PATIENT" / "ct.nii.gz")
     (here / "nodule.nii.gz").symlink_to(here / "PATIENT" / "nodules.nii.gz")
@@ -90,10 +88,8 @@ def folder(
 
 
 def at_hand(words: list[str]) -> list[str]:
-    """Replace what only the reader knows: a CT, points in their patient, how long they want to wait."""
-    point = Path("point.txt").read_text()
+    """Replace what only the reader knows: their CT, and how long they want to wait."""
     words = ["ct.nii.gz" if word == "CT" else word for word in words]
-    words = [point if word.startswith(("ras:", "lps:")) else word for word in words]
     return [INSTEAD.get(before, word) for before, word in zip(["", *words], words, strict=False)]
 
 

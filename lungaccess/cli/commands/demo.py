@@ -22,8 +22,8 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from anatomy.lung import Lung
 
-DEMO_SEED = 2
-"""The first nodule of this synthetic patient can be reached."""
+DEMO_SEED = 1
+"""The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps."""
 DEMO_BUDGET_S = 3.0
 """The cost has settled by then, and a first visitor does not wait long."""
 DEMO_SPACING_MM = 1.25

@@ -34,9 +34,9 @@ BLOCKED = "#D62728"
 def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) -> Path:
     """Draw a needle planned alone and write the picture to `path`.
 
-    Both panels are cuts.  The left one holds start, direction of insertion and target; dashed are the
-    tightest arcs of the needle, between which it reaches.  The right one shows what is blocked, else the
-    start, with the needle's radius and the distance that it has to keep.
+    Both panels are cuts.  The left one follows the path; without one it holds start, direction of insertion
+    and target.  Dashed are the tightest arcs of the needle, between which it reaches.  The right one shows
+    what is blocked, else the start, with the needle's radius and the distance that it has to keep.
 
     Raises
     ------
@@ -50,7 +50,8 @@ def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) 
     layers = Layers(lung)
     start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
     points = np.array([start, *_path_points(answer)])
-    view = plane_view(np.array([start, start + 10.0 * forward, query.target]), "")
+    shown = points if len(points) > 1 else np.array([start, start + 10.0 * forward, query.target])
+    view = plane_view(shown, "")
     found = answer.obstruction
     near_blocked = found is not None and found.place != "reach"
     middle = found.point_lps if found is not None and near_blocked else start
@@ -79,12 +80,12 @@ def _path_points(answer: NeedleAnswer) -> Float:
 def _whole_panel(
     axes: Axes, answer: NeedleAnswer, query: Query, layers: Layers, view: View, points: Float
 ) -> None:
-    """Draw all from start to target in the plane of the start's direction and the target."""
+    """Draw all from start to target on a cut that follows the path, or in the plane of start and target."""
     start = query.lps_from_start[:3, 3]
     shown = view.project(np.concatenate([points, [start, query.target]]))
     drawing.fit(axes, shown.min(axis=0) - 7.0, shown.max(axis=0) + 7.0)
     limits = axes.get_xlim(), axes.get_ylim()
-    paint_cut(axes, layers, view, start)
+    paint_cut(axes, layers, view, points)
     far = 1.15 * float(np.linalg.norm(query.target - start))
     for arc in _tightest_arcs(query, view, 1.0 / answer.environment.limits.kappa, far):
         uv = view.project(arc)
@@ -96,7 +97,11 @@ def _whole_panel(
     axes.set_xlim(limits[0])
     axes.set_ylim(limits[1])
     drawing.dress(axes, view, ticks=False)
-    drawing.title(axes, "From start to target (cut in the plane of both)")
+    drawing.title(
+        axes,
+        "From start to target "
+        + ("(cut in the plane of both)" if answer.path is None else "(cut that follows the path)"),
+    )
 
 
 def _close_panel(

@@ -45,13 +45,13 @@ def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
 
 
 def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
-    """Draw the path of the needle, in the plane that fits it best."""
+    """Draw the path of the needle, in the direction that shows it best, on a cut that follows it."""
     needle = plan.curves().needle.points_lps
     target = np.asarray(plan.target_lps)
     view = plane_view(needle, "")
     shown = np.concatenate([needle, target[None]])
-    _cut_panel(axes, plan, layers, view, needle.mean(axis=0), shown, margin_mm=6.0)
-    drawing.title(axes, "Needle (cut in its best plane)")
+    _cut_panel(axes, plan, layers, view, needle, shown, margin_mm=6.0)
+    drawing.title(axes, "Needle (cut that follows it)")
 
 
 def _bending_plane(plan: Plan, tube: Float) -> Float:
@@ -66,7 +66,7 @@ def _bending_plane(plan: Plan, tube: Float) -> Float:
 def _cut_panel(
     axes: Axes, plan: Plan, layers: Layers, view: View, through: Float, shown: Float, *, margin_mm: float
 ) -> None:
-    """Paint the cut through a point, then the devices, and show all of `shown`."""
+    """Paint the cut through a point or along a curve, then the devices, and show all of `shown`."""
     uv = view.project(shown)
     drawing.fit(axes, uv.min(axis=0) - margin_mm, uv.max(axis=0) + margin_mm)
     paint_cut(axes, layers, view, through)
@@ -96,12 +96,20 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
 
 
 def paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:
-    """Colour each pixel by the structure it lies in; vessels just beside the plane show faintly."""
+    """Colour each pixel by the structure it lies in; vessels just beside the cut show faintly.
+
+    The cut is the plane through a point `(3,)`, or the surface that follows a curve `(N, 3)` in depth: each
+    pixel is as deep as the point of the curve that is nearest in the picture.
+    """
+    from scipy.spatial import cKDTree
+
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     u = np.linspace(left, right, PIXELS)
     v = np.linspace(bottom, top, int(PIXELS * (top - bottom) / (right - left)))
-    depth = float(through @ view.towards_viewer) * view.towards_viewer
-    lps = depth + u[None, :, None] * view.right + v[:, None, None] * view.up
+    lps = u[None, :, None] * view.right + v[:, None, None] * view.up
+    curve = np.atleast_2d(through)
+    nearest = cKDTree(view.project(curve)).query(np.stack(np.meshgrid(u, v), axis=-1))[1]
+    lps = lps + (curve @ view.towards_viewer)[nearest][..., None] * view.towards_viewer
     image = np.ones((len(v), len(u), 3))
     labels = layers.labels(lps)
     for name, colour in PAINT:

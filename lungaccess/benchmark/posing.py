@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from anatomy.liver import LiverImages
 from anatomy.organ import Organ
 from anatomy.patient import PatientImages
 from lungaccess.benchmark.published import PublishedQuery
@@ -30,7 +31,7 @@ def posed_in_lung(lung: Organ, system: System) -> Pose:
     return pose
 
 
-def posed_by_unc(images: PatientImages) -> Pose:
+def posed_by_unc(images: PatientImages | LiverImages) -> Pose:
     """Return what poses queries by the rules of the peer; see `lungaccess.benchmark.unc_rules`."""
     obstacles = unc_obstacles(images)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from anatomy.errors import FileError
+from anatomy.liver import LiverImages
 from anatomy.organ import Organ
 from anatomy.patient import PatientImages
 from anatomy.records import frozen_record
@@ -33,7 +34,7 @@ class PublishedQuery:
     target_lps: Float
 
 
-def published_queries(patient: PatientImages | Organ, name: str) -> list[PublishedQuery]:
+def published_queries(patient: PatientImages | LiverImages | Organ, name: str) -> list[PublishedQuery]:
     """Return each start of a patient with each of its targets, or with that which its name states.
 
     A start called `target2_start1` or `nodule2_start1` belongs to `target2` alone.
@@ -52,7 +53,7 @@ def _belong_together(start: Sequence[str], target: Sequence[str]) -> bool:
     return stated is None or known is None or stated[1] == known[1]
 
 
-def why_no_query(patient: PatientImages | Organ) -> str:
+def why_no_query(patient: PatientImages | LiverImages | Organ) -> str:
     """Return why a patient has no query; "" if it has one."""
     if not patient.starts:
         return NO_STARTS

@@ -11,6 +11,7 @@ import numpy as np
 
 from anatomy.fields import CENTRES
 from anatomy.grid import Grid
+from anatomy.liver import LiverImages
 from anatomy.patient import PatientImages
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
@@ -86,9 +87,18 @@ class UncObstacles:
         )
 
 
-def unc_obstacles(images: PatientImages) -> UncObstacles:
-    """Label the masks of a patient as they are."""
+def unc_obstacles(images: PatientImages | LiverImages) -> UncObstacles:
+    """Label the masks of a patient as they are; of a liver, its vessels and what is not liver or nodule."""
     labels = np.zeros(images.grid.shape, dtype=np.uint16, order="F")
+    if isinstance(images, LiverImages):
+        inside = images.liver.array.copy()
+        for vessels in images.lumens.values():
+            labels[vessels.array] |= VESSEL
+            inside |= vessels.array
+        if images.nodules is not None:
+            inside |= images.nodules.array
+        labels[~inside] |= OUTSIDE
+        return UncObstacles(labels=labels, grid=images.grid)
     labels[images.lumen.array] |= AIRWAY
     labels[images.vessels.array] |= VESSEL
     labels[~images.lung.array] |= OUTSIDE

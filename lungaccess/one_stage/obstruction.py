@@ -9,7 +9,7 @@ from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Float
 from stages.needle import Obstruction
 
-NAMES = ((VESSEL, "a vessel"), (FISSURE, "a fissure"), (OUTSIDE, "the outside of the lung"))
+NAMES = ((VESSEL, "a vessel"), (FISSURE, "a fissure"), (OUTSIDE, "the outside of the organ"))
 LIMITS = {
     "angle": "lies too far aside of straight ahead for the limit of the angle from the start",
     "turn": "lies too far aside of straight ahead for the limit of all turning",

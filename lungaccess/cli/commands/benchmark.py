@@ -18,6 +18,7 @@ from lungaccess.cli.options import PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
+    from anatomy.liver import LiverImages
     from anatomy.organ import Organ
     from anatomy.patient import PatientImages
     from lungaccess.benchmark import BenchmarkRow
@@ -143,17 +144,18 @@ def _rows(
 
 def _posing(
     path: Path, rules: Rules, device: System, output: PatientOptions
-) -> tuple[Pose, Organ | PatientImages]:
+) -> tuple[Pose, Organ | PatientImages | LiverImages]:
     """Return what makes environments of a patient by the rules, and the patient."""
     from lungaccess.benchmark import posed_by_unc, posed_in_lung
 
     if rules == "ours":
         lung = output.load_organ(path)
         return posed_in_lung(lung, device), lung
+    from anatomy.io.liver import is_liver, load_liver
     from anatomy.io.patients import load_patient
 
     with progress(f"reading {path}"):
-        images = load_patient(path)
+        images = load_liver(path) if is_liver(path) else load_patient(path)
     return posed_by_unc(images), images
 
 

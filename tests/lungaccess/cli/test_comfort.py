@@ -152,6 +152,11 @@ def test_a_plan_as_json_says_what_the_check_says(
     assert said["costs"]["cost_map"] is None and "plan.json" in said["files"]
     assert said["headline"]["grade"] == "good" and said["headline"]["success"]["probability"] == 0.95
     assert json.loads((tmp_path / "summary.json").read_text()) == said
+    assert "overview.png" in said["files"]
+    for name in ("overview_png", "tree_png", "cost_over_time_png"):
+        monkeypatch.setattr(f"lungaccess.report.{name}", lambda *_: pytest.fail("it draws"))
+    assert cli.main([*words, "--no-pictures"]) == ExitCode.OK
+    assert not [file for file in json.loads(capsys.readouterr().out)["files"] if file.endswith(".png")]
 
     def fail(*_: Any) -> None:
         raise NoPlan("No way", reasons={"too near a vessel": 3}, advice="A thinner scope")

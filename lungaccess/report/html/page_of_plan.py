@@ -156,4 +156,5 @@ def _summary(plan: Plan) -> str:
         f"{plan.needle.length_mm:.1f} mm in {plural(len(plan.needle.arcs), 'arc')}; target at LPS "
         f"{x:.1f}, {y:.1f}, {z:.1f} mm"
     )
-    return words.text(facts)
+    # Why this system, if it was chosen among several: the last sentence of its choice.
+    return words.text(". ".join((facts, *plan.system_choice[-1:])))

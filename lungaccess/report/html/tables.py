@@ -213,6 +213,7 @@ def provenance_section(plan: Plan, lung: Lung) -> str:
         ("breath hold", plan.breath_hold or "not stated"),
         ("target from", plan.target_origin),
         ("system", plan.system.name),
+        *(("choice of the system", sentence) for sentence in plan.system_choice),
         ("fingerprint of the system", plan.system_fingerprint),
         ("method, seed, iterations", f"{plan.method}, {plan.seed}, {plan.iterations}"),
         ("objective", plan.objective),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from html import escape
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from anatomy.lung import Lung
 from lungaccess.checking import Checker
 from lungaccess.coupled import presets
 from lungaccess.problem.system import System
+from lungaccess.report.html.tables import provenance_section
 
 SYSTEM = replace(la.load_system("ultrathin"), name="does")
 SHORT = replace(SYSTEM, name="too short", needle=replace(SYSTEM.needle, max_length_mm=5.0, diameter_mm=0.7))
@@ -52,6 +54,8 @@ def test_the_plan_is_that_of_the_system_alone(small_lung: Lung, atlas_of: Any) -
     assert la.Plan.from_json(chosen.to_json()).system_choice == chosen.system_choice
     assert "system_choice" not in alone.to_json()
     assert any(name == "choice of the system" for name, _value in chosen.figures())
+    page = provenance_section(chosen, small_lung)
+    assert all(escape(sentence) in page for sentence in chosen.system_choice)
 
 
 def test_what_the_check_refuses_is_not_chosen(

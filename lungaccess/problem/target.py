@@ -6,6 +6,7 @@ import numpy as np
 
 from anatomy.errors import TargetError
 from anatomy.grid import Volume, read_only
+from anatomy.lung import Lung
 from anatomy.morphology import components
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
@@ -212,7 +213,7 @@ def require_free(lung: Organ, point: Float, origin: str = "") -> None:
         if label & bit:
             raise TargetError(
                 f"The target at {_place(point)} lies inside {name}",
-                expected="a point in lung tissue",
+                expected=f"a point in {_word_of(lung)} tissue",
                 remedy="Move the target, or remove the nodule from that mask",
             )
 
@@ -220,13 +221,14 @@ def require_free(lung: Organ, point: Float, origin: str = "") -> None:
 def _outside(lung: Organ, point: Float, origin: str) -> TargetError:
     """Return the error for a target outside the lung, with the frame that was meant if that is plain."""
     flipped = point * np.array([-1.0, -1.0, 1.0])
-    where = "lung" if lung.grid.contains(point).all() else "images"
+    organ = _word_of(lung)
+    where = organ if lung.grid.contains(point).all() else "images"
     if lung.label_at(flipped) & OUTSIDE:
         corners = [lung.grid.lps(np.zeros(3)), lung.grid.lps(np.array(lung.grid.shape) - 1.0)]
         ranges = (f"{a:.0f} to {b:.0f}" for a, b in zip(np.min(corners, 0), np.max(corners, 0), strict=True))
         return TargetError(
             f"The target at {_place(point)} lies outside the {where}",
-            expected=f"a point in lung tissue; the box of the lungs is LPS {', '.join(ranges)} mm",
+            expected=f"a point in {organ} tissue; the box of the {organ} is LPS {', '.join(ranges)} mm",
             remedy="Read the point off the images again",
         )
     frame, _, numbers = origin.removeprefix("point ").partition(":")
@@ -239,9 +241,13 @@ def _outside(lung: Organ, point: Float, origin: str) -> TargetError:
             if other
             else "; with x and y negated it lies inside"
         ),
-        expected="a point in lung tissue, in the frame that is stated",
+        expected=f"a point in {organ} tissue, in the frame that is stated",
         remedy=f"If that is meant, state {typed}",
     )
+
+
+def _word_of(organ: Organ) -> str:
+    return "lung" if isinstance(organ, Lung) else "liver"
 
 
 def _place(point: Float) -> str:

@@ -82,7 +82,7 @@ def test_an_array_in_the_wrong_frame_is_told_so_too(lung: Lung) -> None:
 
 
 def test_a_target_outside_in_both_frames_hears_where_the_lungs_are(lung: Lung) -> None:
-    with pytest.raises(TargetError, match="the box of the lungs is LPS") as caught:
+    with pytest.raises(TargetError, match="the box of the lung is LPS") as caught:
         la.resolve_target(lung, "lps:0,500,0")
     assert "the same numbers" not in str(caught.value)
 

@@ -125,14 +125,19 @@ def _refuse_lobes_alone(folder: Path) -> NoReturn:
 def patients_in(folder: Path) -> list[Path]:
     """Return the patients, of any kind, that lie one or two folders below, or the cases of a data set."""
     cases = cases_in(folder)
-    if cases:
-        return cases
+    return cases or [path for below in _folders_in(folder) for path in _here(below) or _below(below)]
+
+
+def _below(folder: Path) -> list[Path]:
+    """Return the patients one folder below, or the cases of a data set in a folder."""
+    return cases_in(folder) or [path for below in _folders_in(folder) for path in _here(below)]
+
+
+def _here(folder: Path) -> list[Path]:
+    """Return a folder if it is a patient."""
     known: tuple[Callable[[Path], bool], ...] = (is_med_rad, is_liver, is_totalsegmentator)
-    below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    found: list[Path] = []
-    for path in below:
-        if (path / DESCRIPTION).is_file() or any(kind(path) for kind in known):
-            found.append(path)
-        else:
-            found += cases_in(path)
-    return found
+    return [folder] if (folder / DESCRIPTION).is_file() or any(kind(folder) for kind in known) else []
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from anatomy.errors import SettingsError
+from anatomy.io.files import require_writable_folder
 from anatomy.records import frozen_value
 from lungaccess.cli.numbers import Count, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
@@ -240,6 +241,17 @@ class SearchOptions(BudgetOptions):
     processes: Annotated[
         Processes, Parameter(help="How many processes refine the plan at the same time.")
     ] = 1
+
+
+def require_picture(path: Path) -> None:
+    """Raise SettingsError or FileError unless a picture can be written to a path, before any work is done."""
+    if path.suffix.lower() != ".png":
+        raise SettingsError(
+            f"--out is {path}",
+            expected="a file name that ends in .png",
+            remedy="Choose a name such as picture.png",
+        )
+    require_writable_folder(path.parent)
 
 
 def require_map(lung: Lung, objective: Objective) -> None:

@@ -20,6 +20,7 @@ from lungaccess.cli.options import (
     PatientOptions,
     SystemOptions,
     TargetOptions,
+    require_picture,
 )
 from lungaccess.cli.progress import progress
 from stages.needle import Objective
@@ -69,9 +70,8 @@ def needle(
     from anatomy.lung import Lung
     from lungaccess.one_stage import plan_needle
 
-    if out is not None and out.suffix.lower() != ".png":
-        raise SettingsError(f"--out is {out}", expected="a file name that ends in .png")
-
+    if out is not None:
+        require_picture(out)
     stated, weighed = target.stated(), Objective.of(objective)
     device = system.load()
     lung = output.load_organ(patient)

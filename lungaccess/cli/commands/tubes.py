@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Finite, NotNegative
-from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions
+from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions, require_picture
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -54,13 +52,7 @@ def tubes(
     """
     from lungaccess.one_stage import deploy_tubes, load_tubes
 
-    if out.suffix.lower() != ".png":
-        raise SettingsError(
-            f"--out is {out}",
-            expected="a file name that ends in .png",
-            remedy="Choose a name such as tubes.png",
-        )
-    require_writable_folder(out.parent)
+    require_picture(out)
     answer = deploy_tubes(
         load_tubes(system),
         outer,

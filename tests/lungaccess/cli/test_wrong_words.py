@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import lungaccess as la
@@ -28,6 +28,8 @@ from tests.lungaccess.cli.wrong_words import World, arguments_of, kind_of, range
 
 INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "200"))
 """How many wrong command lines are tried."""
+PHASES = (Phase.explicit, Phase.generate)
+"""The words of a failure are short: making them shorter would only take time."""
 BROKEN_TOML = {
     "broken.toml": 'name = "x\n[',
     "unknown_key.toml": 'name = "x"\nsurprise = 1\n',
@@ -117,7 +119,7 @@ def judge(words: list[str], code: int, out: str, err: str) -> None:
         assert out == "", said
 
 
-@settings(max_examples=INVOCATIONS, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=INVOCATIONS, derandomize=True, phases=PHASES, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_a_wrong_command_line_is_explained(
     data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]

@@ -132,7 +132,7 @@ def _patient_rows(lung: Organ) -> list[terminal.Row]:
     rows += [
         ("carina, LPS mm", ", ".join(f"{c:.1f}" for c in lung.tree.carina_lps)),
         ("breath hold", lung.breath_hold or "not stated"),
-        ("fissures", "given" if lung.has_fissures else "not given"),
+        ("fissures", "known" if lung.has_fissures else "not known"),
         ("cost map", "given" if lung.cost is not None else "not given"),
         ("lobes", "given" if lung.lobes is not None else "not given"),
         ("start poses, targets", f"{len(lung.starts)}, {len(lung.targets_lps)}"),

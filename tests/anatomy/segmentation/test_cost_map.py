@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid
-from anatomy.io.masks import require_cost
+from anatomy.io.assembly import require_cost
 from anatomy.patient import PatientImages
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.cost_map import cost_map, obstacles_of

@@ -365,7 +365,7 @@ class TestBadInput:
 
     def test_a_target_of_another_patient(self, small_lung: Lung, atlas: la.Atlas) -> None:
         far = Target(lps_mm=np.array([900.0, 0.0, 0.0]), origin="point")
-        with pytest.raises(TargetError, match="outside the lung"):
+        with pytest.raises(TargetError, match="outside the images"):
             la.plan(small_lung, SYSTEM, far, atlas=atlas)
 
 

@@ -91,7 +91,7 @@ def test_a_plan_is_checked_and_a_bad_target_is_an_answer(runs: list[Run], cache:
     assert len(good.findings) > 50
     assert all(each["ok"] for each in good.findings)
     assert (bad.outcome, bad.status, bad.solved, bad.failed) == ("TargetError", INVALID_GOAL, False, False)
-    assert "outside the lung" in bad.message
+    assert "outside the images" in bad.message
     assert answer(runs[0], cache).digest == good.digest
 
 

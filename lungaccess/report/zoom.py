@@ -101,15 +101,12 @@ def paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:
     The cut is the plane through a point `(3,)`, or the surface that follows a curve `(N, 3)` in depth: each
     pixel is as deep as the point of the curve that is nearest in the picture.
     """
-    from scipy.spatial import cKDTree
-
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     u = np.linspace(left, right, PIXELS)
     v = np.linspace(bottom, top, int(PIXELS * (top - bottom) / (right - left)))
     lps = u[None, :, None] * view.right + v[:, None, None] * view.up
     curve = np.atleast_2d(through)
-    nearest = cKDTree(view.project(curve)).query(np.stack(np.meshgrid(u, v), axis=-1))[1]
-    lps = lps + (curve @ view.towards_viewer)[nearest][..., None] * view.towards_viewer
+    lps = lps + _depth(curve, view, u, v)[..., None] * view.towards_viewer
     image = np.ones((len(v), len(u), 3))
     labels = layers.labels(lps)
     for name, colour in PAINT:
@@ -123,3 +120,16 @@ def paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:
         axes.contourf(u, v, nodule, levels=[0.5, 1.5], colors=[style.NODULE], alpha=0.35, zorder=4)
         axes.contour(u, v, nodule, levels=[0.5], colors=[style.NODULE], linewidths=[1.4], zorder=5)
     axes.set_aspect("equal", adjustable="box")
+
+
+def _depth(curve: Float, view: View, u: Float, v: Float) -> Float:
+    """Return how deep a cut along a curve `(N, 3)` lies at each pixel, `(V, U)` or broadcast to it, mm."""
+    depth = curve @ view.towards_viewer
+    if len(curve) == 1:
+        return np.asarray(depth[None])
+    from scipy.spatial import cKDTree
+
+    # Pixels are smaller than voxels: a block of 2 x 2 has one depth.
+    pixels = np.stack(np.meshgrid(u[::2], v[::2]), axis=-1)
+    blocks = depth[cKDTree(view.project(curve)).query(pixels)[1]]
+    return np.asarray(blocks.repeat(2, axis=0).repeat(2, axis=1)[: len(v), : len(u)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,7 +47,7 @@ def test_bounds_and_obstacles(seed: int, radius_mm: float) -> None:
 def test_it_serves_as_the_cost_of_a_patient() -> None:
     vessels, airways, lung = parts(1)
     cost = cost_map(vessels, airways, lung, GRID)
-    volume = require_cost(cost, GRID, Path("cost.nii.gz"))
+    volume = require_cost(cost, GRID)
     lungs, lumen, mask = (type(cost)(grid=GRID, array=a) for a in (lung, airways.lumen, vessels.mask))
     PatientImages(name="p", kind="masks", grid=GRID, lumen=lumen, vessels=mask, lung=lungs, cost=volume)
 

@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.scope.device import Bronchoscope
+    from stages.scope.motion import ScopeMotion
     from stages.scope.sites import Sites, approach_depth_mm, find_sites, tip_is_feasible
     from stages.scope.tips import (
         LEAVING_MM,

@@ -1,0 +1,84 @@
+"""The motion of a bronchoscope: advance, twist and bend of its bending section, and the body that it leaves.
+
+The bending section is an arc of one curvature, tangent to the shaft behind it; the shaft lies where the
+section led it [Rosell2012, sec. IV-C, in the limit of many short links].  A motion is a row of states.  From
+one state to the next the scope either advances with its twist and bend held, so that the section slides along
+its own arc, or twists and bends in place, both at a steady rate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.grid import read_only
+from anatomy.poses import poses_on_arc
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+
+ADVANCE, TWIST, BEND = range(3)
+"""Columns of a motion's states: advance in mm, twist and bend in rad."""
+SHORTEST_MM = 1e-9
+"""A shorter advance is rounding."""
+
+
+@frozen_record
+class ScopeMotion:
+    """How a bronchoscope gets from the trachea to where it stops; M states.
+
+    Parameters
+    ----------
+    lps_from_entry : (4, 4) float64
+        Base of the bending section when the motion begins: +z forward, +x the way a positive bend turns
+        the tip at twist 0.
+    states : (M, 3) float64
+        Advance of that base in mm, which never falls, twist in rad about the scope's axis, and bend in rad,
+        the angle of the whole section.  A twist turns the scope as a whole; its frame does not roll
+        otherwise (it is a Bishop frame).
+    bending_length_mm : float
+        Length of the bending section.
+    """
+
+    lps_from_entry: Float
+    states: Float
+    bending_length_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("lps_from_entry", "states"):
+            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.float64)))
+
+    @property
+    def pieces(self) -> Float:
+        """The arcs of the body in the last state, from the entry to the tip, the section last, `(P, 3)`.
+
+        Each row holds length in mm, roll before it in rad and signed curvature in 1/mm, as
+        `anatomy.poses.poses_on_arc` takes them, with the roll kept for the next piece.
+        """
+        advance, twist, bend = self.states.T
+        moved = np.flatnonzero(np.diff(advance) > SHORTEST_MM) + 1
+        length = np.append(np.diff(advance)[moved - 1], self.bending_length_mm)
+        which = np.append(moved, len(self.states) - 1)
+        return np.column_stack(
+            [length, np.diff(twist[which], prepend=0.0), bend[which] / self.bending_length_mm]
+        )
+
+    def body(self, step_mm: float) -> Float:
+        """Return frames `(N, 4, 4)` along the body in the last state, at most `step_mm` apart, the tip last.
+
+        The +x of the last one is the way a positive bend turns the tip: it is the frame of the working
+        channel.
+        """
+        frames = [self.lps_from_entry[None]]
+        for length, roll, curvature in self.pieces:
+            at = length * np.linspace(0.0, 1.0, max(1, int(np.ceil(length / step_mm))) + 1)[1:]
+            frames.append(poses_on_arc(frames[-1][-1], roll, curvature, at))
+        return np.concatenate(frames)
+
+    @property
+    def lps_from_tip(self) -> Float:
+        """Frame of the working channel at the tip `(4, 4)`, +z forward, +x as in `body`."""
+        return np.asarray(self.body(np.inf)[-1])
+
+    @property
+    def max_curvature_per_mm(self) -> float:
+        """Largest curvature of the body in the last state, which tubes in the channel pass."""
+        return float(np.abs(self.pieces[:, 2]).max())

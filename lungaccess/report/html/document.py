@@ -14,8 +14,10 @@ from lungaccess.report.pack import script_text
 
 SHARED_MODULES = (
     "decode.js", "vectors.js", "shaders.js", "solids.js", "scene.js", "orbit.js", "slices.js",
-    "structures.js",
+    "structures.js", "anatomy_page.js",
 )  # fmt: skip
+TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
+"""Looks at the target; for `scene_figure`."""
 _IMPORT = re.compile(r"^import .*;\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(async )?(function|class|const|let) )", re.MULTILINE)
 _HOLE = re.compile(r"\{\{(\w+)\}\}")

@@ -12,9 +12,9 @@ import numpy as np
 from anatomy.typed import Float
 from lungaccess.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.report.html import words
-from lungaccess.report.html.document import scene_figure, write_page
+from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, write_page
 from lungaccess.report.html.meshes import structure_meshes
-from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, label_volumes
+from lungaccess.report.html.volumes import page_image
 from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
 
 MODULES = ("no_plan.js",)
-TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
 
 
 def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[str]) -> Path:
@@ -66,10 +65,7 @@ def page_data(explanation: Explanation, lung: Lung) -> dict[str, Any]:
             {"name": f"{each.place.kind}, {each.arcs} arcs", "lps": each.place.lps_mm.tolist()}
             for each in explanation.blocking
         ],
-        "codes": CODES,
-        "labels": label_volumes(lung, np.vstack([target, *(_near(points, target) for _, points in paths)])),
-        "ct": None,
-        "hounsfield": {"lowest": LOWEST_HU, "per_step": HU_PER_STEP},
+        **page_image(lung, np.vstack([target, *(_near(points, target) for _, points in paths)])),
     }
 
 

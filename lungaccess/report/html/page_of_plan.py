@@ -15,9 +15,9 @@ from anatomy.words import plural
 from lungaccess.appraisal import DRAWS, SEED, Appraiser
 from lungaccess.report.html import tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
-from lungaccess.report.html.document import scene_figure, write_page
+from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, write_page
 from lungaccess.report.html.meshes import structure_meshes
-from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, ct_volumes, label_volumes
+from lungaccess.report.html.volumes import page_image
 
 if TYPE_CHECKING:
     from anatomy.grid import Volume
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from lungaccess.risk import ErrorModel
 
 MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
-TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
 THICKER = "; seen from afar, devices are drawn thicker than they are"
 
 
@@ -123,10 +122,7 @@ def page_data(
             {**packed_plan(each, lung, tables.plan_name(n)), **appraisal.to_mapping()}
             for n, (each, appraisal) in enumerate(zip(plans, appraisals, strict=True))
         ],
-        "codes": CODES,
-        "labels": label_volumes(lung, near),
-        "ct": None if options.ct is None else ct_volumes(options.ct, lung, near),
-        "hounsfield": {"lowest": LOWEST_HU, "per_step": HU_PER_STEP},
+        **page_image(lung, near, options.ct),
         "cost_over_time": cost_history(options.cost_over_time),
     }
 

@@ -13,7 +13,7 @@ from anatomy.grid import Volume
 from lungaccess.report.html import words
 from lungaccess.report.html.document import scene_figure, write_page
 from lungaccess.report.html.meshes import Look, packed_surface, structure_meshes
-from lungaccess.report.html.volumes import CODES, HU_PER_STEP, LOWEST_HU, label_volumes
+from lungaccess.report.html.volumes import page_image
 from lungaccess.report.pack import Packed, pack
 from lungaccess.report.reach import CLEARANCE_MM, COLOURS, fullest_point
 
@@ -57,10 +57,7 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
         "page": "reach",
         "patient": lung.name,
         "structures": structure_meshes(lung),
-        "codes": CODES,
-        "labels": label_volumes(lung, centre[None]),
-        "ct": None,
-        "hounsfield": {"lowest": LOWEST_HU, "per_step": HU_PER_STEP},
+        **page_image(lung, centre[None]),
         "centre_lps": centre.tolist(),
         "colours": COLOURS,
         "clearance_range_mm": list(CLEARANCE_MM),

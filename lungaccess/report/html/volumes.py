@@ -54,6 +54,22 @@ def read_ct(path: Path) -> Volume:
     return read_dicom(path) if path.is_dir() else read_volume(path)
 
 
+def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packed:
+    """Return the voxels that the slices of a page show: structures, and a CT if there is one.
+
+    Raises
+    ------
+    AnatomyError
+        If the CT does not hold the devices.
+    """
+    return {
+        "codes": CODES,
+        "labels": label_volumes(lung, device_lps),
+        "ct": None if ct is None else ct_volumes(ct, lung, device_lps),
+        "hounsfield": {"lowest": LOWEST_HU, "per_step": HU_PER_STEP},
+    }
+
+
 def label_codes(lung: Lung, low: ArrayLike, high: ArrayLike) -> Volume:
     """Return one of `CODES` for the voxels from `low` to before `high`, `(3,)` each.
 

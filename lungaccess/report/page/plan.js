@@ -1,13 +1,12 @@
 // The page of a plan.
+import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { Bronchoscopy } from "./bronchoscopy.js";
 import { lineChart } from "./charts.js";
 import { reportData, unpack } from "./decode.js";
 import { Motion, STAGES } from "./motion.js";
-import { Orbit } from "./orbit.js";
-import { Scene } from "./scene.js";
-import { planeAcross, Slice, STANDARD, VoxelImage } from "./slices.js";
+import { planeAcross, STANDARD, VoxelImage } from "./slices.js";
 import { Solids } from "./solids.js";
-import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { addSwitch } from "./structures.js";
 import { rgb } from "./vectors.js";
 
 const DEVICES = [
@@ -25,14 +24,11 @@ const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
 const PLAY_S = 14;
 const LEAST_WIDTH = 0.0016;
 
-const byId = (id) => document.getElementById(id);
-
-class PlanPage {
+class PlanPage extends AnatomyPage {
   constructor(data) {
-    this.data = data;
+    super(data);
     this.slider = byId("position");
     this.shown = Object.fromEntries(DEVICES.map(({ key, shown }) => [key, shown]));
-    this.redraw = oncePerFrame(() => this.draw());
     this.cursors = [];
     this.playing = null;
   }
@@ -43,9 +39,10 @@ class PlanPage {
     this.followed = 0;
     this.listSwitches();
     this.connectControls();
-    await this.openScene();
+    if (await this.openScene(distanceOfAll)) this.addTarget();
     this.image = await VoxelImage.of(this.data);
-    this.openSlices();
+    this.openSlices([...Object.keys(STANDARD), "across"]);
+    byId("ct-controls").hidden = !this.image.hasCt;
     await this.drawCharts();
     this.draw();
   }
@@ -54,29 +51,12 @@ class PlanPage {
     return this.motions[this.followed];
   }
 
-  async openScene() {
-    const canvas = byId("scene");
+  addTarget() {
     const target = this.data.plans[0].target_lps;
-    try {
-      this.scene = new Scene(canvas);
-    } catch (error) {
-      byId("no-scene").hidden = false;
-      byId("no-scene").textContent = `No 3-D view: ${error.message}.`;
-      return;
-    }
-    await Promise.all(this.data.structures.map((packed) => this.scene.addSurface(packed)));
-    const box = this.data.structures.find(({ key }) => key === "lung") || this.data.structures[0];
-    const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
-    const distance = 1.05 * Math.max(...box.size_mm) / Math.tan((15 * Math.PI) / 180) / 2 + box.size_mm[1] / 2;
-    this.orbit = new Orbit(canvas, centre, distance, this.redraw);
-    connectViews(byId("scene-figure"), this.orbit);
     byId("view-target").addEventListener("click", () => this.orbit.approach(target, 170));
     this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"));
-    new ResizeObserver(this.redraw).observe(canvas);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
-    const solids = new Solids();
-    solids.ball(target, 1.6, rgb("#39E0B0"));
-    this.targetBall = solids;
+    this.targetBall = new Solids();
+    this.targetBall.ball(target, 1.6, rgb("#39E0B0"));
   }
 
   listSwitches() {
@@ -86,12 +66,7 @@ class PlanPage {
         this.redraw();
       });
     }
-    for (const structure of this.data.structures) {
-      addSwitch(byId("structures"), structure, (on) => {
-        if (this.scene) this.scene.surfaces.get(structure.key).shown = on;
-        this.redraw();
-      });
-    }
+    this.listStructures();
     this.data.plans.forEach((plan, n) => {
       const name = `${plan.name}${plan.accepted ? "" : " (refused)"}`;
       addSwitch(byId("plans"), { key: `plan-${n}`, name, colour: n ? OTHER : NEEDLE_INK, shown: n === 0 }, (on) => {
@@ -117,21 +92,13 @@ class PlanPage {
     for (const button of document.querySelectorAll("button[data-stage]")) {
       button.addEventListener("click", () => {
         this.stop();
-        this.set(this.motion.starts[Number(button.dataset.stage)]);
+        this.moveTo(this.motion.starts[Number(button.dataset.stage)]);
       });
     }
     for (const id of ["field", "window", "tint"]) byId(id).addEventListener("change", () => this.redraw());
   }
 
-  openSlices() {
-    this.slices = {};
-    for (const name of [...Object.keys(STANDARD), "across"]) {
-      this.slices[name] = new Slice(byId(`slice-${name}`), this.image);
-    }
-    byId("ct-controls").hidden = !this.image.hasCt;
-  }
-
-  set(position) {
+  moveTo(position) {
     this.slider.value = Math.round(1000 * position);
     this.redraw();
   }
@@ -165,12 +132,12 @@ class PlanPage {
     for (const button of document.querySelectorAll("button[data-stage]")) {
       button.setAttribute("aria-pressed", String(Number(button.dataset.stage) === state.stage));
     }
-    if (this.scene) this.drawScene(state);
+    if (this.scene) this.drawDevices(state);
     if (this.slices) this.drawSlices(state);
     for (const move of this.cursors) move(this.motion.alongMm(state));
   }
 
-  drawScene(state) {
+  drawDevices(state) {
     const { scene, shown } = this;
     const radius = thickened(this.motion.plan.radius_mm, this.orbit.distance);
     const followed = this.shownPlans[this.followed];
@@ -187,8 +154,7 @@ class PlanPage {
     scene.setSolids("target", shown.target ? this.targetBall : null);
     scene.fit();
     this.bronchoscopy.draw(state, this.motion);
-    scene.draw(this.orbit.camera(), sceneBackground());
-    showEdges(byId("scene-figure"), this.orbit);
+    this.drawScene();
   }
 
   otherPlans(solids) {
@@ -259,17 +225,19 @@ class PlanPage {
   report() {
     const { state } = this;
     return {
+      ...super.report(),
       plan: this.followed, plans: this.shownPlans, position: state.position, stage: STAGES[state.stage],
       scope_mm: state.scopeMm, outer_mm: state.outerMm, inner_mm: state.innerMm, needle_mm: state.needleMm,
       tip_lps: state.tip, needle_lps: state.needle, camera: state.camera, devices: { ...this.shown },
-      structures: this.scene ? Object.fromEntries([...this.scene.surfaces].map(([key, s]) => [key, s.shown])) : {},
-      triangles: this.scene ? [...this.scene.surfaces.values()].reduce((sum, s) => sum + s.count / 3, 0) : 0,
       solids: this.scene ? Object.fromEntries([...this.scene.solids].map(([key, s]) => [key, s.count / 3])) : {},
-      gl_error: this.scene ? this.scene.gl.getError() : null,
-      slice_edges: this.slices ? Object.fromEntries(Object.entries(this.slices).map(([key, s]) => [key, s.edges])) : {},
       view: this.orbit ? { yaw: this.orbit.yaw, pitch: this.orbit.pitch, distance: this.orbit.distance, edges: this.orbit.edges() } : null,
     };
   }
+}
+
+// Return how far away the whole lung is seen at once, by its size in mm.
+function distanceOfAll(size) {
+  return 1.05 * Math.max(...size) / Math.tan((15 * Math.PI) / 180) / 2 + size[1] / 2;
 }
 
 // Return radii that can be seen from a distance.
@@ -278,12 +246,4 @@ function thickened(radius, distance) {
   return Object.fromEntries(Object.entries(radius).map(([key, mm]) => [key, Math.max(mm, least)]));
 }
 
-const page = new PlanPage(reportData());
-window.lungaccessReport = {
-  ready: page.open(),
-  state: () => page.report(),
-  set: (position) => {
-    page.set(position);
-    page.draw();
-  },
-};
+openPage(new PlanPage(reportData()));

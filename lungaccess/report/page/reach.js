@@ -1,9 +1,8 @@
 // The page of a reachability map.
+import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { reportData, unpack } from "./decode.js";
-import { Orbit } from "./orbit.js";
-import { Scene } from "./scene.js";
-import { Slice, STANDARD, VoxelImage } from "./slices.js";
-import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { STANDARD, VoxelImage } from "./slices.js";
+import { addSwitch } from "./structures.js";
 import { mix, rgb } from "./vectors.js";
 
 // Viridis in five steps: even in lightness, for every colour vision.
@@ -11,7 +10,6 @@ const RAMP = ["#440154", "#3B528B", "#21918C", "#5EC962", "#FDE725"].map(rgb);
 const NO_PATH = [150, 150, 150];
 const OVER_SHARE = 0.85;
 
-const find = (id) => document.getElementById(id);
 const bytes = (colour) => colour.map((value) => Math.round(255 * value));
 
 function ramp(share) {
@@ -20,22 +18,23 @@ function ramp(share) {
   return bytes(mix(RAMP[n], RAMP[n + 1], at - n));
 }
 
-class ReachPage {
+class ReachPage extends AnatomyPage {
   constructor(data) {
-    this.data = data;
+    super(data, ["airway", "lung"]);
     this.place = [...data.centre_lps];
     this.number = 0;
-    this.redraw = oncePerFrame(() => this.draw());
   }
 
   async open() {
     this.maps = await Promise.all(this.data.maps.map(async (map) => ({
       ...map, kindOf: await unpack(map.kind), clearanceOf: await unpack(map.clearance),
     })));
-    await this.openScene();
+    if (await this.openScene((size) => 2.1 * Math.max(...size))) await this.addMaps();
     this.image = await VoxelImage.of(this.data);
     this.listControls();
     this.openSlices();
+    this.followClicks();
+    this.connectSliders();
     this.draw();
   }
 
@@ -43,47 +42,26 @@ class ReachPage {
     return this.maps[this.number];
   }
 
-  async openScene() {
-    try {
-      this.scene = new Scene(find("scene"));
-    } catch (error) {
-      find("no-scene").hidden = false;
-      find("no-scene").textContent = `No 3-D view: ${error.message}.`;
-      return;
-    }
-    const surfaces = this.data.structures.map((packed) => ({ ...packed, shown: ["airway", "lung"].includes(packed.key) }));
-    for (const packed of surfaces) await this.scene.addSurface(packed);
+  async addMaps() {
     for (const [n, map] of this.maps.entries()) {
       for (const packed of map.surfaces) {
         await this.scene.addSurface({ ...packed, key: `${n}: ${packed.key}`, shown: n === 0 && packed.shown });
       }
     }
-    const box = surfaces.find(({ key }) => key === "lung") || surfaces[0];
-    const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
-    this.orbit = new Orbit(find("scene"), centre, 2.1 * Math.max(...box.size_mm), this.redraw);
-    connectViews(find("scene-figure"), this.orbit);
-    new ResizeObserver(this.redraw).observe(find("scene"));
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
   }
 
   listControls() {
-    this.data.structures.forEach((packed) => {
-      const shown = this.scene ? this.scene.surfaces.get(packed.key).shown : false;
-      addSwitch(find("structures"), { ...packed, shown }, (on) => {
-        if (this.scene) this.scene.surfaces.get(packed.key).shown = on;
-        this.redraw();
-      });
-    });
+    this.listStructures();
     this.boxes = new Map();
     for (const { key, name, colour, shown } of this.maps[0].surfaces) {
-      this.boxes.set(key, addSwitch(find("surfaces"), { key, name, colour, shown }, () => this.showSurfaces()));
+      this.boxes.set(key, addSwitch(byId("surfaces"), { key, name, colour, shown }, () => this.showSurfaces()));
     }
-    this.maps.forEach((map, n) => find("system").append(new Option(map.name, n)));
-    find("system").addEventListener("change", (event) => {
+    this.maps.forEach((map, n) => byId("system").append(new Option(map.name, n)));
+    byId("system").addEventListener("change", (event) => {
       this.number = Number(event.target.value);
       this.showSurfaces();
     });
-    find("quantity").addEventListener("change", this.redraw);
+    byId("quantity").addEventListener("change", this.redraw);
   }
 
   showSurfaces() {
@@ -96,14 +74,13 @@ class ReachPage {
     this.redraw();
   }
 
-  openSlices() {
+  connectSliders() {
     const volume = this.image.labels[0];
     const sizes = [volume.width, volume.height, volume.depth];
     this.widthMm = Math.max(...sizes) * volume.spacing;
     this.middle = volume.first.map((first, axis) => first + ((sizes[axis] - 1) * volume.spacing) / 2);
-    this.slices = Object.fromEntries(Object.keys(STANDARD).map((name) => [name, new Slice(find(`slice-${name}`), this.image)]));
     for (let axis = 0; axis < 3; axis++) {
-      const slider = find(`place-${axis}`);
+      const slider = byId(`place-${axis}`);
       slider.min = Math.ceil(volume.first[axis]);
       slider.max = Math.floor(volume.first[axis] + (sizes[axis] - 1) * volume.spacing);
       slider.value = this.place[axis];
@@ -112,20 +89,13 @@ class ReachPage {
         this.redraw();
       });
     }
-    for (const slice of Object.values(this.slices)) {
-      slice.canvas.addEventListener("click", (event) => {
-        const scale = slice.canvas.width / slice.canvas.clientWidth;
-        this.moveTo(slice.pointAt(event.offsetX * scale, event.offsetY * scale));
-      });
-    }
   }
 
   moveTo(place) {
-    this.place = place;
+    super.moveTo(place);
     place.forEach((value, axis) => {
-      find(`place-${axis}`).value = value;
+      byId(`place-${axis}`).value = value;
     });
-    this.redraw();
   }
 
   // Return the index of the map's voxel that holds a point, -1 beyond the map.
@@ -142,7 +112,7 @@ class ReachPage {
     const colours = [];
     for (const [name, code] of Object.entries(map.kinds)) colours[code] = bytes(rgb(this.data.colours[name]));
     const reached = [map.kinds["direct arc"], map.kinds.search];
-    const byClearance = find("quantity").value === "clearance";
+    const byClearance = byId("quantity").value === "clearance";
     const [low, high] = this.data.clearance_range_mm;
     const shades = Array.from({ length: 256 }, (_, n) => ramp((n / map.steps_per_mm - low) / (high - low)));
     return (x, y, z) => {
@@ -157,8 +127,7 @@ class ReachPage {
   draw() {
     if (this.scene) {
       this.scene.fit();
-      this.scene.draw(this.orbit.camera(), sceneBackground());
-      showEdges(find("scene-figure"), this.orbit);
+      this.drawScene();
     }
     if (!this.slices) return;
     this.image.overlay = this.painter();
@@ -168,7 +137,7 @@ class ReachPage {
       away[normal] = this.place[normal];
       this.slices[name].draw(plane, away, this.widthMm, { cross: this.place });
     }
-    find("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(0)).join(", ")} mm: ${this.words()}.`;
+    byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(0)).join(", ")} mm: ${this.words()}.`;
     this.showKey();
   }
 
@@ -183,14 +152,14 @@ class ReachPage {
   }
 
   showKey() {
-    const clearance = find("quantity").value === "clearance";
+    const clearance = byId("quantity").value === "clearance";
     const entries = clearance
       ? [0, 0.25, 0.5, 0.75, 1].map((share) => {
         const mm = this.data.clearance_range_mm[1] * share;
         return [`${mm} mm${share === 1 ? " and more" : ""}`, `rgb(${ramp(share).join(",")})`];
       }).concat([["no path", `rgb(${NO_PATH.join(",")})`]])
       : Object.entries(this.data.colours);
-    find("key").replaceChildren(...entries.map(([name, colour]) => {
+    byId("key").replaceChildren(...entries.map(([name, colour]) => {
       const item = document.createElement("li");
       const swatch = document.createElement("span");
       swatch.className = "swatch";
@@ -203,21 +172,9 @@ class ReachPage {
   // What a test may read; docs/how_to/report.md names the fields.
   report() {
     return {
-      system: this.map.name, quantity: find("quantity").value, place_lps: this.place, words: this.words(),
-      structures: this.scene ? Object.fromEntries([...this.scene.surfaces].map(([key, s]) => [key, s.shown])) : {},
-      triangles: this.scene ? [...this.scene.surfaces.values()].reduce((sum, s) => sum + s.count / 3, 0) : 0,
-      gl_error: this.scene ? this.scene.gl.getError() : null,
-      slice_edges: Object.fromEntries(Object.entries(this.slices).map(([key, s]) => [key, s.edges])),
+      ...super.report(), system: this.map.name, quantity: byId("quantity").value, place_lps: this.place, words: this.words(),
     };
   }
 }
 
-const reachPage = new ReachPage(reportData());
-window.lungaccessReport = {
-  ready: reachPage.open(),
-  state: () => reachPage.report(),
-  set: (place) => {
-    reachPage.moveTo(place);
-    reachPage.draw();
-  },
-};
+openPage(new ReachPage(reportData()));

@@ -28,12 +28,24 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.curves import arc_lengths
 from lungaccess.plans.plan import Plan
 from lungaccess.report import pack
-from lungaccess.report.html import deployment, document, meshes, movie, page_of_plan, tables, volumes, words
+from lungaccess.report.html import (
+    deployment,
+    document,
+    meshes,
+    movie,
+    page_of_no_plan,
+    page_of_plan,
+    page_of_reach,
+    tables,
+    volumes,
+    words,
+)
 from lungaccess.report.html.page_of_reach import STEPS_PER_MM, packed_map
 from tests.lungaccess.report.pages import SIZE_LIMIT, make_plans, make_reach, plan_file, reach_file
 
 NAMESPACE = "http://www.w3.org/2000/svg"
 STRUCTURES = {"airway", "vessel", "pleura", "fissure"}
+SCRIPTED = {"plan.html": page_of_plan, "no_plan.html": page_of_no_plan, "reach.html": page_of_reach}
 
 
 @pytest.fixture(scope="module")
@@ -115,17 +127,18 @@ def test_every_control_has_a_name(page: Path) -> None:
 
 
 def test_scripts_find_only_elements_that_the_page_has() -> None:
-    scene = document.scene_figure(more_views=page_of_plan.TARGET_BUTTON)
-    plan, reach = document.asset("plan.html") + scene, document.asset("reach.html") + document.scene_figure()
-    for own, modules in ((plan, page_of_plan.MODULES), (reach, ("reach.js",))):
-        script = document.bundle([*document.SHARED_MODULES, *modules])
-        present = set(re.findall(r'id="([\w-]+)"', own + document.asset("frame.html")))
-        assert set(re.findall(r'(?:byId|find|getElementById)\("([\w-]+)"\)', script)) <= present
+    for template, page in SCRIPTED.items():
+        script = document.bundle([*document.SHARED_MODULES, *page.MODULES])
+        views = "" if page is page_of_reach else document.TARGET_BUTTON
+        html = document.asset(template) + document.scene_figure(more_views=views)
+        present = set(re.findall(r'id="([\w-]+)"', html + document.asset("frame.html")))
+        wanted = set(re.findall(r'(?:byId|getElementById)\("([\w-]+)"\)', script))
+        assert {"scene", "slice-place"} <= wanted <= present
 
 
 def test_modules_import_what_others_export_and_share_no_name() -> None:
-    for last in (page_of_plan.MODULES, ("reach.js",)):
-        names = [*document.SHARED_MODULES, *last]
+    for page in SCRIPTED.values():
+        names = [*document.SHARED_MODULES, *page.MODULES]
         exported: dict[str, set[str]] = {}
         declared: list[str] = []
         for name in names:

@@ -11,6 +11,7 @@ from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float
+from stages.scope.tip_region import MAX_TURN_AT_TIP_RAD
 
 
 @frozen_record
@@ -132,8 +133,6 @@ def turned_aside(tree: AirwayTree, tip: ScopeTip, polar_rad: float, azimuth_rad:
 
 TURN_CHORD_MM = 2.0
 """The direction from which a scope comes is that of its last few points, about two voxels of the lumen."""
-MAX_TURN_AT_TIP_RAD = math.radians(45.0)
-"""A tip must look along the route, within this angle of its last TURN_CHORD_MM: more means sideways."""
 
 
 def looks_ahead(tree: AirwayTree, tip: ScopeTip) -> bool:

@@ -20,6 +20,7 @@ from anatomy.sides import septum
 from anatomy.typed import Array, Mask, UInt16
 
 Progress = Callable[[str], None]
+Keep = Callable[[str, Array], Array]
 
 FORMAT = 4
 """Version of the processing: raise it when the same images give another lung."""
@@ -61,7 +62,7 @@ def build_lung(
     images: PatientImages,
     *,
     key: str | None = None,
-    keep: Callable[[str, Array], Array] | None = None,
+    keep: Keep | None = None,
     progress: Progress | None = None,
 ) -> Lung:
     """Make the `Lung` of a patient.
@@ -84,8 +85,7 @@ def build_lung(
     """
     from anatomy.tree import tree_from_mask
 
-    keep = keep or (lambda _name, array: array)
-    tell = progress or (lambda _step: None)
+    keep, tell = keep or _unchanged, progress or _silent
     warnings = list(images.warnings)
     _require_tissue(images)
     tell("airway tree")
@@ -93,18 +93,13 @@ def build_lung(
     tell("labels")
     box = WorkingBox(images.lung.array | images.lumen.array, images.grid)
     labels = keep("labels", _labels(images, box, tree, warnings))
-    fields: dict[str, DistanceField] = {}
-    geometry = corner_geometry(box.grid)
-    for name, corners in field_arrays(labels, box.grid, images.fissures is not None, tell):
-        stored = keep(name, corners)
-        fields[name] = DistanceField(name=name, corners=stored, geometry=geometry)
     return Lung(
         name=images.name,
         kind=images.kind,
         key=key or lung_key(images.sources),
         grid=box.grid,
         labels=labels,
-        fields=fields,
+        fields=clearance_fields(labels, box.grid, fissures=images.fissures is not None, keep=keep, tell=tell),
         lumen_depth=_lumen_depth(images.lumen, keep),
         tree=tree,
         nodules=_cut_volume(images.nodules, box, "nodules", keep),
@@ -200,7 +195,36 @@ def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, g
     labels[lumen] |= structures.LUMEN
 
 
-def field_arrays(
+def _unchanged(_name: str, array: Array) -> Array:
+    return array
+
+
+def _silent(_step: str) -> None:
+    pass
+
+
+def clearance_fields(
+    labels: UInt16, grid: Grid, *, fissures: bool = False, keep: Keep = _unchanged, tell: Progress = _silent
+) -> dict[str, DistanceField]:
+    """Return the fields of the clearance to each structure and to all of them, by name.
+
+    Parameters
+    ----------
+    labels : (ni, nj, nk) uint16
+        See `anatomy.structures`.
+    fissures : bool
+        Whether fissures are known, so that there are fields of them.
+    keep, tell
+        As `keep` and `progress` of `build_lung`.
+    """
+    geometry = corner_geometry(grid)
+    return {
+        name: DistanceField(name=name, corners=keep(name, corners), geometry=geometry)
+        for name, corners in _field_arrays(labels, grid, fissures, tell)
+    }
+
+
+def _field_arrays(
     labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress
 ) -> Iterator[tuple[str, UInt16]]:
     """Yield the clearance fields one after the other; the unions are minima of the parts."""
@@ -219,7 +243,7 @@ def field_arrays(
         yield "obstacle_fissure", np.minimum(union, corners)
 
 
-def _lumen_depth(lumen: Volume, keep: Callable[[str, Array], Array]) -> DistanceField:
+def _lumen_depth(lumen: Volume, keep: Keep) -> DistanceField:
     """Make the field of the depth inside the lumen, on the lumen's own box."""
     low, high = bounds(lumen.array)
     grid = lumen.grid.crop(low - 1, high + 1)
@@ -230,7 +254,5 @@ def _lumen_depth(lumen: Volume, keep: Callable[[str, Array], Array]) -> Distance
     return DistanceField(name=field.name, corners=stored, geometry=field.geometry)
 
 
-def _cut_volume(
-    volume: Volume | None, box: WorkingBox, name: str, keep: Callable[[str, Array], Array]
-) -> Volume | None:
+def _cut_volume(volume: Volume | None, box: WorkingBox, name: str, keep: Keep) -> Volume | None:
     return None if volume is None else Volume(grid=box.grid, array=keep(name, box.cut(volume.array)))

@@ -24,7 +24,7 @@ from anatomy.cache import BUILDING, LUNG_FILE, REMOVED
 from anatomy.errors import FileError
 from anatomy.records import frozen_value
 
-ABANDONED_AFTER_S = 24 * 3600.0
+ABANDONED_AFTER_DAYS = 1.0
 """No anatomy takes so long to prepare: what is older and unfinished was left behind."""
 ATLAS_PATTERN = re.compile(r"atlas-[0-9a-f]{64}\.npz")
 KEY_PATTERN = re.compile(r"[0-9a-f]{24}")
@@ -65,9 +65,14 @@ class CacheEntry:
     current: bool
 
     @property
+    def days_unused(self) -> float:
+        """Days since it was last used."""
+        return (time.time() - self.last_used) / SECONDS_PER_DAY
+
+    @property
     def abandoned(self) -> bool:
         """Whether it was left behind by a process that was killed."""
-        return self.kind == "unfinished" and time.time() - self.last_used > ABANDONED_AFTER_S
+        return self.kind == "unfinished" and self.days_unused > ABANDONED_AFTER_DAYS
 
 
 def cache_entries(cache: Path, formats: Mapping[str, int]) -> tuple[CacheEntry, ...]:
@@ -169,9 +174,9 @@ def overdue(
     older_than_days : float, optional
         Time without use after which an entry goes.
     """
-    now, stay = time.time(), []
+    stay = []
     for entry in entries:
-        aged = older_than_days is not None and now - entry.last_used > older_than_days * SECONDS_PER_DAY
+        aged = older_than_days is not None and entry.days_unused > older_than_days
         if entry.kind == "unfinished":
             if entry.abandoned:
                 yield entry

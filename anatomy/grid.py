@@ -149,6 +149,11 @@ class Grid:
         i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
         return i, j, k
 
+    def box_distance_mm(self, voxels: ArrayLike, point_lps: ArrayLike) -> Float:
+        """Return the distances `(N,)` in mm from a point `(3,)` LPS mm to voxels `(N, 3)` as solid boxes."""
+        away = np.maximum(np.abs(np.asarray(voxels) - self.ijk(point_lps)) - 0.5, 0.0) * self.spacing_mm
+        return np.asarray(np.linalg.norm(away, axis=1))
+
     def is_close(self, other: Grid, tolerance_mm: float = 1e-2) -> bool:
         """Tell whether every voxel of the two grids agrees to `tolerance_mm`."""
         if self.shape != other.shape:

@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.build import WorkingBox, close_border, field_arrays, lung_key
-from anatomy.fields import DistanceField, corner_geometry
+from anatomy.build import WorkingBox, clearance_fields, close_border, lung_key
 from anatomy.grid import Grid, Volume
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, OUTSIDE, VESSEL
-from anatomy.typed import Float, Int, Mask
+from anatomy.typed import Float, Mask
 
 ENTRY_BRANCH = 0
 """The branch of the labels that stands for the surface a needle pierces; a liver has no other."""
@@ -46,27 +45,29 @@ class LiverImages:
     sources: Mapping[str, str]
     warnings: tuple[str, ...]
 
+    @property
+    def vessels(self) -> Mask:
+        """The voxels of all vessels together."""
+        return np.asarray(np.logical_or.reduce([volume.array for volume in self.lumens.values()]))
+
+    @property
+    def inside(self) -> Mask:
+        """The voxels of liver, nodules and vessels: masks of a liver leave the other two out."""
+        inside = self.liver.array | self.vessels
+        return inside if self.nodules is None else inside | self.nodules.array
+
 
 def build_liver(images: LiverImages) -> Organ:
     """Make the `Organ` of a liver.
 
-    Liver, nodules and vessels are inside, as masks of a liver leave the other two out; what is not inside is
-    an obstacle, and so are the vessels.
+    What is not inside is an obstacle, and so are the vessels.
     """
-    vessels: Mask = np.logical_or.reduce([volume.array for volume in images.lumens.values()])
-    inside = images.liver.array | vessels
-    if images.nodules is not None:
-        inside |= images.nodules.array
+    inside = images.inside
     box = WorkingBox(inside, images.grid)
     labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
     labels[~box.cut(inside)] = OUTSIDE
     close_border(labels)
-    labels[box.cut(vessels)] |= VESSEL
-    geometry = corner_geometry(box.grid)
-    fields = {
-        name: DistanceField(name=name, corners=corners, geometry=geometry)
-        for name, corners in field_arrays(labels, box.grid, False, lambda _step: None)
-    }
+    labels[box.cut(images.vessels)] |= VESSEL
     nodules = images.nodules
     return Organ(
         name=images.name,
@@ -74,7 +75,7 @@ def build_liver(images: LiverImages) -> Organ:
         key=lung_key(images.sources),
         grid=box.grid,
         labels=labels,
-        fields=fields,
+        fields=clearance_fields(labels, box.grid),
         nodules=None if nodules is None else Volume(grid=box.grid, array=box.cut(nodules.array)),
         cost=None,
         starts=images.starts,
@@ -97,19 +98,8 @@ def with_entry(organ: Organ, start_lps: Float, radius_mm: float) -> Organ:
     high = np.ceil(organ.grid.ijk(start_lps) + radius_mm / organ.grid.spacing_mm).astype(np.int64) + 1
     low, high = np.maximum(low, 0), np.minimum(high, organ.grid.shape)
     voxels = np.argwhere(np.ones(np.maximum(high - low, 0), dtype=bool)) + low
-    near = voxels[_box_distance_mm(organ.grid, voxels, start_lps) <= radius_mm]
+    near = voxels[organ.grid.box_distance_mm(voxels, start_lps) <= radius_mm]
     at = tuple(near[(organ.labels[tuple(near.T)] & OUTSIDE) != 0].T)
     labels = organ.labels.copy(order="F")
     labels[at] = (labels[at] & ~np.uint16(OUTSIDE)) | AIRWAY | ((ENTRY_BRANCH + 1) << BRANCH_SHIFT)
-    corners = dict(field_arrays(labels, organ.grid, False, lambda _step: None))
-    fields = {
-        name: DistanceField(name=name, corners=corners[name], geometry=field.geometry)
-        for name, field in organ.fields.items()
-    }
-    return replace(organ, labels=labels, fields=fields)
-
-
-def _box_distance_mm(grid: Grid, voxels: Int, point: Float) -> Float:
-    """Return the distance of a point to voxels as solid boxes, `(N,)` mm."""
-    away = np.maximum(np.abs(voxels - grid.ijk(point)) - 0.5, 0.0) * grid.spacing_mm
-    return np.asarray(np.linalg.norm(away, axis=1))
+    return replace(organ, labels=labels, fields=clearance_fields(labels, organ.grid))

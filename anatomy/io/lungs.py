@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.io.masks import MaskSet
 from anatomy.lobes import LOBES, fissures_between, grown_into, main_pieces
-from anatomy.morphology import grown_by_one
+from anatomy.morphology import bounds, grown_by_one, window
 from anatomy.typed import Mask, UInt8
 
 
@@ -74,15 +74,7 @@ def fill_lung(masks: MaskSet) -> MaskSet:
     lobes = masks.masks["lung"]
     tubes: Mask = np.logical_or.reduce(roles)
     lung: Mask = lobes | tubes
-    box = _box(lung)
+    box = window(*bounds(lung, 2))
     closed = ~grown_by_one(~grown_by_one(lung[box]))
     lung[box] |= closed & grown_by_one(tubes[box]) & grown_by_one(grown_by_one(lobes[box]))
     return replace(masks, masks={**masks.masks, "lung": lung})
-
-
-def _box(mask: Mask) -> tuple[slice, ...]:
-    """Return the box around all voxels of a mask, two voxels wider on every side."""
-    along_jk = np.any(mask, axis=0)
-    lines = np.any(mask, axis=(1, 2)), np.any(along_jk, axis=1), np.any(along_jk, axis=0)
-    hits = [np.flatnonzero(line) for line in lines]
-    return tuple(slice(max(0, int(hit[0]) - 2), int(hit[-1]) + 3) for hit in hits)

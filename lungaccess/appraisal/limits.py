@@ -96,7 +96,8 @@ class Limit:
     used : float
         How much of the limit is used: 1 at the limit, 0 far from it.
     stated : float or None
-        The lower bound that the plan itself states, see `docs/check.md`; None for what is no clearance.
+        The lower bound that the plan itself states, see docs/explanation/check.md; None for what is no
+        clearance.
     ok : bool
         Whether the check accepts it.
     """

@@ -72,8 +72,8 @@ class UncObstacles:
         labels = self.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].copy(order="F")
         grid = self.grid.crop(low, high)
         if exempt_mm > 0.0:
-            part = labels[grid.window(ends[0], exempt_mm)]
-            first = np.array([axis.start for axis in grid.window(ends[0], exempt_mm)])
+            window = grid.window(ends[0], exempt_mm)
+            part, first = labels[window], np.array([axis.start for axis in window])
             voxels = np.argwhere(part & OBSTACLES)
             near = np.linalg.norm(grid.lps(voxels + first) - ends[0], axis=1) <= exempt_mm
             part[tuple(voxels[near].T)] = 0
@@ -91,13 +91,8 @@ def unc_obstacles(images: PatientImages | LiverImages) -> UncObstacles:
     """Label the masks of a patient as they are; of a liver, its vessels and what is not liver or nodule."""
     labels = np.zeros(images.grid.shape, dtype=np.uint16, order="F")
     if isinstance(images, LiverImages):
-        inside = images.liver.array.copy()
-        for vessels in images.lumens.values():
-            labels[vessels.array] |= VESSEL
-            inside |= vessels.array
-        if images.nodules is not None:
-            inside |= images.nodules.array
-        labels[~inside] |= OUTSIDE
+        labels[images.vessels] |= VESSEL
+        labels[~images.inside] |= OUTSIDE
         return UncObstacles(labels=labels, grid=images.grid)
     labels[images.lumen.array] |= AIRWAY
     labels[images.vessels.array] |= VESSEL

@@ -187,7 +187,7 @@ class ErrorOptions:
 @Parameter(name="*")
 @frozen_value
 class BudgetOptions:
-    """How long to search; SettingsError unless time and iterations are numbers that a search can end with."""
+    """How long to search."""
 
     budget: Annotated[
         Seconds | None,
@@ -198,20 +198,6 @@ class BudgetOptions:
         Parameter(help="Number of iterations instead of a time: the same seed then gives the same plan."),
     ] = None
     seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0
-
-    def __post_init__(self) -> None:
-        if self.budget is not None and not 0.0 < self.budget < float("inf"):
-            raise SettingsError(
-                f"--budget is {self.budget:g} s",
-                expected="a finite time above 0",
-                remedy="State seconds, such as --budget 10",
-            )
-        if self.iterations is not None and self.iterations < 1:
-            raise SettingsError(
-                f"--iterations is {self.iterations}",
-                expected="at least 1",
-                remedy="State a count, such as --iterations 200",
-            )
 
     @property
     def time_s(self) -> float | None:

@@ -133,8 +133,7 @@ class Explanation:
 
     def _how_often(self, plan: Plan | None) -> str:
         """Say how often a plan succeeds: that it exists says too little."""
-        shares = [self.chances.get(name) for name, each in self.plans.items() if each is plan]
-        chance = shares[0] if shares else None
+        chance = self.chances.get(self.file_of(plan) or "")
         return "" if chance is None else f" (succeeds in {100.0 * chance.value:.0f} of 100)"
 
     @property
@@ -167,6 +166,10 @@ class Explanation:
             if each.accepted
         }
         return found
+
+    def file_of(self, plan: object) -> str | None:
+        """Return the name of the file of a plan, None if it has none."""
+        return next((name for name, each in self.plans.items() if each is plan), None)
 
     @property
     def not_tried(self) -> tuple[Part, ...]:

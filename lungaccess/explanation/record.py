@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ from anatomy.typed import Float
 from lungaccess.coupled import Attempt
 from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, Structure
 from lungaccess.explanation.explanation import Change, Explanation
-from lungaccess.explanation.neighbours import Neighbour, ReachedShare
-from lungaccess.plans.plan import Plan
+from lungaccess.explanation.neighbours import ReachedShare
 from lungaccess.risk import Share
 
 Record = dict[str, Any]
@@ -37,7 +35,7 @@ def save_explanation(explanation: Explanation, folder: str | os.PathLike[str]) -
 
 def explanation_record(explanation: Explanation) -> Record:
     """Return an explanation as plain values: lengths in mm, points in LPS and RAS mm."""
-    e, plans = explanation, explanation.plans
+    e = explanation
     return {
         "found": False,
         "accepted": False,
@@ -55,19 +53,19 @@ def explanation_record(explanation: Explanation) -> Record:
         "nearest_miss": {
             "path_to_the_target": _blocked_arc(e.blocked_arc),
             "path_beyond_the_limits": _beyond(e.arc_beyond_limits),
-            "nearest_point_reached": _neighbour(e.neighbour, plans),
+            "nearest_point_reached": _neighbour(e),
         },
         "presets": [
-            *(_attempt(each, plans) for each in e.attempts),
+            *(_attempt(e, each) for each in e.attempts),
             *({"system": name, "tried": False} for name in e.untried),
         ],
-        "changes": [_change(each, plans) for each in e.changes],
+        "changes": [_change(e, each) for each in e.changes],
         "through_fissures": e.through_fissures,
         "reached_shares": [_share(each) for each in e.shares],
         "proved_unreachable": None if e.verdict is None else e.verdict.proved,
         "parts": [{"part": part.name, "outcome": part.outcome, "why": part.why} for part in e.parts],
         "chances_under_default_errors": {name: _chance(share) for name, share in e.chances.items()},
-        "files": list(plans),
+        "files": list(e.plans),
         "explain_s": e.time_s,
     }
 
@@ -76,11 +74,6 @@ def point(lps_mm: Float) -> Record:
     """Return a point (3,) LPS mm in both frames."""
     ras = LPS_FROM_RAS[:3, :3] @ lps_mm
     return {"lps_mm": [float(c) for c in lps_mm], "ras_mm": [float(c) for c in ras]}
-
-
-def file_of(plan: object, plans: Mapping[str, Plan]) -> str | None:
-    """Return the name of the file of a plan, None if it has none."""
-    return next((name for name, each in plans.items() if each is plan), None)
 
 
 def _structure(structure: Structure) -> Record:
@@ -126,13 +119,14 @@ def _beyond(arc: ArcBeyondLimits | None) -> Record | None:
     }
 
 
-def _neighbour(neighbour: Neighbour | None, plans: Mapping[str, Plan]) -> Record | None:
+def _neighbour(e: Explanation) -> Record | None:
+    neighbour = e.neighbour
     if neighbour is None:
         return None
     return {
         **point(neighbour.plan.target_lps),
         "from_target_mm": neighbour.from_target_mm,
-        "plan": file_of(neighbour.plan, plans),
+        "plan": e.file_of(neighbour.plan),
     }
 
 
@@ -140,24 +134,24 @@ def _chance(share: Share) -> Record:
     return {"succeeds": share.value, "interval": list(share.interval), "procedures": share.samples}
 
 
-def _attempt(attempt: Attempt, plans: Mapping[str, Plan]) -> Record:
+def _attempt(e: Explanation, attempt: Attempt) -> Record:
     return {
         "system": attempt.system.name,
         "tried": True,
         "found": attempt.succeeded,
         "why": attempt.why,
-        "plan": file_of(attempt.plan, plans),
+        "plan": e.file_of(attempt.plan),
     }
 
 
-def _change(change: Change, plans: Mapping[str, Plan]) -> Record:
+def _change(e: Explanation, change: Change) -> Record:
     return {
         "change": str(change.change),
         "parameter": change.change.parameter,
         "present_mm": change.change.present,
         "needed_mm": change.change.needed,
         "accepted": change.accepted,
-        "plan": file_of(change.change.plan, plans),
+        "plan": e.file_of(change.change.plan),
     }
 
 

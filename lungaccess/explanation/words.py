@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from anatomy.records import frozen_value
 from anatomy.typed import Float
 from lungaccess.explanation.explanation import Explanation
-from lungaccess.explanation.record import file_of, point
+from lungaccess.explanation.record import point
 
 Row = tuple[str, ...]
 
@@ -127,4 +127,4 @@ def _proof(e: Explanation) -> Iterator[Row]:
 
 
 def _file(e: Explanation, plan: object) -> str:
-    return file_of(plan, e.plans) or ""
+    return e.file_of(plan) or ""

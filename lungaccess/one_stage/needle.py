@@ -290,8 +290,7 @@ def _distance_to_branch(lung: Organ, point: Float, branch: int, cap_mm: float) -
     labels = lung.labels[part]
     found = np.argwhere(((labels & AIRWAY) != 0) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == branch))
     found = found + np.array([axis.start for axis in part])
-    gap = np.maximum(np.abs(found - lung.grid.ijk(point)) - 0.5, 0.0) * lung.grid.spacing_mm
-    return float(np.linalg.norm(gap, axis=1).min(initial=cap_mm))
+    return float(lung.grid.box_distance_mm(found, point).min(initial=cap_mm))
 
 
 def begins_at_wall(lung: Organ, point: Float, radius_mm: float) -> bool:

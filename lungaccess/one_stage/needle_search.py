@@ -70,7 +70,6 @@ def search_path(
     time_s: float | None = None,
     clock: Callable[[], float] = working_s,
     portion: int = SLICE,
-    until_first: bool = False,
 ) -> PathSearch:
     """Search a path; what is proved to have none at reach, start or target is not searched.
 
@@ -86,8 +85,6 @@ def search_path(
         Returns seconds: of the wall without compilation of kernels, or of this process.
     portion : int
         Iterations between two looks at the clock.
-    until_first : bool
-        Whether to stop at the first path.
     """
     blocked = find_obstruction(environment, query)
     if blocked is not None and blocked.proved:
@@ -96,19 +93,14 @@ def search_path(
         found = _by_ompl(environment, query, planner, seed, time_s or 0.0, clock)
     else:
         search = PLANNERS[planner](environment, query, seed or 0, objective)
-        found = _advance(search, iterations, time_s, clock, portion, until_first)
+        found = _advance(search, iterations, time_s, clock, portion)
     if found.path is not None:
         return found
     return PathSearch(outcome=found.outcome, obstruction=blocked or easiest_obstruction(environment, query))
 
 
 def _advance(
-    search: Search,
-    iterations: int | None,
-    time_s: float | None,
-    clock: Callable[[], float],
-    portion: int,
-    until_first: bool,
+    search: Search, iterations: int | None, time_s: float | None, clock: Callable[[], float], portion: int
 ) -> PathSearch:
     first, first_path_s = None, None
     began, left = clock(), iterations
@@ -120,8 +112,6 @@ def _advance(
         left = None if left is None else left - count
         if first is None and search.path is not None:
             first, first_path_s = search.path, clock() - began
-            if until_first:
-                break
     return PathSearch(
         outcome=_outcome(search),
         path=search.path,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -99,8 +98,7 @@ def _remove(entries: Iterable[CacheEntry], output: PatientOptions) -> ExitCode:
 
 
 def _row(entry: CacheEntry) -> terminal.Row:
-    days = (time.time() - entry.last_used) / 86400.0
-    used = "today" if days < 1.0 else f"{days:.0f} days ago"
+    used = "today" if entry.days_unused < 1.0 else f"{entry.days_unused:.0f} days ago"
     kind = entry.kind if entry.current else f"old {entry.kind}"
     pictures = size_in_words(entry.pictures_bytes) if entry.pictures_bytes else ""
     return kind, entry.patient, size_in_words(entry.size_bytes), pictures, used, entry.path.name[:12]
@@ -113,6 +111,6 @@ def _record(entry: CacheEntry) -> dict[str, object]:
         "patient": entry.patient,
         "size_bytes": entry.size_bytes,
         "pictures_bytes": entry.pictures_bytes,
-        "last_used_days_ago": round((time.time() - entry.last_used) / 86400.0, 3),
+        "last_used_days_ago": round(entry.days_unused, 3),
         "current_format": entry.current,
     }

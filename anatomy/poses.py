@@ -96,3 +96,23 @@ def poses_on_arc(frame: Float, roll_rad: float, curvature_per_mm: float, lengths
     poses[:, :3, 3] = frame[:3, 3] + ahead[:, None] * forward + aside[:, None] * bend
     poses[:, 3, 3] = 1.0
     return poses
+
+
+def poses_on_pieces(frame: Float, pieces: Float, step_mm: float) -> tuple[Float, Float]:
+    """Return poses `(N, 4, 4)` at the ends of arcs and between them, and their arc lengths `(N,)`.
+
+    Parameters
+    ----------
+    frame : (4, 4) float64
+        Where the first arc starts.
+    pieces : (P, 3) float64
+        Length in mm, roll before it in rad, which is kept for the next, and curvature in 1/mm of each arc.
+    step_mm : float
+        Largest distance between two poses.
+    """
+    poses, lengths = [np.asarray(frame)[None]], [np.zeros(1)]
+    for length, roll, curvature in pieces:
+        at = length * np.linspace(0.0, 1.0, max(1, math.ceil(length / step_mm)) + 1)[1:]
+        poses.append(poses_on_arc(poses[-1][-1], roll, curvature, at))
+        lengths.append(lengths[-1][-1] + at)
+    return np.concatenate(poses), np.concatenate(lengths)

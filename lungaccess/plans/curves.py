@@ -5,13 +5,12 @@ Reports and exports use these curves.  The independent check integrates the devi
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from anatomy.grid import freeze_arrays
-from anatomy.poses import poses_on_arc
+from anatomy.poses import poses_on_pieces
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.parts import NeedlePath, ScopeRoute, TubeDeployment
@@ -69,8 +68,8 @@ def device_curves(
     Where two arcs of the needle meet, the pose is that at the end of the first, before the turn.
     """
     tubes = system.tubes
-    tube_poses, tube_mm = _poses(scope.lps_from_scope_tip, tube_pieces(tube, tubes), step_mm)
-    needle_poses, needle_mm = _poses(needle.lps_from_start, needle_pieces(needle), step_mm)
+    tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube, tubes), step_mm)
+    needle_poses, needle_mm = poses_on_pieces(needle.lps_from_start, needle_pieces(needle), step_mm)
     in_outer = tube_mm <= tube.outer_insertion_mm + SHORTEST_MM
     return DeviceCurves(
         scope=_scope_curve(scope, system.scope.radius_mm),
@@ -122,16 +121,6 @@ def needle_pieces(needle: NeedlePath) -> Float:
 def arc_lengths(points: Float) -> Float:
     """Return the length in mm `(N,)` along a polyline `(N, 3)` up to each of its points."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-
-
-def _poses(lps_from_start: Float, pieces: Float, step_mm: float) -> tuple[Float, Float]:
-    """Return poses `(N, 4, 4)` at the ends of arcs and between them, and their arc lengths `(N,)`."""
-    poses, lengths = [np.asarray(lps_from_start)[None]], [np.zeros(1)]
-    for length, roll, curvature in pieces:
-        at = length * np.linspace(0.0, 1.0, max(1, math.ceil(length / step_mm)) + 1)[1:]
-        poses.append(poses_on_arc(poses[-1][-1], roll, curvature, at))
-        lengths.append(lengths[-1][-1] + at)
-    return np.concatenate(poses), np.concatenate(lengths)
 
 
 def _carried_back(points: Float, lps_from_tip: Float) -> Float:

@@ -47,6 +47,44 @@ class ScopeRoute(Record):
 
 
 @frozen_record
+class ScopeInsertion(Record):
+    """How the bronchoscope gets from the trachea to where it stops, and the frame of its tip there.
+
+    Parameters
+    ----------
+    lps_from_entry : (4, 4) float64
+        Base of the bending section when the motion begins, in the trachea; +z is forward, +x the way a
+        positive bend turns the tip at twist 0.
+    states : (M, 3) float64
+        Advance of that base in mm, twist in rad and bend in rad; see `stages.scope.ScopeMotion`.
+    lps_from_scope_tip : (4, 4) float64
+        Frame of the working channel in the last state: +z is forward, +x the way a positive bend turns the
+        tip, which is up in the camera's picture.
+    branches : (B,) int64
+        Branches of the airway tree from the trachea to the one in which the tip is.
+    generation : int
+        Generation of the last branch; the trachea is 0.
+    length_mm, length_from_carina_mm : float
+        Length of the body from the entry to the tip, and of its part beyond the place nearest to the carina.
+    min_lumen_margin_mm : float
+        Smallest distance of the body's axis from the border of the lumen, in every state and between them,
+        minus the radius of the scope.
+    max_curvature_per_mm : float
+        Largest curvature of the body in the last state, which the tubes pass in the working channel.
+    """
+
+    lps_from_entry: Float = field(metadata=shaped(4, 4))
+    states: Float = field(metadata=shaped(None, 3))
+    lps_from_scope_tip: Float = field(metadata=shaped(4, 4))
+    branches: Int = field(metadata=shaped(None, dtype=np.int64))
+    generation: int
+    length_mm: float
+    length_from_carina_mm: float
+    min_lumen_margin_mm: float
+    max_curvature_per_mm: float
+
+
+@frozen_record
 class WallExit(Record):
     """Where the axis of the tube leaves the airway lumen.
 

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import numpy as np
+
 from anatomy.settings import impossible, quantity, settings, text
+from anatomy.typed import Float
+
+SHORTEST_MM = 1e-9
+"""A shorter advance is rounding."""
 
 
 @settings
@@ -38,3 +44,20 @@ class Bronchoscope:
     def radius_mm(self) -> float:
         """Outer radius, mm."""
         return 0.5 * self.outer_diameter_mm
+
+
+def laid_pieces(states: Float, bending_length_mm: float) -> Float:
+    """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of each arc of a body.
+
+    The section lays the shaft where it advances; the section itself is the last arc.
+
+    Parameters
+    ----------
+    states : (M, 3) float64
+        Advance in mm, twist in rad and bend in rad; see `stages.scope.ScopeMotion`.
+    """
+    advance, twist, bend = states.T
+    moved = np.flatnonzero(np.diff(advance) > SHORTEST_MM) + 1
+    length = np.append(np.diff(advance)[moved - 1], bending_length_mm)
+    which = np.append(moved, len(states) - 1)
+    return np.column_stack([length, np.diff(twist[which], prepend=0.0), bend[which] / bending_length_mm])

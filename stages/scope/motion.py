@@ -11,14 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.grid import read_only
-from anatomy.poses import poses_on_arc
+from anatomy.poses import poses_on_pieces
 from anatomy.records import frozen_record
 from anatomy.typed import Float
+from stages.scope.device import laid_pieces
 
 ADVANCE, TWIST, BEND = range(3)
 """Columns of a motion's states: advance in mm, twist and bend in rad."""
-SHORTEST_MM = 1e-9
-"""A shorter advance is rounding."""
 
 
 @frozen_record
@@ -53,13 +52,12 @@ class ScopeMotion:
         Each row holds length in mm, roll before it in rad and signed curvature in 1/mm, as
         `anatomy.poses.poses_on_arc` takes them, with the roll kept for the next piece.
         """
-        advance, twist, bend = self.states.T
-        moved = np.flatnonzero(np.diff(advance) > SHORTEST_MM) + 1
-        length = np.append(np.diff(advance)[moved - 1], self.bending_length_mm)
-        which = np.append(moved, len(self.states) - 1)
-        return np.column_stack(
-            [length, np.diff(twist[which], prepend=0.0), bend[which] / self.bending_length_mm]
-        )
+        return laid_pieces(self.states, self.bending_length_mm)
+
+    @property
+    def length_mm(self) -> float:
+        """Length of the body in the last state, from the entry to the tip."""
+        return float(self.states[-1, ADVANCE] - self.states[0, ADVANCE]) + self.bending_length_mm
 
     def body(self, step_mm: float) -> Float:
         """Return frames `(N, 4, 4)` along the body in the last state, at most `step_mm` apart, the tip last.
@@ -67,11 +65,7 @@ class ScopeMotion:
         The +x of the last one is the way a positive bend turns the tip: it is the frame of the working
         channel.
         """
-        frames = [self.lps_from_entry[None]]
-        for length, roll, curvature in self.pieces:
-            at = length * np.linspace(0.0, 1.0, max(1, int(np.ceil(length / step_mm))) + 1)[1:]
-            frames.append(poses_on_arc(frames[-1][-1], roll, curvature, at))
-        return np.concatenate(frames)
+        return poses_on_pieces(self.lps_from_entry, self.pieces, step_mm)[0]
 
     @property
     def lps_from_tip(self) -> Float:

@@ -16,6 +16,7 @@ from experiments.support.mutants.mutant import changed
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, load_system, system_fingerprint
+from tests.lungaccess.rigid import arc, turned
 from tests.stages.scenes import forked_tree
 
 SPACING_MM = (1.0, 0.9, 1.1)
@@ -84,21 +85,6 @@ def toy_lung() -> Any:
         breath_hold="inspiration",
         sources={"airway.nii.gz": "0" * 64},
         warnings=(),
-    )
-
-
-def turned(pose: np.ndarray, roll_rad: float) -> np.ndarray:
-    """The pose after a turn about its own z."""
-    c, s = np.cos(roll_rad), np.sin(roll_rad)
-    return pose @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-
-
-def arc(length_mm: float, k: float) -> np.ndarray:
-    """Closed form of an arc that bends towards +x."""
-    a = k * length_mm
-    x, z = length_mm * np.sin(0.5 * a) * np.sinc(0.5 * a / np.pi), length_mm * np.sinc(a / np.pi)
-    return np.array(
-        [[np.cos(a), 0, np.sin(a), x], [0, 1, 0, 0], [-np.sin(a), 0, np.cos(a), z], [0, 0, 0, 1.0]]
     )
 
 

@@ -1,0 +1,60 @@
+"""What a plan states of the motion of its bronchoscope."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.typed import Float
+from lungaccess.plans.parts import ScopeInsertion
+from stages.scope import ScopeMotion
+
+PASSING_STEP_MM = 0.25
+"""Spacing of the points of a body that are taken as a polyline to find where it passes a place."""
+
+
+def scope_insertion(
+    motion: ScopeMotion, tree: AirwayTree, tree_point: int, min_lumen_margin_mm: float
+) -> ScopeInsertion:
+    """Return the part of a plan that a motion makes.
+
+    Parameters
+    ----------
+    tree : AirwayTree
+        The airway of the patient.
+    tree_point : int
+        Its point nearest to the tip.
+    min_lumen_margin_mm : float
+        Smallest lumen depth of the body's axis over the whole motion, minus the radius of the scope.
+    """
+    branches = _branches_to(tree, int(tree.branch_of_point[tree_point]))
+    length = motion.length_mm
+    return ScopeInsertion(
+        lps_from_entry=motion.lps_from_entry,
+        states=motion.states,
+        lps_from_scope_tip=motion.lps_from_tip,
+        branches=np.array(branches),
+        generation=int(tree.generation[branches[-1]]),
+        length_mm=length,
+        length_from_carina_mm=length - _passes_mm(motion, tree.carina_lps),
+        min_lumen_margin_mm=min_lumen_margin_mm,
+        max_curvature_per_mm=motion.max_curvature_per_mm,
+    )
+
+
+def _branches_to(tree: AirwayTree, branch: int) -> list[int]:
+    branches = [branch]
+    while (parent := int(tree.branch_parent[branches[0]])) >= 0:
+        branches.insert(0, parent)
+    return branches
+
+
+def _passes_mm(motion: ScopeMotion, point_lps: Float) -> float:
+    """Return the length of the body in the last state up to where it is nearest to a point."""
+    points = motion.body(PASSING_STEP_MM)[:, :3, 3]
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    along = ((point_lps - points[:-1]) * steps).sum(axis=1) / np.maximum(lengths, 1e-12) ** 2
+    share = np.clip(along, 0.0, 1.0)
+    nearest = int(np.linalg.norm(points[:-1] + share[:, None] * steps - point_lps, axis=1).argmin())
+    return float(lengths[:nearest].sum() + share[nearest] * lengths[nearest])

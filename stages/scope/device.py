@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import numpy as np
@@ -15,7 +16,10 @@ SHORTEST_MM = 1e-9
 
 @settings
 class Bronchoscope:
-    """A flexible bronchoscope with one working channel, which is thinner than the scope."""
+    """A flexible bronchoscope with one working channel, which is thinner than the scope.
+
+    Its tip is a bending section, an arc of one curvature; behind it the shaft lies where the section led it.
+    """
 
     name: Annotated[str, text("model of the bronchoscope")]
     outer_diameter_mm: Annotated[
@@ -31,6 +35,16 @@ class Bronchoscope:
     bend_down_deg: Annotated[
         float, quantity("largest downward bending of the tip", at_least=0.0, at_most=270.0)
     ]
+    bending_length_mm: Annotated[float, quantity("length of the bending section", above=0.0, at_most=100.0)]
+    min_bending_radius_mm: Annotated[
+        float, quantity("radius of the tightest arc of the bending section", above=0.0, at_most=1000.0)
+    ]
+    min_shaft_radius_mm: Annotated[
+        float, quantity("radius of the tightest arc in which the shaft may lie", above=0.0, at_most=1000.0)
+    ]
+    bending_stiffness_n_mm2: Annotated[
+        float, quantity("bending stiffness of the bending section", above=0.0, at_most=1e7)
+    ]
 
     def __post_init__(self) -> None:
         if self.channel_diameter_mm >= self.outer_diameter_mm:
@@ -39,11 +53,29 @@ class Bronchoscope:
                 self.channel_diameter_mm,
                 f"less than outer_diameter_mm = {self.outer_diameter_mm:g}",
             )
+        for name in ("min_bending_radius_mm", "min_shaft_radius_mm"):
+            if getattr(self, name) <= self.radius_mm:
+                wide = f"more than half of outer_diameter_mm, {self.radius_mm:g}: no scope bends into itself"
+                raise impossible(name, getattr(self, name), wide)
 
     @property
     def radius_mm(self) -> float:
         """Outer radius, mm."""
         return 0.5 * self.outer_diameter_mm
+
+    @property
+    def bends_rad(self) -> tuple[float, float]:
+        """Bend of the whole section farthest down (0 or negative) and farthest up, rad.
+
+        The angle of the data sheet ends a bend, or the least radius where that is met first.
+        """
+        tightest = self.bending_length_mm / self.min_bending_radius_mm
+        return -min(math.radians(self.bend_down_deg), tightest), min(math.radians(self.bend_up_deg), tightest)
+
+    @property
+    def laying_curvature_per_mm(self) -> float:
+        """Largest curvature with which the section may advance, for the shaft then lies in it."""
+        return 1.0 / max(self.min_bending_radius_mm, self.min_shaft_radius_mm)
 
 
 def laid_pieces(states: Float, bending_length_mm: float) -> Float:

@@ -43,7 +43,8 @@ class Session:
     >>> lung = build_lung(make_phantom(seed=1, size="small").images)
     >>> scope = Bronchoscope(
     ...     name="thin", outer_diameter_mm=3.0, channel_diameter_mm=1.2,
-    ...     bend_up_deg=180.0, bend_down_deg=130.0,
+    ...     bend_up_deg=180.0, bend_down_deg=130.0, bending_length_mm=15.0,
+    ...     min_bending_radius_mm=8.0, min_shaft_radius_mm=10.0, bending_stiffness_n_mm2=420.0,
     ... )
     >>> lumen, model = lumen_of_lung(lung), model_of(scope)
     >>> start = start_state(lumen, lung.tree, model)

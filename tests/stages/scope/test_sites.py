@@ -41,7 +41,8 @@ def forked_lung(mediastinum_mm: float = MEDIASTINUM_MM) -> Lung:
 def scope(diameter_mm: float, margin_mm: float = 0.0) -> Bronchoscope:
     return Bronchoscope(
         name="test", outer_diameter_mm=diameter_mm, channel_diameter_mm=1.0, lumen_margin_mm=margin_mm,
-        bend_up_deg=180.0, bend_down_deg=130.0,
+        bend_up_deg=180.0, bend_down_deg=130.0, bending_length_mm=15.0,
+        min_bending_radius_mm=8.0, min_shaft_radius_mm=10.0, bending_stiffness_n_mm2=1000.0,
     )  # fmt: skip
 
 

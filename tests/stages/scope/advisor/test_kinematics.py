@@ -222,7 +222,8 @@ def test_the_tip_looks_forward_and_the_tool_backward() -> None:
 def scope(up: float = 180.0, down: float = 130.0) -> Bronchoscope:
     return Bronchoscope(
         name="test", outer_diameter_mm=4.0, channel_diameter_mm=2.0, lumen_margin_mm=0.25,
-        bend_up_deg=up, bend_down_deg=down,
+        bend_up_deg=up, bend_down_deg=down, bending_length_mm=15.0,
+        min_bending_radius_mm=8.0, min_shaft_radius_mm=10.0, bending_stiffness_n_mm2=1000.0,
     )  # fmt: skip
 
 

@@ -90,6 +90,10 @@ def test_the_tip_can_look_along_most_sites(small_lung: Lung) -> None:
         lumen_margin_mm=0.1,
         bend_up_deg=180.0,
         bend_down_deg=130.0,
+        bending_length_mm=15.0,
+        min_bending_radius_mm=8.0,
+        min_shaft_radius_mm=10.0,
+        bending_stiffness_n_mm2=1000.0,
     )
     sites = find_sites(small_lung, scope, reach_mm=30.0, turning=False)
     field = navigation_field(lumen_of_lung(small_lung), 0)

@@ -56,7 +56,7 @@ docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs site
 
 bench: $(VENV)/.installed-dev
-	cd benchmarks && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr $(BENCH_ARGS)
+	cd benchmarks && export ASV_PYTHONPATH="$(CURDIR)" && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr $(BENCH_ARGS)
 
 # Real anatomy is used where LUNGACCESS_DATA names its folder.
 results: $(VENV)/.installed-study

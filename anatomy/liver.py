@@ -9,6 +9,7 @@ import numpy as np
 
 from anatomy.build import WorkingBox, clearance_fields, close_border, lung_key
 from anatomy.grid import Grid, Volume
+from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, OUTSIDE, VESSEL
@@ -94,12 +95,9 @@ def with_entry(organ: Organ, start_lps: Float, radius_mm: float) -> Organ:
     What is outside within `radius_mm` of the start `(3,)` LPS mm gets the labels of an airway branch,
     `ENTRY_BRANCH`, so that it is exempt for the first millimetres of a needle and an obstacle after them.
     """
-    low = np.floor(organ.grid.ijk(start_lps) - radius_mm / organ.grid.spacing_mm).astype(np.int64)
-    high = np.ceil(organ.grid.ijk(start_lps) + radius_mm / organ.grid.spacing_mm).astype(np.int64) + 1
-    low, high = np.maximum(low, 0), np.minimum(high, organ.grid.shape)
-    voxels = np.argwhere(np.ones(np.maximum(high - low, 0), dtype=bool)) + low
-    near = voxels[organ.grid.box_distance_mm(voxels, start_lps) <= radius_mm]
-    at = tuple(near[(organ.labels[tuple(near.T)] & OUTSIDE) != 0].T)
+    window = organ.grid.window(start_lps, radius_mm)
+    outside = voxels_in(window, (organ.labels[window] & OUTSIDE) != 0)
+    at = tuple(outside[organ.grid.box_distance_mm(outside, start_lps) <= radius_mm].T)
     labels = organ.labels.copy(order="F")
     labels[at] = (labels[at] & ~np.uint16(OUTSIDE)) | AIRWAY | ((ENTRY_BRANCH + 1) << BRANCH_SHIFT)
     return replace(organ, labels=labels, fields=clearance_fields(labels, organ.grid))

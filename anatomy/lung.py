@@ -8,6 +8,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.fields import DistanceField
 from anatomy.grid import Volume
 from anatomy.lobes import LOBES
+from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.typed import Float
@@ -55,14 +56,11 @@ class Lung(Organ):
         """Return the name of the lobe that holds a point `(3,)` LPS mm or is near it; "" if not known."""
         if self.lobes is None:
             return ""
-        reach = np.ceil(NEAREST_LOBE_MM / self.grid.spacing_mm).astype(np.int64)
-        centre = np.floor(self.grid.ijk(point_lps) + 0.5).astype(np.int64)
-        low = np.clip(centre - reach, 0, self.grid.shape)
-        high = np.clip(centre + reach + 1, 0, self.grid.shape)
-        window = self.lobes.array[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-        voxels = np.argwhere(window)
+        window = self.grid.window(point_lps, NEAREST_LOBE_MM)
+        voxels = voxels_in(window, self.lobes.array[window] > 0)
         if not len(voxels):
             return ""
-        distance = np.linalg.norm(self.grid.lps(voxels + low) - point_lps, axis=1)
+        distance = np.linalg.norm(self.grid.lps(voxels) - point_lps, axis=1)
         nearest = int(np.argmin(distance))
-        return LOBES[int(window[tuple(voxels[nearest])])] if distance[nearest] <= NEAREST_LOBE_MM else ""
+        number = int(self.lobes.array[tuple(voxels[nearest])])
+        return LOBES[number] if distance[nearest] <= NEAREST_LOBE_MM else ""

@@ -47,6 +47,11 @@ def voxels_of(mask: Mask) -> Int:
     return ijk if order == "C" else ijk[np.lexsort(ijk.T[::-1])]
 
 
+def voxels_in(window: Window, mask: Mask) -> Int:
+    """Return the indices `(N, 3)`, in the whole image, of the voxels of a mask of a window of it."""
+    return np.asarray(np.argwhere(mask) + np.array([axis.start for axis in window]))
+
+
 def components(mask: Mask) -> tuple[Int, Int]:
     """Return the voxels `(N, 3)` of a mask, and the number `(N,)` of the part of each, from 0.
 

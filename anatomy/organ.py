@@ -105,7 +105,12 @@ class Organ:
         return self.fields["obstacle_fissure" if with_fissures and self.has_fissures else "obstacle"]
 
     def mask(self, name: str) -> Volume:
-        """Return a structure as a bool volume: airway, lumen, vessel, outside, fissure or nodule."""
+        """Return a structure as a bool volume: airway, lumen, vessel, outside, fissure or nodule.
+
+        "lung" is what is not outside: the lungs with all that lies in them, or the liver.
+        """
+        if name == "lung":
+            return Volume(grid=self.grid, array=(self.labels & structures.OUTSIDE) == 0)
         if name == "nodule":
             if self.nodules is None:
                 raise AnatomyError(
@@ -114,7 +119,8 @@ class Organ:
             return self.nodules
         if name not in structures.BITS:
             raise AnatomyError(
-                f"There is no structure {name!r}", expected=f"one of {', '.join(structures.BITS)}, nodule"
+                f"There is no structure {name!r}",
+                expected=f"one of {', '.join(structures.BITS)}, lung, nodule",
             )
         return Volume(grid=self.grid, array=(self.labels & structures.BITS[name]) != 0)
 

@@ -12,6 +12,7 @@ import numpy as np
 from anatomy.fields import CENTRES
 from anatomy.grid import Grid
 from anatomy.liver import LiverImages
+from anatomy.morphology import voxels_in
 from anatomy.patient import PatientImages
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
@@ -73,10 +74,9 @@ class UncObstacles:
         grid = self.grid.crop(low, high)
         if exempt_mm > 0.0:
             window = grid.window(ends[0], exempt_mm)
-            part, first = labels[window], np.array([axis.start for axis in window])
-            voxels = np.argwhere(part & OBSTACLES)
-            near = np.linalg.norm(grid.lps(voxels + first) - ends[0], axis=1) <= exempt_mm
-            part[tuple(voxels[near].T)] = 0
+            voxels = voxels_in(window, (labels[window] & OBSTACLES) != 0)
+            near = np.linalg.norm(grid.lps(voxels) - ends[0], axis=1) <= exempt_mm
+            labels[tuple(voxels[near].T)] = 0
         return environment_of_labels(
             labels,
             grid,

@@ -167,6 +167,11 @@ class Explanation:
         }
         return found
 
+    @property
+    def miss(self) -> BlockedArc | ArcBeyondLimits | None:
+        """The path to the target that violates least: within the needle's limits if there is one."""
+        return self.blocked_arc or self.arc_beyond_limits
+
     def file_of(self, plan: object) -> str | None:
         """Return the name of the file of a plan, None if it has none."""
         return next((name for name, each in self.plans.items() if each is plan), None)

@@ -10,22 +10,21 @@ from anatomy.errors import SettingsError, TargetError
 from anatomy.kernels.field import exact_distance
 from anatomy.liver import with_entry
 from anatomy.lung import Lung
+from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
 from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float
-from lungaccess.one_stage.needle_search import OMPL_PLANNERS, search_path
+from lungaccess.one_stage.needle_search import OMPL_PLANNERS, PathSearch, search_path
 from lungaccess.one_stage.obstruction import obstruction_record
 from lungaccess.plans.costs import known_costs
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import (
     PLANNERS,
-    ArcPath,
     NeedleEnvironment,
     Objective,
-    Obstruction,
     Query,
     begun_at_wall,
     needle_environment,
@@ -37,24 +36,16 @@ WALL_MM = 3.0
 
 
 @frozen_record
-class NeedleAnswer:
-    """What a planner found.
+class NeedleAnswer(PathSearch):
+    """What a planner found, and what it was asked.
 
     Parameters
     ----------
-    outcome : str
-        "path"; "no path", if there is a proof; a search's own words for its end; else "nothing found".
-    path : ArcPath or None
-        Proved clear and within all limits.
-    cost : float
-        Of the path under the objective, as estimated within the search.
     branches : tuple of int
         Branches of the airway tree whose wall the start is taken to have pierced, the nearest first; none if
         no airway is near.
     at_wall : bool
         Whether the needle begins so near to the lumen that it pierces the wall itself.
-    obstruction : Obstruction or None
-        What stands in the way, if there is no path.
     lobe : str
         Where what stands in the way lies; "" if the lobes are not known.
     environment : NeedleEnvironment
@@ -63,31 +54,19 @@ class NeedleAnswer:
         What it was asked.
     objective : Objective
         What it was asked to make small; planners of OMPL look at none.
-    first_path_s : float or None
-        Time to the first path.
     """
 
-    outcome: str
-    path: ArcPath | None
-    cost: float
     branches: tuple[int, ...]
     at_wall: bool
-    obstruction: Obstruction | None
     lobe: str
     environment: NeedleEnvironment
     query: Query
     objective: Objective
-    first_path_s: float | None
 
     @property
     def branch(self) -> int:
         """The branch that is exempt at the exit; -1 for none."""
         return self.branches[0] if self.branches else -1
-
-    @property
-    def proved(self) -> bool:
-        """Whether it is proved that no path exists."""
-        return self.outcome == "no path"
 
     @property
     def costs(self) -> dict[str, float]:
@@ -199,20 +178,12 @@ def plan_needle(
         iterations=iterations,
         time_s=time_s,
     )
+    blocked = found.obstruction
     return NeedleAnswer(
-        outcome=found.outcome,
-        path=found.path,
-        cost=found.cost,
-        branches=asked.branches,
-        at_wall=asked.at_wall,
-        obstruction=found.obstruction,
-        lobe=lung.lobe_at(found.obstruction.point_lps)
-        if found.obstruction and isinstance(lung, Lung)
-        else "",
-        environment=asked.environment,
-        query=asked.query,
+        **vars(found),
+        **vars(asked),
+        lobe=lung.lobe_at(blocked.point_lps) if blocked and isinstance(lung, Lung) else "",
         objective=weighed,
-        first_path_s=found.first_path_s,
     )
 
 
@@ -288,8 +259,8 @@ def _distance_to_branch(lung: Organ, point: Float, branch: int, cap_mm: float) -
     """Return the distance in mm from a point to the airway voxels of a branch as boxes, at most `cap_mm`."""
     part = lung.grid.window(point, cap_mm)
     labels = lung.labels[part]
-    found = np.argwhere(((labels & AIRWAY) != 0) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == branch))
-    found = found + np.array([axis.start for axis in part])
+    of_branch = ((labels & AIRWAY) != 0) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == branch)
+    found = voxels_in(part, of_branch)
     return float(lung.grid.box_distance_mm(found, point).min(initial=cap_mm))
 
 

@@ -15,7 +15,7 @@ from lungaccess.report.pack import Packed, pack, unpack
 from lungaccess.report.views import STANDARD, View
 
 if TYPE_CHECKING:
-    from anatomy.grid import Grid, Volume
+    from anatomy.grid import Grid
     from anatomy.organ import Organ
 
 
@@ -63,18 +63,8 @@ class Layers:
         return made
 
     def _mask(self, name: str) -> Array | None:
-        """Return a bool mask `[i, j, k]`, or None where the patient has none.
-
-        `name` is one of `Organ.mask`, or "lung" for what is not outside.
-        """
-        lung = self._lung
-        if not self.has(name):
-            return None
-        if name == "nodule":
-            return _array(lung.nodules)
-        if name == "lung":
-            return ~np.asarray(_array(lung.mask("outside")), dtype=np.bool_)
-        return _array(lung.mask(name))
+        """Return a mask of `Organ.mask` as `[i, j, k]`, or None where the patient has none."""
+        return self._lung.mask(name).array if self.has(name) else None
 
     def has(self, name: str) -> bool:
         """Tell whether a mask of fissures, or of nodules, came with the patient; the others always do."""
@@ -123,10 +113,6 @@ class Layers:
         ins = [(place >= 0) & (place < n) for place, n in zip(places, self._lung.grid.shape, strict=True)]
         inside = ins[0] & ins[1] & ins[2]
         return inside, tuple(place[inside] for place in places)
-
-
-def _array(volume: Volume | None) -> Array | None:
-    return None if volume is None else volume.array
 
 
 def _unfold(mask: Array, grid: Grid) -> tuple[Float, int]:

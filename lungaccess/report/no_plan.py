@@ -64,7 +64,7 @@ def _starts_panel(axes: Axes, explanation: Explanation, layers: Layers, view: Vi
             colour = START_COLOURS[tuple(FAILS)[code]]
             axes.scatter(dots[:, 0], dots[:, 1], s=7, c=colour, lw=0, zorder=5 + len(FAILS) - code)
     _paths(axes, explanation, view)
-    low, high = _box(explanation, view)
+    low = high = view.project(explanation.target.lps_mm)
     if lung is not None:
         left, right, bottom, top = lung.extent_mm
         low, high = np.minimum(low, [left, bottom]), np.maximum(high, [right, top])
@@ -112,8 +112,7 @@ def _cut_panel(axes: Axes, explanation: Explanation, layers: Layers) -> None:
 
 def _miss(explanation: Explanation) -> Float | None:
     """Return the points of the path to the target that violates least."""
-    arc = explanation.blocked_arc or explanation.arc_beyond_limits
-    return None if arc is None else arc.points_lps
+    return None if explanation.miss is None else explanation.miss.points_lps
 
 
 def _nearest(explanation: Explanation) -> Float | None:
@@ -126,11 +125,6 @@ def _other(explanation: Explanation) -> Float | None:
     """Return the points of the needle of the least invasive preset that reaches the target."""
     plans = [attempt.plan for attempt in explanation.attempts if attempt.succeeded]
     return None if not plans or plans[0] is None else plans[0].curves().needle.points_lps
-
-
-def _box(explanation: Explanation, view: View) -> tuple[Float, Float]:
-    uv = view.project(explanation.target.lps_mm)[None]
-    return uv.min(axis=0), uv.max(axis=0)
 
 
 def _legend(explanation: Explanation) -> list[Line2D]:

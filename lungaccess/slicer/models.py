@@ -43,9 +43,6 @@ def structure_surface(lung: Lung, name: str, *, most: int = MOST_TRIANGLES) -> S
 def _mask(lung: Lung, name: str) -> Volume | None:
     if name == "nodule" and lung.nodules is None:
         return None
-    if name == "lung":
-        outside = lung.mask("outside")
-        return Volume(grid=outside.grid, array=~outside.array)
     if name == "airway":
         wall, lumen = lung.mask("airway"), lung.mask("lumen")
         return Volume(grid=wall.grid, array=wall.array | lumen.array)

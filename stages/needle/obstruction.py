@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from anatomy.morphology import voxels_in
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
@@ -112,10 +113,9 @@ def _nearest(environment: NeedleEnvironment, label: int, point: Float, distance_
     """Return the point (3,) of a voxel with this label that is nearest to a point, at a known distance."""
     grid = environment.grid
     part = grid.window(point, distance_mm + float(grid.spacing_mm.max()))
-    voxels = np.argwhere(environment.obstacles.labels[part] == label)
+    voxels = voxels_in(part, environment.obstacles.labels[part] == label)
     if not len(voxels):
         return None
-    voxels = voxels + np.array([axis.start for axis in part])
     half = environment.obstacles.geometry[:, 5]
     nearest = np.clip(grid.ijk(point), voxels - half, voxels + half)
     at = int(np.argmin(np.linalg.norm(grid.lps(nearest) - point, axis=1)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from anatomy.morphology import components, voxels_of
+from anatomy.morphology import components, voxels_in, voxels_of, window
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
@@ -27,3 +27,11 @@ def test_a_winding_part_is_one() -> None:
     mask = np.zeros((40, 40, 30), dtype=np.bool_)
     mask[tuple(path.T)] = True
     assert set(components(mask)[1]) == {0}
+
+
+def test_voxels_of_a_window_have_their_indices_in_the_whole_image() -> None:
+    mask = np.random.default_rng(3).random((6, 7, 8)) > 0.7
+    part = window(np.array([1, 2, 3]), np.array([5, 6, 8]))
+    inside = np.zeros_like(mask)
+    inside[part] = mask[part]
+    assert voxels_in(part, mask[part]).tolist() == np.argwhere(inside).tolist()

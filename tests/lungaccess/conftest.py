@@ -77,6 +77,7 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
     labels = np.zeros(shape, dtype=np.uint16)
     for name, mask in masks.items():
         labels[mask] |= np.uint16(BITS[name])
+    masks |= {"lung": ~masks["outside"], "nodule": ball}
     fields = {
         name: _Field(grid, masks[key])
         for name, key in {"airway": "airway", "vessel": "vessel", "pleura": "outside"}.items()

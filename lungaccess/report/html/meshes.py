@@ -94,9 +94,6 @@ def _structure_meshes(lung: Lung) -> list[Packed]:
 
 def structure(lung: Lung, key: str) -> Volume | None:
     """Return the voxels of a structure that a page shows, None where the patient lacks it."""
-    if key == "lung":
-        outside = lung.mask("outside")
-        return Volume(grid=outside.grid, array=~np.asarray(outside.array, dtype=np.bool_))
     if key == "nodule":
         return lung.nodules
     if key == "fissure" and not lung.has_fissures:

@@ -105,10 +105,10 @@ def _starts(explanation: Explanation) -> list[Packed]:
 
 def _paths(explanation: Explanation) -> Iterator[tuple[Packed, Float]]:
     """Yield the paths that can be shown: the miss, the nearest plan, and plans of other systems."""
-    miss = explanation.blocked_arc or explanation.arc_beyond_limits
     radius = explanation.system.needle.radius_mm
-    if miss is not None:
-        yield _path("path that violates least (not allowed)", MISS, radius, [miss.points_lps], True)
+    if explanation.miss is not None:
+        points = explanation.miss.points_lps
+        yield _path("path that violates least (not allowed)", MISS, radius, [points], True)
     if explanation.neighbour is not None:
         yield _devices("plan to the nearest point reached", NEAREST, explanation.neighbour.plan, True)
     for attempt in explanation.attempts:

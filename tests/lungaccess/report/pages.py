@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
+from typing import Any
 
 import lungaccess as la
 from anatomy.grid import Volume
@@ -44,3 +47,10 @@ def plan_file(plans: tuple[Plan, ...], lung: Lung, ct: Volume | None, folder: Pa
 def reach_file(reach: ReachMap, lung: Lung, folder: Path) -> Path:
     """Write the page of a map."""
     return reach_page([reach], lung, folder / "reach.html")
+
+
+def report_data(page: Path) -> dict[str, Any]:
+    """Return the data of a page."""
+    found = re.search(r'<script type="application/json" id="report-data">(.*?)</script>', page.read_text())
+    assert found is not None
+    return dict(json.loads(found.group(1)))

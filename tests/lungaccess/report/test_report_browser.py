@@ -14,7 +14,7 @@ from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import volumes
 from tests.lungaccess.report import browser
-from tests.lungaccess.report.pages import make_plans, make_reach, plan_file, reach_file
+from tests.lungaccess.report.pages import make_reach, plan_file, reach_file
 
 pytestmark = [
     pytest.mark.browser,
@@ -32,11 +32,6 @@ let red = 0, blue = 0;
 for (let n = 0; n < d.length; n += 4) { red += d[n]; blue += d[n + 2]; }
 return [4 * red / d.length, 4 * blue / d.length]"""
 LUMEN = (14, 58, 87)
-
-
-@pytest.fixture(scope="module")
-def plans(small_lung: Lung) -> tuple[Plan, ...]:
-    return make_plans(small_lung)
 
 
 @pytest.fixture(scope="module")

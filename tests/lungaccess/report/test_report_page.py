@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from itertools import combinations, pairwise
+from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from PIL import Image
 
 import lungaccess as la
-from anatomy.errors import AnatomyError
-from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.structures import VESSEL
 from lungaccess.appraisal import SHOWN_LIMITS
@@ -31,42 +24,18 @@ from lungaccess.report import pack
 from lungaccess.report.html import (
     deployment,
     document,
-    meshes,
-    movie,
     page_of_no_plan,
     page_of_plan,
     page_of_reach,
     tables,
-    volumes,
     words,
 )
 from lungaccess.report.html.page_of_reach import STEPS_PER_MM, packed_map
-from tests.lungaccess.report.pages import SIZE_LIMIT, make_plans, make_reach, plan_file, reach_file
+from tests.lungaccess.report.pages import SIZE_LIMIT, make_reach, reach_file, report_data
 
 NAMESPACE = "http://www.w3.org/2000/svg"
 STRUCTURES = {"airway", "vessel", "pleura", "fissure"}
 SCRIPTED = {"plan.html": page_of_plan, "no_plan.html": page_of_no_plan, "reach.html": page_of_reach}
-
-
-@pytest.fixture(scope="module")
-def plans(small_lung: Lung) -> tuple[Plan, ...]:
-    return make_plans(small_lung)
-
-
-@pytest.fixture(scope="module")
-def page(plans: tuple[Plan, ...], small_lung: Lung, small_phantom: Any, tmp_path_factory: Any) -> Path:
-    return plan_file(plans, small_lung, small_phantom.ct, tmp_path_factory.mktemp("page"))
-
-
-@pytest.fixture(scope="module")
-def data(page: Path) -> dict[str, Any]:
-    return report_data(page)
-
-
-def report_data(page: Path) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="report-data">(.*?)</script>', page.read_text())
-    assert found is not None
-    return dict(json.loads(found.group(1)))
 
 
 class Elements(HTMLParser):
@@ -92,9 +61,6 @@ def elements(page: Path) -> Elements:
     parser = Elements()
     parser.feed(page.read_text())
     return parser
-
-
-# The file ----------------------------------------------------------------------------------------
 
 
 def test_a_page_is_complete_in_itself(page: Path) -> None:
@@ -173,32 +139,7 @@ def test_a_hole_without_a_part_is_refused() -> None:
     assert document.filled("{{a}}", {"a": "{{b}}"}) == "{{b}}"
 
 
-# Numbers as text ---------------------------------------------------------------------------------
-
-
-@given(st.sampled_from(["u1", "u2", "i4"]), st.lists(st.integers(0, 255), max_size=60), st.booleans())
-def test_whole_numbers_survive_packing(kind: str, values: list[int], wide: bool) -> None:
-    scale = 257 if wide and kind != "u1" else 1
-    array = np.array(values, dtype=np.int64).reshape(1, -1) * scale
-    if kind == "i4":
-        array = -array
-    np.testing.assert_array_equal(pack.unpack(pack.pack(array, kind)), array)
-
-
-@given(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), max_size=40))
-def test_single_precision_survives_packing(values: list[float]) -> None:
-    np.testing.assert_array_equal(pack.unpack(pack.pack(values, "f4")), np.array(values, dtype=np.float32))
-
-
-@pytest.mark.parametrize(
-    ("values", "kind"), [([np.nan], "f4"), ([1e300], "f4"), ([256], "u1"), ([0.5], "i4")]
-)
-def test_what_a_type_cannot_hold_is_refused(values: list[float], kind: str) -> None:
-    with np.errstate(over="ignore", invalid="ignore"), pytest.raises(AnatomyError):
-        pack.pack(values, kind)
-
-
-# The plan ----------------------------------------------------------------------------------------
+# The plan ---------------------------------------------------------------------------------------
 
 
 def test_the_data_decode_to_the_points_of_the_plans(data: dict[str, Any], plans: tuple[Plan, ...]) -> None:
@@ -316,201 +257,7 @@ def test_every_plan_of_the_page_has_its_chance(data: dict[str, Any]) -> None:
         assert headline["draws"] == 200 and headline["errors"]["name"] == "default"
 
 
-# Surfaces and volumes ----------------------------------------------------------------------------
-
-
-def unpacked(packed: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    steps = pack.unpack(packed["vertices"]).astype(float) / meshes.STEPS
-    vertices = np.array(packed["low_lps"]) + steps * np.array(packed["size_mm"])
-    return vertices, meshes.faces_from_differences(pack.unpack(packed["faces"]))
-
-
-def test_a_ball_stays_a_ball() -> None:
-    grid = Grid.from_spacing((60, 60, 60), [0.5] * 3, [-15.0, -12.0, -9.0])
-    centre = grid.lps([30.0, 30.0, 30.0])
-    points = grid.lps(np.stack(np.meshgrid(*[np.arange(60)] * 3, indexing="ij"), axis=-1))
-    ball = Volume(grid=grid, array=np.linalg.norm(points - centre, axis=-1) <= 10.0)
-    look = meshes.Look(
-        key="ball", name="Ball", colour="#123456", opacity=0.5, shown=True, cell_mm=1.2, most_faces=3000
-    )
-    vertices, faces = unpacked(meshes.packed_surface(ball, look))
-    assert 300 < len(faces) <= look.most_faces
-    radii = np.linalg.norm(vertices - centre, axis=1)
-    np.testing.assert_allclose(radii, 10.0, atol=0.6)
-    a, b, c = (vertices[faces[:, n]] - centre for n in range(3))
-    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
-    assert volume == pytest.approx(4.0 / 3.0 * np.pi * 1000.0, rel=0.05)
-
-
-def test_no_surface_has_more_triangles_than_its_look_allows(data: dict[str, Any], small_lung: Lung) -> None:
-    looks = {look.key: look for look in meshes.LOOKS}
-    assert [each["key"] for each in data["structures"]] == [look.key for look in meshes.LOOKS]
-    for packed in data["structures"]:
-        vertices, faces = unpacked(packed)
-        assert 0 < len(faces) <= looks[packed["key"]].most_faces
-        assert faces.min() == 0
-        assert faces.max() == len(vertices) - 1
-        mask = meshes.structure(small_lung, packed["key"])
-        assert mask is not None
-        where = mask.grid.lps(np.argwhere(mask.array))
-        slack = 2.0 * looks[packed["key"]].cell_mm + 2.0 * float(mask.grid.spacing_mm.max())
-        np.testing.assert_allclose(vertices.min(axis=0), where.min(axis=0), atol=slack)
-        np.testing.assert_allclose(vertices.max(axis=0), where.max(axis=0), atol=slack)
-
-
-def voxels(packed: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values `[i, j, k]` and LPS centres of a packed volume."""
-    array = pack.unpack(packed["voxels"])
-    if packed["differences"]:
-        array = np.cumsum(array, axis=2, dtype=np.uint8)
-    array = array.transpose(2, 1, 0)
-    grid = Grid.from_spacing(array.shape, [packed["spacing_mm"]] * 3, packed["first_lps"])
-    return array, grid.lps(np.stack(np.meshgrid(*map(np.arange, array.shape), indexing="ij"), axis=-1))
-
-
-def test_label_volumes_agree_with_the_labels(data: dict[str, Any], small_lung: Lung) -> None:
-    codes = volumes.label_codes(small_lung, (0, 0, 0), small_lung.grid.shape)
-    rng = np.random.default_rng(0)
-    coarse, fine = data["labels"]
-    assert fine["spacing_mm"] <= coarse["spacing_mm"]
-    for packed in (coarse, fine):
-        array, centres = voxels(packed)
-        chosen = rng.integers(0, array.size, 4000)
-        lps, values = centres.reshape(-1, 3)[chosen], array.reshape(-1)[chosen]
-        ijk = small_lung.grid.ijk(lps)
-        clear = (np.abs(ijk - np.floor(ijk) - 0.5) > 1e-3).all(axis=1) & small_lung.grid.contains(lps)
-        index = np.floor(ijk[clear] + 0.5).astype(int)
-        np.testing.assert_array_equal(values[clear], codes.array[tuple(index.T)])
-    assert set(np.unique(codes.array)) == set(volumes.CODES.values())
-
-
-def test_ct_bytes_say_the_hounsfield_units(small_lung: Lung, plans: tuple[Plan, ...]) -> None:
-    grid = small_lung.grid
-    lps = grid.lps(np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1))
-    slope, middle = np.array([3.0, -2.0, 1.5]), lps.reshape(-1, 3).mean(axis=0)
-    ramp = Volume(grid=grid, array=((lps - middle) @ slope - 500.0).astype(np.float32))
-    near = deployment.device_points(plans[0])
-    for packed in volumes.ct_volumes(ramp, small_lung, near):
-        array, centres = voxels(packed)
-        inner = tuple(slice(3, -3) for _ in range(3))
-        wanted = (centres[inner] - middle) @ slope - 500.0
-        found = volumes.LOWEST_HU + volumes.HU_PER_STEP * array[inner].astype(float)
-        within = (wanted > -1300) & (wanted < 200)
-        assert within.any()
-        # Half a step of rounding, and half a voxel where several are averaged to one.
-        allowed = 0.5 * volumes.HU_PER_STEP + np.abs(slope) @ grid.spacing_mm
-        assert np.abs(found - wanted)[within].max() <= allowed
-        assert abs((found - wanted)[within].mean()) <= 0.6 * volumes.HU_PER_STEP
-
-
-def test_a_ct_of_something_else_is_refused(small_lung: Lung, plans: tuple[Plan, ...]) -> None:
-    far = Grid.from_spacing((8, 8, 8), [1.0] * 3, [900.0, 900.0, 900.0])
-    ct = Volume(grid=far, array=np.zeros(far.shape, dtype=np.int16))
-    with pytest.raises(AnatomyError, match="CT"):
-        volumes.ct_volumes(ct, small_lung, deployment.device_points(plans[0]))
-
-
-def test_a_ct_in_the_patients_folder_is_found(tmp_path: Path) -> None:
-    assert volumes.find_ct(tmp_path) is None
-    (tmp_path / "ct.nrrd").touch()
-    assert volumes.find_ct(tmp_path) == tmp_path / "ct.nrrd"
-
-
-# Virtual bronchoscopy ----------------------------------------------------------------------------
-
-
-def test_rays_meet_the_wall_where_the_lumen_ends(small_lung: Lung, plans: tuple[Plan, ...]) -> None:
-    scope = plans[0].scope
-    lumen = movie.SmoothLumen(small_lung, np.asarray(scope.points_lps))
-    n = int(np.argmax(scope.lumen_radius_mm))
-    pose = movie.camera_poses(plans[0], len(scope.points_lps))[n]
-    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-    rays = np.cos(angles)[:, None] * pose[:3, 0] + np.sin(angles)[:, None] * pose[:3, 1]
-    away = lumen.wall_distance(pose[:3, 3], rays)
-    voxel = float(small_lung.grid.spacing_mm.max())
-    assert away.min() == pytest.approx(scope.lumen_radius_mm[n], abs=1.2 * voxel)
-    np.testing.assert_allclose(lumen.share(pose[:3, 3] + away[:, None] * rays), movie.HALF, atol=0.3)
-    inwards = lumen.normals(pose[:3, 3] + away[:, None] * rays)
-    assert ((inwards * rays).sum(axis=1) < -0.5).all()
-
-
-def test_the_movie_has_its_pictures(small_lung: Lung, plans: tuple[Plan, ...], tmp_path: Path) -> None:
-    path = movie.bronchoscopy_webp(plans[0], small_lung, tmp_path / "fly.webp", frames=3, pixels=48)
-    with Image.open(path) as picture:
-        assert (picture.format, picture.size, picture.n_frames) == ("WEBP", (48, 48), 3)
-        first = np.asarray(picture.convert("RGB"), dtype=float)
-        picture.seek(2)
-        last = np.asarray(picture.convert("RGB"), dtype=float)
-    assert first[24, 40].mean() > 40
-    assert first[0, 0].mean() < 30
-    assert np.abs(first - last).mean() > 2
-
-
-# Colours -----------------------------------------------------------------------------------------
-
-# Linear RGB as people without one kind of cone see it [Machado2009, severity 1].
-VISIONS = {
-    "full": np.eye(3),
-    "protanopia": np.array(
-        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
-    ),
-    "deuteranopia": np.array(
-        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
-    ),
-    "tritanopia": np.array(
-        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
-    ),
-}
-
-
-def lab(colour: str, vision: np.ndarray) -> np.ndarray:
-    """Return CIE L*a*b* of "#rrggbb" as a vision sees it."""
-    srgb = np.array([int(colour[n : n + 2], 16) for n in (1, 3, 5)]) / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(vision @ linear, 0.0, 1.0)
-    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ seen
-    f = np.cbrt(np.maximum(xyz / np.array([0.9505, 1.0, 1.089]), 1e-6))
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
-
-
-COLOURS_TOGETHER = {
-    "devices": ("plan.js", ["#0072B2", "#E69F00", "#D81B60"]),
-    "clearance of the needle": ("motion.js", ["#D81B60", "#56B4E9"]),
-    "devices in slices": ("plan.js", ["#3FA9E8", "#E69F00", "#FF4081"]),
-    "charts": ("plan.js", ["#3A9BD5", "#D81B60", "#B8860B", "#785EF0"]),
-}
-
-
-@pytest.mark.parametrize("vision", VISIONS)
-def test_colours_are_told_apart_by_every_vision(vision: str) -> None:
-    for name, (module, colours) in COLOURS_TOGETHER.items():
-        assert all(colour in document.asset(module) for colour in colours), name
-        for one, other in combinations(colours, 2):
-            gap = np.linalg.norm(lab(one, VISIONS[vision]) - lab(other, VISIONS[vision]))
-            assert gap > 20.0, (name, one, other)
-
-
-def test_text_stands_out_in_light_and_dark() -> None:
-    style = document.asset("style.css")
-    schemes = [dict(re.findall(r"--(\w+): (#\w{6})", part)) for part in style.split("@media", 2)[:2]]
-    assert len(schemes) == 2
-    for scheme in schemes:
-        for ink in ("ink", "faint", "accent", "good", "fair", "bad"):
-            for paper in ("paper", "card"):
-                assert contrast(scheme[ink], scheme[paper]) >= 4.5, (ink, paper)
-
-
-def contrast(one: str, other: str) -> float:
-    """Return the contrast of two colours as WCAG 2 defines it."""
-    light = []
-    for colour in (one, other):
-        srgb = np.array([int(colour[n : n + 2], 16) for n in (1, 3, 5)]) / 255.0
-        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-        light.append(float(linear @ [0.2126, 0.7152, 0.0722]))
-    return (max(light) + 0.05) / (min(light) + 0.05)
-
-
-# Commands ----------------------------------------------------------------------------------------
+# Commands ---------------------------------------------------------------------------------------
 
 
 def test_the_command_writes_page_and_movie(
@@ -555,24 +302,7 @@ def test_a_map_decodes_to_itself(small_lung: Lung, tmp_path: Path) -> None:
         assert f'<th scope="row">{row.name}</th><td>{row.volume_ml:.0f}</td>' in page.read_text()
 
 
-def test_edges_of_the_page_grid_are_those_of_the_lung() -> None:
-    grid = Grid.from_spacing((40, 50, 60), [2.0] * 3, [5.0, 6.0, 7.0])
-    coarse, fine = volumes.page_grids(grid, np.array([[40.0, 50.0, 60.0]]))
-    for made in (coarse, fine):
-        low = made.lps(np.full(3, -0.5))
-        high = made.lps(np.array(made.shape) - 0.5)
-        assert (low >= grid.lps(np.full(3, -0.5)) - 1e-9).all()
-        assert (high >= np.array([40.0, 50.0, 60.0])).all()
-    np.testing.assert_allclose(coarse.lps(np.full(3, -0.5)), [4.0, 5.0, 6.0])
-    assert np.prod(coarse.shape) <= 1.05 * volumes.COARSE_VOXELS
-
-
 def test_arc_lengths_add_up() -> None:
     points = np.array([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
     assert arc_lengths(points).tolist() == [0.0, 5.0, 17.0]
     assert all(a <= b for a, b in pairwise(arc_lengths(points)))
-
-
-def test_a_lung_without_nodules_and_fissures_has_fewer_surfaces(bare_lung: Any) -> None:
-    bare = SimpleNamespace(**{**vars(bare_lung), "nodules": None})
-    assert [each["key"] for each in meshes.structure_meshes(bare)] == ["lung", "vessel", "airway"]

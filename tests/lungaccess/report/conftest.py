@@ -1,0 +1,27 @@
+"""Plans of the small phantom and the page of them, made once for all tests of this folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from anatomy.lung import Lung
+from lungaccess.plans.plan import Plan
+from tests.lungaccess.report.pages import make_plans, plan_file, report_data
+
+
+@pytest.fixture(scope="session")
+def plans(small_lung: Lung) -> tuple[Plan, ...]:
+    return make_plans(small_lung)
+
+
+@pytest.fixture(scope="session")
+def page(plans: tuple[Plan, ...], small_lung: Lung, small_phantom: Any, tmp_path_factory: Any) -> Path:
+    return plan_file(plans, small_lung, small_phantom.ct, tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="session")
+def data(page: Path) -> dict[str, Any]:
+    return report_data(page)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.fresh import FreshProcess
-from benchmarks.scenes import configurations, mechanics
+from benchmarks.scenes import configurations, mechanics, random_mechanics
 from stages.tube.mechanics import TubeMechanics
 
 CONFIGURATIONS = 4000
@@ -48,6 +48,24 @@ class Solves:
         some = slice(0, 400)
         one, two = (m.batch(self.angles[some], self.beta[some]).base_from_tip for m in (self.made, fine))
         return float(1e3 * np.abs(one[:, :3, 3] - two[:, :3, 3]).max())
+
+
+class RandomDesigns:
+    """Designs drawn at random, where some configurations are near snapping."""
+
+    params = (2, 3)
+    param_names = ("tubes",)
+
+    def setup(self, tubes: int) -> None:
+        """Make 40 designs with 100 configurations each, and compile."""
+        self.made = random_mechanics(tubes, 40)
+        self.joints = [configurations(made, 100, seed) for seed, made in enumerate(self.made)]
+        self.time_4000_solves(tubes)
+
+    def time_4000_solves(self, tubes: int) -> None:
+        """4000 configurations, in one call a design."""
+        for made, joints in zip(self.made, self.joints, strict=True):
+            made.batch(*joints)
 
 
 class Compile(FreshProcess):

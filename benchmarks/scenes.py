@@ -172,6 +172,35 @@ def configurations(made: TubeMechanics, count: int, seed: int = 0) -> tuple[Floa
     return rng.uniform(-math.pi, math.pi, beta.shape), beta
 
 
+def random_mechanics(count: int, designs: int, seed: int = 0) -> list[TubeMechanics]:
+    """Return nested curved tubes drawn at random, of which some snap.
+
+    The thinnest bore is 0.5 to 1.3 mm, walls 0.08 to 0.25 mm, clearances 0.03 to 0.12 mm; the tubes are 0.3
+    to 0.7 m long, and curved by up to 0.015/mm over 15 to 60 mm.
+    """
+    from stages.tube.device import Tube
+    from stages.tube.mechanics import TubeMechanics
+
+    rng = np.random.default_rng(seed)
+    made = []
+    for _ in range(designs):
+        bore, longest, tubes = rng.uniform(0.5, 1.3), rng.uniform(300.0, 700.0), []
+        for number in range(count):
+            outer = bore + 2.0 * rng.uniform(0.08, 0.25)
+            tubes.append(
+                Tube(
+                    outer_diameter_mm=outer,
+                    inner_diameter_mm=bore,
+                    length_mm=longest - 60.0 * number,
+                    curved_length_mm=rng.uniform(15.0, 60.0),
+                    precurvature_per_mm=rng.uniform(0.001, 0.015),
+                )
+            )
+            bore = outer + rng.uniform(0.03, 0.12)
+        made.append(TubeMechanics(tubes))
+    return made
+
+
 def tours(lesions: int) -> list[Subtree]:
     """Return the subtrees to random lesions in `TOUR_MODELS` random airways."""
     from experiments.support.tour_models import random_airway, random_lesions

@@ -119,7 +119,7 @@ class Equilibrium:
         for m, x in enumerate(s):
             dpsi, drate = self._derivatives_at(float(x))
             found[m] = equilibrium.determinant_at(
-                dpsi, drate, self.beta_mm, min(float(x), 0.0), matrix, right
+                dpsi[None], drate[None], 0, self.beta_mm, min(float(x), 0.0), matrix, right
             )
         return found
 
@@ -207,10 +207,7 @@ class Equilibrium:
             # Nothing is ahead of the front plate.
             poses[:, [0, 4, 8]] = 1.0
             return poses, psi + self.tip_angles_rad, rates
-        for m, x in enumerate(s):
-            pose.frame_at(
-                self._cutting, self._nodes, self._steps, self._poses, float(x), poses[m], psi[m], rates[m]
-            )
+        pose.frames_at(self._cutting, self._nodes, self._steps, self._poses, s, poses, psi, rates)
         return poses, psi, rates
 
 

@@ -26,6 +26,8 @@ LARGEST_TURN = 0.8
 """Of the angles between tubes in one step of Newton's method, rad."""
 NEWTON_STEPS = 25
 """Newton's method converges in fewer than 10 steps from a guess nearby."""
+NEAR_ENOUGH = 1e-3
+"""Largest error of a base angle on the way, rad: little beside the turns that Newton's method corrects."""
 LEAST_STRIDE = 1e-3
 ROUND = 12
 """Angles tried all round for each tube but the last."""
@@ -69,24 +71,30 @@ def _solve(matrix, right):
 
 
 @inner_kernel
-def _relative(dpsi, drate, beta, s, matrix):
+def _relative(dpsi, drate, at, beta, s, matrix):
     """Fill `matrix` (n - 1, n - 1) with how angles between the tubes at `s` depend on those at the tip.
 
-    Behind the front plate every tube goes on with constant torsion as far as its own rear end.
+    Behind the front plate every tube goes on with constant torsion as far as its own rear end; `at` is the
+    node that `s` is counted from.
     """
     last = matrix.shape[0]
     for i in range(last):
         for c in range(last):
-            matrix[i, c] = dpsi[c, i] + max(s, beta[i]) * drate[c, i]
-            matrix[i, c] -= dpsi[c, last] + max(s, beta[last]) * drate[c, last]
+            matrix[i, c] = dpsi[at, c, i] - dpsi[at, c, last]
+            if s < 0.0:
+                matrix[i, c] += max(s, beta[i]) * drate[at, c, i] - max(s, beta[last]) * drate[at, c, last]
 
 
 @numba.njit(cache=True)
-def determinant_at(dpsi, drate, beta, s, matrix, right):
-    """Return det d psi(s) / d psi_tip at or behind a node; `matrix` and `right` are scratch."""
+def determinant_at(dpsi, drate, at, beta, s, matrix, right):
+    """Return det d psi(s) / d psi_tip at or behind node `at`; `matrix` and `right` are scratch."""
     if matrix.shape[0] == 0:
         return 1.0
-    _relative(dpsi, drate, beta, s, matrix)
+    _relative(dpsi, drate, at, beta, s, matrix)
+    if matrix.shape[0] == 1:
+        return matrix[0, 0]
+    if matrix.shape[0] == 2:
+        return matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     right[:] = 0.0
     return _solve(matrix, right)
 
@@ -99,28 +107,28 @@ def _least_behind(dpsi, drate, beta, matrix, right):
     of them, a parabola for three, of which the vertex is looked at.
     """
     n = beta.shape[0]
-    least = determinant_at(dpsi, drate, beta, 0.0, matrix, right)
+    least = determinant_at(dpsi, drate, 0, beta, 0.0, matrix, right)
     for i in range(n):
         near = 0.0
         for j in range(n):
             if beta[i] < beta[j] < near:
                 near = beta[j]
         far = beta[i]
-        ends = determinant_at(dpsi, drate, beta, far, matrix, right)
+        ends = determinant_at(dpsi, drate, 0, beta, far, matrix, right)
         least = min(least, ends)
         if n == 3:
-            a = determinant_at(dpsi, drate, beta, near, matrix, right)
-            b = determinant_at(dpsi, drate, beta, 0.5 * (near + far), matrix, right)
+            a = determinant_at(dpsi, drate, 0, beta, near, matrix, right)
+            b = determinant_at(dpsi, drate, 0, beta, 0.5 * (near + far), matrix, right)
             bow = a - 2.0 * b + ends
             if bow > 0.0:
                 vertex = 0.25 * (3.0 * a - 4.0 * b + ends) / bow
                 if 0.0 < vertex < 1.0:
                     s = near + vertex * (far - near)
-                    least = min(least, determinant_at(dpsi, drate, beta, s, matrix, right))
+                    least = min(least, determinant_at(dpsi, drate, 0, beta, s, matrix, right))
         elif n > 3:
             for m in range(1, SHARES):
                 s = near + (far - near) * m / SHARES
-                least = min(least, determinant_at(dpsi, drate, beta, s, matrix, right))
+                least = min(least, determinant_at(dpsi, drate, 0, beta, s, matrix, right))
     return least
 
 
@@ -132,9 +140,16 @@ def _turns_back(dpsi, drate, beta, at, matrix, before, right):
     """
     last = matrix.shape[0]
     trace = 0.0
+    if last == 2:
+        # The inverse of a matrix of two rows is its adjugate over its determinant.
+        _relative(dpsi, drate, at, beta, 0.0, matrix)
+        _relative(dpsi, drate, at + 1, beta, 0.0, before)
+        trace = matrix[0, 0] * before[1, 1] + matrix[1, 1] * before[0, 0]
+        trace -= matrix[0, 1] * before[1, 0] + matrix[1, 0] * before[0, 1]
+        return trace * (before[0, 0] * before[1, 1] - before[0, 1] * before[1, 0]) <= 0.0
     for c in range(last):
-        _relative(dpsi[at], drate[at], beta, 0.0, matrix)
-        _relative(dpsi[at + 1], drate[at + 1], beta, 0.0, before)
+        _relative(dpsi, drate, at, beta, 0.0, matrix)
+        _relative(dpsi, drate, at + 1, beta, 0.0, before)
         # Row c of the step's matrix X solves X before = matrix.
         for m in range(last):
             right[m] = matrix[c, m]
@@ -155,10 +170,10 @@ def least_determinant(nodes, beta):
     if last == 0:
         return least
     for at in range(dpsi.shape[0] - 2, -1, -1):
-        least = min(least, determinant_at(dpsi[at], drate[at], beta, _PLATE, matrix, right))
+        least = min(least, determinant_at(dpsi, drate, at, beta, _PLATE, matrix, right))
         if last > 1 and _turns_back(dpsi, drate, beta, at, matrix, before, right):
             return -math.inf
-    return min(least, _least_behind(dpsi[0], drate[0], beta, matrix, right))
+    return min(least, _least_behind(dpsi, drate, beta, matrix, right))
 
 
 @inner_kernel
@@ -176,7 +191,7 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
     if last > 0:
         for i in range(last):
             right[i] = base_angles[i] - psi[0, i] - beta[i] * rate[0, i] - error
-        _relative(dpsi[0], drate[0], beta, rearmost, matrix)
+        _relative(dpsi, drate, 0, beta, rearmost, matrix)
         _solve(matrix, right)
         size = np.abs(right).max()
         if not size < LARGEST_TURN:
@@ -192,13 +207,16 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
 
 
 @inner_kernel
-def _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
-    """Let Newton's method find tip angles for base angles from a guess; return the last error, rad."""
+def _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, enough):
+    """Let Newton's method find tip angles for base angles from a guess; return the last error, rad.
+
+    It stops where the error is below `enough`.
+    """
     worst = math.inf
     for _ in range(NEWTON_STEPS):
         twist(design, cutting, tip_angles, owners, nodes, steps)
         worst = _newton_step(nodes, beta, base_angles, tip_angles, matrix, right)
-        if worst < TOLERANCE:
+        if worst < enough:
             break
     return worst
 
@@ -215,8 +233,11 @@ def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_ang
     while done < 1.0 and stride > LEAST_STRIDE:
         share = min(done + stride, 1.0)
         eased = (pieces, math.sqrt(share) * moments, directions, count)
-        worst = _newton(design, eased, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
-        if worst < TOLERANCE:
+        enough = TOLERANCE if share == 1.0 else NEAR_ENOUGH
+        worst = _newton(
+            design, eased, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, enough
+        )
+        if worst < enough:
             done = share
             kept[:] = tip_angles
         else:
@@ -241,7 +262,9 @@ def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, t
             if i < n - 1:
                 tip_angles[i] += 2.0 * math.pi * (code % ROUND) / ROUND
                 code //= ROUND
-        worst = _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
+        worst = _newton(
+            design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, TOLERANCE
+        )
         if worst < TOLERANCE:
             if least_determinant(nodes, beta) > 0.0:
                 return worst
@@ -264,7 +287,9 @@ def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stab
     """
     last = beta.shape[0] - 1
     matrix, right = np.zeros((last, last)), np.zeros(last)
-    worst = _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
+    worst = _newton(
+        design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, TOLERANCE
+    )
     least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
     if least > 0.0 or (worst < TOLERANCE and not prefer_stable):
         return worst, least

@@ -13,7 +13,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from stages.tube.kernels.assembly import BENT, BENT_TUBE, SOFTNESS
-from stages.tube.kernels.pose import COMMUTATOR, GAUSS, step_of, turned
+from stages.tube.kernels.pose import COMMUTATOR, GAUSS, step_of
 
 TERMS = 14
 """Of the series of the exponential's derivative: for a step of a radian the rest is below rounding."""
@@ -103,36 +103,28 @@ def motions(cutting, nodes, steps, poses, moved):
     lengths, dlengths, piece_of = steps
     twist, change, local = np.zeros(6), np.zeros(6), np.zeros(6)
     first, second = np.zeros(4), np.zeros(4)
-    motion, frames = np.zeros((4, 12)), np.zeros((2, 12))
-    angles = np.zeros(psi.shape[1])
+    motion = np.zeros((2, 12))
     moved[:] = 0.0
     for at in range(lengths.shape[0]):
         k = piece_of[at]
         piece = pieces[k]
         h = lengths[at]
-        step_of(
-            piece, moments[k], directions[k], h, psi[at], rate[at], psi[at + 1], rate[at + 1],
-            0.0, 1.0, twist, angles, motion,
-        )  # fmt: skip
+        step_of(cutting, nodes, steps, at, 0.0, 1.0, twist, motion)
         i = int(piece[BENT_TUBE])
         for c in range(moved.shape[0]):
             dh = dlengths[at, c]
             if piece[BENT] == 1.0:
-                # Turned into the frame of the one bent tube, along its arc, and turned back.
-                kappa = piece[SOFTNESS] * moments[k, i]
+                # Along the arc of the one bent tube, then turned back by its torsion.
                 change[:] = 0.0
-                change[2] = dpsi[at, c, i]
-                _add_moved(poses[at], change, moved[c])
-                turned(poses[at], psi[at, i], frames[0])
-                change[0] = dh * kappa * math.cos(directions[k, i])
-                change[1] = dh * kappa * math.sin(directions[k, i])
+                change[0] = dh / h * twist[0] - twist[1] * dpsi[at, c, i]
+                change[1] = dh / h * twist[1] + twist[0] * dpsi[at, c, i]
                 change[2] = dh * rate[at, i] + h * drate[at, c, i]
                 change[5] = dh
                 _derivative_of_exponential(twist, change, local)
-                _add_moved(frames[0], local, moved[c])
-                change[:] = 0.0
-                change[2] = -dpsi[at + 1, c, i]
-                _add_moved(poses[at + 1], change, moved[c])
+                _add_moved(poses[at], local, moved[c])
+                local[:] = 0.0
+                local[2] = -change[2]
+                _add_moved(poses[at + 1], local, moved[c])
             else:
                 ends = (psi[at], rate[at], psi[at + 1], rate[at + 1])
                 changes = (dpsi[at, c], drate[at, c], dpsi[at + 1, c], drate[at + 1, c])

@@ -27,69 +27,128 @@ P1, P2, P3 = 14.0 / 336.0, 100.0 / 336.0, 54.0 / 336.0
 R1, R2, R3, R4 = 14.0 / 336.0, 125.0 / 336.0, 162.0 / 336.0, 35.0 / 336.0
 
 
+# Rows of the scratch: pulls at the four stages of a step, and the angles at which they are looked for.
+ANGLES, SCRATCH_ROWS = 4, 5
+# Columns of `pairs`: two bent tubes, what their sine pulls at each, and the angle between them at rest.
+FIRST, SECOND, PULL_FIRST, PULL_SECOND, REST, PAIR_COLUMNS = range(6)
+
+
 @inner_kernel
-def _pull(torsional, softness, moments, directions, psi, dpsi, f, df):
-    """Fill `f` (n,) with psi'' and `df` (columns, n) with its derivatives."""
-    n = psi.shape[0]
+def _pair_up(torsional, pieces, moments, directions, k, pairs):
+    """Fill `pairs` with the pairs of bent tubes in piece `k`; return how many there are."""
+    count = 0
+    n = moments.shape[1]
     for i in range(n):
-        f[i] = 0.0
-    for c in range(df.shape[0]):
-        for i in range(n):
-            df[c, i] = 0.0
-    for i in range(n):
-        if moments[i] == 0.0:
-            continue
         for j in range(i + 1, n):
-            if moments[j] == 0.0:
-                continue
-            most = softness * moments[i] * moments[j]
-            angle = psi[j] + directions[j] - psi[i] - directions[i]
-            pull = most * math.sin(angle)
-            stiffening = most * math.cos(angle)
-            f[i] -= pull / torsional[i, 1]
-            f[j] += pull / torsional[j, 1]
-            for c in range(df.shape[0]):
-                change = stiffening * (dpsi[c, j] - dpsi[c, i])
-                df[c, i] -= change / torsional[i, 1]
-                df[c, j] += change / torsional[j, 1]
+            most = pieces[k, SOFTNESS] * moments[k, i] * moments[k, j]
+            if most != 0.0:
+                pairs[count, FIRST] = i
+                pairs[count, SECOND] = j
+                pairs[count, PULL_FIRST] = most / torsional[i, 1]
+                pairs[count, PULL_SECOND] = most / torsional[j, 1]
+                pairs[count, REST] = directions[k, j] - directions[k, i]
+                count += 1
+    return count
 
 
 @inner_kernel
-def _step(torsional, softness, moments, directions, h, dh, psi, rate, dpsi, drate, new, work, dwork):
-    """Take a step of -h; `new` gets (psi, rate, dpsi, drate) at its end.
+def _pull(pairs, count, work, stage):
+    """Fill `work[stage]` (1 + columns, n) with psi'' at `work[ANGLES]`, and with its derivatives."""
+    rows, n = work.shape[1], work.shape[2]
+    for row in range(rows):
+        for i in range(n):
+            work[stage, row, i] = 0.0
+    for p in range(count):
+        i, j = int(pairs[p, FIRST]), int(pairs[p, SECOND])
+        one, two = pairs[p, PULL_FIRST], pairs[p, PULL_SECOND]
+        angle = work[ANGLES, 0, j] - work[ANGLES, 0, i] + pairs[p, REST]
+        sine, cosine = math.sin(angle), math.cos(angle)
+        work[stage, 0, i] -= one * sine
+        work[stage, 0, j] += two * sine
+        for row in range(1, rows):
+            change = cosine * (work[ANGLES, row, j] - work[ANGLES, row, i])
+            work[stage, row, i] -= one * change
+            work[stage, row, j] += two * change
+
+
+@inner_kernel
+def _look_ahead(nodes, at, h, share, a1, a2, a3, work):
+    """Put into `work[ANGLES]` the angles at a share of the step down from node `at`, and derivatives."""
+    _s, psi, rate, dpsi, drate = nodes
+    along, h2 = share * h, h * h
+    for i in range(work.shape[2]):
+        bent = a1 * work[0, 0, i] + a2 * work[1, 0, i] + a3 * work[2, 0, i]
+        work[ANGLES, 0, i] = psi[at, i] - along * rate[at, i] + h2 * bent
+    for c in range(work.shape[1] - 1):
+        for i in range(work.shape[2]):
+            bent = a1 * work[0, c + 1, i] + a2 * work[1, c + 1, i] + a3 * work[2, c + 1, i]
+            work[ANGLES, c + 1, i] = dpsi[at, c, i] - along * drate[at, c, i] + h2 * bent
+
+
+@inner_kernel
+def _add_stretch(nodes, at, h, dh, share, a1, a2, a3, work):
+    """Add to the derivatives in `work[ANGLES]` what they owe to derivatives `dh` (N, columns) of the step."""
+    rate = nodes[2]
+    for i in range(work.shape[2]):
+        bent = a1 * work[0, 0, i] + a2 * work[1, 0, i] + a3 * work[2, 0, i]
+        for c in range(work.shape[1] - 1):
+            work[ANGLES, c + 1, i] += dh[at - 1, c] * (2.0 * h * bent - share * rate[at, i])
+
+
+@inner_kernel
+def _look_from(nodes, at, h, dh, stretches, pairs, count, work):
+    """Fill the four stages of `work` of the step of `h` down from node `at`."""
+    _look_ahead(nodes, at, h, 0.0, 0.0, 0.0, 0.0, work)
+    _pull(pairs, count, work, 0)
+    _look_ahead(nodes, at, h, C2, A21, 0.0, 0.0, work)
+    if stretches:
+        _add_stretch(nodes, at, h, dh, C2, A21, 0.0, 0.0, work)
+    _pull(pairs, count, work, 1)
+    _look_ahead(nodes, at, h, C3, A31, A32, 0.0, work)
+    if stretches:
+        _add_stretch(nodes, at, h, dh, C3, A31, A32, 0.0, work)
+    _pull(pairs, count, work, 2)
+    _look_ahead(nodes, at, h, 1.0, A41, A42, A43, work)
+    if stretches:
+        _add_stretch(nodes, at, h, dh, 1.0, A41, A42, A43, work)
+    _pull(pairs, count, work, 3)
+
+
+@inner_kernel
+def _step(nodes, at, h, dh, stretches, pairs, count, work):
+    """Take a step of -h from node `at` to the one before it.
 
     `rate` is along s, but the step goes down: its sign is turned where it enters and leaves.
     """
-    n = psi.shape[0]
-    columns = dh.shape[0]
-    y = work[4]
-    dy = dwork[4]
-    _pull(torsional, softness, moments, directions, psi, dpsi, work[0], dwork[0])
-    for stage in range(1, 4):
-        c = C2 if stage == 1 else (C3 if stage == 2 else 1.0)
-        a1 = A21 if stage == 1 else (A31 if stage == 2 else A41)
-        a2 = 0.0 if stage == 1 else (A32 if stage == 2 else A42)
-        a3 = A43 if stage == 3 else 0.0
-        for i in range(n):
-            y[i] = psi[i] - c * h * rate[i] + h * h * (a1 * work[0, i] + a2 * work[1, i] + a3 * work[2, i])
-        for k in range(columns):
-            for i in range(n):
-                bent = a1 * work[0, i] + a2 * work[1, i] + a3 * work[2, i]
-                dbent = a1 * dwork[0, k, i] + a2 * dwork[1, k, i] + a3 * dwork[2, k, i]
-                dy[k, i] = dpsi[k, i] - c * (dh[k] * rate[i] + h * drate[k, i])
-                dy[k, i] += 2.0 * h * dh[k] * bent + h * h * dbent
-        _pull(torsional, softness, moments, directions, y, dy, work[stage], dwork[stage])
-    for i in range(n):
-        bent = P1 * work[0, i] + P2 * work[1, i] + P3 * work[2, i]
-        turned = R1 * work[0, i] + R2 * work[1, i] + R3 * work[2, i] + R4 * work[3, i]
-        new[0][i] = psi[i] - h * rate[i] + h * h * bent
-        new[1][i] = rate[i] - h * turned
-        for k in range(columns):
-            dbent = P1 * dwork[0, k, i] + P2 * dwork[1, k, i] + P3 * dwork[2, k, i]
-            dturned = R1 * dwork[0, k, i] + R2 * dwork[1, k, i] + R3 * dwork[2, k, i] + R4 * dwork[3, k, i]
-            new[2][k, i] = dpsi[k, i] - dh[k] * rate[i] - h * drate[k, i]
-            new[2][k, i] += 2.0 * h * dh[k] * bent + h * h * dbent
-            new[3][k, i] = drate[k, i] - dh[k] * turned - h * dturned
+    _s, psi, rate, dpsi, drate = nodes
+    _look_from(nodes, at, h, dh, stretches, pairs, count, work)
+    h2 = h * h
+    for i in range(work.shape[2]):
+        bent = P1 * work[0, 0, i] + P2 * work[1, 0, i] + P3 * work[2, 0, i]
+        turned = R1 * work[0, 0, i] + R2 * work[1, 0, i] + R3 * work[2, 0, i] + R4 * work[3, 0, i]
+        psi[at - 1, i] = psi[at, i] - h * rate[at, i] + h2 * bent
+        rate[at - 1, i] = rate[at, i] - h * turned
+        for c in range(work.shape[1] - 1):
+            dbent = P1 * work[0, c + 1, i] + P2 * work[1, c + 1, i] + P3 * work[2, c + 1, i]
+            dturned = R1 * work[0, c + 1, i] + R2 * work[1, c + 1, i]
+            dturned += R3 * work[2, c + 1, i] + R4 * work[3, c + 1, i]
+            dpsi[at - 1, c, i] = dpsi[at, c, i] - h * drate[at, c, i] + h2 * dbent
+            drate[at - 1, c, i] = drate[at, c, i] - h * dturned
+            if stretches:
+                dpsi[at - 1, c, i] += dh[at - 1, c] * (2.0 * h * bent - rate[at, i])
+                drate[at - 1, c, i] -= dh[at - 1, c] * turned
+
+
+@inner_kernel
+def _coast(nodes, at, h, dh):
+    """Take a step of -h from node `at` where no two tubes are bent: torsion stays."""
+    _s, psi, rate, dpsi, drate = nodes
+    for i in range(psi.shape[1]):
+        psi[at - 1, i] = psi[at, i] - h * rate[at, i]
+        rate[at - 1, i] = rate[at, i]
+        for c in range(dpsi.shape[1]):
+            dpsi[at - 1, c, i] = dpsi[at, c, i] - h * drate[at, c, i] - dh[at - 1, c] * rate[at, i]
+            drate[at - 1, c, i] = drate[at, c, i]
 
 
 @numba.njit(cache=True)
@@ -118,8 +177,9 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
     n = tip_angles.shape[0]
     columns = owners.shape[0]
     at = lengths.shape[0]
-    work = np.zeros((5, n))
-    dwork = np.zeros((5, columns, n))
+    work = np.zeros((SCRATCH_ROWS, columns + 1, n))
+    pairs = np.zeros((n * (n - 1) // 2, PAIR_COLUMNS))
+    stretches = False
     s[at] = pieces[count - 1, FAR] if count > 0 else 0.0
     for i in range(n):
         psi[at, i] = tip_angles[i]
@@ -127,8 +187,11 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
         for c in range(columns):
             dpsi[at, c, i] = 1.0 if owners[c] == -1 - i else 0.0
             drate[at, c, i] = 0.0
+    for c in range(columns):
+        stretches = stretches or owners[c] >= 0
     for k in range(count - 1, -1, -1):
         number = int(pieces[k, STEPS])
+        bent = _pair_up(design[0], pieces, moments, directions, k, pairs)
         h = (pieces[k, FAR] - pieces[k, NEAR]) / number
         for m in range(number):
             at -= 1
@@ -141,8 +204,7 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
                     moved += 1.0 if pieces[k, FAR_OWNER] == owners[c] else 0.0
                     moved -= 1.0 if pieces[k, NEAR_OWNER] == owners[c] else 0.0
                 dlengths[at, c] = moved / number
-            new = (psi[at], rate[at], dpsi[at], drate[at])
-            _step(
-                design[0], pieces[k, SOFTNESS], moments[k], directions[k], h, dlengths[at],
-                psi[at + 1], rate[at + 1], dpsi[at + 1], drate[at + 1], new, work, dwork,
-            )  # fmt: skip
+            if bent > 0:
+                _step(nodes, at + 1, h, dlengths, stretches, pairs, bent, work)
+            else:
+                _coast(nodes, at + 1, h, dlengths)

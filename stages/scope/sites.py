@@ -10,9 +10,9 @@ from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
-from anatomy.structures import AIRWAY, OUTSIDE
-from anatomy.typed import Bool, Float, Int, Labels
+from anatomy.typed import Bool, Float, Int
 from stages.scope.device import Bronchoscope
+from stages.scope.passages import find_passages
 from stages.scope.tips import ScopeTip, approach, looks_ahead, tip_at, turned_aside
 
 
@@ -92,10 +92,8 @@ def find_sites(
         as far as its body fits into the lumen.
     """
     tree = lung.tree
-    needed = scope.radius_mm + scope.lumen_margin_mm
-    narrowest_so_far = _narrowest_on_the_route(lung)
-    passable = narrowest_so_far >= needed
-    ahead = _distance_to_exit(tree, _in_lung_tissue(lung)) <= reach_mm
+    places = find_passages(lung, scope, reach_mm=reach_mm)
+    narrowest_so_far, passable, ahead = places.lumen_radius_mm, places.passable, places.exits_ahead
     spaced = np.flatnonzero(ahead & _every(tree, spacing_mm))
     looking = _looking_ahead(tree, spaced)
     straight = looking[passable[looking]]
@@ -115,7 +113,7 @@ def find_sites(
         lumen_radius_mm=narrowest_so_far,
         passable=passable,
         exits_ahead=ahead,
-        narrowest=_where_too_narrow(tree, passable, narrowest_so_far, needed),
+        narrowest=places.narrowest,
         widest_scope_mm=max(2.0 * (widest - scope.lumen_margin_mm), 0.0),
     )
 
@@ -192,83 +190,9 @@ def _looking_ahead(tree: AirwayTree, points: Int) -> Int:
     return np.array([p for p in points if looks_ahead(tree, tip_at(tree, int(p)))], dtype=np.int64)
 
 
-PROOF_STEP_MM = 0.05
-"""Spacing of the samples of a proof along the medial axis; half of it is lost, far less than a voxel."""
-
-
-def _narrowest_on_the_route(lung: Lung) -> Float:
-    """Return the proved lumen radius of the narrowest place between the root and each point.
-
-    The depth in the lumen is 1-Lipschitz: between two samples it is at most half their distance less.
-    """
-    tree = lung.tree
-    parent = np.maximum(tree.parent_point, 0)
-    step = tree.points_lps - tree.points_lps[parent]
-    count = max(1, math.ceil(float(np.linalg.norm(step, axis=1).max()) / PROOF_STEP_MM))
-    share = np.linspace(0.0, 1.0, count + 1)
-    samples = tree.points_lps[parent][:, None] + share[:, None] * step[:, None]
-    depth = lung.lumen_depth.lower_bound_mm(samples.reshape(-1, 3)).reshape(len(step), -1)
-    narrowest = np.maximum(depth.min(axis=1) - np.linalg.norm(step, axis=1) / (2 * count), 0.0)
-    for point in range(1, tree.n_points):
-        narrowest[point] = min(narrowest[point], narrowest[tree.parent_point[point]])
-    return np.asarray(narrowest, dtype=np.float64)
-
-
-WALL_PROBE_MM = 2.5
-"""Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes leave."""
-PROBE_DIRECTIONS = 8
-"""Directions across the airway in which tissue is looked for; at 2 to 6 mm they are a few voxels apart."""
-
-
-def _in_lung_tissue(lung: Lung) -> Bool:
-    """Tell at which tree points free lung tissue lies beside the airway, in some direction."""
-    tree = lung.tree
-    helper = np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)]
-    first = np.cross(tree.tangents, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(tree.tangents, first)
-    nowhere = np.ones(tree.n_points, dtype=bool)
-    for phi in np.arange(PROBE_DIRECTIONS) * (2 * math.pi / PROBE_DIRECTIONS):
-        direction = math.cos(phi) * first + math.sin(phi) * second
-        probe = tree.points_lps + (tree.radius_mm + WALL_PROBE_MM)[:, None] * direction
-        nowhere &= (_labels_at(lung, probe) & (OUTSIDE | AIRWAY)) != 0
-    return ~nowhere
-
-
-def _labels_at(lung: Lung, points: Float) -> Labels:
-    ijk = np.floor(lung.grid.ijk(points) + 0.5).astype(np.int64)
-    inside = ((ijk >= 0) & (ijk < lung.grid.shape)).all(axis=1)
-    labels = np.full(len(points), OUTSIDE, dtype=np.uint16)
-    labels[inside] = lung.labels[tuple(ijk[inside].T)]
-    return labels
-
-
-def _distance_to_exit(tree: AirwayTree, in_tissue: Bool) -> Float:
-    """Return the distance from each point down the tree to the next point in lung tissue."""
-    distance_mm = np.where(in_tissue, 0.0, np.inf)
-    for point in range(tree.n_points - 1, 0, -1):
-        parent = tree.parent_point[point]
-        step = tree.distance_from_root_mm[point] - tree.distance_from_root_mm[parent]
-        distance_mm[parent] = min(distance_mm[parent], distance_mm[point] + step)
-    return distance_mm
-
-
 def _every(tree: AirwayTree, spacing_mm: float) -> Bool:
     """Choose points about `spacing_mm` apart along the tree."""
     slot = np.floor(tree.distance_from_root_mm / spacing_mm)
     chosen = np.ones(tree.n_points, dtype=bool)
     chosen[1:] = slot[1:] != slot[tree.parent_point[1:]]
     return chosen
-
-
-def _where_too_narrow(
-    tree: AirwayTree, passable: Bool, radius_mm: Float, needed_mm: float
-) -> tuple[int, float]:
-    """Say at which generation most routes end, and by how much (median)."""
-    ends = np.flatnonzero(~passable[1:] & passable[tree.parent_point[1:]]) + 1
-    if not len(ends):
-        return (-1, 0.0) if passable[0] else (0, float(needed_mm - radius_mm[0]))
-    generation = tree.generation[tree.branch_of_point[ends]]
-    worst = int(np.argmax(np.bincount(generation)))
-    shortfall = needed_mm - radius_mm[ends[generation == worst]]
-    return worst, float(np.median(shortfall))

@@ -1,0 +1,228 @@
+"""The tree of states of a bronchoscope over the whole airway, grown along its branches."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.records import frozen_record
+from anatomy.typed import Bool, Float, Int
+from stages.scope.kernels import growth as kernel
+from stages.scope.kernels.body import Walls
+from stages.scope.kernels.growth import Device, Route
+
+STEP_MM = 1.0
+"""Advance from layer to layer: about a voxel and a half, far shorter than a bending section."""
+BEAMS = (24, 96)
+"""States kept in a layer, and those kept where fewer did not get to the end of a branch."""
+RINGS_PER_MM = (0.003, 0.01, 0.03)
+"""Curvatures beside that which leads to the route ahead: at a tip of 15 mm they move it by 0.3 to 3 mm."""
+SPOKES = 8
+"""Directions of a ring: 45 degrees apart."""
+TANGENT_MM = 3.0
+"""The direction of a route is that of its chord so far each way: several voxels, less than a branch."""
+LEAST_ROOM_MM = 0.3
+"""The room beside the axis counts at least so much, about half a voxel: costs stay finite where it is narrow."""
+START_MM = 30.0
+"""The first straight section may begin so far down the trachea."""
+TURNED_A_LAYER = 8
+"""States of a layer from which tips are turned, spread over those that it keeps, the best among them."""
+FROM_FORK = (2.0, 4.0)
+"""Motions into a branch part from those into others so many lengths of the section before the fork."""
+
+
+@frozen_record
+class StateTree:
+    """States of a scope, each reached from an earlier one; N states.
+
+    Parameters
+    ----------
+    states : (N, 26) float64
+        See `stages.scope.kernels.growth`.
+    parent : (N,) int64
+        -1 for the first one.
+    by_straight : (N,) bool
+        Whether the section is straightened before it twists on the way from the parent.
+    advance_mm : (N,) float64
+        Advance of the base since the first state.
+    turned_from : (T,) int64
+        States from which tips may be turned: some of each layer.
+    """
+
+    states: Float
+    parent: Int
+    by_straight: Bool
+    advance_mm: Float
+    turned_from: Int
+
+
+class Growth:
+    """Grows the states of a scope along the routes of an airway.
+
+    Parameters
+    ----------
+    passable : (N,) bool
+        Tree points that the scope can pass; routes end at the last of them.
+    """
+
+    def __init__(self, walls: Walls, tree: AirwayTree, passable: Bool, device: Device) -> None:
+        self._walls, self._tree, self._device = walls, tree, device
+        self._passable = passable
+        self._offsets = rings(RINGS_PER_MM, SPOKES)
+        self._rows: list[Float] = []
+        self._parents: list[Int] = []
+        self._straight: list[Bool] = []
+        self._advance: list[float] = []
+        self._count = 0
+        self._layers: dict[int, list[tuple[int, float]]] = {}
+        """Of each branch: number of a layer and how far from the root its tips are, in the median."""
+
+    def grow(self) -> StateTree:
+        """Grow along all branches, parents first."""
+        for branch in range(self._tree.n_branches):
+            points = self._tree.branch_points(branch)
+            points = points[self._passable[points]]
+            if len(points):
+                self._grow_branch(branch, self._tree.route(int(points[-1])))
+        return self._result()
+
+    def _grow_branch(self, branch: int, points: Int) -> None:
+        route = self._route(points)
+        if branch == 0 and not self._begin(route):
+            return
+        for beam, lengths in zip(BEAMS, FROM_FORK, strict=True):
+            layers = self._follow(branch, points, route, beam, lengths * self._device.length)
+            known = self._layers.get(branch, [])
+            if not known or (layers and layers[-1][1] > known[-1][1]):
+                self._layers[branch] = layers
+            if layers and layers[-1][1] >= self._tree.distance_from_root_mm[points[-1]] - 2.0 * STEP_MM:
+                return
+
+    def _follow(
+        self, branch: int, points: Int, route: Route, beam: int, before_mm: float
+    ) -> list[tuple[int, float]]:
+        """Follow a route from some way before its last fork; return the layers."""
+        start = self._start(branch, before_mm)
+        if start is None:
+            return []
+        layers = [start]
+        from_root = self._tree.distance_from_root_mm[points]
+        states = self._rows[start[0]].copy()
+        numbers = self._number(start[0])
+        begin = int(self._tree.branch_start[branch])
+        shared = int(np.searchsorted(points, begin)) if branch else len(points)
+        states[:, kernel.NEAR] = np.minimum(states[:, kernel.NEAR], max(shared - 1, 0))
+        end = len(points) - 1
+        while True:
+            out = np.zeros((beam, kernel.COLUMNS))
+            parents, straight = np.zeros(beam, dtype=np.int64), np.zeros(beam, dtype=np.bool_)
+            kept = kernel.grow_layer(
+                self._walls, self._device, route, states, self._offsets, STEP_MM, out, parents, straight
+            )
+            if not kept:
+                return layers
+            states = out[:kept].copy()
+            layer = self._add(states, numbers[parents[:kept]], straight[:kept], self._advance[layers[-1][0]])
+            numbers = self._number(layer)
+            near = states[:, kernel.NEAR].astype(np.int64)
+            layers.append((layer, float(np.median(from_root[near]))))
+            if near.min() >= end or len(layers) > 4 * len(points) + 100:
+                return layers
+
+    def _start(self, branch: int, before_mm: float) -> tuple[int, float] | None:
+        """Return the last layer of the branches before one that is at least so far before its fork."""
+        if branch == 0:
+            return self._layers[0][0]
+        tree = self._tree
+        hangs_on = int(tree.parent_point[tree.branch_start[branch]])
+        limit = float(tree.distance_from_root_mm[hangs_on]) - before_mm
+        above = int(tree.branch_parent[branch])
+        while above >= 0:
+            before = [layer for layer in self._layers.get(above, []) if layer[1] <= limit]
+            if before:
+                return before[-1]
+            above = int(tree.branch_parent[above])
+        return self._layers[0][0] if self._layers.get(0) else None
+
+    def _begin(self, route: Route) -> bool:
+        """Put a straight section into the trachea, where the first one fits."""
+        from anatomy import poses
+
+        length = self._device.length
+        along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route.points, axis=0), axis=1)))
+        for n in range(int(np.searchsorted(along, START_MM))):
+            tip = int(np.searchsorted(along, along[n] + length))
+            if tip >= len(along):
+                return False
+            frame = poses.pose(route.points[n], route.points[tip] - route.points[n])
+            state = np.zeros((1, kernel.COLUMNS))
+            state[0, : kernel.U] = np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
+            state[0, kernel.NEAR] = tip
+            if kernel.put_first(self._walls, self._device, route, state[0]):
+                layer = self._add(state, np.array([-1]), np.array([False]), -STEP_MM)
+                self._layers[0] = [(layer, float(along[tip]))]
+                return True
+        return False
+
+    def _route(self, points: Int) -> Route:
+        tree = self._tree
+        places = np.ascontiguousarray(tree.points_lps[points])
+        along = tree.distance_from_root_mm[points]
+        ahead = np.minimum(np.searchsorted(along, along + TANGENT_MM), len(points) - 1)
+        behind = np.maximum(np.searchsorted(along, along - TANGENT_MM, side="right") - 1, 0)
+        chords = places[ahead] - places[behind]
+        lengths = np.linalg.norm(chords, axis=1, keepdims=True)
+        tangents = np.where(lengths > 0.0, chords / np.maximum(lengths, 1e-9), tree.tangents[points])
+        room = np.maximum(tree.radius_mm[points] - self._device.radius, LEAST_ROOM_MM)
+        return Route(points=places, tangents=tangents, room=room)
+
+    def _add(self, states: Float, parents: Int, straight: Bool, advance_mm: float) -> int:
+        self._rows.append(states)
+        self._parents.append(np.asarray(parents, dtype=np.int64))
+        self._straight.append(straight)
+        self._advance.append(advance_mm + STEP_MM)
+        self._count += len(states)
+        return len(self._rows) - 1
+
+    def _number(self, layer: int) -> Int:
+        """Return the numbers of the states of a layer; the last one was added just now."""
+        if layer == len(self._rows) - 1:
+            return np.arange(self._count - len(self._rows[layer]), self._count)
+        begin = sum(len(rows) for rows in self._rows[:layer])
+        return np.arange(begin, begin + len(self._rows[layer]))
+
+    def _result(self) -> StateTree:
+        if not self._rows:
+            empty = np.zeros(0)
+            return StateTree(
+                states=np.zeros((0, kernel.COLUMNS)),
+                parent=empty.astype(np.int64),
+                by_straight=empty.astype(bool),
+                advance_mm=empty,
+                turned_from=empty.astype(np.int64),
+            )
+        begins = np.append(0, np.cumsum([len(rows) for rows in self._rows]))
+        used = sorted({layer for layers in self._layers.values() for layer, _ in layers})
+        some = [
+            begins[layer]
+            + np.unique(np.linspace(0, len(self._rows[layer]) - 1, TURNED_A_LAYER).astype(np.int64))
+            for layer in used
+        ]
+        return StateTree(
+            states=np.concatenate(self._rows),
+            parent=np.concatenate(self._parents),
+            by_straight=np.concatenate(self._straight),
+            advance_mm=np.repeat(self._advance, [len(rows) for rows in self._rows]),
+            turned_from=np.concatenate(some),
+        )
+
+
+def rings(sizes: tuple[float, ...], spokes: int) -> Float:
+    """Return offsets `(2 + R * spokes, 2)`: two of 0, and rings of growing size, every other one turned."""
+    out = [(0.0, 0.0), (0.0, 0.0)]
+    for number, size in enumerate(sizes):
+        angles = (np.arange(spokes) + 0.5 * (number % 2)) * (2.0 * math.pi / spokes)
+        out += [(size * math.cos(angle), size * math.sin(angle)) for angle in angles]
+    return np.array(out)

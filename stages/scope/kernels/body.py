@@ -1,0 +1,235 @@
+"""The bending section of a bronchoscope in the lumen: its arc, the room around it, and changes in place.
+
+A base frame is `(12,)`: the columns +x, +y and +z, and the point.  A section's curvature vector `(u, v)` in
+1/mm lies in the plane of +x and +y: the section is an arc of that curvature which bends towards it.  An
+advance carries the frame along the arc without roll (a Bishop frame), so that the vector keeps its parts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
+from anatomy.kernels.labels import OUTSIDE
+from anatomy.typed import Float, UInt16
+
+EASY_MM = 0.15
+"""Where the field's bound leaves so much room, voxels are not searched: a step could grow but little."""
+STRAIGHT_RAD = 1e-4
+"""Below this angle the series of an arc is exact in double precision."""
+FINEST_MM = 0.02
+"""A change in place is cut into pieces until the tip moves by less than this; then it is given up."""
+BLOCKED = -1.0
+"""The room of what is not proved to be free."""
+
+
+class Walls(NamedTuple):
+    """What is around the lumen, for kernels.
+
+    solid : (ni, nj, nk) uint16, OUTSIDE where there is no lumen; geometry : (3, 6) of it, see
+    `anatomy.kernels.field`; depth, depth_geometry : field of the depth in the lumen.
+    """
+
+    solid: UInt16
+    geometry: Float
+    depth: UInt16
+    depth_geometry: Float
+
+
+@inner_kernel
+def arc_parts(kappa, length):
+    """Return how far an arc goes ahead, and its way aside divided by its curvature."""
+    angle = kappa * length
+    if angle < STRAIGHT_RAD:
+        return length * (1.0 - angle * angle / 6.0), 0.5 * length * length * (1.0 - angle * angle / 12.0)
+    return math.sin(angle) / kappa, 2.0 * (math.sin(0.5 * angle) / kappa) ** 2
+
+
+@inner_kernel
+def move_along(base, u, v, length, out):
+    """Fill `out` (12,) with the frame at `length` mm along the arc that starts at a base frame."""
+    kappa2 = u * u + v * v
+    ahead, aside = arc_parts(math.sqrt(kappa2), length)
+    for k in range(3):
+        x = base[k]
+        y = base[3 + k]
+        z = base[6 + k]
+        across = u * x + v * y
+        turn = aside * across + ahead * z
+        out[k] = x - u * turn
+        out[3 + k] = y - v * turn
+        out[6 + k] = z - kappa2 * aside * z + ahead * across
+        out[9 + k] = base[9 + k] + ahead * z + aside * across
+
+
+@inner_kernel
+def point_along(base, u, v, length):
+    """Return the point at `length` mm along the arc that starts at a base frame."""
+    ahead, aside = arc_parts(math.sqrt(u * u + v * v), length)
+    fu = aside * u
+    fv = aside * v
+    return (
+        base[9] + ahead * base[6] + fu * base[0] + fv * base[3],
+        base[10] + ahead * base[7] + fu * base[1] + fv * base[4],
+        base[11] + ahead * base[8] + fu * base[2] + fv * base[5],
+    )
+
+
+@inner_kernel
+def room_at(walls, radius, x, y, z):
+    """Return a lower bound on the room around a ball of `radius`, negative if the wall may cut it."""
+    bound = distance_bound(walls.depth, walls.depth_geometry, x, y, z)
+    if bound - radius >= EASY_MM:
+        return bound - radius
+    g = walls.depth_geometry
+    if bound + math.sqrt(g[0, 4] + g[1, 4] + g[2, 4]) + 0.01 < radius:
+        return BLOCKED
+    cap = radius + EXACT_REACH_MM
+    return exact_distance(walls.solid, walls.geometry, x, y, z, OUTSIDE, -1, cap)[0] - radius
+
+
+@inner_kernel
+def room_along(walls, radius, base, u, v, begin, end, growth, longest_step):
+    """Return the least room met along an arc from `begin` to `end` mm, BLOCKED if it is not proved free.
+
+    At `s` mm from the base, `growth * s * s` mm more are asked for, and the room is what is beyond that.  It
+    changes by no more than one walks, and what is asked for shrinks on the way back to the base: the walk
+    begins at the far end, where most arcs touch, and goes as far as the room allows.  Between two places
+    there may be less room than met, by half of `longest_step`, but always some.
+    """
+    at = end
+    least = math.inf
+    while True:
+        x, y, z = point_along(base, u, v, at)
+        room = room_at(walls, radius, x, y, z) - growth * at * at
+        if room < MIN_GAP_MM:
+            return BLOCKED
+        least = min(least, room)
+        if at <= begin:
+            return least
+        at = max(at - min(room, longest_step), begin)
+
+
+@inner_kernel
+def change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, finest, longest_step):
+    """Return the least room met along a steady change of twist and bend, BLOCKED if it is not proved free.
+
+    A point `s` mm from the base moves by at most D s^2 / 2 where the curvature vector moves by D.  So the
+    change is free if both its ends have D s^2 / 4 to spare at every s: each place is nearer than that to the
+    same place of one of them.  Else it is halved, until the tip moves by less than FINEST_MM.  It is halved at
+    least until the tip moves by less than `finest`.
+    """
+    most = max(abs(bend), abs(to_bend))
+    u = to_bend / length * math.cos(to_twist)
+    v = to_bend / length * math.sin(to_twist)
+    if room_along(walls, radius, base, u, v, 0.0, length, 0.0, longest_step) < 0.0:
+        return BLOCKED
+    change = math.hypot(to_bend - bend, most * (to_twist - twist)) / length
+    pieces = 1
+    while 0.5 * change / pieces * length * length > finest:
+        pieces *= 2
+    while True:
+        growth = 0.25 * change / pieces
+        least = math.inf
+        for n in range(pieces + 1):
+            t = n / pieces
+            kappa = (bend + t * (to_bend - bend)) / length
+            angle = twist + t * (to_twist - twist)
+            u = kappa * math.cos(angle)
+            v = kappa * math.sin(angle)
+            room = room_along(walls, radius, base, u, v, 0.0, length, growth, longest_step)
+            if room < 0.0:
+                if room_along(walls, radius, base, u, v, 0.0, length, 0.0, longest_step) < 0.0:
+                    return BLOCKED
+                least = BLOCKED
+                break
+            least = min(least, room)
+        if least >= 0.0:
+            return least
+        if 2.0 * growth * length * length < FINEST_MM:
+            return BLOCKED
+        pieces *= 2
+
+
+@inner_kernel
+def turn_room(walls, radius, length, base, twist, bend, to_twist, to_bend, by_straight):
+    """Return the least room met along a change in place, which may go by the straight section."""
+    if not by_straight:
+        return change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, math.inf, math.inf)
+    room = change_room(walls, radius, length, base, twist, bend, twist, 0.0, math.inf, math.inf)
+    if room < 0.0:
+        return room
+    after = change_room(walls, radius, length, base, to_twist, 0.0, to_twist, to_bend, math.inf, math.inf)
+    return min(room, after)
+
+
+@inner_kernel
+def nearest_setting(twist, bend, u, v, length, least_bend, most_bend):
+    """Return twist and bend of a curvature vector, and whether to change to them by the straight section.
+
+    The bend may be up or down, with the twist turned by half a turn; the change is the smallest that there
+    is.  The bend is infinite if the section can bend to it neither way.
+    """
+    size = math.hypot(u, v) * length
+    turn = 2.0 * math.pi
+    angle = math.atan2(v, u)
+    best = math.inf
+    found_twist, found_bend = twist, math.inf
+    for down in range(2):
+        to_bend = -size if down else size
+        if not least_bend <= to_bend <= most_bend:
+            continue
+        away = angle + down * math.pi - twist
+        away -= turn * math.floor(away / turn + 0.5)
+        change = math.hypot(to_bend - bend, max(abs(bend), size) * away)
+        if change < best:
+            best = change
+            found_twist = twist + away
+            found_bend = to_bend
+    return found_twist, found_bend, best > abs(bend) + size
+
+
+@numba.njit(cache=True)
+def motion_room(walls, radius, length, entry, states, finest, longest_step, where):
+    """Return the least room met by a whole motion; `where` (1,) is set to the state from which it is BLOCKED.
+
+    states : (M, 3) advance, twist and bend.  Steps that both advance and turn are not looked for here.
+    """
+    base = entry.copy()
+    moved = entry.copy()
+    least = math.inf
+    where[0] = -1
+    for n in range(states.shape[0]):
+        kappa = states[n, 2] / length
+        u = kappa * math.cos(states[n, 1])
+        v = kappa * math.sin(states[n, 1])
+        last = n + 1 == states.shape[0]
+        advance = 0.0 if last else states[n + 1, 0] - states[n, 0]
+        if advance > 0.0 or last or n == 0:
+            room = room_along(walls, radius, base, u, v, 0.0, length + advance, 0.0, longest_step)
+        else:
+            room = math.inf
+        if room >= 0.0 and advance <= 0.0 and not last:
+            room = change_room(
+                walls,
+                radius,
+                length,
+                base,
+                states[n, 1],
+                states[n, 2],
+                states[n + 1, 1],
+                states[n + 1, 2],
+                finest,
+                longest_step,
+            )
+        if room < 0.0:
+            where[0] = n
+            return BLOCKED
+        least = min(least, room)
+        move_along(base, u, v, advance, moved)
+        base[:] = moved
+    return least

@@ -1,0 +1,165 @@
+"""Motions of a bronchoscope in hand-made airways, re-proved by code of its own."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from anatomy.lung import Lung
+from anatomy.structures import LUMEN, VESSEL
+from stages.scope import Bronchoscope, ScopeMotion, ScopeMotions, find_motions, prove_motion
+from stages.scope.tip_region import in_tip_region
+from tests.stages.scenes import brute_clearance
+from tests.stages.scope.airways import forked_lung
+
+SCOPE = Bronchoscope(
+    name="thin", outer_diameter_mm=4.0, channel_diameter_mm=2.0, lumen_margin_mm=0.1,
+    bend_up_deg=180.0, bend_down_deg=60.0, bending_length_mm=15.0, min_bending_radius_mm=8.0,
+    min_shaft_radius_mm=10.0, bending_stiffness_n_mm2=1000.0,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def lung() -> Lung:
+    return forked_lung()
+
+
+@pytest.fixture(scope="module")
+def motions(lung: Lung) -> ScopeMotions:
+    return find_motions(lung, SCOPE, reach_mm=60.0)
+
+
+def section(base: np.ndarray, twist: float, bend: float, lengths: np.ndarray) -> np.ndarray:
+    """Points of a section by 200 short straight links, each turned by its share of the bend."""
+    c, s = math.cos(twist), math.sin(twist)
+    towards = c * base[:3, 0] + s * base[:3, 1]
+    fine = np.linspace(0.0, lengths[-1], 201)
+    angles = bend / SCOPE.bending_length_mm * 0.5 * (fine[1:] + fine[:-1])
+    steps = np.cos(angles)[:, None] * base[:3, 2] + np.sin(angles)[:, None] * towards
+    points = base[:3, 3] + np.vstack([np.zeros(3), np.cumsum(steps * np.diff(fine)[:, None], axis=0)])
+    return np.stack([np.interp(lengths, fine, points[:, k]) for k in range(3)], axis=1)
+
+
+def slid(base: np.ndarray, twist: float, bend: float, advance: float) -> np.ndarray:
+    """The base moved along the section's arc, without roll: by Rodrigues' formula, in 400 steps."""
+    out = base.copy()
+    axis = -math.sin(twist) * base[:3, 0] + math.cos(twist) * base[:3, 1]
+    k = np.cross(np.eye(3), axis) * -1.0
+    angle = bend / SCOPE.bending_length_mm * advance
+    turn = np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * k @ k
+    out[:3, :3] = turn @ base[:3, :3]
+    out[:3, 3] = section(base, twist, bend, np.array([0.0, advance]))[-1]
+    return out
+
+
+def places(motion: ScopeMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the body's axis at many times of a motion, and its last tip."""
+    base, out = np.array(motion.lps_from_entry), []
+    length = SCOPE.bending_length_mm
+    lengths = np.linspace(0.0, length, 31)
+    for a, b in zip(motion.states[:-1], motion.states[1:], strict=True):
+        assert not (b[0] > a[0] and (b[1:] != a[1:]).any()), "it slides or turns, never both"
+        assert b[0] >= a[0]
+        if b[0] > a[0]:
+            ahead = np.linspace(0.0, length + b[0] - a[0], 2 + int(2 * (length + b[0] - a[0])))
+            out.append(section(base, a[1], a[2], ahead))
+            base = slid(base, a[1], a[2], b[0] - a[0])
+        else:
+            for t in np.linspace(0.0, 1.0, 7):
+                out.append(section(base, *(a[1:] + t * (b[1:] - a[1:])), lengths))
+    last = section(base, motion.states[-1, 1], motion.states[-1, 2], lengths)
+    return np.concatenate([*out, last]), last[-1]
+
+
+def test_bodies_stay_in_the_lumen_in_and_between_states(lung: Lung, motions: ScopeMotions) -> None:
+    """Places all over the motion, measured to every voxel around the lumen."""
+    outside = np.where(lung.labels & LUMEN, 0, VESSEL).astype(np.uint16)
+    for tip in range(0, motions.count, max(motions.count // 8, 1)):
+        motion = motions.motion(tip)
+        points, end = places(motion)
+        depth = brute_clearance(outside, lung.grid, points, VESSEL, 4.0).min()
+        assert depth >= SCOPE.radius_mm + SCOPE.lumen_margin_mm
+        assert np.allclose(end, motions.tips[tip, :3], atol=2e-3)
+        margin = prove_motion(lung, SCOPE, motion)
+        assert isinstance(margin, float)
+        assert margin <= depth - SCOPE.radius_mm - SCOPE.lumen_margin_mm + 1e-3
+
+
+def test_tips_are_where_their_motions_end(lung: Lung, motions: ScopeMotions) -> None:
+    nearest, inside = in_tip_region(lung.tree, motions.tips)
+    assert inside.all() and np.array_equal(nearest, motions.tree_point)
+    for tip in range(0, motions.count, 37):
+        motion = motions.motion(tip)
+        frame = motion.lps_from_tip
+        expected = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
+        assert np.allclose(motions.tips[tip], expected, atol=1e-9)
+        assert motion.max_curvature_per_mm == pytest.approx(motions.max_curvature_per_mm[tip])
+
+
+def test_tips_are_all_over_the_airway(lung: Lung, motions: ScopeMotions) -> None:
+    """In each branch, to within 4 mm of its closed end, about every mm, and looking many ways."""
+    tree = lung.tree
+    for branch in range(1, tree.n_branches):
+        points = tree.branch_points(branch)
+        mine = np.isin(motions.tree_point, points)
+        if motions.passages.passable[points[-1]]:
+            last = tree.distance_from_root_mm[motions.tree_point[mine]].max()
+            assert last > tree.distance_from_root_mm[points[-1]] - 4.0
+    cosine = np.einsum("sk,sk->s", motions.tips[:, 3:6], tree.tangents[motions.tree_point])
+    assert (np.degrees(np.arccos(np.clip(cosine, -1, 1))) > 30.0).sum() > 50
+    assert (~motions.turned).sum() > 50
+
+
+def test_the_same_twice(lung: Lung, motions: ScopeMotions) -> None:
+    again = find_motions(lung, SCOPE, reach_mm=60.0)
+    assert np.array_equal(again.tips, motions.tips)
+    assert np.array_equal(again.motion(7).states, motions.motion(7).states)
+
+
+def test_bodies_keep_the_curvature_that_tubes_stand(lung: Lung) -> None:
+    found = find_motions(lung, SCOPE, reach_mm=60.0, max_curvature_per_mm=0.04)
+    assert found.count
+    worst = max(found.motion(tip).max_curvature_per_mm for tip in range(0, found.count, 5))
+    assert worst <= 0.04 + 1e-12
+
+
+def test_bends_stay_within_the_device(motions: ScopeMotions) -> None:
+    low, high = SCOPE.bends_rad
+    for tip in range(0, motions.count, 11):
+        motion = motions.motion(tip)
+        assert motion.states[:, 2].min() >= low - 1e-12 and motion.states[:, 2].max() <= high + 1e-12
+
+
+def test_a_thick_scope_gets_nowhere(lung: Lung) -> None:
+    from dataclasses import replace
+
+    found = find_motions(lung, replace(SCOPE, outer_diameter_mm=15.0), reach_mm=60.0)
+    assert found.count == 0 and found.tips.shape == (0, 9)
+
+
+@pytest.mark.parametrize("fault", ["bend", "advance", "both", "back", "shaft", "length", "wall"])
+def test_tampered_motions_have_no_proof(lung: Lung, motions: ScopeMotions, fault: str) -> None:
+    from dataclasses import replace
+
+    motion = motions.motion(int(np.argmax(motions.tree_point)))
+    states = motion.states.copy()
+    if fault == "bend":
+        states[-1, 2] = 2.0
+    elif fault == "advance":
+        states = np.vstack([states, states[-1] + [30.0, 0.0, 0.0]])
+        states[-2, 2] = states[-1, 2] = 0.0
+    elif fault == "both":
+        states = np.vstack([states, states[-1] + [0.5, 0.1, 0.0]])
+    elif fault == "back":
+        states = np.vstack([states, states[-1] - [0.5, 0.0, 0.0]])
+    elif fault == "shaft":
+        states = np.vstack([states, states[-1], states[-1]])
+        states[-2:, 2] = 1.8
+        states[-1, 0] += 1.0
+    elif fault == "wall":
+        states = states * [1.0, 1.0, 0.0]
+    length = motion.bending_length_mm + (1.0 if fault == "length" else 0.0)
+    tampered = replace(motion, states=states, bending_length_mm=length)
+    assert isinstance(prove_motion(lung, SCOPE, tampered), str)

@@ -24,7 +24,7 @@ SPOKES = 8
 TANGENT_MM = 3.0
 """The direction of a route is that of its chord so far each way: several voxels, less than a branch."""
 LEAST_ROOM_MM = 0.3
-"""The room beside the axis counts at least so much, about half a voxel: costs stay finite where it is narrow."""
+"""The room beside the axis counts at least so much, half a voxel: costs stay finite where it is narrow."""
 START_MM = 30.0
 """The first straight section may begin so far down the trachea."""
 TURNED_A_LAYER = 8
@@ -205,11 +205,7 @@ class Growth:
             )
         begins = np.append(0, np.cumsum([len(rows) for rows in self._rows]))
         used = sorted({layer for layers in self._layers.values() for layer, _ in layers})
-        some = [
-            begins[layer]
-            + np.unique(np.linspace(0, len(self._rows[layer]) - 1, TURNED_A_LAYER).astype(np.int64))
-            for layer in used
-        ]
+        some = [begins[layer] + _spread(len(self._rows[layer])) for layer in used]
         return StateTree(
             states=np.concatenate(self._rows),
             parent=np.concatenate(self._parents),
@@ -217,6 +213,11 @@ class Growth:
             advance_mm=np.repeat(self._advance, [len(rows) for rows in self._rows]),
             turned_from=np.concatenate(some),
         )
+
+
+def _spread(count: int) -> Int:
+    """Return at most TURNED_A_LAYER of the numbers below a count, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, TURNED_A_LAYER).astype(np.int64))
 
 
 def rings(sizes: tuple[float, ...], spokes: int) -> Float:

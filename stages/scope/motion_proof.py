@@ -1,4 +1,4 @@
-"""The proof of one motion of a bronchoscope: the limits of the device, and room for it in and between states."""
+"""The proof of one motion of a bronchoscope: the limits of the device, and room in and between states."""
 
 from __future__ import annotations
 
@@ -21,31 +21,42 @@ ROUNDING = 1e-9
 
 
 def prove_motion(lung: Lung, scope: Bronchoscope, motion: ScopeMotion) -> float | str:
-    """Prove a motion: return its margin in mm, or say in words why there is no proof.
+    """Prove one motion; see `MotionProver.prove`."""
+    return MotionProver(lung, scope).prove(motion)
 
-    The margin is a lower bound on the distance between the scope's surface and the wall of the lumen,
-    beyond the gap that the scope keeps, over all places of the body during the whole motion.  It counts
-    only what the proof saw: at most 0.1 mm is lost.
-    """
-    wrong = broken_limit(scope, motion)
-    if wrong:
-        return wrong
-    frame = motion.lps_from_entry
-    entry = np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
-    where = np.zeros(1, dtype=np.int64)
-    room = motion_room(
-        walls_of(lung),
-        scope.radius_mm + scope.lumen_margin_mm,
-        scope.bending_length_mm,
-        entry,
-        motion.states,
-        PROOF_TURN_MM,
-        PROOF_STEP_MM,
-        where,
-    )
-    if room < 0.0:
-        return f"the scope is not proved to be free of the wall from state {int(where[0])} on"
-    return max(float(room) - 0.5 * PROOF_STEP_MM, 0.0)
+
+class MotionProver:
+    """Proves motions of a scope in a lung."""
+
+    def __init__(self, lung: Lung, scope: Bronchoscope) -> None:
+        self._scope, self._walls = scope, walls_of(lung)
+
+    def prove(self, motion: ScopeMotion) -> float | str:
+        """Prove a motion: return its margin in mm, or say in words why there is no proof.
+
+        The margin is a lower bound on the distance between the scope's surface and the wall of the lumen,
+        beyond the gap that the scope keeps, over all places of the body during the whole motion.  It counts
+        only what the proof saw: at most 0.1 mm is lost.
+        """
+        wrong = broken_limit(self._scope, motion)
+        if wrong:
+            return wrong
+        frame = motion.lps_from_entry
+        entry = np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
+        where = np.zeros(1, dtype=np.int64)
+        room = motion_room(
+            self._walls,
+            self._scope.radius_mm + self._scope.lumen_margin_mm,
+            self._scope.bending_length_mm,
+            entry,
+            motion.states,
+            PROOF_TURN_MM,
+            PROOF_STEP_MM,
+            where,
+        )
+        if room < 0.0:
+            return f"the scope is not proved to be free of the wall from state {int(where[0])} on"
+        return max(float(room) - 0.5 * PROOF_STEP_MM, 0.0)
 
 
 def broken_limit(scope: Bronchoscope, motion: ScopeMotion) -> str:

@@ -22,7 +22,7 @@ from stages.scope.tip_region import in_tip_region
 TURNED_SPACING_MM = 2.0
 """Spacing of turned tips: each place has many directions, and nearer ones give about the same poses."""
 TURN_RINGS_PER_MM = (0.004, 0.008, 0.014, 0.022, 0.032, 0.045, 0.06)
-"""Curvatures beside that of a state from which tips look: at a tip of 15 mm they turn it by 3 to 50 degrees."""
+"""Curvatures beside that of a state: they turn the tip of a section of 15 mm by 3 to 50 degrees."""
 TURN_SPOKES = 12
 POLAR_RAD = math.radians(15.0)
 """Turned tips are told apart by rings of so many degrees about the direction of the airway."""

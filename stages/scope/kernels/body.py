@@ -120,8 +120,8 @@ def change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, fin
 
     A point `s` mm from the base moves by at most D s^2 / 2 where the curvature vector moves by D.  So the
     change is free if both its ends have D s^2 / 4 to spare at every s: each place is nearer than that to the
-    same place of one of them.  Else it is halved, until the tip moves by less than FINEST_MM.  It is halved at
-    least until the tip moves by less than `finest`.
+    same place of one of them.  Else it is halved, until the tip moves by less than FINEST_MM; it is halved
+    until the tip moves by less than `finest` in any case.
     """
     most = max(abs(bend), abs(to_bend))
     u = to_bend / length * math.cos(to_twist)

@@ -14,14 +14,14 @@ from stages.scope.kernels.body import move_along, nearest_setting, point_along, 
 
 BASE, U, V, TWIST, BEND, TIP, HEADING, NEAR, COST, ROOM, CURVATURE = 0, 12, 13, 14, 15, 16, 19, 22, 23, 24, 25
 COLUMNS = 26
-"""Columns of a state: base frame, curvature vector, twist, bend, tip and its direction, the route point nearest
-to the tip, cost, least room met on the way, largest curvature of the body."""
+"""Columns of a state: base frame, curvature vector, twist, bend, tip and its direction, the route point
+nearest to the tip, cost, least room met on the way, largest curvature of the body."""
 TIP_MM, TIP_RAD = 0.15, 0.06
 """States whose tips and bases are nearer than this together count as the same."""
 MEMORY = 0.5
-"""Share of the cost of the state before that is added: one good state does not make up for a bad way to it."""
+"""Share of the cost of the state before that is added: a good state does not make up for a bad way."""
 CHANGE_COST = 0.3
-"""Cost of a change in place for each mm that the tip moves: as far off the axis as half the room is as bad."""
+"""Cost of a change in place for each mm that the tip moves: as bad as half the room off the axis."""
 WIDE_ANGLE = 0.06
 """1 - cos of 20 degrees: a tip that looks so far aside costs as much as one that is at the wall."""
 
@@ -37,7 +37,7 @@ class Device(NamedTuple):
 
 
 class Route(NamedTuple):
-    """R points of the medial axis from the root on: `points` and `tangents` (R, 3), free `room` (R,) in mm."""
+    """R points of the medial axis from the root on: points and tangents (R, 3), free room (R,) in mm."""
 
     points: Float
     tangents: Float
@@ -203,7 +203,7 @@ def grow_layer(walls, device, route, states, offsets, step, out, parents, by_str
 
 @numba.njit(cache=True)
 def put_first(walls, device, route, state):
-    """Fill in the first state of a tree, whose base frame and route point are given; tell whether it is free."""
+    """Fill in the first state of a tree, of given base frame and route point; tell whether it is free."""
     scratch = np.zeros(12)
     settle(route, device.length, state, scratch)
     room = room_along(walls, device.radius, state, state[U], state[V], 0.0, device.length, 0.0, math.inf)

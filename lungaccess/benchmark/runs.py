@@ -10,8 +10,8 @@ import numpy as np
 from anatomy.kernel_clock import working_cpu_s
 from anatomy.records import frozen_value
 from lungaccess.benchmark.published import PublishedQuery
-from lungaccess.one_stage import OMPL_PLANNERS, PathSearch, reason_in_words, search_path
-from stages.needle import ArcPath, NeedleEnvironment, Query, obstacle_clearance_mm
+from lungaccess.one_stage import PathSearch, reason_in_words, search_path
+from stages.needle import OMPL_PLANNERS, ArcPath, NeedleEnvironment, Query, obstacle_clearance_mm
 
 SLICE = 200
 """Iterations between two looks at the clock: a fraction of a millisecond."""

@@ -15,7 +15,7 @@ from anatomy.io.files import require_writable_folder
 from anatomy.records import frozen_value
 from lungaccess.cli.numbers import Count, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
-from stages.needle import TERMS, Objective
+from stages.needle import NEEDLE_PLANNERS, OUR_PLANNERS, TERMS, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -26,9 +26,12 @@ if TYPE_CHECKING:
     from lungaccess.risk import ErrorModel
 
     ObjectiveText = str
+    OurPlannerName = str
+    PlannerName = str
 else:
     ObjectiveText = Literal[tuple(term.option for term in TERMS)] | str
-"""The costs by name, for help and completion, or a weighted sum; `Objective.of` reads it."""
+    OurPlannerName, PlannerName = Literal[OUR_PLANNERS], Literal[NEEDLE_PLANNERS]
+"""The costs by name, for help and completion, or a weighted sum, which `Objective.of` reads; the planners."""
 
 Method = Literal[
     "atlas", "kuntz2015", "kuntz2015-without-rejection", "reference", "reference-without-rejection"
@@ -224,6 +227,13 @@ class SearchOptions(BudgetOptions):
             "as printed, with collisions of surface meshes, slow."
         ),
     ] = "atlas"
+    needle_planner: Annotated[
+        PlannerName | None,
+        Parameter(
+            help="Planner of the needle's paths, instead of the method's own (atlas: ao-rrt, kuntz2015: "
+            "rrt); those that begin with control are OMPL's."
+        ),
+    ] = None
     processes: Annotated[
         Processes, Parameter(help="How many processes refine the plan at the same time.")
     ] = 1

@@ -140,6 +140,7 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
     options: dict[str, Any] = {
         "objective": search.objective,
         "method": search.method,
+        "needle_planner": search.needle_planner or "",
         "seed": search.seed,
         "iterations": search.iterations,
         "time_s": search.time_s,

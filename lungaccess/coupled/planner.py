@@ -20,7 +20,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from stages.needle import Objective
+from stages.needle import Objective, require_planner
 
 METHODS: dict[str, SearchFactory] = {
     "atlas": AtlasSearch,
@@ -62,6 +62,7 @@ def plan(
     *,
     objective: str | Objective = "inverse_clearance",
     method: str = "atlas",
+    needle_planner: str = "",
     seed: int = 0,
     iterations: int | None = None,
     time_s: float | None = None,
@@ -86,6 +87,11 @@ def plan(
         "kuntz2015-without-rejection": the same without its workspace test.  "reference" and
         "reference-without-rejection": the same as printed, with FCL on meshes, slow; see
         `lungaccess.coupled.kuntz2015_fcl`.
+    needle_planner : str
+        One of `stages.needle.NEEDLE_PLANNERS`, ours or OMPL's, instead of the method's own: for the needle
+        search of "atlas" ("ao-rrt") and line 9 of "kuntz2015" ("rrt").  All of them are planners of one
+        problem of OMPL.  OMPL can be seeded once in a process, so a search with a planner of OMPL needs a
+        process of its own.
     seed : int
         The same seed and `iterations` give the same plans.
     iterations : int, optional
@@ -110,8 +116,9 @@ def plan(
     NoPlan
         If the search ends without a plan; counts the reasons.
     SettingsError
-        If objective or method is unknown, the atlas belongs to another lung or system, or there cannot be so
-        many processes.
+        If objective, method or needle planner is unknown, the method takes no needle planner, the atlas
+        belongs to another lung or system, there cannot be so many processes, or OMPL was used before in this
+        process.
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
@@ -122,8 +129,18 @@ def plan(
             expected=f"one of {', '.join(METHODS)}",
             remedy="Choose one of them",
         )
+    if needle_planner:
+        require_planner(needle_planner)
     tell = on_progress or (lambda _event: None)
-    task = Task(lung=lung, system=system, target=target, objective=weighed, method=method, seed=seed)
+    task = Task(
+        lung=lung,
+        system=system,
+        target=target,
+        objective=weighed,
+        method=method,
+        needle_planner=needle_planner,
+        seed=seed,
+    )
     if atlas is not None:
         require_same(atlas, lung, system)
     atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(atlas_event(share)))

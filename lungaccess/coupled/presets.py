@@ -19,6 +19,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
+from stages.needle import OMPL_PLANNERS
 
 
 @frozen_record
@@ -93,9 +94,15 @@ def plan_with_presets(
     NoPlan
         If no system reaches the target; `attempts` says why, system by system.
     SettingsError
-        If two systems have the same name.
+        If two systems have the same name, or the needle planner is one of OMPL.
     """
     ordered = least_invasive_first(systems) if systems else presets_by_invasiveness()
+    if options.get("needle_planner") in OMPL_PLANNERS:
+        raise SettingsError(
+            f"{options['needle_planner']} is to plan with {len(ordered)} systems, one after the other",
+            expected="one system: OMPL can be seeded once in a process",
+            remedy="Name the system, or choose another needle planner",
+        )
     if len({system.name for system in ordered}) < len(ordered):
         raise SettingsError("Two systems have the same name", expected="a name of its own for each")
     checker = Checker(lung)

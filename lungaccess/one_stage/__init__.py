@@ -15,7 +15,7 @@ if TYPE_CHECKING:
         pierced_branches,
         plan_needle,
     )
-    from lungaccess.one_stage.needle_search import OMPL_PLANNERS, OMPL_TOLERANCE_MM, PathSearch, search_path
+    from lungaccess.one_stage.needle_search import PathSearch, search_path
     from lungaccess.one_stage.obstruction import (
         obstruction_record,
         obstruction_rows,

@@ -14,21 +14,21 @@ from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
-from anatomy.suggestion import did_you_mean
 from anatomy.typed import Float
-from lungaccess.one_stage.needle_search import OMPL_PLANNERS, PathSearch, search_path
+from lungaccess.one_stage.needle_search import PathSearch, search_path
 from lungaccess.one_stage.obstruction import obstruction_record
 from lungaccess.plans.costs import known_costs
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import (
-    PLANNERS,
+    OMPL_PLANNERS,
     NeedleEnvironment,
     Objective,
     Query,
     begun_at_wall,
     needle_environment,
     path_costs,
+    require_planner,
 )
 
 WALL_MM = 3.0
@@ -134,8 +134,8 @@ def plan_needle(
     lps_from_start : (4, 4) float64
         +z is the direction of insertion.
     planner : str
-        One of `search.planners.PLANNERS`, or of `OMPL_PLANNERS`: those look at no objective, end by time
-        alone, and can be seeded once in a process, so each call needs a process of its own.
+        One of `stages.needle.NEEDLE_PLANNERS`.  Those of OMPL look at no objective, end by time alone, and
+        can be seeded once in a process, so each call needs a process of its own.
     objective : str or Objective
         What is made small; see `stages.needle.objective.Objective.of`.
     iterations, time_s : optional
@@ -149,14 +149,8 @@ def plan_needle(
     TargetError
         If the start lies outside the images.
     """
-    known = (*PLANNERS, *OMPL_PLANNERS)
     weighed = Objective.of(objective)
-    if planner not in known:
-        raise SettingsError(
-            f"There is no needle planner {planner!r}",
-            expected=f"one of {', '.join(known)}",
-            remedy=did_you_mean(planner, known),
-        )
+    require_planner(planner)
     if time_s is None and (iterations is None or planner in OMPL_PLANNERS):
         raise SettingsError(
             f"The needle search {planner} has no limit",

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from anatomy.kernel_clock import working_s
 from anatomy.records import frozen_record
 from stages.needle import (
+    OMPL_PLANNERS,
+    OMPL_TOLERANCE_MM,
     PLANNERS,
     SHORTEST,
     ArcPath,
@@ -22,10 +24,6 @@ from stages.needle import (
 
 SLICE = 500
 """Iterations between two looks at the clock: some milliseconds."""
-OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
-"""Planners of OMPL itself.  They steer by chance, and end within OMPL_TOLERANCE_MM of the target."""
-OMPL_TOLERANCE_MM = 1.0
-"""Distance to the target that counts as reached; random steering hardly ever comes nearer."""
 
 
 @frozen_record
@@ -76,7 +74,7 @@ def search_path(
     Parameters
     ----------
     planner : str
-        One of `stages.needle.search.planners.PLANNERS` or of `OMPL_PLANNERS`; those end by time alone.
+        One of `stages.needle.NEEDLE_PLANNERS`; those of OMPL end by time alone.
     seed : int or None
         OMPL can be seeded once in a process; without a seed, its planners draw anew at each call.
     iterations, time_s : optional

@@ -62,6 +62,7 @@ def assemble(
         clearance_mm={"tube": _tube_clearance(task, candidate), "needle": _needle_clearance(task, candidate)},
         costs=task.objective.stated(costs.path_costs(lung, candidate.path, with_fissures=task.with_fissures)),
         method=task.method,
+        needle_planner=task.needle_planner,
         seed=task.seed,
         iterations=iteration,
         timing=timing,

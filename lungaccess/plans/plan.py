@@ -55,6 +55,8 @@ class Plan(Record):
     costs : mapping of str to float
         "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, and the cost under the
         objective where that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
+    needle_planner : str
+        The planner of the needle that the search was told to use; "" for the method's own.
     system_choice : tuple of str
         Where the system was chosen among several: in sentences, which were tried, why each failed, and why
         this one was chosen; see `lungaccess.coupled.presets`.  Empty otherwise.
@@ -85,6 +87,7 @@ class Plan(Record):
     seed: int
     iterations: int
     timing: Mapping[str, float]
+    needle_planner: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
     system_choice: tuple[str, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:

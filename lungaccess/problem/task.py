@@ -13,7 +13,8 @@ from stages.needle import Objective
 class Task:
     """What a search for plans is asked: they keep the objective small, and state the search's name, `method`.
 
-    TargetError is raised if the target lies outside the lung or inside an obstacle.
+    `needle_planner` is one of `stages.needle.NEEDLE_PLANNERS`, or "" for the method's own.  TargetError is
+    raised if the target lies outside the lung or inside an obstacle.
     """
 
     lung: Lung
@@ -21,6 +22,7 @@ class Task:
     target: Target
     objective: Objective = Objective(inverse_clearance=1.0)
     method: str = "atlas"
+    needle_planner: str = ""
     seed: int = 0
 
     def __post_init__(self) -> None:

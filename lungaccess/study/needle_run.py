@@ -9,11 +9,11 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
-from lungaccess.one_stage import OMPL_TOLERANCE_MM, plan_needle
+from lungaccess.one_stage import plan_needle
 from lungaccess.problem.target import point_target
 from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
 from lungaccess.study.runs import Run
-from stages.needle import Query, violation
+from stages.needle import OMPL_TOLERANCE_MM, Query, violation
 
 
 def needle_answer(run: Run, lung: Lung) -> Answer:

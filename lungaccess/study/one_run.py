@@ -117,6 +117,7 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
         target,
         objective=problem.objective,
         method=run.planner.method,
+        needle_planner=run.planner.needle_planner,
         seed=run.seed,
         iterations=run.iterations,
         time_s=problem.time_s,

@@ -13,7 +13,7 @@ from pydantic import Field
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.io.files import read_text
 from anatomy.settings import impossible, parse, quantity, settings, switch, text
-from stages.needle import Objective
+from stages.needle import NEEDLE_PLANNERS, OMPL_PLANNERS, Objective
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
@@ -96,8 +96,9 @@ class PlannerChoice:
     kind : str
         "plan" for all three stages, "needle" for the needle alone from the case's start poses.
     method : str
-        One of `lungaccess.coupled.planner.METHODS`; for the needle, of
-        `stages.needle.search.planners.PLANNERS` or of `lungaccess.one_stage.needle.OMPL_PLANNERS`.
+        One of `lungaccess.coupled.planner.METHODS`; for the needle, of `stages.needle.NEEDLE_PLANNERS`.
+    needle_planner : str
+        For "plan", one of the latter instead of the method's own.
     iterations : int or None
         Instead of those of the budget.
     own_process : bool
@@ -107,6 +108,7 @@ class PlannerChoice:
     name: Annotated[str, text("name of the planner in tables")]
     kind: Annotated[Literal["plan", "needle"], Field(description="plan or needle")] = "plan"
     method: Annotated[str, text("a method of plan, or a planner of the needle")] = "atlas"
+    needle_planner: Annotated[str, text("a planner of the needle", may_be_empty=True)] = ""
     iterations: Iterations | None = None
     own_process: Annotated[bool, switch("whether each run has a fresh process")] = False
 
@@ -114,13 +116,14 @@ class PlannerChoice:
         known = methods(self.kind)
         if self.method not in known:
             raise impossible("method", self.method, f"one of {', '.join(known)}")
+        if self.needle_planner and (self.kind == "needle" or self.needle_planner not in NEEDLE_PLANNERS):
+            expected = f"one of {', '.join(NEEDLE_PLANNERS)}, for a planner of the kind plan"
+            raise impossible("needle_planner", self.needle_planner, expected)
 
     @property
     def is_of_ompl(self) -> bool:
         """Whether it is a planner of OMPL, whose random numbers can be seeded once in a process."""
-        from lungaccess.one_stage import OMPL_PLANNERS
-
-        return self.kind == "needle" and self.method in OMPL_PLANNERS
+        return (self.method if self.kind == "needle" else self.needle_planner) in OMPL_PLANNERS
 
 
 @settings
@@ -176,7 +179,8 @@ class Study:
         ):
             if len(set(names)) < len(names):
                 raise impossible(key, names, "each only once")
-        if self.budget.time_s is None and any(each.is_of_ompl for each in self.planner):
+        of_ompl = [each for each in self.planner if each.kind == "needle" and each.is_of_ompl]
+        if self.budget.time_s is None and of_ompl:
             raise impossible("budget", "no time_s", "time_s, which planners of OMPL end by")
         if any(each.kind == "needle" for each in self.planner) and not all(c.starts for c in self.case):
             raise impossible("case", "starts = []", "start poses in every case, for planners of the needle")
@@ -185,10 +189,7 @@ class Study:
 def methods(kind: str) -> tuple[str, ...]:
     """Return the names of the planners of a kind, "plan" or "needle"."""
     if kind == "needle":
-        from lungaccess.one_stage import OMPL_PLANNERS
-        from stages.needle import PLANNERS
-
-        return (*PLANNERS, *OMPL_PLANNERS)
+        return NEEDLE_PLANNERS
     from lungaccess.coupled.planner import METHODS
 
     return tuple(METHODS)

@@ -47,6 +47,13 @@ if TYPE_CHECKING:
         blocker_on_path,
         direct_path,
     )
+    from stages.needle.planner_names import (
+        NEEDLE_PLANNERS,
+        OMPL_PLANNERS,
+        OMPL_TOLERANCE_MM,
+        OUR_PLANNERS,
+        require_planner,
+    )
     from stages.needle.query import Query
     from stages.needle.reach import (
         DEFAULT_ARCS,

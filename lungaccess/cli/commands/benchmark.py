@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from anatomy.errors import LungaccessError, SettingsError
-from anatomy.suggestion import did_you_mean
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
@@ -61,7 +60,7 @@ def med_rad(
         ours: proved clearance of the system's needle, with the exemption at the airway wall. unc: a needle of
         2 mm that keeps from voxel centres, obstacles within 3 mm of the start ignored, 1 mm goal tolerance.
     planners : str
-        Names separated by commas: rrt, optimal, resolution, decide; of OMPL control.RRT, control.EST,
+        Names separated by commas: rrt, ao-rrt, optimal, resolution, decide; of OMPL control.RRT, control.EST,
         control.KPIECE1.
     radius : str
         Least radii of curvature in mm, separated by commas; if not given, that of the system, or 50,100,121
@@ -160,22 +159,15 @@ def _posing(
 
 
 def _planners(text: str) -> tuple[str, ...]:
-    from lungaccess.one_stage import OMPL_PLANNERS
-    from stages.needle import PLANNERS
+    from stages.needle import NEEDLE_PLANNERS, require_planner
 
-    known = (*PLANNERS, *OMPL_PLANNERS)
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     for name in names:
-        if name not in known:
-            raise SettingsError(
-                f"There is no needle planner {name!r}",
-                expected=f"names separated by commas, of {', '.join(known)}",
-                remedy=did_you_mean(name, known) or "Choose some of them, such as --planners rrt,decide",
-            )
+        require_planner(name)
     if not names:
         raise SettingsError(
             "--planners names no planner",
-            expected=", ".join(known),
+            expected=", ".join(NEEDLE_PLANNERS),
             remedy="Name one or more, such as --planners rrt",
         )
     return names

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from cyclopts import Parameter
@@ -16,6 +16,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import (
     BudgetOptions,
     ObjectiveText,
+    OurPlannerName,
     PatientFolder,
     PatientOptions,
     SystemOptions,
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from anatomy.organ import Organ
     from anatomy.typed import Float
     from lungaccess.one_stage import NeedleAnswer
-
-NeedlePlanner = Literal["decide", "rrt", "optimal", "resolution"]
 
 
 def needle(
@@ -47,10 +46,10 @@ def needle(
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     planner: Annotated[
-        NeedlePlanner,
+        OurPlannerName,
         Parameter(
-            help="decide: a path, or a proof that there is none; rrt; optimal: better and better paths; "
-            "resolution: the best path of pieces at a resolution, or the statement that it has none."
+            help="decide: a path, or a proof that there is none; rrt; ao-rrt and optimal: better and better "
+            "paths; resolution: the best path of pieces at a resolution, or the statement that it has none."
         ),
     ] = "decide",
     objective: Annotated[

@@ -87,6 +87,12 @@ class ReferenceSearch:
     ) -> None:
         if not (rrt_iterations if rrt_time_s is None else rrt_time_s) > 0:
             raise SettingsError("The RRT has no budget", expected="rrt_iterations or rrt_time_s above 0")
+        if task.needle_planner:
+            raise SettingsError(
+                f"The needle planner {task.needle_planner} is named for the reference mode",
+                expected="none: its RRT moves among surface meshes",
+                remedy="Leave it out, or choose the method atlas or kuntz2015",
+            )
         system = task.system
         self.task, self._atlas, self._rejects = task, atlas, rejects
         self._evaluator = CandidateEvaluator(task)

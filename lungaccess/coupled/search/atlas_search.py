@@ -15,7 +15,8 @@ from lungaccess.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
 from lungaccess.coupled.search.entries import different
 from lungaccess.coupled.search.local_sampling import sampling_near_target
 from lungaccess.coupled.search.local_search import LocalSearch, LocalSearchRun
-from lungaccess.coupled.search.needle_search import needle_searches
+from lungaccess.coupled.search.needle_planner import NamedNeedlePlanner
+from lungaccess.coupled.search.needle_search import PLANNER, needle_searches
 from lungaccess.coupled.search.rounds import LocalSearchRounds
 from lungaccess.coupled.search.settings import SearchSettings
 from lungaccess.plans.candidate import Candidate
@@ -46,6 +47,7 @@ class AtlasSearch:
         self.evaluator = self.arcs.evaluator
         self.blocked = self.evaluator.blocked
         self.incumbent = Incumbent()
+        self._needle_planner = NamedNeedlePlanner(self.evaluator, PLANNER)
         self._direct = DirectArcSearch(self.arcs, self.incumbent, self.settings)
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
         self._share = (0, 1)
@@ -88,7 +90,9 @@ class AtlasSearch:
         rounds = LocalSearchRounds(local_search, self.evaluator, self.incumbent, settings)
         starts = self._starts(local_search)
         sampled = self._sampled(local_search)
-        searched = needle_searches(self.arcs, self.incumbent, settings, self._rng, self._share)
+        searched = needle_searches(
+            self.arcs, self._needle_planner, self.incumbent, settings, self._rng, self._share
+        )
         yield from rounds.halve(list(islice(starts, settings.starts)))
         for turn in count(1):
             yield from rounds.intensify()

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property
-from typing import TYPE_CHECKING
 
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.coupled.search.needle_planner import NamedNeedlePlanner
 from lungaccess.coupled.search.random_placement import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 
-if TYPE_CHECKING:
-    from stages.needle.ompl import NeedleProblem
-
 RRT_ITERATIONS = 300
 """Iterations of each RRT; the paper gives it 0.05 s, but a run by time cannot be repeated exactly."""
+PLANNER = "rrt"
+"""The planner of line 9 where none is named: the paper's."""
 
 
 class KuntzSearch:
@@ -39,6 +37,7 @@ class KuntzSearch:
     def __init__(self, task: Task, atlas: Atlas, *, rejects: bool = True) -> None:
         self._task, self._atlas, self._rejects = task, atlas, rejects
         self._evaluator = CandidateEvaluator(task)
+        self._needle_planner = NamedNeedlePlanner(self._evaluator, PLANNER)
         self.blocked = self._evaluator.blocked
 
     def steps(self) -> Iterator[Step]:
@@ -56,12 +55,5 @@ class KuntzSearch:
         )
         if isinstance(deployment, str) or (self._rejects and not evaluator.reaches(deployment.lps_from_tip)):
             return None
-        query, seed = evaluator.query(deployment), placement.needle_seed
-        path = self._needle_problem.plan(query, seed=seed, iterations=RRT_ITERATIONS)
+        path = self._needle_planner.path(deployment, seed=placement.needle_seed, iterations=RRT_ITERATIONS)
         return None if path is None else Candidate(tip=tip, deployment=deployment, path=path)
-
-    @cached_property
-    def _needle_problem(self) -> NeedleProblem:
-        from stages.needle.ompl import NeedleProblem
-
-        return NeedleProblem(self._evaluator.environment)

@@ -11,11 +11,13 @@ import numpy as np
 from lungaccess.coupled.search.base import Incumbent, Step, evaluated_step
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.entries import different
+from lungaccess.coupled.search.needle_planner import NamedNeedlePlanner
 from lungaccess.coupled.search.settings import SearchSettings
 from lungaccess.plans.candidate import Candidate
-from stages.needle import OptimalSearch
 
 PHASE = "needle search"
+PLANNER = "ao-rrt"
+"""The planner where none is named: of those that look for low cost, it finds its first path soonest."""
 DOUBLINGS = 3
 """In so many passes over the deployments the iterations double.  Later passes have other random numbers."""
 SLACK = 1.3
@@ -24,6 +26,7 @@ SLACK = 1.3
 
 def needle_searches(
     arcs: DirectArcs,
+    planner: NamedNeedlePlanner,
     incumbent: Incumbent,
     settings: SearchSettings,
     rng: np.random.Generator,
@@ -55,23 +58,24 @@ def needle_searches(
         for entry in ordered.tolist():
             if bounds[entry] >= incumbent.cost:
                 break
-            found = _with_path(arcs, entry, SLACK * incumbent.cost, iterations, rng)
+            found = _with_path(arcs, planner, entry, SLACK * incumbent.cost, iterations, rng)
             first = found is not None and incumbent.step is None
             yield evaluated_step(arcs.evaluator, PHASE, found) if first else nothing, found
         yield nothing, None
 
 
 def _with_path(
-    arcs: DirectArcs, entry: int, cost_limit: float, iterations: int, rng: np.random.Generator
+    arcs: DirectArcs,
+    planner: NamedNeedlePlanner,
+    entry: int,
+    cost_limit: float,
+    iterations: int,
+    rng: np.random.Generator,
 ) -> Candidate | None:
     """Return a deployment with a path that costs less than the limit, None if none is found."""
     candidate = arcs.candidate(entry)
     seed = int(rng.integers(2**63))
     if candidate is None:
         return None
-    evaluator = arcs.evaluator
-    query = evaluator.query(candidate.deployment)
-    search = OptimalSearch(evaluator.environment, query, seed=seed, objective=evaluator.objective)
-    search.cost = cost_limit
-    search.advance(iterations)
-    return None if search.path is None else replace(candidate, path=search.path)
+    path = planner.path(candidate.deployment, seed=seed, iterations=iterations, cost_limit=cost_limit)
+    return None if path is None else replace(candidate, path=path)

@@ -14,6 +14,7 @@ import numba
 
 from anatomy.kernels.arcs import any_normal, point_on_arc
 from anatomy.kernels.compiling import inner_kernel
+from stages.needle.kernels.cost import map_costs_on_arc
 from stages.needle.kernels.limits import TINY
 from stages.needle.kernels.proof import blocker_on_arc
 
@@ -86,6 +87,21 @@ def is_allowed(obstacles, limits, state, origin, branch):
     return blocker_on_arc(obstacles, limits, pose, (0.0, nx, ny, nz), 0.0, length, branch) == 0
 
 
+@inner_kernel
+def _arc_from(state, c, s, curvature):
+    """Return pose and bend of an arc from a state, towards the angle of cosine `c` and sine `s` about it."""
+    ex, ey, ez = axes(state)
+    pose = (state[0], state[1], state[2], ez[0], ez[1], ez[2])
+    return pose, (curvature, c * ex[0] + s * ey[0], c * ex[1] + s * ey[1], c * ex[2] + s * ey[2])
+
+
+@numba.njit(cache=True)
+def is_forbidden(costs, geometry, state, roll, curvature, length):
+    """Tell whether an arc from a state meets a voxel of infinite cost, or leaves the grid."""
+    pose, bend = _arc_from(state, math.cos(roll), math.sin(roll), curvature)
+    return map_costs_on_arc(costs, geometry, pose, bend, length, True)[0] == math.inf
+
+
 @numba.njit(cache=True)
 def proved_step(obstacles, limits, state, roll, curvature, length, origin, branch):
     """Return the state at the end of an arc, not a number where the arc is not proved clear.
@@ -93,10 +109,8 @@ def proved_step(obstacles, limits, state, roll, curvature, length, origin, branc
     The arc bends towards the angle `roll` about the tip's axis, which the rotation does not keep: the
     end is the start turned about the arc's axis alone.  A negative length is no arc.
     """
-    ex, ey, ez = axes(state)
     c, s = math.cos(roll), math.sin(roll)
-    pose = (state[0], state[1], state[2], ez[0], ez[1], ez[2])
-    bend = (curvature, c * ex[0] + s * ey[0], c * ex[1] + s * ey[1], c * ex[2] + s * ey[2])
+    pose, bend = _arc_from(state, c, s, curvature)
     begin = inserted_at(state, origin)
     if not length >= 0.0 or blocker_on_arc(obstacles, limits, pose, bend, length, begin, branch) != 0:
         return math.nan, math.nan, math.nan, state[3], state[4], state[5], state[6]

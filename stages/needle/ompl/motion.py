@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from ompl import base
 
 from anatomy.kernels.field import MIN_GAP_MM
@@ -57,19 +58,19 @@ def _limits_of_steps(environment: NeedleEnvironment) -> Limits:
 def propagator(environment: NeedleEnvironment, question: Question) -> Callable[[Any, Any, float, Any], None]:
     """Return how OMPL moves a state by a control."""
     limits = _limits_of_steps(environment)
+    costs = environment.cost_map
+    forbidden = None if costs is None or np.isfinite(costs.array).all() else costs.array
 
     def propagate(state: Any, u: Any, duration: float, result: Any) -> None:
         """Advance along a share `duration` of an arc that bends towards `u[1]`, if that is proved clear."""
+        begin, arc = numbers_of(state), (u[1], u[2], duration * u[0])
         moved = states.proved_step(
-            environment.obstacles,
-            limits,
-            numbers_of(state),
-            u[1],
-            u[2],
-            duration * u[0],
-            question.origin,
-            question.branch,
+            environment.obstacles, limits, begin, *arc, question.origin, question.branch
         )
+        if forbidden is not None and states.is_forbidden(
+            forbidden, environment.obstacles.geometry, begin, *arc
+        ):
+            moved = (math.nan, math.nan, math.nan, *begin[3:])
         put_numbers(result, moved)
 
     return propagate

@@ -113,6 +113,8 @@ class NeedlePlanner(base.Planner):
         self.iterations = NO_LIMIT
         """Most iterations to spend."""
         self.anytime = False
+        self.cost_limit = math.inf
+        """What a path must cost less than."""
         self.query: Query | None = None
         self.path: ArcPath | None = None
         self.search: Search | None = None
@@ -127,6 +129,7 @@ class NeedlePlanner(base.Planner):
         if query is None or start is None or not self._question.begins_at(start):
             return base.PlannerStatus(base.PlannerStatus.INVALID_START)
         self.search = search = self._make_search(query, self.seed)
+        search.cost = self.cost_limit
         status = base.PlannerStatus.TIMEOUT
         while not (termination() or search.finished):
             portion = min(SLICE_ITERATIONS, self.iterations - self.iterations_used)

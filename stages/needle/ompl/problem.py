@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import count
 from typing import Any
 
+import numpy as np
 from ompl import base, control, util
 
 from anatomy.errors import SettingsError
 from stages.needle.environment import NeedleEnvironment
+from stages.needle.objective import SHORTEST, Objective
 from stages.needle.ompl.motion import ARC_STEPS, control_bounds, position_bounds, propagator, validity
-from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question
+from stages.needle.ompl.planner import NO_LIMIT, NeedleGoal, NeedlePlanner, Question
 from stages.needle.ompl.states import path_of, put_numbers
-from stages.needle.path import ArcPath
+from stages.needle.path import ArcPath, direct_path
+from stages.needle.planner_names import OMPL_PLANNERS
 from stages.needle.query import Query
 from stages.needle.search.base import Search
 from stages.needle.search.planners import PLANNERS
@@ -25,6 +30,9 @@ SearchFactory = Callable[[NeedleEnvironment, Query, int], Search]
 """Makes a search of an environment, a query and a seed."""
 Allocator = Callable[[Any], Any]
 """Makes an OMPL planner of a `control.SpaceInformation`."""
+LED_MM = 5.0
+"""So near to the target `plan` lets a planner of OMPL end, which steers by chance: one arc leads on from
+there, and it comes there within hundreds of iterations, to 1 mm within many thousands."""
 
 
 class NeedleProblem:
@@ -35,6 +43,9 @@ class NeedleProblem:
     searches : mapping of names to callables, optional
         Each makes a search of an environment, a query and a seed.  The first is the default; without any,
         all of `stages.needle.search.planners`.
+    objective : Objective, optional
+        What those make small, the patient's cost map included; the planners of OMPL look at no objective,
+        but enter no voxel of infinite cost.
 
     Attributes
     ----------
@@ -45,12 +56,16 @@ class NeedleProblem:
     """
 
     def __init__(
-        self, environment: NeedleEnvironment, searches: Mapping[str, SearchFactory] | None = None
+        self,
+        environment: NeedleEnvironment,
+        searches: Mapping[str, SearchFactory] | None = None,
+        objective: Objective = SHORTEST,
     ) -> None:
         self.environment = environment
-        self._searches = dict(searches or PLANNERS)
+        ours = {name: partial(make, objective=objective) for name, make in PLANNERS.items()}
+        self._searches: dict[str, SearchFactory] = dict(searches or ours)
         self._question = Question()
-        self._own: dict[str, NeedlePlanner] = {}
+        self._own: dict[str, Any] = {}
         self._tolerance_mm = 0.0
         position = base.SE3StateSpace()
         position.setBounds(position_bounds(environment))
@@ -85,25 +100,22 @@ class NeedleProblem:
             return lambda si: NeedlePlanner(si, search, question, name)
 
         found = {name: ours(name, make) for name, make in self._searches.items()}
-        return found | {
-            "control.RRT": control.RRT,
-            "control.EST": control.EST,
-            "control.KPIECE1": control.KPIECE1,
-        }
+        return found | {name: getattr(control, name.removeprefix("control.")) for name in OMPL_PLANNERS}
 
-    def own(self, method: str | None = None) -> NeedlePlanner:
-        """Return the planner that `plan` uses, made once for each search.
+    def own(self, method: str | None = None) -> Any:
+        """Return the planner that `plan` uses, made once for each name of `planners`.
 
         Raises
         ------
         SettingsError
-            If there is no such search.
+            If there is no such planner.
         """
         name = self.default if method is None else method
-        if name not in self._searches:
-            raise SettingsError(f"There is no needle search {name!r}", expected=", ".join(self._searches))
         if name not in self._own:
-            self._own[name] = self.planners()[name](self.si)
+            known = self.planners()
+            if name not in known:
+                raise SettingsError(f"There is no needle planner {name!r}", expected=", ".join(known))
+            self._own[name] = known[name](self.si)
         return self._own[name]
 
     def plan(
@@ -115,19 +127,26 @@ class NeedleProblem:
         time_s: float = math.inf,
         method: str | None = None,
         anytime: bool = False,
+        cost_limit: float = math.inf,
     ) -> ArcPath | None:
         """Search a path of arcs.
+
+        A planner of OMPL ends with its first path, within LED_MM of the target; the path is then led to the
+        target itself by one arc in place of its last ones, as few arcs in all as are proved.
 
         Parameters
         ----------
         seed, iterations : int
-            The same pair gives the same path, if the time does not run out first.
+            The same pair gives the same path, if the time does not run out first.  The planners of OMPL take
+            their random numbers from `seed_ompl` instead.
         time_s : float
             Stop after this time.
         method : str, optional
-            Name of the search.
+            Name of the planner, one of `planners`.
         anytime : bool
             Go on to better paths until time, iterations or search are at their end.
+        cost_limit : float
+            What a path of our searches must cost less than, under the objective.
 
         Returns
         -------
@@ -135,15 +154,35 @@ class NeedleProblem:
             A path proved clear and within all limits; None if none was found.
         """
         planner = self.own(method)
-        planner.seed, planner.iterations, planner.anytime = seed, iterations, anytime
+        ours = isinstance(planner, NeedlePlanner)
         definition = base.ProblemDefinition(self.si)
-        definition.setGoal(self._ask(query, 0.0))
+        definition.setGoal(self._ask(query, 0.0 if ours else LED_MM))
         definition.addStartState(self._start())
         planner.clear()
         planner.setProblemDefinition(definition)
         # Not through SimpleSetup.solve, which sets everything up again for each query.
-        planner.solve(_termination(time_s))
-        return planner.path
+        if ours:
+            planner.seed, planner.iterations, planner.anytime = seed, iterations, anytime
+            planner.cost_limit = cost_limit
+            planner.solve(_termination(time_s))
+            return planner.path  # type: ignore[no-any-return]
+        self.si.setup()
+        planner.setup()
+        planner.solve(_termination(time_s, iterations))
+        return self._led_to_target(query, definition) if definition.hasExactSolution() else None
+
+    def _led_to_target(self, query: Query, definition: Any) -> ArcPath | None:
+        """Return a path that ends beside the target with one arc to it in place of its last ones, proved."""
+        path = path_of(definition.getSolutionPath())
+        frames = path.frames()
+        for kept in range(len(path.arcs)):
+            last = direct_path(frames[kept], query.target)
+            whole = ArcPath(
+                lps_from_start=query.lps_from_start, arcs=np.vstack([path.arcs[:kept], last.arcs])
+            )
+            if not violation(self.environment, query, whole):
+                return whole
+        return None
 
     def pose(self, query: Query, *, goal_tolerance_mm: float = 0.0) -> None:
         """Put a query to `setup`, whose planner, start and goal then wait for `setup.solve`.
@@ -212,13 +251,21 @@ def seed_ompl(seed: int) -> None:
     _seeds.append(seed)
     if refused:
         raise SettingsError(
-            f"OMPL cannot begin with the seed {seed}",
+            f"OMPL cannot begin with the seed {seed}: it can be seeded once in a process",
             expected="a number of 1 or more, before OMPL has drawn its first",
-            remedy="Call it first in a new process",
+            remedy="Start a new process for each call with a planner of OMPL: each command is one",
         )
 
 
-def _termination(time_s: float) -> Any:
-    if math.isinf(time_s):
-        return base.plannerNonTerminatingCondition()
-    return base.timedPlannerTerminationCondition(time_s)
+def _termination(time_s: float, iterations: int = NO_LIMIT) -> Any:
+    """Return what ends a planner: the time, or so many looks at it, one an iteration of OMPL's planners."""
+    timed = (
+        base.plannerNonTerminatingCondition()
+        if math.isinf(time_s)
+        else base.timedPlannerTerminationCondition(time_s)
+    )
+    if iterations >= NO_LIMIT:
+        return timed
+    looks = count()
+    counted = base.PlannerTerminationCondition(lambda: next(looks) >= iterations)
+    return base.plannerOrTerminationCondition(timed, counted)

@@ -31,7 +31,8 @@ class Search(Protocol):
     path : ArcPath or None
         The best path so far, proved clear and within all limits.
     cost : float
-        Its cost under the objective, as estimated within the search; infinite without a path.
+        Its cost under the objective, as estimated within the search.  Without a path it is what a path must
+        cost less than: infinite unless the caller sets it before the first `advance`.
     finished : bool
         Nothing is left to be found.
     """

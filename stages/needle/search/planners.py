@@ -6,9 +6,11 @@ from typing import Protocol
 
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
+from stages.needle.planner_names import OUR_PLANNERS
 from stages.needle.query import Query
 from stages.needle.search.base import RestartingRRT, Search
 from stages.needle.search.decision import Decision
+from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.resolution import ResolutionSearch
 
@@ -24,6 +26,12 @@ class MakeSearch(Protocol):
 
 def _rrt(environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST) -> Search:
     return RestartingRRT(environment, query, seed=seed, objective=objective)
+
+
+def _ao_rrt(
+    environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
+) -> Search:
+    return OptimalSearch(environment, query, seed=seed, objective=objective)
 
 
 def _optimal(
@@ -45,10 +53,7 @@ def _decide(
     return Decision(environment, query, seed=seed, objective=objective)
 
 
-PLANNERS: dict[str, MakeSearch] = {
-    "rrt": _rrt,
-    "optimal": _optimal,
-    "resolution": _resolution,
-    "decide": _decide,
-}
+PLANNERS: dict[str, MakeSearch] = dict(
+    zip(OUR_PLANNERS, (_rrt, _ao_rrt, _optimal, _resolution, _decide), strict=True)
+)
 """See docs/explanation/needle.md."""

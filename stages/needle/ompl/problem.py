@@ -12,6 +12,7 @@ import numpy as np
 from ompl import base, control, util
 
 from anatomy.errors import SettingsError
+from stages.needle.costs import map_integral
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.ompl.motion import ARC_STEPS, control_bounds, position_bounds, propagator, validity
@@ -180,7 +181,8 @@ class NeedleProblem:
             whole = ArcPath(
                 lps_from_start=query.lps_from_start, arcs=np.vstack([path.arcs[:kept], last.arcs])
             )
-            if not violation(self.environment, query, whole):
+            allowed = math.isfinite(map_integral(self.environment.cost_map, whole))
+            if allowed and not violation(self.environment, query, whole):
                 return whole
         return None
 

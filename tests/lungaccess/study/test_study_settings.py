@@ -59,6 +59,11 @@ def test_a_file_is_read_with_its_folder(tmp_path: Path) -> None:
         ({"case": {"objective": "length=-1"}}, "weights of 0 or more"),
         ({"case": {"peripheral": {"per_lung": -1}}}, "at least 0"),
         ({"planner": [{"name": "a", "method": "atlass"}]}, "kuntz2015"),
+        ({"planner": [{"name": "a", "needle_planner": "control.RTT"}]}, "control.RRT"),
+        (
+            {"planner": [{"name": "a", "kind": "needle", "method": "rrt", "needle_planner": "rrt"}]},
+            "of the kind plan",
+        ),
         ({"planner": [{"name": "a", "kind": "needle", "method": "rrt"}]}, "start poses in every case"),
         ({"planner": [{"name": "a"}, {"name": "a"}]}, "each only once"),
         ({"planner": {"name": "a"}}, "not an array of tables"),

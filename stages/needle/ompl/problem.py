@@ -31,7 +31,7 @@ SearchFactory = Callable[[NeedleEnvironment, Query, int], Search]
 """Makes a search of an environment, a query and a seed."""
 Allocator = Callable[[Any], Any]
 """Makes an OMPL planner of a `control.SpaceInformation`."""
-LED_MM = 5.0
+BESIDE_TARGET_MM = 5.0
 """So near to the target `plan` lets a planner of OMPL end, which steers by chance: one arc leads on from
 there, and it comes there within hundreds of iterations, to 1 mm within many thousands."""
 
@@ -132,8 +132,8 @@ class NeedleProblem:
     ) -> ArcPath | None:
         """Search a path of arcs.
 
-        A planner of OMPL ends with its first path, within LED_MM of the target; the path is then led to the
-        target itself by one arc in place of its last ones, as few arcs in all as are proved.
+        A planner of OMPL ends with its first path, within BESIDE_TARGET_MM of the target; one arc in place of
+        its last ones then brings the path to the target itself, with as few arcs in all as are proved.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class NeedleProblem:
         planner = self.own(method)
         ours = isinstance(planner, NeedlePlanner)
         definition = base.ProblemDefinition(self.si)
-        definition.setGoal(self._ask(query, 0.0 if ours else LED_MM))
+        definition.setGoal(self._ask(query, 0.0 if ours else BESIDE_TARGET_MM))
         definition.addStartState(self._start())
         planner.clear()
         planner.setProblemDefinition(definition)
@@ -170,9 +170,9 @@ class NeedleProblem:
         self.si.setup()
         planner.setup()
         planner.solve(_termination(time_s, iterations))
-        return self._led_to_target(query, definition) if definition.hasExactSolution() else None
+        return self._brought_to_target(query, definition) if definition.hasExactSolution() else None
 
-    def _led_to_target(self, query: Query, definition: Any) -> ArcPath | None:
+    def _brought_to_target(self, query: Query, definition: Any) -> ArcPath | None:
         """Return a path that ends beside the target with one arc to it in place of its last ones, proved."""
         path = path_of(definition.getSolutionPath())
         frames = path.frames()

@@ -62,6 +62,7 @@ KINDS = (
     _Kind(what="tube bend (strain)", findings=("tube.strain",), unit="%", scale=100.0),
     _distance("sideways sweep of tubes", "tube.sweep.limit", "tube.sweep.stated_limit"),
     _angle("tubes to wall at exit", "tube.exit.angle.limit", "tube.exit.angle.stated_limit"),
+    _distance("tubes in the wall", "tube.wall_run.limit", "tube.wall_run.stated_limit"),
     _length("extension beyond scope", "tube.extension"),
     _length("inner beyond outer tube", "tube.protrusion"),
     _distance("needle to vessel", "needle.clearance.vessel"),

@@ -26,7 +26,7 @@ from stages.needle import StartIndex
 from stages.scope import Sites
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
-FORMAT = 4
+FORMAT = 5
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 """What reading a damaged or foreign file raises; the atlas is then made anew."""

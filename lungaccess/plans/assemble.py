@@ -146,6 +146,7 @@ def _tube(task: Task, candidate: Candidate) -> TubeDeployment:
             point_lps=_exit_point(task, candidate),
             arc_length_mm=deployment.exit_mm,
             wall_angle_rad=deployment.wall_angle_rad,
+            wall_run_mm=deployment.wall_run_mm,
         ),
         lateral_sweep_mm=deployment.lateral_sweep_mm,
         follow_the_leader_error_mm=deployment.lateral_sweep_mm,

@@ -86,7 +86,7 @@ class ScopeInsertion(Record):
 
 @frozen_record
 class WallExit(Record):
-    """Where the axis of the tube leaves the airway lumen.
+    """Where the axis of the tube leaves the airway lumen for good.
 
     Parameters
     ----------
@@ -97,12 +97,15 @@ class WallExit(Record):
         Length of tube between the tip of the scope and that point.
     wall_angle_rad : float
         Angle between tube and wall; pi/2 is perpendicular.
+    wall_run_mm : float
+        Length of the tube's body, beyond that point, that lies in the wall of the branch.
     """
 
     branch: int
     point_lps: Float = field(metadata=shaped(3))
     arc_length_mm: float
     wall_angle_rad: float
+    wall_run_mm: float
 
 
 @frozen_record

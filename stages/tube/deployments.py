@@ -43,7 +43,9 @@ class Deployments:
     branch : (E,) int64
         Pierced branch.
     exit_mm, wall_angle_rad : (E,) float64
-        Arc length at which the axis leaves the lumen, and its angle to the wall there.
+        Arc length at which the axis leaves the lumen for good, and its angle to the wall there.
+    wall_run_mm : (E,) float64
+        Length of body in the wall of the pierced branch, beyond the exit.
     positions, tangents : (E, 3) float64
         Tip of the inner tube, LPS mm.
     candidates : int
@@ -59,6 +61,7 @@ class Deployments:
     branch: Int
     exit_mm: Float
     wall_angle_rad: Float
+    wall_run_mm: Float
     positions: Float
     tangents: Float
     candidates: int
@@ -182,6 +185,7 @@ def _as_deployments(rows: Float, angles: Float, refused: Int, candidates: int) -
         branch=read_only(rows[:, 4].astype(np.int64)),
         exit_mm=read_only(rows[:, 5].copy()),
         wall_angle_rad=read_only(rows[:, 6].copy()),
+        wall_run_mm=read_only(rows[:, 7].copy()),
         positions=read_only(rows[:, tip : tip + 3].copy()),
         tangents=read_only(rows[:, tip + 3 : tip + 6].copy()),
         candidates=candidates,

@@ -12,6 +12,10 @@ from pydantic import Field
 from anatomy.settings import impossible, quantity, settings
 from anatomy.typed import Float
 
+DEFAULT_WALL_RUN_MM = 5.0
+"""A straight tube of radius r has (t + r) / sin(a) of its length in a wall of thickness t that it meets at
+the angle a: so much do 1.9 mm tubes at 30 degrees need for 1.5 mm, the wall of a segmental bronchus."""
+
 
 @settings
 class BentPiece:
@@ -174,6 +178,10 @@ class ConcentricTubes:
     min_wall_angle_deg: Annotated[
         float, quantity("smallest angle between tube and airway wall at the exit", at_least=0.0, at_most=90.0)
     ] = 10.0
+    max_wall_run_mm: Annotated[
+        float,
+        quantity("longest stretch of tube in the wall of the airway it leaves", above=0.0, at_most=100.0),
+    ] = DEFAULT_WALL_RUN_MM
     max_extension_mm: Annotated[
         float, quantity("largest extension beyond the tip of the scope", above=0.0, at_most=300.0)
     ] = 60.0

@@ -38,7 +38,7 @@ def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
 
 
 def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
-    """Return the `(10,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad."""
+    """Return the `(N_TUBES,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad."""
     constants = np.zeros(kernels.N_TUBES)
     inner, outer = tubes.inner, tubes.outer
     constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
@@ -51,6 +51,7 @@ def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
     constants[kernels.MAX_SWEEP] = tubes.max_lateral_sweep_mm
     constants[kernels.MAX_EXTENSION] = tubes.max_extension_mm
     constants[kernels.MAX_PROTRUSION] = tubes.max_inner_protrusion_mm
+    constants[kernels.MAX_WALL_RUN] = tubes.max_wall_run_mm
     return constants
 
 

@@ -22,6 +22,7 @@ REASONS: dict[int, str] = {
     kernels.NEAR_OTHER_BRANCH: "the tube comes too near another airway",
     kernels.REENTERS_LUMEN: "the tube enters an airway again",
     kernels.FLAT_EXIT: "the tube meets the airway wall at too flat an angle",
+    kernels.LONG_WALL_RUN: "the tube runs too far in the wall of the airway that it leaves",
     kernels.SWEEPS: "the tube would sweep tissue sideways",
     kernels.TOO_LONG: "the tube would extend too far",
     kernels.PROTRUDES: "the inner tube is too short to protrude so far",
@@ -47,6 +48,7 @@ class Deployment:
     branch: int
     exit_mm: float
     wall_angle_rad: float
+    wall_run_mm: float
     lateral_sweep_mm: float
 
     @property
@@ -109,5 +111,6 @@ class DeploymentValidator:
             branch=int(trace[kernels.BRANCH]),
             exit_mm=float(trace[kernels.LEFT_AT]),
             wall_angle_rad=float(trace[kernels.WALL_ANGLE]),
+            wall_run_mm=float(trace[kernels.WALL_RUN]),
             lateral_sweep_mm=float(kernels.lateral_sweep(self._constants, float(outer_mm), float(inner_mm))),
         )

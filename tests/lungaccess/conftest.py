@@ -186,7 +186,9 @@ def make_plan() -> Plan:
             outer_insertion_mm=12.0,
             inner_insertion_mm=24.0,
             lps_from_tip=start,
-            exit=WallExit(branch=1, point_lps=exit_point, arc_length_mm=8.0, wall_angle_rad=0.9),
+            exit=WallExit(
+                branch=1, point_lps=exit_point, arc_length_mm=8.0, wall_angle_rad=0.9, wall_run_mm=2.0
+            ),
             lateral_sweep_mm=0.4,
             follow_the_leader_error_mm=0.1,
         ),

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from anatomy import structures
 from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng, direction, far, signed
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath
+from stages.tube.shape import centreline
 
 
 def route_cut(case: Case, rng: Rng) -> Mutant | None:
@@ -118,6 +120,37 @@ def exit_edited(case: Case, rng: Rng) -> Mutant | None:
     return Mutant(plan=changed(case.plan, **edits[int(rng.integers(len(edits)))]))
 
 
+def exit_at_a_corner(case: Case, rng: Rng) -> Mutant | None:
+    """The exit is stated where the axis cuts a corner of the wall, before it leaves for good."""
+    tube, lung = case.plan.tube, case.lung
+    arc = np.arange(0.0, tube.exit.arc_length_mm - 0.05, 0.005)
+    points = centreline(
+        case.plan.system.tubes,
+        case.plan.scope.lps_from_scope_tip,
+        tube.rotation_rad,
+        tube.outer_insertion_mm,
+        tube.inner_insertion_mm,
+        arc,
+    )
+    index = np.rint(lung.grid.ijk(points)).astype(np.int64)
+    wet = (lung.labels[tuple(index.T)] & structures.LUMEN) != 0
+    leaves = np.flatnonzero(wet[:-1] & ~wet[1:])
+    if not len(leaves):
+        return None
+    n = int(rng.choice(leaves))
+    edits = {"tube__exit__arc_length_mm": float(arc[n]), "tube__exit__point_lps": points[n]}
+    return Mutant(plan=changed(case.plan, **edits, exemption__exit_point_lps=points[n]))
+
+
+def wall_run_edited(case: Case, rng: Rng) -> Mutant | None:
+    """Less or more of the tube is said to lie in the wall than does."""
+    least, most = (case.limit(f"tube.wall_run.stated{end}") for end in ("", ".most"))
+    if least is None or most is None or least < 0.1:
+        return None
+    run = least - far(rng, 0.05, least) if rng.integers(2) else most + far(rng, 0.05, 5.0)
+    return Mutant(plan=changed(case.plan, tube__exit__wall_run_mm=run))
+
+
 def exemption_longer(case: Case, rng: Rng) -> Mutant | None:
     """More needle is exempt than the device allows, or less than none."""
     limit = case.plan.system.needle.exit_exemption_mm
@@ -182,6 +215,8 @@ MUTATIONS: tuple[Mutation, ...] = (
     route_statement_edited,
     tube_edited,
     exit_edited,
+    exit_at_a_corner,
+    wall_run_edited,
     exemption_longer,
     arcs_edited,
     needle_statement_edited,

@@ -47,6 +47,7 @@ def random_system(rng: Rng) -> System:
             "scope.lumen_margin_mm": rng.choice([0.0, rng.uniform(0.0, 0.5)]),
             "tubes.max_lateral_sweep_mm": rng.uniform(0.1, 2.0),
             "tubes.min_wall_angle_deg": rng.uniform(5.0, 40.0),
+            "tubes.max_wall_run_mm": rng.uniform(2.0, 8.0),
             "tubes.max_extension_mm": rng.uniform(30.0, 60.0),
             "tubes.inner.curved_length_mm": rng.uniform(20.0, 60.0),
             "tubes.inner.precurvature_per_mm": rng.uniform(0.005, 0.035),

@@ -64,6 +64,7 @@ def device_too_weak(case: Case, rng: Rng) -> Mutant | None:
         "tubes.max_extension_mm": "tube.extension",
         "tubes.max_lateral_sweep_mm": "tube.sweep.limit",
         "tubes.max_strain": "tube.strain",
+        "tubes.max_wall_run_mm": "tube.wall_run.limit",
         "tubes.min_wall_angle_deg": "tube.exit.angle.stated_limit",
     }
     key = str(rng.choice(list(keys)))

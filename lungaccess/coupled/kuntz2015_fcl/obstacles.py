@@ -60,6 +60,12 @@ class Solid:
             return True
         return self._surface.polyline_distance_mm(line_lps) <= distance_mm
 
+    def distance_mm(self, point_lps: Float) -> float:
+        """Return the distance of a point `(3,)` from the solid, 0 inside it."""
+        if self._holds(labels_at(self._lung, point_lps[None]))[0]:
+            return 0.0
+        return self._surface.polyline_distance_mm(point_lps)
+
     def depth_mm(self, point_lps: Float) -> float:
         """Return how far inside the solid a point `(3,)` lies, 0 outside it."""
         if not self._holds(labels_at(self._lung, point_lps[None]))[0]:

@@ -51,10 +51,12 @@ class TubeValidator:
             return REASONS[kernels.PROTRUDES]
         points, at_mm = shape.sample(LABEL_STEP_MM)
         labels = labels_at(self._obstacles.lung, points)
-        outside = np.flatnonzero((labels & LUMEN) == 0)
-        if not len(outside) or outside[0] == 0:
+        outside = (labels & LUMEN) == 0
+        # One sample alone, between others in the lumen, is the corner of a voxel.
+        left = np.flatnonzero(outside & np.append(outside[1:], True))
+        if outside[0] or not len(left):
             return REASONS[kernels.NO_EXIT]
-        first = int(outside[0])
+        first = int(left[0])
         branch = int(branch_of(labels[first - 1 : first])[0])
         if self._mediastinal[branch]:
             return REASONS[kernels.LEAVES_MEDIASTINAL]
@@ -69,6 +71,9 @@ class TubeValidator:
         refused = self._clear(shape, contact_mm, exit_mm, branch)
         if refused:
             return refused
+        wall_run_mm = self._wall_run_mm(shape, exit_mm)
+        if wall_run_mm > self._system.tubes.max_wall_run_mm:
+            return REASONS[kernels.LONG_WALL_RUN]
         return Deployment(
             rotation_rad=float(rotation),
             outer_mm=float(outer_mm),
@@ -77,6 +82,7 @@ class TubeValidator:
             branch=branch,
             exit_mm=exit_mm,
             wall_angle_rad=angle,
+            wall_run_mm=wall_run_mm,
             lateral_sweep_mm=0.0,
         )
 
@@ -94,18 +100,30 @@ class TubeValidator:
 
     def _contained(self, labels: Labels, beyond_mm: Float, branch: int) -> str:
         """Return why the axis beyond the exit lies in something, or an empty text."""
-        lumen = (labels & LUMEN) != 0
         own = branch_of(labels) == branch
-        in_tissue = beyond_mm >= kernels.WALL_ZONE_MM
-        if not in_tissue.any():
+        if beyond_mm[-1] < kernels.WALL_ZONE_MM:
             return REASONS[kernels.NO_EXIT]
-        if (lumen & (in_tissue | ~own)).any():
+        if (labels & LUMEN).any():
             return REASONS[kernels.REENTERS_LUMEN]
         if (labels & self._obstacles.forbidden).any():
             return NEAR_TISSUE
         if (((labels & AIRWAY) != 0) & ~own).any():
             return REASONS[kernels.NEAR_OTHER_BRANCH]
         return ""
+
+    def _wall_run_mm(self, shape: ArcPath, exit_mm: float) -> float:
+        """Return how much of the tube beyond the exit is nearer to an airway than its radius, if not less."""
+        tubes, outer_mm = self._system.tubes, float(shape.arcs[0, 0])
+        run, at = 0.0, exit_mm
+        while at < shape.length_mm:
+            in_outer = at < outer_mm
+            radius = tubes.outer.radius_mm if in_outer else tubes.inner.radius_mm
+            end = outer_mm if in_outer else shape.length_mm
+            beyond = self._obstacles.airways.distance_mm(frame_at(shape, at)[:3, 3]) - radius
+            step = min(max(abs(beyond), kernels.RUN_STEP_MM), end - at)
+            run += step if beyond < kernels.RUN_STEP_MM else 0.0
+            at += step
+        return run
 
     def _contact_mm(self, points: Float, at_mm: Float, outer_mm: float) -> float:
         """Return the arc length from which on the tube is never clear of the wall, up to its exit."""

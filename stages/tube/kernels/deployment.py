@@ -19,14 +19,15 @@ from stages.tube.kernels.wall_exit import (
     SWEEPS,
     TOO_LONG,
     WALL_ANGLE,
+    WALL_RUN,
     advance,
     reset,
 )
 
 # Columns of an enumerated deployment: site, rotation (indices), outer and inner insertion (mm),
-# pierced branch, arc length at the exit (mm), wall angle (rad), tip pose (6).
-ENTRY_TIP = 7
-ENTRY_COLUMNS = 13
+# pierced branch, arc length at the exit (mm), wall angle (rad), run in the wall (mm), tip pose (6).
+ENTRY_TIP = 8
+ENTRY_COLUMNS = 14
 
 
 @numba.njit(cache=True, nogil=True)
@@ -75,6 +76,7 @@ def _record(entries, row, site, rotation, outer, inner, trace, pose, reasons):
     entry[4] = trace[BRANCH]
     entry[5] = trace[LEFT_AT]
     entry[6] = trace[WALL_ANGLE]
+    entry[7] = trace[WALL_RUN]
     for m in range(6):
         entry[ENTRY_TIP + m] = pose[m]
     return 1
@@ -90,7 +92,7 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
     Parameters
     ----------
     environment : TubeEnvironment
-    tubes : (10,) float64
+    tubes : (N_TUBES,) float64
     base : (6,) float64
         Scope tip pose.
     normals : (T, 3) float64
@@ -98,11 +100,11 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
     site : int
     stops : (S,) float64
         Insertions in mm, increasing from 0.
-    entries : (rows, 13) float64
+    entries : (rows, ENTRY_COLUMNS) float64
         Receives the accepted deployments; at least `T S (S + 1) / 2` rows.
-    reasons : (12,) int64
+    reasons : (N_REASONS,) int64
         Counts the refused ones by reason.
-    work : (2, 5) float64
+    work : (2, N_TRACE) float64
         Scratch.
 
     Returns

@@ -1,8 +1,8 @@
 """The planar shape of deployed tubes, in closed form, and how they sweep sideways.
 
 A straight outer tube and an inner tube with a precurved distal part, rotated together, need no torsion: the
-centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `(10,)` float64 array of the
-numbers below: curvatures in 1/mm, lengths in mm, the angle in rad.
+centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `(N_TUBES,)` float64 array of
+the numbers below: curvatures in 1/mm, lengths in mm, the angle in rad.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numba
 from anatomy.kernels.arcs import normal_on_arc, pose_on_arc, sine_length, versine_length
 
 OVERLAP_CURVATURE, INNER_CURVATURE, CURVED_LENGTH, OUTER_RADIUS, INNER_RADIUS, MARGIN = range(6)
-MIN_WALL_ANGLE, MAX_SWEEP, MAX_EXTENSION, MAX_PROTRUSION, N_TUBES = range(6, 11)
+MIN_WALL_ANGLE, MAX_SWEEP, MAX_EXTENSION, MAX_PROTRUSION, MAX_WALL_RUN, N_TUBES = range(6, 12)
 
 SWEEP_SAMPLES = 100
 """Samples of the sweep between its two sharp peaks; it is smooth there, and they are computed exactly."""

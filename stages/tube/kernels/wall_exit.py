@@ -1,7 +1,7 @@
 """A tube followed from the lumen through the wall into the tissue, and whether each point of it is allowed.
 
-`tubes` is the array of `planar`.  `trace` is a `(5,)` float64 array that keeps where the tube is and how it
-left the lumen.
+`tubes` is the array of `planar`.  `trace` is a `(N_TRACE,)` float64 array that keeps where the tube is, how
+it left the lumen, and how much of its body is in the wall since.
 """
 
 from __future__ import annotations
@@ -15,19 +15,30 @@ from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float, Labels, UInt16
-from stages.tube.kernels.planar import MIN_WALL_ANGLE
+from stages.tube.kernels.planar import MAX_WALL_RUN, MIN_WALL_ANGLE
 
 # trace
-PHASE, LEFT_AT, BRANCH, WALL_ANGLE, HAZARD, N_TRACE = range(6)
+PHASE, LEFT_AT, BRANCH, WALL_ANGLE, HAZARD, WALL_RUN, REFUSAL, N_TRACE = range(8)
 
-IN_LUMEN, IN_WALL, IN_TISSUE = 0.0, 1.0, 2.0
+IN_LUMEN, LEAVING, IN_WALL, IN_TISSUE = 0.0, 1.0, 2.0, 3.0
 
 # reasons why a deployment is refused
 ACCEPTED, NO_EXIT, NEAR_VESSEL, NEAR_PLEURA, NEAR_FISSURE, NEAR_OTHER_BRANCH, REENTERS_LUMEN = range(7)
-FLAT_EXIT, SWEEPS, TOO_LONG, PROTRUDES, LEAVES_MEDIASTINAL, N_REASONS = range(7, 13)
+FLAT_EXIT, SWEEPS, TOO_LONG, PROTRUDES, LEAVES_MEDIASTINAL, LONG_WALL_RUN, N_REASONS = range(7, 14)
 
+FREE = -1
+"""Stands for the label of an obstacle where a bound says that there is none."""
 FINE_STEP_MM = 0.05
 """Least step in the lumen, where the axis may cut corners of voxels: a tenth of a voxel."""
+CORNER_MM = 0.1
+"""An axis that is back in a lumen after no more than this has cut the corner of a voxel and not left: it is
+never farther than half of this from the lumen."""
+LOOK_MM = 0.02
+"""Spacing of the points that are looked up for lumen while the axis leaves: well below CORNER_MM."""
+RUN_STEP_MM = 0.02
+"""The run of the body in the wall is known to this at each place where it begins or ends."""
+RUN_REACH_MM = 0.3
+"""How far beyond the radius the wall is searched: half a voxel, since a longer search costs its cube."""
 WALL_ZONE_MM = 1.0
 """Within this length the tube pierces the wall; airways that tubes leave have thinner walls."""
 OUT_OF_LUMEN_MM = 0.02
@@ -112,11 +123,9 @@ def wall_angle(labels, geometry, pose):
 
 @numba.njit(cache=True)
 def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
-    """Find where the axis leaves the lumen between two arc lengths of a piece, and validate the exit."""
+    """Find where the axis leaves the lumen between two arc lengths of a piece, and judge it as an exit."""
     _field, labels, geometry, _bits, _lumen, _lumen_geometry, mediastinal = environment
     branch = int(trace[BRANCH])
-    if branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
-        return LEAVES_MEDIASTINAL
     for _ in range(BISECTIONS):
         middle = 0.5 * (inside + outside)
         x, y, z = point_on_arc(pose, bend, middle)
@@ -124,24 +133,40 @@ def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
             inside = middle
         else:
             outside = middle
-    trace[PHASE] = IN_WALL
+    trace[PHASE] = LEAVING
     trace[LEFT_AT] = s0 + inside
+    trace[WALL_RUN] = 0.0
+    if branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
+        trace[REFUSAL] = LEAVES_MEDIASTINAL
+        return
     trace[WALL_ANGLE] = wall_angle(labels, geometry, pose_on_arc(pose, bend, inside))
-    if trace[WALL_ANGLE] < tubes[MIN_WALL_ANGLE]:
-        return FLAT_EXIT
-    return int(trace[HAZARD])
+    trace[REFUSAL] = FLAT_EXIT if trace[WALL_ANGLE] < tubes[MIN_WALL_ANGLE] else trace[HAZARD]
+
+
+@numba.njit(cache=True)
+def _first_in_lumen(environment, pose, bend, begin, end):
+    """Return the first of points LOOK_MM apart that lies in a lumen, `end` among them; -1 if none does."""
+    labels, geometry = environment.labels, environment.geometry
+    s = begin
+    while s < end:
+        s = min(s + LOOK_MM, end)
+        x, y, z = point_on_arc(pose, bend, s)
+        if label_at(labels, geometry, x, y, z) & LUMEN:
+            return s
+    return -1.0
 
 
 @numba.njit(cache=True)
 def _tissue_gap(environment, trace, x, y, z, required):
     """Return the clearance beyond `required` outside the lumen and the label that limits it.
 
-    Exempt is the wall of the pierced branch; its lumen must stay out of reach of the axis.
+    The label is FREE if not even the pierced branch is so near.  Exempt is the wall of that branch; its
+    lumen must stay out of reach of the axis.
     """
     field, labels, geometry, bits, _lumen, _lumen_geometry, _mediastinal = environment
     gap = distance_bound(field, geometry, x, y, z) - required
     if gap >= MIN_GAP_MM:
-        return gap, 0
+        return gap, FREE
     reach = required + EXACT_REACH_MM
     branch = int(trace[BRANCH])
     distance, label = exact_distance(labels, geometry, x, y, z, bits, branch, reach)
@@ -175,49 +200,94 @@ def _lumen_step(environment, trace, x, y, z, radius, required):
 
 
 @numba.njit(cache=True)
+def _run_in_wall(environment, pose, bend, begin, end, radius):
+    """Return how much of a stretch is nearer to an airway than `radius`: at least the true length.
+
+    Other branches than the pierced one are farther away than that.
+    """
+    labels, geometry = environment.labels, environment.geometry
+    run = 0.0
+    s = begin
+    while s < end:
+        x, y, z = point_on_arc(pose, bend, s)
+        distance, _label = exact_distance(labels, geometry, x, y, z, AIRWAY, -1, radius + RUN_REACH_MM)
+        step = min(max(abs(distance - radius), RUN_STEP_MM), end - s)
+        if distance < radius + RUN_STEP_MM:
+            run += step
+        s += step
+    return run
+
+
+@numba.njit(cache=True)
+def _march_beyond(environment, tubes, trace, pose, bend, s0, s, end, radius, clearance):
+    """Follow one arc from `s` to `end`, out of the lumen; see `march`."""
+    required = radius + clearance
+    while True:
+        x, y, z = point_on_arc(pose, bend, s)
+        gap, label = _tissue_gap(environment, trace, x, y, z, required)
+        if gap < MIN_GAP_MM:
+            return REENTERS_LUMEN if label == LUMEN else _reason(label)
+        to = min(s + gap, end)
+        if trace[PHASE] == IN_WALL:
+            zone = trace[LEFT_AT] + WALL_ZONE_MM - s0
+            if s >= zone:
+                trace[PHASE] = IN_TISSUE
+                continue
+            to = min(to, max(zone, s + 1e-6))
+            if _first_in_lumen(environment, pose, bend, s, to) >= 0.0:
+                return REENTERS_LUMEN
+        if label != FREE:
+            trace[WALL_RUN] += _run_in_wall(environment, pose, bend, s, to, radius)
+            if trace[WALL_RUN] > tubes[MAX_WALL_RUN]:
+                return LONG_WALL_RUN
+        if s >= end:
+            return ACCEPTED
+        s = to
+
+
+@numba.njit(cache=True)
 def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
     """Follow one arc of the tube, from `s0` mm beyond the scope tip, and validate every point of it.
 
-    In the lumen the axis moves freely, and corners of voxels that it cuts for less than FINE_STEP_MM may
-    go unnoticed.  Where it leaves, the wall is pierced within WALL_ZONE_MM; from
-    there on the axis is out of every lumen, and the tube keeps `clearance` from its surface to
-    vessels, pleura, fissures and other branches.  Returns a reason, ACCEPTED if there is none.
+    In the lumen the axis moves freely, and cuts corners of voxels for up to CORNER_MM.  Where it
+    leaves for longer, it has left for good: the wall is pierced within WALL_ZONE_MM, the axis meets no
+    lumen again, and the tube keeps `clearance` from its surface to vessels, pleura, fissures and other
+    branches.  Returns a reason, ACCEPTED if there is none.
     """
     labels, geometry = environment.labels, environment.geometry
-    required = radius + clearance
     s = 0.0
     last = 0.0
     while True:
-        x, y, z = point_on_arc(pose, bend, s)
         if trace[PHASE] == IN_LUMEN:
+            x, y, z = point_on_arc(pose, bend, s)
             if label_at(labels, geometry, x, y, z) & LUMEN:
-                step = _lumen_step(environment, trace, x, y, z, radius, required)
-            elif s0 + s == 0.0:
-                return NO_EXIT
-            else:
-                reason = _leave_lumen(environment, tubes, trace, pose, bend, last, s, s0)
-                if reason != ACCEPTED:
-                    return reason
-                s = max(trace[LEFT_AT] - s0, 0.0)
+                if s >= length:
+                    return ACCEPTED
+                last = s
+                s = min(s + _lumen_step(environment, trace, x, y, z, radius, radius + clearance), length)
                 continue
-        else:
-            gap, label = _tissue_gap(environment, trace, x, y, z, required)
-            if gap < MIN_GAP_MM:
-                return REENTERS_LUMEN if label == LUMEN else _reason(label)
-            step = gap
-            if trace[PHASE] == IN_WALL:
-                here = label_at(labels, geometry, x, y, z)
-                if here & LUMEN and (here >> BRANCH_SHIFT) - 1 != int(trace[BRANCH]):
-                    return REENTERS_LUMEN
-                zone = trace[LEFT_AT] + WALL_ZONE_MM - s0
-                if s >= zone:
-                    trace[PHASE] = IN_TISSUE
-                    continue
-                step = min(step, max(zone - s, 1e-6))
-        if s >= length:
-            return ACCEPTED
-        last = s
-        s = min(s + step, length)
+            if s0 + s == 0.0:
+                return NO_EXIT
+            _leave_lumen(environment, tubes, trace, pose, bend, last, s, s0)
+        begin = max(trace[LEFT_AT] - s0, 0.0)
+        if trace[PHASE] == LEAVING:
+            left = trace[LEFT_AT] + CORNER_MM - s0
+            s = _first_in_lumen(environment, pose, bend, begin, min(left, length))
+            if s >= 0.0:
+                trace[PHASE] = IN_LUMEN
+                last = s
+                continue
+            if left > length:
+                reason = _march_beyond(
+                    environment, tubes, trace, pose, bend, s0, begin, length, radius, clearance
+                )
+                if trace[REFUSAL] == ACCEPTED:
+                    trace[REFUSAL] = reason
+                return ACCEPTED
+            if trace[REFUSAL] != ACCEPTED:
+                return int(trace[REFUSAL])
+            trace[PHASE] = IN_WALL
+        return _march_beyond(environment, tubes, trace, pose, bend, s0, begin, length, radius, clearance)
 
 
 @numba.njit(cache=True)

@@ -239,11 +239,14 @@ def toy_tube(
     near = centres[np.linalg.norm(centres - points[last], axis=1) <= 2.5]
     out = points[last] - near.mean(axis=0)
     angle = np.arcsin(out @ frames[last, :3, 2] / np.linalg.norm(out))
+    behind = brute_distance(lung, (lung.labels & structures.AIRWAY) != 0, points[last:-1])
+    radius = np.where(at[last:-1] < outer_mm, tubes.outer.radius_mm, tubes.inner.radius_mm)
     wall_exit = WallExit(
         branch=int(labels[last] >> structures.BRANCH_SHIFT) - 1,
         point_lps=points[last],
         arc_length_mm=float(at[last]),
         wall_angle_rad=float(angle),
+        wall_run_mm=float(np.diff(at[last:])[behind < radius].sum()),
     )
     tube = TubeDeployment(
         rotation_rad=ROTATION_RAD,

@@ -120,7 +120,9 @@ def test_a_run_that_was_interrupted_goes_on(
     small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(random_plans, "PLANS_A_BATCH", 2)
-    monkeypatch.setattr("lungaccess.coupled.explanation.explain", lambda *_: la.NoPlan("No plan", reasons={}))
+    monkeypatch.setattr(
+        "lungaccess.coupled.explanation.explain", lambda *_, **__: la.NoPlan("No plan", reasons={})
+    )
     monkeypatch.setattr(random_plans, "random_system", lambda _rng: la.load_system("ultrathin"))
     files = [tmp_path / name for name in ("at-once.jsonl", "in-parts.jsonl")]
     for file, parts in zip(files, [(4,), (2, 4)], strict=True):

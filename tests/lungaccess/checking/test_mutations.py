@@ -392,6 +392,7 @@ def test_far_away_from_everything(plan: Plan, lung: Any, tools: Any) -> None:
 def test_sweep_understated(plan: Plan, lung: Any, tools: Any, system: Any) -> None:
     """4 mm of the curve leave the scope straightened: the tubes move sideways while the inner advances."""
     outer, inner = plan.tube.outer_insertion_mm, 43.0
+    system = override(system, {"tubes.max_wall_run_mm": 8.0, "name": "wall"})
     longer = tools.toy_plan(lung, system, outer, inner, ((12.0, 0.4, 0.0),))
     sweep = _sweep_by_hand(system, outer, inner)
     assert 0.2 < sweep < system.tubes.max_lateral_sweep_mm

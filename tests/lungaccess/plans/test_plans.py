@@ -43,7 +43,9 @@ def make_plan(values: np.ndarray | None = None, **changes: Any) -> Plan:
             outer_insertion_mm=v[7],
             inner_insertion_mm=v[8],
             lps_from_tip=pose,
-            exit=WallExit(branch=1, point_lps=v[9:12], arc_length_mm=v[12], wall_angle_rad=v[13]),
+            exit=WallExit(
+                branch=1, point_lps=v[9:12], arc_length_mm=v[12], wall_angle_rad=v[13], wall_run_mm=v[14]
+            ),
             lateral_sweep_mm=v[14],
             follow_the_leader_error_mm=v[15],
         ),

@@ -24,7 +24,8 @@ CURVED = 40.0
 
 
 def tubes_of(**changes: float) -> ConcentricTubes:
-    """An outer tube of 1.6 mm, an inner one of 1.2 mm with 40 mm of 40 mm radius."""
+    """An outer tube of 1.6 mm, an inner one of 1.2 mm with 40 mm of 40 mm radius, any run in the wall."""
+    changes.setdefault("max_wall_run_mm", 100.0)
     curved = changes.pop("curved_length_mm", CURVED)
     length = changes.pop("inner_length_mm", 680.0)
     kappa = changes.pop("kappa", KAPPA)

@@ -34,7 +34,7 @@ from experiments.support.mutants.all import mutate
 from experiments.support.mutants.mutant import Case, Mutant
 from experiments.support.mutants.random_plans import plans_of_batch
 from lungaccess.checking import Checker, CheckReport
-from lungaccess.coupled import explain
+from lungaccess.coupled import explanation
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 
@@ -179,7 +179,7 @@ def main() -> None:
     parser.add_argument("--table", type=Path, help="print the table of this file and do nothing else")
     words = parser.parse_args()
     # Why there is no plan takes another atlas, and is not what is attacked.
-    explain.explain = lambda _search, _iterations: la.NoPlan("No plan", reasons={})
+    explanation.explain = lambda *_, **__: la.NoPlan("No plan", reasons={})
     if words.table is not None:
         sys.stdout.write(table(read(words.table)) + "\n")
         return

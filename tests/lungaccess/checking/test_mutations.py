@@ -267,6 +267,9 @@ def test_airway_too_narrow_for_the_scope(plan: Plan, lung: Any, tools: Any) -> N
         ({"tube__exit__branch": 2, "exemption__branch": 2}, "tube.exit.branch"),
         ({"tube__exit__wall_angle_rad": 1.2}, "tube.exit.angle"),
         ({"tube__exit__arc_length_mm": 29.0}, "tube.exit.arc"),
+        ({"tube__exit__wall_run_mm": 1.0}, "tube.wall_run.stated"),
+        ({"tube__exit__wall_run_mm": 4.9}, "tube.wall_run.stated.most"),
+        ({"tube__exit__wall_run_mm": 5.5}, "tube.wall_run.stated_limit"),
         ({"tube__rotation_rad": 0.8}, "tube.tip.position"),
         ({"tube__inner_insertion_mm": 38.5}, "tube.tip.position"),
         ({"tube__outer_insertion_mm": 21.0}, "tube.tip.position"),
@@ -436,6 +439,7 @@ def test_tubes_beyond_their_limits(plan: Plan, lung: Any, tools: Any) -> None:
         ("tubes.max_extension_mm", 37.0, "tube.extension"),
         ("tubes.inner.length_mm", 650.0, "tube.protrusion"),
         ("tubes.min_wall_angle_deg", 40.0, "tube.exit.angle.limit"),
+        ("tubes.max_wall_run_mm", 1.5, "tube.wall_run.limit"),
     ):
         own = override(plan.system, {key: value, "name": "own"})
         assert name in refusals(

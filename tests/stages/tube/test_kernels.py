@@ -203,6 +203,37 @@ class TestExit:
         exact = math.asin(math.sin(KAPPA * found.exit_mm))
         assert math.degrees(found.wall_angle_rad) == pytest.approx(math.degrees(exact), abs=6.0)
 
+    @pytest.mark.parametrize("out_mm", [0.03, 0.09, 0.13, 0.4])
+    def test_a_corner_is_no_exit(self, out_mm: float) -> None:
+        """A wall voxel in the lumen, of which the axis cuts a corner at 45 degrees before it leaves."""
+        canvas = plane_canvas()
+        x, z = canvas.points[..., 0], canvas.points[..., 2]
+        canvas.labels[(np.abs(x + 1.75) < 0.1) & (np.abs(z + 1.75) < 0.1)] &= ~np.uint16(LUMEN)
+        forward = np.array([1.0, 0.0, 1.0]) / math.sqrt(2.0)
+        base = np.array([-5.0, 0.13, -5.5 + out_mm / math.sqrt(2.0)])
+        straight = tubes_of(curved_length_mm=0.0, kappa=0.0)
+        found = validated(canvas.lung(), 12.0, 12.0, base=base, forward=forward, tubes=straight)
+        if out_mm <= kernels.CORNER_MM:
+            assert accepted(found).exit_mm == pytest.approx(5.0 * math.sqrt(2.0), abs=2e-3)
+        else:
+            assert found == REFUSALS["again"]
+
+    @pytest.mark.parametrize("outer_mm", [0.0, 12.0])
+    @pytest.mark.parametrize("angle_deg", [20.0, 45.0, 88.0])
+    def test_run_in_the_wall(self, angle_deg: float, outer_mm: float) -> None:
+        """A straight tube is in a flat wall until its axis is beyond it by its radius."""
+        angle, radius = math.radians(angle_deg), 0.8 if outer_mm else 0.6
+        forward = np.array([math.sin(angle), 0.0, math.cos(angle)])
+        base = np.array([0.0, 0.13, -2.0]) - 4.0 * forward
+        expected = (1.0 + radius) / math.sin(angle)
+        for limit in (expected + 0.1, expected - 0.1):
+            tubes = tubes_of(curved_length_mm=0.0, kappa=0.0, max_wall_run_mm=limit)
+            found = validated(plane_canvas().lung(), outer_mm, 12.0, base=base, forward=forward, tubes=tubes)
+            if limit > expected:
+                assert expected - 1e-6 <= accepted(found).wall_run_mm <= expected + 0.05
+            else:
+                assert found == REFUSALS["wall"]
+
     def test_tip_pose_of_both_tubes(self) -> None:
         found = accepted(validated(plane_canvas().lung(), 12.0, 32.0, rotation=0.2))
         tip = found.lps_from_tip
@@ -229,6 +260,7 @@ REFUSALS = {
     "branch": "the tube comes too near another airway",
     "again": "the tube enters an airway again",
     "flat": "the tube meets the airway wall at too flat an angle",
+    "wall": "the tube runs too far in the wall of the airway that it leaves",
     "none": "the tube does not leave the airway",
     "long": "the tube would extend too far",
     "short": "the inner tube is too short to protrude so far",
@@ -426,6 +458,7 @@ class TestEnumeration:
                         assert row[4] == trace[kernels.BRANCH]
                         assert row[5] == pytest.approx(trace[kernels.LEFT_AT], abs=1e-3)
                         assert row[6] == pytest.approx(trace[kernels.WALL_ANGLE], abs=1e-2)
+                        assert row[7] == pytest.approx(trace[kernels.WALL_RUN], abs=0.1)
         assert count > 100
         assert reasons[kernels.NEAR_VESSEL] > 0
         if tubes is not TUBES:

@@ -67,8 +67,10 @@ def test_tubes_are_clear_behind_the_exit(atlas: la.Atlas, small_lung: Lung) -> N
         )
         assert (gap >= radius + margin - 1e-9).all()
         labels = small_lung.labels[tuple(np.rint(small_lung.grid.ijk(points)).astype(int).T)]
-        assert (labels[s < found.exit_mm[n] - 0.2] & LUMEN).all()
-        assert not (labels[s > found.exit_mm[n] + 1.0] & LUMEN).any()
+        dry = (labels & LUMEN) == 0
+        # Of three samples in a row, 0.1 mm, one is in the lumen before the exit: corners of voxels at most.
+        assert not (dry[2:] & dry[1:-1] & dry[:-2])[s[2:] < found.exit_mm[n]].any()
+        assert dry[s > found.exit_mm[n] + 0.02].all()
 
 
 def test_no_tube_leaves_trachea_or_main_bronchi(atlas: la.Atlas, small_lung: Lung) -> None:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from anatomy.lung import Lung
+from anatomy.typed import Float
 from stages.scope.device import SHORTEST_MM, Bronchoscope
 from stages.scope.kernels.body import motion_room
-from stages.scope.lumen_walls import walls_of
+from stages.scope.kernels.shifting import shifted_tips
+from stages.scope.lumen_walls import kernel_device, walls_of
 from stages.scope.motion import ADVANCE, BEND, ScopeMotion
+from stages.scope.shifting import TipRow, as_shifts
 
 PROOF_STEP_MM = 0.1
 """Longest step of the proof along the body; half of it is lost, far less than a voxel."""
@@ -30,6 +34,7 @@ class MotionProver:
 
     def __init__(self, lung: Lung, scope: Bronchoscope) -> None:
         self._scope, self._walls = scope, walls_of(lung)
+        self._device = kernel_device(scope, math.inf)
 
     def prove(self, motion: ScopeMotion) -> float | str:
         """Prove a motion: return its margin in mm, or say in words why there is no proof.
@@ -41,8 +46,7 @@ class MotionProver:
         wrong = broken_limit(self._scope, motion)
         if wrong:
             return wrong
-        frame = motion.lps_from_entry
-        entry = np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
+        entry = _entry(motion)
         where = np.zeros(1, dtype=np.int64)
         room = motion_room(
             self._walls,
@@ -57,6 +61,26 @@ class MotionProver:
         if room < 0.0:
             return f"the scope is not proved to be free of the wall from state {int(where[0])} on"
         return max(float(room) - 0.5 * PROOF_STEP_MM, 0.0)
+
+    def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> TipRow:
+        """Return tips along the motion to one of them, and which of their motions are proved.
+
+        Parameters
+        ----------
+        motion : ScopeMotion
+            A proved one.
+        shifts_mm : (K,) float64
+            How much farther the base stops, see `stages.scope.shifting.shifted`.
+        """
+        shifts = as_shifts(shifts_mm)
+        tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
+        shifted_tips(self._walls, self._device, _entry(motion), motion.states, shifts, tips, rooms)
+        return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=(rooms >= 0.0) | (shifts == 0.0))
+
+
+def _entry(motion: ScopeMotion) -> Float:
+    frame = motion.lps_from_entry
+    return np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
 
 
 def broken_limit(scope: Bronchoscope, motion: ScopeMotion) -> str:

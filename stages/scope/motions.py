@@ -16,6 +16,7 @@ from stages.scope.kernels import growth as kernel
 from stages.scope.kernels import turning
 from stages.scope.lumen_walls import kernel_device, walls_of
 from stages.scope.motion import ScopeMotion
+from stages.scope.motion_steps import State, slide, turn
 from stages.scope.passages import Passages, find_passages
 from stages.scope.tip_region import in_tip_region
 
@@ -86,13 +87,13 @@ class ScopeMotions:
         chain = [int(self.state[tip])]
         while tree.parent[chain[-1]] >= 0:
             chain.append(int(tree.parent[chain[-1]]))
-        rows: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
+        rows: list[State] = [(0.0, 0.0, 0.0)]
         for node in chain[-2::-1]:
             twist, bend = tree.states[node, kernel.TWIST], tree.states[node, kernel.BEND]
-            _turn(rows, float(twist), float(bend), bool(tree.by_straight[node]))
-            _advance(rows, float(tree.advance_mm[node]))
+            turn(rows, float(twist), float(bend), bool(tree.by_straight[node]))
+            slide(rows, float(tree.advance_mm[node]))
         twist, bend, straight = self.settings[tip].tolist()
-        _turn(rows, twist, bend, straight > 0.0)
+        turn(rows, twist, bend, straight > 0.0)
         return ScopeMotion(
             lps_from_entry=self.lps_from_entry,
             states=np.array(rows),
@@ -117,25 +118,6 @@ class ScopeMotions:
 
 
 MM_AS_ANGLE_RAD = math.radians(10.0)
-
-
-def _turn(rows: list[tuple[float, float, float]], twist: float, bend: float, by_straight: bool) -> None:
-    advance, twist_before, bend_before = rows[-1]
-    if (twist, bend) == (twist_before, bend_before):
-        return
-    if by_straight and bend_before != 0.0:
-        rows.append((advance, twist_before, 0.0))
-    if by_straight and twist != twist_before and bend != 0.0:
-        rows.append((advance, twist, 0.0))
-    rows.append((advance, twist, bend))
-
-
-def _advance(rows: list[tuple[float, float, float]], advance_mm: float) -> None:
-    """Advance with twist and bend held; one advance goes on with the one before."""
-    _, twist, bend = rows[-1]
-    if len(rows) > 1 and rows[-2][1:] == (twist, bend):
-        rows.pop()
-    rows.append((advance_mm, twist, bend))
 
 
 def _no_tip() -> Exception:

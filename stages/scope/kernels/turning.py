@@ -9,6 +9,7 @@ import numpy as np
 
 from stages.scope.kernels.body import move_along, nearest_setting, turn_room
 from stages.scope.kernels.growth import BEND, ROOM, TWIST, U, V
+from stages.scope.kernels.shifting import put_tip
 
 
 @numba.njit(cache=True)
@@ -71,11 +72,5 @@ def tip_frames(length, states, tips):
     out = np.zeros((tips.shape[0], 9))
     scratch = np.zeros(12)
     for t in range(tips.shape[0]):
-        move_along(states[t], tips[t, 6], tips[t, 7], length, scratch)
-        cosine = math.cos(tips[t, 8])
-        sine = math.sin(tips[t, 8])
-        for k in range(3):
-            out[t, k] = scratch[9 + k]
-            out[t, 3 + k] = scratch[6 + k]
-            out[t, 6 + k] = cosine * scratch[k] + sine * scratch[3 + k]
+        put_tip(states[t], tips[t, 8], tips[t, 9], length, out[t], scratch)
     return out

@@ -9,7 +9,15 @@ import pytest
 
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN, VESSEL
-from stages.scope import Bronchoscope, ScopeMotion, ScopeMotions, find_motions, prove_motion
+from stages.scope import (
+    Bronchoscope,
+    MotionProver,
+    ScopeMotion,
+    ScopeMotions,
+    evenly,
+    find_motions,
+    prove_motion,
+)
 from stages.scope.tip_region import in_tip_region
 from tests.stages.scenes import brute_clearance
 from tests.stages.scope.airways import forked_lung
@@ -137,6 +145,28 @@ def test_a_thick_scope_gets_nowhere(lung: Lung) -> None:
 
     found = find_motions(lung, replace(SCOPE, outer_diameter_mm=15.0), reach_mm=60.0)
     assert found.count == 0 and found.tips.shape == (0, 9)
+
+
+def test_a_row_of_tips_along_a_motion(lung: Lung, motions: ScopeMotions) -> None:
+    """Every tip that the row calls proved has a motion that the proof of single motions accepts."""
+    prover, seen = MotionProver(lung, SCOPE), 0
+    for tip in range(0, motions.count, max(motions.count // 12, 1)):
+        motion = motions.motion(tip)
+        row = prover.row(motion, evenly(0.5, 3.0))
+        home = row.shifts_mm.tolist().index(0.0)
+        assert np.allclose(row.tips[home], motions.tips[tip]) and row.proved[home]
+        for k in np.flatnonzero(row.proved):
+            moved = row.motion_to(int(k))
+            frame = moved.lps_from_tip
+            assert np.allclose(row.tips[k], np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]]))
+            assert isinstance(prover.prove(moved), float)
+            seen += 1
+    assert seen > 60
+
+
+def test_the_tip_nearest_to_a_measured_pose(motions: ScopeMotions) -> None:
+    pose = motions.tips[motions.count // 2]
+    assert motions.nearest(pose[:3] + [0.01, 0.0, 0.0], pose[3:6]) == motions.count // 2
 
 
 @pytest.mark.parametrize("fault", ["bend", "advance", "both", "back", "shaft", "length", "wall"])

@@ -27,7 +27,7 @@ LEAST_ROOM_MM = 0.3
 """The room beside the axis counts at least so much, half a voxel: costs stay finite where it is narrow."""
 START_MM = 30.0
 """The first straight section may begin so far down the trachea."""
-TURNED_A_LAYER = 8
+TURNED_A_LAYER = 16
 """States of a layer from which tips are turned, spread over those that it keeps, the best among them."""
 FROM_FORK = (2.0, 4.0)
 """Motions into a branch part from those into others so many lengths of the section before the fork."""
@@ -56,6 +56,30 @@ class StateTree:
     by_straight: Bool
     advance_mm: Float
     turned_from: Int
+
+    def only(self, needed: Int) -> tuple[StateTree, Int]:
+        """Return the states on the ways to some of them, and the new numbers of those.
+
+        Parameters
+        ----------
+        needed : (S,) int64
+            Numbers of states.
+        """
+        keep = np.zeros(len(self.parent), dtype=np.bool_)
+        keep[needed] = True
+        keep[:1] = True
+        for state in range(len(self.parent) - 1, 0, -1):
+            if keep[state]:
+                keep[self.parent[state]] = True
+        number = np.cumsum(keep) - 1
+        parent = self.parent[keep]
+        return StateTree(
+            states=self.states[keep],
+            parent=np.where(parent >= 0, number[parent], -1),
+            by_straight=self.by_straight[keep],
+            advance_mm=self.advance_mm[keep],
+            turned_from=number[self.turned_from[keep[self.turned_from]]],
+        ), number[needed]
 
 
 class Growth:

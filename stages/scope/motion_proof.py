@@ -14,7 +14,9 @@ from stages.scope.kernels.body import motion_room
 from stages.scope.kernels.shifting import shifted_tips
 from stages.scope.lumen_walls import kernel_device, walls_of
 from stages.scope.motion import ADVANCE, BEND, ScopeMotion
+from stages.scope.passages import find_passages
 from stages.scope.shifting import TipRow, as_shifts
+from stages.scope.tip_region import in_tip_region
 
 PROOF_STEP_MM = 0.1
 """Longest step of the proof along the body; half of it is lost, far less than a voxel."""
@@ -34,7 +36,8 @@ class MotionProver:
 
     def __init__(self, lung: Lung, scope: Bronchoscope) -> None:
         self._scope, self._walls = scope, walls_of(lung)
-        self._device = kernel_device(scope, math.inf)
+        self._device, self._tree = kernel_device(scope, math.inf), lung.tree
+        self._passable = find_passages(lung, scope, reach_mm=0.0).passable
 
     def prove(self, motion: ScopeMotion) -> float | str:
         """Prove a motion: return its margin in mm, or say in words why there is no proof.
@@ -63,7 +66,10 @@ class MotionProver:
         return max(float(room) - 0.5 * PROOF_STEP_MM, 0.0)
 
     def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> TipRow:
-        """Return tips along the motion to one of them, and which of their motions are proved.
+        """Return tips along the motion to one of them, and which of them may be tips of a plan.
+
+        Those have a proved motion, lie in the region of scope tips, and near a tree point that the scope
+        passes, as all tips of `find_motions` do.
 
         Parameters
         ----------
@@ -75,7 +81,9 @@ class MotionProver:
         shifts = as_shifts(shifts_mm)
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
         shifted_tips(self._walls, self._device, _entry(motion), motion.states, shifts, tips, rooms)
-        return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=(rooms >= 0.0) | (shifts == 0.0))
+        nearest, inside = in_tip_region(self._tree, tips)
+        proved = (rooms >= 0.0) & inside & self._passable[nearest]
+        return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=proved | (shifts == 0.0))
 
 
 def _entry(motion: ScopeMotion) -> Float:

@@ -237,6 +237,7 @@ class _Tips:
     def motions(self, kept: Int, rooms: Float) -> ScopeMotions:
         """Return the record."""
         tips, source = self._tips[kept], self._source[kept]
+        states, number = self._states.only(source)
         frames = turning.tip_frames(self._device.length, self._states.states[source], tips)
         entry = np.eye(4)
         if len(self._states.states):
@@ -251,10 +252,10 @@ class _Tips:
             turned=np.arange(len(kept)) >= self._straight,
             room_mm=rooms,
             max_curvature_per_mm=curvature,
-            state=source,
+            state=number,
             settings=tips[:, 8:11],
             lps_from_entry=entry,
-            states=self._states,
+            states=states,
             bending_length_mm=self._device.length,
             passages=self._passages,
         )

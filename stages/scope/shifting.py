@@ -27,7 +27,7 @@ class TipRow:
     tips : (K, 9) float64
         Point, direction, and +x of the working channel's frame, LPS mm.
     proved : (K,) bool
-        Whether the motion to the tip is proved.
+        Whether the motion to the tip is proved, and the tip where tips of plans may be.
     """
 
     motion: ScopeMotion

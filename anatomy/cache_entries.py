@@ -26,10 +26,11 @@ from anatomy.records import frozen_value
 
 ABANDONED_AFTER_DAYS = 1.0
 """No anatomy takes so long to prepare: what is older and unfinished was left behind."""
-ATLAS_PATTERN = re.compile(r"atlas-[0-9a-f]{64}\.npz")
+ARRAYS_PATTERN = re.compile(r"(atlas|shapes)-[0-9a-f]{64}\.npz")
+"""Files of arrays: deployment atlases, and the shapes of tubes."""
 KEY_PATTERN = re.compile(r"[0-9a-f]{24}")
 UNFINISHED_PATTERN = re.compile(
-    rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}-{ATLAS_PATTERN.pattern}"
+    rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}-{ARRAYS_PATTERN.pattern}"
 )
 SECONDS_PER_DAY = 24 * 3600.0
 
@@ -41,9 +42,9 @@ class CacheEntry:
     Parameters
     ----------
     path : Path
-        A folder, or the file of an atlas.
+        A folder, or the file of an atlas or of shapes.
     kind : str
-        "anatomy", "atlas", or "unfinished" for what is being written or was left behind.
+        "anatomy", "atlas", "shapes", or "unfinished" for what is being written or was left behind.
     patient : str
         Whose it is; empty if it does not say so.
     size_bytes : int
@@ -103,12 +104,12 @@ def _entry(path: Path, formats: Mapping[str, int]) -> CacheEntry | None:
             stated = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
         used = told.stat().st_mtime if told.is_file() else path.stat().st_mtime
         return _made(path, "anatomy", stated, used, formats)
-    if ATLAS_PATTERN.fullmatch(path.name):
-        return _made(path, "atlas", _atlas_header(path), path.stat().st_mtime, formats)
+    if arrays := ARRAYS_PATTERN.fullmatch(path.name):
+        return _made(path, arrays[1], _header(path), path.stat().st_mtime, formats)
     return None
 
 
-def _atlas_header(path: Path) -> dict[str, Any]:
+def _header(path: Path) -> dict[str, Any]:
     with contextlib.suppress(ValueError, KeyError, EOFError, BadZipFile), np.load(path) as stored:
         return dict(json.loads(str(stored["rest"])))
     return {}

@@ -13,6 +13,7 @@ from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.tube.equilibrium import Equilibrium
 from stages.tube.errors import ConvergenceError
+from stages.tube.kernels.shapes import LARGEST_STRAY_RAD, SAME_BRANCH_RAD, UNSUSPICIOUS_RAD
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.sequences import Sequence, joint_steps
 
@@ -24,11 +25,6 @@ SAMPLE_MM = 0.25
 TRACK_SPACING_MM = 0.1
 """Spacing of the final centreline, which is taken to be straight in between: good to 1e-4 mm."""
 
-LARGEST_STRAY_RAD = 0.1
-"""Largest difference between the turns of tips and bases in one step."""
-UNSUSPICIOUS_RAD = 0.02
-"""A smaller difference cannot be a jump that matters."""
-SAME_BRANCH_RAD = 1e-6
 HALVINGS = 12
 """How often a step is halved before its branch of equilibria is said to end there."""
 

@@ -27,7 +27,7 @@ cache = App(
 
 @cache.default
 def show(*, output: PatientOptions = PatientOptions()) -> ExitCode:
-    """List prepared anatomies, their pictures, and deployment atlases, the least recently used first."""
+    """List prepared anatomies, their pictures, atlases and shapes of tubes, the least recently used first."""
     folder = output.cache or default_cache()
     entries, limit = _entries(folder), cache_limit_bytes()
     size = sum(entry.size_bytes for entry in entries)
@@ -75,8 +75,9 @@ def _entries(folder: Path) -> tuple[CacheEntry, ...]:
     from anatomy.build import FORMAT
     from anatomy.cache_entries import cache_entries
     from lungaccess.coupled.atlas_store import FORMAT as ATLAS_FORMAT
+    from stages.tube.shape_store import FORMAT as SHAPES_FORMAT
 
-    return cache_entries(folder, {"anatomy": FORMAT, "atlas": ATLAS_FORMAT})
+    return cache_entries(folder, {"anatomy": FORMAT, "atlas": ATLAS_FORMAT, "shapes": SHAPES_FORMAT})
 
 
 def _remove(entries: Iterable[CacheEntry], output: PatientOptions) -> ExitCode:

@@ -207,7 +207,7 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
 
 
 @inner_kernel
-def _newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, enough):
+def newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, enough):
     """Let Newton's method find tip angles for base angles from a guess; return the last error, rad.
 
     It stops where the error is below `enough`.
@@ -234,7 +234,7 @@ def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_ang
         share = min(done + stride, 1.0)
         eased = (pieces, math.sqrt(share) * moments, directions, count)
         enough = TOLERANCE if share == 1.0 else NEAR_ENOUGH
-        worst = _newton(
+        worst = newton(
             design, eased, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, enough
         )
         if worst < enough:
@@ -262,7 +262,7 @@ def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, t
             if i < n - 1:
                 tip_angles[i] += 2.0 * math.pi * (code % ROUND) / ROUND
                 code //= ROUND
-        worst = _newton(
+        worst = newton(
             design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, TOLERANCE
         )
         if worst < TOLERANCE:
@@ -287,7 +287,7 @@ def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stab
     """
     last = beta.shape[0] - 1
     matrix, right = np.zeros((last, last)), np.zeros(last)
-    worst = _newton(
+    worst = newton(
         design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, TOLERANCE
     )
     least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf

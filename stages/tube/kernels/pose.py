@@ -79,7 +79,7 @@ def turned(pose, angle, out):
 
 
 @inner_kernel
-def _curvature(cutting, k, share, h, psi, rate, at):
+def curvature(cutting, k, share, h, psi, rate, at):
     """Return the curvature (x, y) of the centreline at a share of the step ahead of node `at`, 1/mm.
 
     It is in the Bishop frame; angles within the step lie on the cubic through angles and rates at its ends.
@@ -127,8 +127,8 @@ def step_of(cutting, nodes, steps, at, begin, end, twist, out):
         twist[0] = twist[1] = twist[2] = twist[3] = twist[4] = 0.0
         twist[5] = h
     else:
-        ux1, uy1 = _curvature(cutting, k, begin + GAUSS * (end - begin), lengths[at], psi, rate, at)
-        ux2, uy2 = _curvature(cutting, k, end - GAUSS * (end - begin), lengths[at], psi, rate, at)
+        ux1, uy1 = curvature(cutting, k, begin + GAUSS * (end - begin), lengths[at], psi, rate, at)
+        ux2, uy2 = curvature(cutting, k, end - GAUSS * (end - begin), lengths[at], psi, rate, at)
         c = COMMUTATOR * h * h
         twist[0] = 0.5 * h * (ux1 + ux2)
         twist[1] = 0.5 * h * (uy1 + uy2)

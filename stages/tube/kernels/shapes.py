@@ -1,0 +1,378 @@
+"""All deployments of one design with given rotations of the rear ends, in the frame of the scope tip.
+
+Every deployment is one step of insertion beyond another, its parent: all tubes go out with flush tips, and
+each stops at its own insertion.  So the sequence to a deployment is the chain of its parents, and its
+equilibrium is followed from that of its parent.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
+from anatomy.kernels.compiling import inner_kernel
+from stages.tube.kernels.assembly import BENT, FAR, NEAR, PIECE_COLUMNS, cut
+from stages.tube.kernels.equilibrium import TOLERANCE, least_determinant, newton, scratch_for
+from stages.tube.kernels.pose import GAUSS, curvature, frames_at, lay
+
+LARGEST_STRAY_RAD = 0.1
+"""Largest turn of a tip against its rear end in one step."""
+UNSUSPICIOUS_RAD = 0.02
+"""A smaller turn cannot be a jump that matters."""
+SAME_BRANCH_RAD = 1e-6
+LEAST_SHARE = 2.0**-12
+"""Of a step, by which its branch of equilibria is said to end."""
+ARC_ERROR_MM = 0.005
+"""Wanted error of each arc that replaces a piece of changing curvature: far below the margins of plans."""
+MOST_ARCS = 12
+"""In which a piece is cut at most; what error remains is stated."""
+
+# Columns of an arc: length in mm; direction of its bend about the tangent, from +x of the frame that is
+# carried along without turning; curvature; radius of the outermost tube.
+LENGTH, DIRECTION, CURVATURE, RADIUS, ARC_COLUMNS = range(5)
+# Columns of a result: the least determinant and the largest strain up to a deployment, sweep, error of
+# following the leader, error of the arcs, length beyond the scope, and the tip frame as a pose.
+LEAST, STRAIN, SWEEP, LEADER, ERROR, EXTENSION, TIP, SHAPE_COLUMNS = 0, 1, 2, 3, 4, 5, 6, 18
+
+
+@inner_kernel
+def _settled(design, base_angles, beta, step, tip_angles):
+    """Solve from a guess; return the error of the base angles, the cutting, nodes and steps."""
+    n = beta.shape[0]
+    last = n - 1
+    most = 1 + n + 2 * design[2].shape[0]
+    pieces, moments, directions = np.zeros((most, PIECE_COLUMNS)), np.zeros((most, n)), np.zeros((most, n))
+    count, n_steps = cut(design, beta, step, pieces, moments, directions)
+    cutting = (pieces, moments, directions, count)
+    nodes, steps = scratch_for(n_steps, n, last)
+    matrix, right = np.zeros((last, last)), np.zeros(last)
+    worst = newton(
+        design, cutting, base_angles, beta, -1 - np.arange(last), nodes, steps, tip_angles, matrix, right,
+        TOLERANCE,
+    )  # fmt: skip
+    return worst, cutting, nodes, steps
+
+
+@inner_kernel
+def _largest(one, other):
+    worst = 0.0
+    for i in range(one.shape[0]):
+        worst = max(worst, abs(one[i] - other[i]))
+    return worst
+
+
+@inner_kernel
+def _reach(design, base_angles, begin, end, step, tip_angles):
+    """Follow a branch of stable equilibria from rear ends `begin` to `end`, in smaller steps where needed.
+
+    `tip_angles` are those at `begin` and become those at `end`.  Returns the least determinant on the way, 0
+    or less if the branch ends there; and cutting, nodes and steps at `end`.
+    """
+    done, stride, least = 0.0, 1.0, 1.0
+    tips, back = tip_angles.copy(), tip_angles.copy()
+    worst, cutting, nodes, steps = _settled(design, base_angles, end, step, tips)
+    while True:
+        share = min(done + stride, 1.0)
+        here = worst < TOLERANCE
+        determinant = least_determinant(nodes, begin + share * (end - begin)) if here else -math.inf
+        stray = _largest(tips, tip_angles)
+        here = here and determinant > 0.0 and stray <= LARGEST_STRAY_RAD
+        if here and stray > UNSUSPICIOUS_RAD:
+            back[:] = tips
+            worst = _settled(design, base_angles, begin + done * (end - begin), step, back)[0]
+            here = worst < TOLERANCE and _largest(back, tip_angles) <= SAME_BRANCH_RAD
+        if here:
+            done = share
+            tip_angles[:] = tips
+            least = min(least, determinant)
+            if done == 1.0:
+                return least, cutting, nodes, steps
+        else:
+            stride *= 0.5
+            if stride < LEAST_SHARE:
+                return min(determinant, 0.0), cutting, nodes, steps
+            tips[:] = tip_angles
+        beta = begin + min(done + stride, 1.0) * (end - begin)
+        worst, cutting, nodes, steps = _settled(design, base_angles, beta, step, tips)
+
+
+@inner_kernel
+def _largest_strain(design, radii, beta, cutting, nodes, steps):
+    """Return the largest strain of bending ahead of the scope tip."""
+    pieces, moments, directions, _count = cutting
+    psi, rate = nodes[1], nodes[2]
+    worst = 0.0
+    for at in range(steps[0].shape[0]):
+        k = steps[2][at]
+        middle = 0.5 * (pieces[k, NEAR] + pieces[k, FAR])
+        for end in range(2):
+            x, y = curvature(cutting, k, float(end), steps[0][at], psi, rate, at)
+            for i in range(radii.shape[0]):
+                if beta[i] + design[1][i] < middle:
+                    continue
+                own = moments[k, i] / design[0][i, 0]
+                angle = psi[at + end, i] + directions[k, i]
+                off = math.hypot(x - own * math.cos(angle), y - own * math.sin(angle))
+                worst = max(worst, radii[i] * off)
+    return worst
+
+
+@inner_kernel
+def _mean_curvature(cutting, nodes, steps, k, begin, end):
+    """Return the mean curvature (x, y) of piece `k` between two arc lengths."""
+    s, psi, rate, _dpsi, _drate = nodes
+    x = y = 0.0
+    for share in (GAUSS, 1.0 - GAUSS):
+        at_mm = begin + share * (end - begin)
+        at = min(max(np.searchsorted(s, at_mm, "right") - 1, 0), steps[0].shape[0] - 1)
+        h = steps[0][at]
+        u, v = curvature(cutting, k, (at_mm - s[at]) / h, h, psi, rate, at)
+        x += 0.5 * u
+        y += 0.5 * v
+    return x, y
+
+
+@inner_kernel
+def _changes(cutting, nodes, steps, k):
+    """Return by how much the curvature vector changes along piece `k`, at most, and its size there."""
+    psi, rate = nodes[1], nodes[2]
+    changed, size = 0.0, 0.0
+    for at in range(steps[0].shape[0]):
+        if steps[2][at] == k:
+            x0, y0 = curvature(cutting, k, 0.0, steps[0][at], psi, rate, at)
+            x1, y1 = curvature(cutting, k, 1.0, steps[0][at], psi, rate, at)
+            changed += math.hypot(x1 - x0, y1 - y0)
+            size = max(size, math.hypot(x0, y0), math.hypot(x1, y1))
+    return changed, size
+
+
+@inner_kernel
+def _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places):
+    """Write the arcs of a deployment to `arcs`, from row `first` on.
+
+    Fills `places` (rows, 4) with arc length and point of their ends and middles.  Returns the number of arcs,
+    -1 if there is no room, and the largest error between two places.
+    """
+    pieces, _moments, _directions, count = cutting
+    pose, across = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+    number, between = 0, 0.0
+    for k in range(count):
+        length = pieces[k, FAR] - pieces[k, NEAR]
+        changed = _changes(cutting, nodes, steps, k)[0] if pieces[k, BENT] > 0.0 else 0.0
+        # An arc in place of curvature that changes steadily by c over h mm strays by c h^2 / 12.
+        share = math.ceil((changed * length * length / (12.0 * ARC_ERROR_MM)) ** (1.0 / 3.0))
+        cuts = min(max(int(share), 1), MOST_ARCS)
+        h = length / cuts
+        between = max(between, changed / cuts * h * h / 64.0)
+        outermost = 0
+        for i in range(radii.shape[0]):
+            if beta[i] + design[1][i] > 0.5 * (pieces[k, NEAR] + pieces[k, FAR]):
+                outermost = i
+        for m in range(cuts):
+            begin = pieces[k, NEAR] + m * h
+            if first + number >= arcs.shape[0] or 2 * number + 1 >= places.shape[0]:
+                return -1, between
+            x, y = 0.0, 0.0
+            if pieces[k, BENT] > 0.0:
+                x, y = _mean_curvature(cutting, nodes, steps, k, begin, begin + h)
+            kappa, direction = math.hypot(x, y), math.atan2(-x, y) if x != 0.0 or y != 0.0 else 0.0
+            arc = arcs[first + number]
+            arc[LENGTH], arc[DIRECTION], arc[CURVATURE], arc[RADIUS] = h, direction, kappa, radii[outermost]
+            bend = bend_towards(pose, across, direction, kappa)
+            for part in range(1, 3):
+                place = places[2 * number + part - 1]
+                place[0] = begin + 0.5 * part * h
+                place[1], place[2], place[3] = point_on_arc(pose, bend, 0.5 * part * h)
+            pose, across = carried(pose, across, bend, direction, h)
+            number += 1
+    return number, between
+
+
+@inner_kernel
+def bend_towards(pose, across, direction, kappa):
+    """Return the bend of an arc towards a direction about the tangent, counted from the normal `across`."""
+    _x, _y, _z, tx, ty, tz = pose
+    c, s = math.cos(direction), math.sin(direction)
+    ax, ay, az = across
+    bx, by, bz = ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax
+    return kappa, c * ax + s * bx, c * ay + s * by, c * az + s * bz
+
+
+@inner_kernel
+def carried(pose, across, bend, direction, length):
+    """Return pose and normal `across` at the end of an arc; the normal is carried without turning."""
+    after = pose_on_arc(pose, bend, length)
+    nx, ny, nz = normal_on_arc(pose, bend, length)
+    _x, _y, _z, tx, ty, tz = after
+    c, s = math.cos(direction), math.sin(direction)
+    # The normal of the arc is `across` turned by the direction about the tangent; so back.
+    bx, by, bz = ty * nz - tz * ny, tz * nx - tx * nz, tx * ny - ty * nx
+    return after, (c * nx - s * bx, c * ny - s * by, c * nz - s * bz)
+
+
+@inner_kernel
+def _apart(bodies, one, other, j):
+    x = bodies[one, j, 0] - bodies[other, j, 0]
+    y = bodies[one, j, 1] - bodies[other, j, 1]
+    z = bodies[one, j, 2] - bodies[other, j, 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@inner_kernel
+def _bow(bodies, a, i, b, j, c, k):
+    """Return the size of the second difference of three points."""
+    total = 0.0
+    for m in range(3):
+        bow = bodies[a, i, m] - 2.0 * bodies[b, j, m] + bodies[c, k, m]
+        total += bow * bow
+    return math.sqrt(total)
+
+
+@inner_kernel
+def _off_track(bodies, other, j, final, last):
+    """Return the distance of a point of a body to the final one, a polyline, near the same arc length."""
+    best = math.inf
+    for e in range(max(j - 3, 0), min(j + 3, last)):
+        along, off, long2, gap2 = 0.0, 0.0, 0.0, 0.0
+        for m in range(3):
+            a = bodies[final, e + 1, m] - bodies[final, e, m]
+            d = bodies[other, j, m] - bodies[final, e, m]
+            along += a * d
+            long2 += a * a
+            gap2 += d * d
+        share = min(max(along / long2, 0.0), 1.0)
+        off = gap2 - 2.0 * share * along + share * share * long2
+        best = min(best, off)
+    return math.sqrt(max(best, 0.0))
+
+
+@inner_kernel
+def _diagonal_bow(bodies, states, parents, state):
+    """Return the largest second difference, along the body, of how far points stray when the tip is there."""
+    worst = 0.0
+    ahead, at = state, parents[state]
+    while at >= 0 and parents[at] >= 0:
+        behind, j = parents[at], states[at, 0]
+        total = 0.0
+        for m in range(3):
+            bow = bodies[ahead, j + 1, m] - 2.0 * bodies[at, j, m] + bodies[behind, j - 1, m]
+            bow -= bodies[state, j + 1, m] - 2.0 * bodies[state, j, m] + bodies[state, j - 1, m]
+            total += bow * bow
+        worst = max(worst, math.sqrt(total))
+        ahead, at = at, behind
+    return worst
+
+
+@inner_kernel
+def _sweep(bodies, states, parents, state, sagitta):
+    """Return how far the body was from its final place, and from its final track, at any step.
+
+    Points and steps are stops apart; what lies between is bounded by second differences: between three
+    places a smooth curve strays from their chords by an eighth of it, and a kink by a quarter.
+    """
+    sweep = leader = bow = 0.0
+    at = parents[state]
+    later, latest = state, -1
+    while at >= 0:
+        for j in range(1, states[at, 0] + 1):
+            apart = _apart(bodies, at, state, j)
+            sweep = max(sweep, apart)
+            if apart > leader:
+                off = _off_track(bodies, at, j, state, states[state, 0]) + sagitta
+                leader = max(leader, min(apart, off))
+            if latest >= 0:
+                bow = max(bow, _bow(bodies, at, j, later, j, latest, j))
+        later, latest, at = at, later, parents[at]
+    bow = 0.25 * max(bow, _diagonal_bow(bodies, states, parents, state))
+    return sweep + bow, leader + bow
+
+
+@numba.njit(cache=True, nogil=True)
+def follow_all(design, radii, base_angles, stops, states, parents, step, results, first, arcs):
+    """Follow all deployments with given rotations of the rear ends.
+
+    Parameters
+    ----------
+    design : tuple
+        See `assembly`.
+    radii, base_angles : (n,) float64
+        Outer radius of each tube, mm, and rotation of its rear end, rad.
+    stops : (K,) float64
+        Insertions, rising from 0, mm.
+    states : (S, n) int64
+        Deployments as indices of stops, not rising from the innermost tube on; the first is all 0.
+    parents : (S,) int64
+        Of each the deployment one stop before, -1 for the first; it is listed before.
+    step : float
+        See `assembly.cut`.
+    results : (S, SHAPE_COLUMNS) float64
+        Is filled; a least determinant of 0 or less says that the tubes snap on the way.
+    first : (S + 1,) int64
+        Is filled: where the arcs of each deployment begin in `arcs`.
+    arcs : (rows, ARC_COLUMNS) float64
+        Is filled.
+
+    Returns
+    -------
+    int
+        Number of arcs, -1 if there is no room for them.
+    """
+    n_states, n = states.shape
+    n_stops = stops.shape[0]
+    bodies = np.zeros((n_states, n_stops, 3))
+    tips = np.zeros((n_states, n))
+    found, angles, rates = np.zeros((n_stops, 12)), np.zeros((n_stops, n)), np.zeros((n_stops, n))
+    places = np.zeros((2 * MOST_ARCS * (1 + n + 2 * design[2].shape[0]), 4))
+    at_places, more_angles = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n))
+    more_rates = np.zeros((places.shape[0], n))
+    tips[0] = base_angles
+    results[0] = 0.0
+    results[0, LEAST] = 1.0
+    for b in range(design[2].shape[0]):
+        results[0, STRAIN] = max(results[0, STRAIN], radii[int(design[2][b, 0])] * design[2][b, 3])
+    for m in (0, 4, 8):
+        results[0, TIP + m] = 1.0
+    sagitta = 0.0
+    first[0] = first[1] = 0
+    for state in range(1, n_states):
+        parent = parents[state]
+        first[state + 1] = first[state]
+        results[state] = results[parent]
+        results[state, EXTENSION] = stops[states[state, 0]]
+        if results[parent, LEAST] <= 0.0:
+            continue
+        begin, end = stops[states[parent]] - design[1], stops[states[state]] - design[1]
+        tips[state] = tips[parent]
+        least, cutting, nodes, steps = _reach(design, base_angles, begin, end, step, tips[state])
+        results[state, LEAST] = min(results[parent, LEAST], least)
+        if least <= 0.0:
+            continue
+        poses = np.zeros((steps[0].shape[0] + 1, 12))
+        lay(cutting, nodes, steps, poses)
+        results[state, TIP:] = poses[-1]
+        out = states[state, 0] + 1
+        frames_at(cutting, nodes, steps, poses, stops[:out], found, angles, rates)
+        bodies[state, :out] = found[:out, 9:]
+        strain = _largest_strain(design, radii, end, cutting, nodes, steps)
+        results[state, STRAIN] = max(results[parent, STRAIN], strain)
+        number, between = _lay_arcs(design, radii, end, cutting, nodes, steps, arcs, first[state], places)
+        if number < 0:
+            return -1
+        first[state + 1] += number
+        frames_at(cutting, nodes, steps, poses, places[: 2 * number, 0], at_places, more_angles, more_rates)
+        worst = 0.0
+        for m in range(2 * number):
+            off = 0.0
+            for axis in range(3):
+                off += (at_places[m, 9 + axis] - places[m, 1 + axis]) ** 2
+            worst = max(worst, off)
+        results[state, ERROR] = math.sqrt(worst) + between
+        bent = 0.0
+        for m in range(first[state], first[state + 1]):
+            bent = max(bent, arcs[m, CURVATURE])
+        sagitta = max(sagitta, bent * (stops[1] - stops[0]) ** 2 / 8.0)
+        results[state, SWEEP], results[state, LEADER] = _sweep(bodies, states, parents, state, sagitta)
+    return first[n_states]

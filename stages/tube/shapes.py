@@ -1,0 +1,257 @@
+"""All deployments of a design in the frame of the scope tip: their shapes, and what it takes to get there.
+
+They do not depend on the patient, who only decides where the scope tip is and how all tubes together are
+turned about it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Annotated
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.grid import read_only
+from anatomy.records import frozen_record
+from anatomy.settings import quantity, settings
+from anatomy.typed import Float, Int
+from stages.tube.device import Tube
+from stages.tube.equilibrium import matrices
+from stages.tube.kernels import shapes as kernel
+from stages.tube.mechanics import TubeMechanics
+from stages.tube.nesting import SAME_MM
+
+THREADS = 2
+"""The kernel runs without the interpreter's lock."""
+BEND_RAD = 0.5 * math.pi
+"""Base angle at which a tube bends towards +x of the scope tip."""
+SNAPS = "the tubes would snap on the way"
+SWEEPS = "the tubes would sweep tissue sideways"
+STRAINS = "a tube would be strained too much"
+ARCS_A_DEPLOYMENT = 16
+"""Room for arcs at first; it is doubled where that is too little."""
+
+
+@settings
+class ShapeLimits:
+    """What a deployment may do, whatever the patient."""
+
+    max_extension_mm: Annotated[
+        float, quantity("largest extension beyond the tip of the scope", above=0.0, at_most=300.0)
+    ] = 60.0
+    max_lateral_sweep_mm: Annotated[
+        float, quantity("largest sideways motion of the tubes in tissue", at_least=0.0, at_most=20.0)
+    ] = 1.0
+    max_strain: Annotated[float, quantity("largest strain of the material", above=0.0, at_most=0.1)] = 0.04
+
+
+@settings
+class ShapeGrid:
+    """Which deployments are looked at.
+
+    All tubes stop at multiples of `stop_mm`, or a little less or more, so that the last stop is the
+    longest insertion; the rear ends of bent tubes are turned against the innermost of them by multiples of
+    360 degrees over `rotations`.
+    """
+
+    stop_mm: Annotated[float, quantity("spacing of insertions", above=0.0, at_most=50.0)] = 2.0
+    rotations: Annotated[int, quantity("relative rotations of a tube", at_least=1, at_most=360)] = 24
+
+    @classmethod
+    def default(cls, tubes: Sequence[Tube]) -> ShapeGrid:
+        """Return the grid for a design: coarser for two independent rotations, whose deployments are many."""
+        if _free_rotations(tubes) > 1:
+            return cls(stop_mm=4.0, rotations=12)
+        return cls()
+
+
+@frozen_record
+class TubeShapes:
+    """The S deployments of a design of n tubes that can be reached and keep the limits, and counts of others.
+
+    Tubes are listed from the innermost.  The sequence to each is that of `stages.tube.sequences.together`.
+
+    Parameters
+    ----------
+    insertions_mm, rotations_rad : (S, n) float64
+        How far each tube comes out, and how its rear end is turned; 0 bends towards +x of the scope tip.
+    arcs : (A, 4) float64
+        Length in mm; direction of the bend in rad about the tangent, from +x of a frame that is carried along
+        without turning; curvature in 1/mm; radius of the outermost tube in mm.
+    first_arc : (S + 1,) int64
+        Where the arcs of each deployment begin.
+    scope_from_tip : (S, 4, 4) float64
+        Frame carried to the innermost tip without turning; +z forward.
+    least_determinant : (S,) float64
+        Least on the whole way; see `Equilibrium.determinant`.
+    lateral_sweep_mm, follow_the_leader_error_mm : (S,) float64
+        Largest on the whole way; see `DeployedSequence`.  Between steps it is bounded by second differences.
+    strain : (S,) float64
+        Largest of bending on the whole way, the scope being straight.
+    arc_error_mm : (S,) float64
+        Largest distance between the arcs and the tubes; clearances have to be larger by it.
+    candidates : int
+        Deployments looked at.
+    refused : dict of str to int
+        Counts by reason.
+    """
+
+    tubes: tuple[Tube, ...]
+    limits: ShapeLimits
+    grid: ShapeGrid
+    insertions_mm: Float
+    rotations_rad: Float
+    arcs: Float
+    first_arc: Int
+    scope_from_tip: Float
+    least_determinant: Float
+    lateral_sweep_mm: Float
+    follow_the_leader_error_mm: Float
+    strain: Float
+    arc_error_mm: Float
+    candidates: int
+    refused: dict[str, int]
+
+    @property
+    def count(self) -> int:
+        """Number of deployments, S."""
+        return len(self.insertions_mm)
+
+    def arcs_of(self, shape: int) -> Float:
+        """Return the arcs `(a, 4)` of one deployment."""
+        return self.arcs[self.first_arc[shape] : self.first_arc[shape + 1]]
+
+
+def tube_shapes(
+    tubes: Sequence[Tube], limits: ShapeLimits | None = None, grid: ShapeGrid | None = None
+) -> TubeShapes:
+    """Return all deployments of a design that follow a stable branch of equilibria and keep its limits.
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+        One, two or three, the innermost first.
+    limits : ShapeLimits, optional
+    grid : ShapeGrid, optional
+        `ShapeGrid.default` if None.
+
+    Raises
+    ------
+    SettingsError
+        If there are more than three tubes, or they do not nest.
+    """
+    if len(tubes) > 3:
+        raise SettingsError(
+            f"There are {len(tubes)} tubes",
+            expected="one, two or three",
+            remedy="Leave out tubes, or ask `deploy` for single deployments",
+        )
+    limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
+    mechanics = TubeMechanics(tubes)
+    stops = _stops(mechanics, limits, grid)
+    states, parents = _states(mechanics, stops)
+    rotations = _rotations(mechanics.tubes, grid)
+    radii = np.array([tube.radius_mm for tube in tubes])
+
+    def with_rotations(base: Float) -> tuple[Float, Int, Float]:
+        return _follow(mechanics, radii, base + BEND_RAD, stops, states, parents)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        found = list(pool.map(with_rotations, rotations))
+    results = np.concatenate([rows for rows, _, _ in found])
+    kept, refused = _within(results, limits)
+    counts = np.concatenate([np.diff(first) for _, first, _ in found])
+    arcs = np.concatenate([arcs for _, _, arcs in found])[np.repeat(kept, counts)]
+    values = results[kept]
+    return TubeShapes(
+        tubes=mechanics.tubes,
+        limits=limits,
+        grid=grid,
+        insertions_mm=read_only(np.tile(stops[states], (len(rotations), 1))[kept]),
+        rotations_rad=read_only(np.repeat(rotations, len(states), axis=0)[kept]),
+        arcs=read_only(arcs),
+        first_arc=read_only(np.concatenate([[0], np.cumsum(counts[kept])])),
+        scope_from_tip=read_only(matrices(values[:, kernel.TIP :])),
+        least_determinant=read_only(values[:, kernel.LEAST].copy()),
+        lateral_sweep_mm=read_only(values[:, kernel.SWEEP].copy()),
+        follow_the_leader_error_mm=read_only(values[:, kernel.LEADER].copy()),
+        strain=read_only(values[:, kernel.STRAIN].copy()),
+        arc_error_mm=read_only(values[:, kernel.ERROR].copy()),
+        candidates=len(rotations) * (len(states) - 1),
+        refused=refused,
+    )
+
+
+def _free_rotations(tubes: Sequence[Tube]) -> int:
+    """Return how many tubes can be turned against another so that the shape changes."""
+    return max(sum(bool(tube.bends) for tube in tubes) - 1, 0)
+
+
+def _stops(mechanics: TubeMechanics, limits: ShapeLimits, grid: ShapeGrid) -> Float:
+    """Return the insertions of any tube, from 0 on."""
+    longest = min(limits.max_extension_mm, float(mechanics.lengths_mm[0]))
+    return np.linspace(0.0, longest, max(round(longest / grid.stop_mm), 1) + 1)
+
+
+def _states(mechanics: TubeMechanics, stops: Float) -> tuple[Int, Int]:
+    """Return all deployments as indices of stops `(S, n)`, and of each the one a step before `(S,)`.
+
+    The tubes that are farthest out go back together, with flush tips.
+    """
+    lengths, n = mechanics.lengths_mm, mechanics.count
+    of: dict[tuple[int, ...], int] = {}
+    states, parents = [], []
+    for state in sorted(itertools.combinations_with_replacement(range(len(stops) - 1, -1, -1), n)):
+        ahead = -np.diff(stops[list(state)])
+        if (ahead > -np.diff(lengths) + SAME_MM).any() or (stops[list(state)] > lengths + SAME_MM).any():
+            continue
+        flush = sum(place == state[0] for place in state)
+        before = (*[state[0] - 1] * flush, *state[flush:])
+        parents.append(of[before] if state[0] > 0 else -1)
+        of[state] = len(states)
+        states.append(state)
+    return np.array(states, dtype=np.int64), np.array(parents, dtype=np.int64)
+
+
+def _rotations(tubes: Sequence[Tube], grid: ShapeGrid) -> Float:
+    """Return the rotations of the rear ends `(R, n)`; 0 for straight tubes and the first bent one."""
+    turns = 2.0 * math.pi / grid.rotations * np.arange(grid.rotations)
+    bent = [number for number, tube in enumerate(tubes) if tube.bends]
+    free = [turns if number in bent[1:] else turns[:1] for number in range(len(tubes))]
+    return np.array(list(itertools.product(*free)))
+
+
+def _follow(
+    mechanics: TubeMechanics, radii: Float, base: Float, stops: Float, states: Int, parents: Int
+) -> tuple[Float, Int, Float]:
+    """Return results, first arcs and arcs of all deployments with given rotations of the rear ends."""
+    results = np.zeros((len(states), kernel.SHAPE_COLUMNS))
+    first = np.zeros(len(states) + 1, dtype=np.int64)
+    room = ARCS_A_DEPLOYMENT * len(states)
+    while True:
+        arcs = np.zeros((room, kernel.ARC_COLUMNS))
+        count = kernel.follow_all(
+            mechanics.design, radii, base, stops, states, parents, mechanics.step_rad, results, first, arcs
+        )
+        if count >= 0:
+            return results, first, arcs[:count].copy()
+        room *= 2
+
+
+def _within(results: Float, limits: ShapeLimits) -> tuple[np.ndarray, dict[str, int]]:
+    """Return which deployments keep the limits `(S,)`, and how many do not by reason."""
+    verdicts = {
+        SNAPS: results[:, kernel.LEAST] <= 0.0,
+        STRAINS: results[:, kernel.STRAIN] > limits.max_strain,
+        SWEEPS: results[:, kernel.SWEEP] > limits.max_lateral_sweep_mm,
+    }
+    kept = results[:, kernel.EXTENSION] > 0.0
+    refused = {}
+    for why, wrong in verdicts.items():
+        refused[why] = int((kept & wrong).sum())
+        kept &= ~wrong
+    return kept, {why: count for why, count in refused.items() if count}

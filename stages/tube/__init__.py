@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     )
     from stages.tube.sequences import Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape import centreline
-    from stages.tube.shape_store import open_shapes
+    from stages.tube.shape_store import SHAPES_FORMAT, open_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
     from stages.tube.validation import REASONS, Deployment, DeploymentValidator
 

@@ -21,7 +21,7 @@ from anatomy.settings import to_mapping
 from stages.tube.device import Tube
 from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
 
-FORMAT = 1
+SHAPES_FORMAT = 1
 """Raise it when shapes change: stored ones of another format are made anew."""
 DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 """What reading a damaged or foreign file raises; the shapes are then made anew."""
@@ -50,7 +50,7 @@ def open_shapes(
     """
     limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
     design = {
-        "format": FORMAT,
+        "format": SHAPES_FORMAT,
         "tubes": [to_mapping(tube) for tube in tubes],
         "limits": to_mapping(limits),
         "grid": to_mapping(grid),
@@ -64,7 +64,7 @@ def open_shapes(
     most_bytes = cache_limit_bytes()
     made = tube_shapes(tubes, limits, grid)
     _save(made, path)
-    make_room(path.parent, most_bytes, {"shapes": FORMAT}, keep=(path,))
+    make_room(path.parent, most_bytes, {"shapes": SHAPES_FORMAT}, keep=(path,))
     return made
 
 
@@ -74,7 +74,7 @@ def _arrays(shapes: TubeShapes) -> dict[str, Any]:
 
 
 def _save(shapes: TubeShapes, path: Path) -> None:
-    rest = {"format": FORMAT, "name": "", "candidates": shapes.candidates, "refused": shapes.refused}
+    rest = {"format": SHAPES_FORMAT, "name": "", "candidates": shapes.candidates, "refused": shapes.refused}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary, open(temporary, "wb") as stream:

@@ -204,7 +204,8 @@ def _states(mechanics: TubeMechanics, stops: Float) -> tuple[Int, Int]:
     """
     lengths, n = mechanics.lengths_mm, mechanics.count
     of: dict[tuple[int, ...], int] = {}
-    states, parents = [], []
+    states: list[tuple[int, ...]] = []
+    parents: list[int] = []
     for state in sorted(itertools.combinations_with_replacement(range(len(stops) - 1, -1, -1), n)):
         ahead = -np.diff(stops[list(state)])
         if (ahead > -np.diff(lengths) + SAME_MM).any() or (stops[list(state)] > lengths + SAME_MM).any():

@@ -75,7 +75,7 @@ def _entries(folder: Path) -> tuple[CacheEntry, ...]:
     from anatomy.build import FORMAT
     from anatomy.cache_entries import cache_entries
     from lungaccess.coupled.atlas_store import FORMAT as ATLAS_FORMAT
-    from stages.tube.shape_store import FORMAT as SHAPES_FORMAT
+    from stages.tube import SHAPES_FORMAT
 
     return cache_entries(folder, {"anatomy": FORMAT, "atlas": ATLAS_FORMAT, "shapes": SHAPES_FORMAT})
 

@@ -214,7 +214,7 @@ def carried(pose, across, bend, direction, length):
 
 
 @inner_kernel
-def _apart(bodies, one, other, j):
+def _distance(bodies, one, other, j):
     x = bodies[one, j, 0] - bodies[other, j, 0]
     y = bodies[one, j, 1] - bodies[other, j, 1]
     z = bodies[one, j, 2] - bodies[other, j, 2]
@@ -278,11 +278,11 @@ def _sweep(bodies, states, parents, state, sagitta):
     later, latest = state, -1
     while at >= 0:
         for j in range(1, states[at, 0] + 1):
-            apart = _apart(bodies, at, state, j)
-            sweep = max(sweep, apart)
-            if apart > leader:
+            strayed = _distance(bodies, at, state, j)
+            sweep = max(sweep, strayed)
+            if strayed > leader:
                 off = _off_track(bodies, at, j, state, states[state, 0]) + sagitta
-                leader = max(leader, min(apart, off))
+                leader = max(leader, min(strayed, off))
             if latest >= 0:
                 bow = max(bow, _bow(bodies, at, j, later, j, latest, j))
         later, latest, at = at, later, parents[at]

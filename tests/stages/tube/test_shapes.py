@@ -129,8 +129,8 @@ class TestCurvedTubes:
             there = deploy(mechanics, together(curved.tubes, turned, curved.insertions_mm[shape])).final
             arcs = curved.arcs_of(shape)
             at = np.linspace(0.0, arcs[:, 0].sum(), 200)
-            apart = np.linalg.norm(there.backbone(at) - [point_at(arcs, s) for s in at], axis=1)
-            assert 0.1 * curved.arc_error_mm[shape] < apart.max() <= curved.arc_error_mm[shape]
+            strayed = np.linalg.norm(there.backbone(at) - [point_at(arcs, s) for s in at], axis=1)
+            assert 0.1 * curved.arc_error_mm[shape] < strayed.max() <= curved.arc_error_mm[shape]
 
     def test_strain_is_at_least_that_of_straight_tubes_in_the_scope(self, curved: TubeShapes) -> None:
         assert (curved.strain >= max(each.rest_strain for each in curved.tubes)).all()

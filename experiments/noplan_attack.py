@@ -93,7 +93,7 @@ class Attack:
             found += [(REFUSED, refusal.candidate) for refusal in search.refused_by_proof[judged:]]
             judged = len(search.refused_by_proof)
             for outcome, candidate in found:
-                plan = assemble(search.task, self.atlas.sites, candidate, iteration=iteration, timing={})
+                plan = assemble(search.task, candidate, iteration=iteration, timing={})
                 report = la.check(plan, self.atlas.lung, self.atlas.system)
                 if report.accepted:
                     return outcome, plan, iteration, unaccepted

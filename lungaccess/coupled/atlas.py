@@ -12,7 +12,7 @@ from anatomy.typed import Float
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
-from stages.scope import Sites, find_sites
+from stages.scope import ScopeMotions, find_motions
 from stages.tube import (
     DEFAULT_ROTATIONS,
     DEFAULT_STOP_MM,
@@ -22,8 +22,8 @@ from stages.tube import (
     tracking_length_mm,
 )
 
-SITE_SPACING_MM = 1.0
-"""A free choice: local search and local sampling cover what lies between two sites."""
+TIP_SPACING_MM = 1.0
+"""A free choice: local search and local sampling cover with the tubes what lies between two tips."""
 TURNED_COARSER = 2
 """By this factor deployments from turned tips have fewer rotations and stops: their directions are many."""
 
@@ -36,8 +36,10 @@ class Atlas:
     ----------
     with_fissures : bool
         Whether fissures are obstacles.
+    motions : ScopeMotions
+        Every scope tip with the proved motion that brings the device there.
     deployments : Deployments
-        `deployments.site` indexes `sites`.
+        `deployments.site` indexes the tips of `motions`.
     index : StartIndex
         Made from the deployments: finds those with a target in the needle's workspace, for any needle.
     build_s : float
@@ -47,7 +49,7 @@ class Atlas:
     lung: Lung
     system: System
     with_fissures: bool
-    sites: Sites
+    motions: ScopeMotions
     deployments: Deployments
     index: StartIndex
     build_s: float
@@ -75,26 +77,26 @@ def build_atlas(
     *,
     rotations: int = DEFAULT_ROTATIONS,
     stop_spacing_mm: float = DEFAULT_STOP_MM,
-    site_spacing_mm: float = SITE_SPACING_MM,
+    site_spacing_mm: float = TIP_SPACING_MM,
     progress: Callable[[float], None] | None = None,
 ) -> Atlas:
-    """Enumerate sites, rotations and insertions, and keep what is safe.
+    """Find the motions of the scope, enumerate rotations and insertions at their tips, and keep what is safe.
 
     Parameters
     ----------
     rotations : int
         Evenly spaced rotations of the tubes, and further ones where tube or exit is near a limit.
     stop_spacing_mm, site_spacing_mm : float
-        Spacing of insertions and of sites along the airway.
+        Spacing of insertions and of scope tips along the airway.
     progress : callable, optional
         Called with the share of the work done.
     """
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)
     reach = tracking_length_mm(system.tubes)
-    places = find_sites(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
-    straight = int((~places.turned).sum())
-    share = straight / max(places.count, 1)
+    motions = find_motions(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
+    straight = int((~motions.turned).sum())
+    share = straight / max(motions.count, 1)
     tell = progress or (lambda _share: None)
 
     def enumerated(poses: Float, rotations: int, spacing_mm: float, begin: float, end: float) -> Deployments:
@@ -109,16 +111,16 @@ def build_atlas(
             progress=lambda done: tell(begin + done * (end - begin)),
         )
 
-    found = enumerated(places.poses[:straight], rotations, stop_spacing_mm, 0.0, share)
-    if straight < places.count:
+    found = enumerated(motions.tips[:straight], rotations, stop_spacing_mm, 0.0, share)
+    if straight < motions.count:
         # Tips turned aside look in so many directions that each of them needs fewer rotations and stops.
         coarse = max(1, rotations // TURNED_COARSER), stop_spacing_mm * TURNED_COARSER
-        found = join_deployments(found, enumerated(places.poses[straight:], *coarse, share, 1.0), straight)
+        found = join_deployments(found, enumerated(motions.tips[straight:], *coarse, share, 1.0), straight)
     return Atlas(
         lung=lung,
         system=system,
         with_fissures=with_fissures,
-        sites=places,
+        motions=motions,
         deployments=found,
         index=StartIndex(found.positions, found.tangents),
         build_s=time.perf_counter() - began,

@@ -6,9 +6,9 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -19,11 +19,11 @@ from anatomy.grid import read_only
 from anatomy.io.files import atomic_write
 from anatomy.lung import Lung
 from anatomy.settings import to_mapping
-from lungaccess.coupled.atlas import SITE_SPACING_MM, Atlas, build_atlas
+from lungaccess.coupled.atlas import TIP_SPACING_MM, Atlas, build_atlas
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
-from stages.scope import Sites
+from stages.scope import ScopeMotions
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
 FORMAT = 5
@@ -38,7 +38,7 @@ def open_atlas(
     *,
     rotations: int = DEFAULT_ROTATIONS,
     stop_spacing_mm: float = DEFAULT_STOP_MM,
-    site_spacing_mm: float = SITE_SPACING_MM,
+    site_spacing_mm: float = TIP_SPACING_MM,
     cache: Path | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Atlas:
@@ -96,14 +96,8 @@ def _save(atlas: Atlas, path: Path) -> None:
     arrays: dict[str, Any] = {}
     rest: dict[str, Any] = {"with_fissures": atlas.with_fissures, "build_s": atlas.build_s}
     rest |= {"format": FORMAT, "name": atlas.lung.name}
-    for name, part in (("sites", atlas.sites), ("deployments", atlas.deployments)):
-        for field in fields(part):
-            value = getattr(part, field.name)
-            key = f"{name}.{field.name}"
-            if isinstance(value, np.ndarray):
-                arrays[key] = value
-            else:
-                rest[key] = value
+    for name, part in (("motions", atlas.motions), ("deployments", atlas.deployments)):
+        _take_apart(part, name, arrays, rest)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary, open(temporary, "wb") as stream:
@@ -116,6 +110,33 @@ def _save(atlas: Atlas, path: Path) -> None:
         ) from error
 
 
+def _take_apart(record: Any, name: str, arrays: dict[str, Any], rest: dict[str, Any]) -> None:
+    """Add the fields of a record by dotted names: arrays to one mapping, what is plain to the other."""
+    for field in fields(record):
+        value, key = getattr(record, field.name), f"{name}.{field.name}"
+        if is_dataclass(value):
+            _take_apart(value, key, arrays, rest)
+        elif isinstance(value, np.ndarray):
+            arrays[key] = value
+        else:
+            rest[key] = value
+
+
+def _put_together(cls: Any, name: str, values: dict[str, Any]) -> Any:
+    """Return the record that was taken apart."""
+    hints = get_type_hints(cls)
+    parts: dict[str, Any] = {}
+    for field in fields(cls):
+        key = f"{name}.{field.name}"
+        value = (
+            _put_together(hints[field.name], key, values)
+            if is_dataclass(hints[field.name])
+            else values[key]
+        )
+        parts[field.name] = tuple(value) if isinstance(value, list) else value
+    return cls(**parts)
+
+
 def _load(path: Path, lung: Lung, system: System) -> Atlas | None:
     """Read an atlas; None if there is none or it is damaged."""
     try:
@@ -123,15 +144,12 @@ def _load(path: Path, lung: Lung, system: System) -> Atlas | None:
             arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
             rest = json.loads(str(stored["rest"]))
         values = arrays | rest
-        sites: Any = {field.name: values[f"sites.{field.name}"] for field in fields(Sites)}
-        sites["narrowest"] = tuple(sites["narrowest"])
-        found: Any = {field.name: values[f"deployments.{field.name}"] for field in fields(Deployments)}
-        deployments = Deployments(**found)
+        deployments = _put_together(Deployments, "deployments", values)
         return Atlas(
             lung=lung,
             system=system,
             with_fissures=rest["with_fissures"],
-            sites=Sites(**sites),
+            motions=_put_together(ScopeMotions, "motions", values),
             deployments=deployments,
             index=StartIndex(deployments.positions, deployments.tangents),
             build_s=rest["build_s"],

@@ -19,7 +19,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.task import Task
-from stages.scope import Bronchoscope
+from stages.scope import Bronchoscope, MotionProver
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 TIGHTEST_RADIUS_MM = 20.0
@@ -34,7 +34,7 @@ SCOPE_STEP_MM = 0.1
 """Steps in which the changed parameters are given."""
 ROTATIONS = DEFAULT_ROTATIONS // 2
 STOP_MM = 2.0 * DEFAULT_STOP_MM
-"""A thinner scope has many more sites; its deployments are enumerated more coarsely to save time."""
+"""A thinner scope has many more tips; its deployments are enumerated more coarsely to save time."""
 
 _THIN: WeakKeyDictionary[Atlas, Atlas] = WeakKeyDictionary()
 """Atlases of the thinnest scopes by the atlases they belong to: they take seconds to make."""
@@ -151,12 +151,15 @@ def scope_changes(
     thin = DirectArcs(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), thin_atlas)
     near, site = thin.in_workspace, thin_atlas.deployments.site
     clear = near[thin.blockers(near)[0] == 0]
-    radius_mm = thin_atlas.sites.narrowest_radius_mm[site[clear]] - scope.lumen_margin_mm
-    for entry in clear[np.argsort(-radius_mm, kind="stable")]:
+    prover = MotionProver(task.lung, thin_atlas.system.scope)
+    for entry in clear[np.argsort(-thin_atlas.motions.room_mm[site[clear]], kind="stable")]:
         candidate = thin.proved(int(entry))
         if candidate is None:
             continue
-        widest = 2.0 * float(radius_mm[clear == entry][0])
+        room_mm = prover.prove(candidate.tip.motion)
+        if isinstance(room_mm, str):
+            continue
+        widest = thin_atlas.system.scope.outer_diameter_mm + 2.0 * room_mm
         needed = round(math.floor(widest / SCOPE_STEP_MM + 1e-9) * SCOPE_STEP_MM, 6)
         system = _with_scope(task.system, needed)
         plan = _assembled(replace(task, system=system), thin_atlas, candidate)
@@ -205,4 +208,4 @@ def _planned(task: Task, atlas: Atlas, system: System) -> Plan | None:
 
 
 def _assembled(task: Task, atlas: Atlas, candidate: Candidate) -> Plan:
-    return assemble(task, atlas.sites, candidate, iteration=0, timing={"atlas_s": atlas.build_s})
+    return assemble(task, candidate, iteration=0, timing={"atlas_s": atlas.build_s})

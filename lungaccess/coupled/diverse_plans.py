@@ -101,7 +101,7 @@ def alternatives(
     if not chosen:
         raise explain(task, atlas, arcs.evaluator.blocked, 0, counterfactuals=counterfactuals)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
-    plans = [assemble(task, atlas.sites, each, iteration=0, timing=timing) for each in chosen]
+    plans = [assemble(task, each, iteration=0, timing=timing) for each in chosen]
     return with_front(plans)
 
 

@@ -46,15 +46,21 @@ def explain(
 
 def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
     atlas = arcs.atlas
-    if atlas.sites.count == 0:
+    if atlas.motions.count == 0:
         scope = f"the scope ({arcs.task.system.scope.outer_diameter_mm:g} mm) fits nowhere"
-        generation, excess = atlas.sites.narrowest
+        passages = atlas.motions.passages
+        if (passages.passable & passages.exits_ahead).any():
+            return (
+                "no motion brings the scope to a place from which tubes leave the airway: its bending section "
+                "does not pass the forks"
+            )
+        generation, excess = atlas.motions.passages.narrowest
         if generation < 0:
             return f"{scope}; no airway lies in lung tissue"
         narrow = f"too narrow at generation {generation}, typically by {2 * excess:.1f} mm"
         return f"{scope}; the airway is {narrow}"
     if atlas.deployments.count == 0:
-        return "the tubes cannot leave the airway safely from any site"
+        return "the tubes cannot leave the airway safely from any scope tip"
     if not len(arcs.in_workspace):
         return "the target lies outside the needle's workspace for every deployment"
     obstacles = blocked.copy()
@@ -66,9 +72,9 @@ def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
 def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
     """Count, stage by stage, what was ruled out and why."""
     atlas = arcs.atlas
-    reasons = {"scope: sites": atlas.sites.count}
-    generation, excess = atlas.sites.narrowest
-    closed = int((~atlas.sites.passable).sum())
+    reasons = {"scope: tips with a proved motion": atlas.motions.count}
+    generation, excess = atlas.motions.passages.narrowest
+    closed = int((~atlas.motions.passages.passable).sum())
     if closed:
         reasons[
             f"scope: tree points beyond airways too narrow (mostly at generation {generation}, "
@@ -87,11 +93,11 @@ def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
 def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...]) -> str:
     """Say what would help, the smallest change first.
 
-    Where no site or no deployment is left, say which change brings one back, if that is known.
+    Where no scope tip or no deployment is left, say which change brings one back, if that is known.
     """
     atlas = arcs.atlas
-    if atlas.sites.count == 0:
-        return _thinner_scope(atlas.sites.widest_scope_mm)
+    if atlas.motions.count == 0:
+        return _thinner_scope(atlas.motions.passages.widest_scope_mm)
     if atlas.deployments.count == 0:
         return ""
     if direct:
@@ -111,7 +117,7 @@ def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...])
 
 
 def _thinner_scope(widest_mm: float) -> str:
-    """Say how thin the scope must be to have a site, rounded down to a tenth."""
+    """Say how thin the scope must be to pass a place with an exit ahead, rounded down to a tenth."""
     tenths = math.floor(10.0 * widest_mm)
     return f"A bronchoscope of {tenths / 10:.1f} mm or less fits somewhere" if tenths else ""
 

@@ -189,7 +189,7 @@ def atlas_event(share: float) -> ProgressEvent:
         elapsed_s=0.0,
         best_cost=None,
         phase="atlas",
-        message=f"deployment atlas, {share:.0%} of the sites",
+        message=f"deployment atlas, {share:.0%} of the scope tips",
     )
 
 
@@ -215,7 +215,7 @@ def _run(
         if step.candidate is not None:
             best = step.cost
             timing = {"planning_s": clock.elapsed_s, "atlas_s": atlas.build_s}
-            yield assemble(task, atlas.sites, step.candidate, iteration=iteration, timing=timing)
+            yield assemble(task, step.candidate, iteration=iteration, timing=timing)
         if limits.are_reached(iteration, clock.elapsed_s, best is not None):
             break
         if clock.due():

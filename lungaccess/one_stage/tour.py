@@ -237,7 +237,7 @@ def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
     blockers, lengths, _costs = arcs.blockers(held)
     clear = np.flatnonzero(blockers == 0)
     clear = held[clear[np.argsort(lengths[clear], kind="stable")]]
-    points = atlas.sites.tree_point[entries.site[clear]]
+    points = atlas.motions.tree_point[entries.site[clear]]
     good: set[int] = set()
     tried: dict[int, int] = {}
     for entry, point in zip(clear.tolist(), points.tolist(), strict=True):

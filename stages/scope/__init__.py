@@ -10,21 +10,11 @@ if TYPE_CHECKING:
     from stages.scope.device import Bronchoscope
     from stages.scope.motion import ScopeMotion
     from stages.scope.motion_proof import MotionProver, prove_motion
-    from stages.scope.motions import ScopeMotions, find_motions
+    from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
     from stages.scope.passages import Passages, find_passages
     from stages.scope.shifting import TipRow, evenly, shifted
-    from stages.scope.sites import Sites, approach_depth_mm, find_sites, tip_is_feasible
+    from stages.scope.sites import find_sites
     from stages.scope.tip_region import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD, in_tip_region
-    from stages.scope.tips import (
-        LEAVING_MM,
-        MedialAxis,
-        ScopeTip,
-        approach,
-        leaving_point,
-        looks_ahead,
-        tip_at,
-        turned_aside,
-        walk,
-    )
+    from stages.scope.tips import LEAVING_MM
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -37,6 +37,23 @@ OFF_AXIS_MM = 1.0
 
 
 @frozen_record
+class ScopeTip:
+    """A pose of the scope's tip, and the motion that brings the device there.
+
+    Parameters
+    ----------
+    lps_from_scope_tip : (4, 4) float64
+        Frame of the working channel: +z is forward, rotations of the tubes count from +x.
+    tree_point : int
+        Nearest point of the airway tree.
+    """
+
+    motion: ScopeMotion
+    lps_from_scope_tip: Float
+    tree_point: int
+
+
+@frozen_record
 class ScopeMotions:
     """Tips of a scope in one airway, each with a proved motion to it; S tips, N states.
 
@@ -98,6 +115,13 @@ class ScopeMotions:
             lps_from_entry=self.lps_from_entry,
             states=np.array(rows),
             bending_length_mm=self.bending_length_mm,
+        )
+
+    def tip(self, tip: int) -> ScopeTip:
+        """Return a tip with its motion."""
+        motion = self.motion(tip)
+        return ScopeTip(
+            motion=motion, lps_from_scope_tip=motion.lps_from_tip, tree_point=int(self.tree_point[tip])
         )
 
     def nearest(self, point_lps: ArrayLike, forward: ArrayLike) -> int:

@@ -97,8 +97,8 @@ def enumerate_deployments(
 
     Parameters
     ----------
-    scope_tips : (S, 6) float64
-        Point and unit tangent of each scope tip, LPS mm.
+    scope_tips : (S, 9) float64
+        Point, direction and +x of the frame of each scope tip, LPS mm; rotations count from that +x.
     with_fissures : bool
         Whether fissures are obstacles.
     rotations : int
@@ -109,7 +109,7 @@ def enumerate_deployments(
     progress : callable, optional
         Told the share of sites done.
     """
-    tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 6)
+    tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 9)
     coarse: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
     angles = np.concatenate([coarse, coarse + math.pi / rotations])
     stops = insertion_stops(tubes, stop_spacing_mm)
@@ -120,7 +120,7 @@ def enumerate_deployments(
 
     def one_site(site: int) -> tuple[Float, Int, int]:
         nonlocal done
-        frame = frames.pose(tips[site, :3], tips[site, 3:])
+        frame = frames.pose(tips[site, :3], tips[site, 3:6], tips[site, 6:])
         refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
         work = np.zeros((2, kernels.N_TRACE))
 
@@ -128,7 +128,7 @@ def enumerate_deployments(
             normals = frames.bending_directions(frame, angles[turns])
             rows = np.zeros((most * len(turns), kernels.ENTRY_COLUMNS))
             count = kernels.enumerate_site(
-                environment, constants, tips[site], normals, site, stops, rows, refused, work
+                environment, constants, tips[site, :6], normals, site, stops, rows, refused, work
             )
             found = rows[:count].copy()
             found[:, 1] = turns[found[:, 1].astype(np.int64)]

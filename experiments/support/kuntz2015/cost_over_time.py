@@ -67,7 +67,7 @@ def joint_gain(search: AtlasSearch) -> dict[str, float]:
     for name, step in (("direct", direct), ("sampled", sampled)):
         if step is None or step.candidate is None:
             continue
-        better = refine(search.task, search.atlas.sites, step.candidate)
+        better = refine(search.task, step.candidate)
         costs[name] = step.cost
         costs[f"{name}, refined"] = step.cost if better is None else search.evaluator.cost(better.path)
     return costs

@@ -166,7 +166,7 @@ def bent_plans(task: Task, atlas: Atlas, rng: Rng) -> Iterator[Plan]:
             continue
         end = Target(lps_mm=path.frames()[-1][:3, 3], origin="point")
         here = replace(task, target=end)
-        yield assemble(here, atlas.sites, replace(candidate, path=path), iteration=0, timing={})
+        yield assemble(here, replace(candidate, path=path), iteration=0, timing={})
         made += 1
         if made == AT_A_TIME:
             return

@@ -26,7 +26,6 @@ from stages.tube import Deployment
 
 PHASE = "reference"
 FOUND = "found"
-LOOKS_BACK = "the scope's tip looks sideways behind a fork"
 OUT_OF_WORKSPACE = "the target lies outside the needle's workspace"
 NO_PATH = "the RRT found no path"
 """What can become of a placement, besides the reasons why tubes are refused."""
@@ -126,10 +125,10 @@ class ReferenceSearch:
         shape = self._tubes.shape(
             tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
         )
-        reached = placement.looks_ahead and (not self._rejects or self._evaluator.reaches(shape.frames()[-1]))
+        reached = not self._rejects or self._evaluator.reaches(shape.frames()[-1])
         began = self._spend("placement", began)
         if not reached:
-            self.counts[OUT_OF_WORKSPACE if placement.looks_ahead else LOOKS_BACK] += 1
+            self.counts[OUT_OF_WORKSPACE] += 1
             return None
         deployment = self._tubes.validate(shape)
         began = self._spend("tubes", began)

@@ -68,7 +68,7 @@ class DirectArcs:
         """Return a deployment of the atlas in full with its arc, None if the tubes are refused."""
         entries = self.atlas.deployments
         return self.evaluator.direct(
-            self.atlas.sites.tip(self.task.lung.tree, int(entries.site[entry])),
+            self.atlas.motions.tip(int(entries.site[entry])),
             float(entries.rotation_rad[entry]),
             float(entries.outer_mm[entry]),
             float(entries.inner_mm[entry]),

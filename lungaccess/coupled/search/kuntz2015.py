@@ -27,7 +27,7 @@ class KuntzSearch:
     Parameters
     ----------
     atlas : Atlas
-        Only its sites are used, to know where the scope fits.
+        Only its motions of the scope are used.
     rejects : bool
         Whether line 8 is carried out; the paper compares with a run without it.
     """
@@ -44,7 +44,7 @@ class KuntzSearch:
         """Search until the caller stops, or not at all if the scope fits nowhere."""
         incumbent = Incumbent()
         for iteration, placement in enumerate(random_placements(self._task, self._atlas), start=1):
-            candidate = self._attempt(placement) if placement.looks_ahead else None
+            candidate = self._attempt(placement)
             yield incumbent.improved(evaluated_step(self._evaluator, self.phase, candidate, iteration))
 
     def _attempt(self, placement: Placement) -> Candidate | None:

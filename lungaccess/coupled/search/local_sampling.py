@@ -42,11 +42,10 @@ class LocalSampling:
     ) -> None:
         self._kernel_arguments = local_search
         self._evaluator, self._rng = arcs.evaluator, rng
-        entries, sites, tree = arcs.atlas.deployments, arcs.atlas.sites, arcs.task.lung.tree
+        entries, motions = arcs.atlas.deployments, arcs.atlas.motions
         numbers, self._pose_of = np.unique(entries.site[chosen], return_inverse=True)
-        self._tips = [sites.tip(tree, int(site)) for site in numbers]
-        frames = np.array([tip.lps_from_scope_tip for tip in self._tips])
-        self._poses = np.ascontiguousarray(frames[:, :3, [3, 2, 0]].transpose(0, 2, 1).reshape(-1, 9))
+        self._motions, self._numbers = motions, numbers
+        self._poses = np.ascontiguousarray(motions.tips[numbers])
         self._deployed = (entries.rotation_rad[chosen], entries.outer_mm[chosen], entries.inner_mm[chosen])
 
     def sample(self, cost_limit: float) -> Candidate | None:
@@ -69,7 +68,7 @@ class LocalSampling:
         if not cost < cost_limit:
             return None
         rotation, outer, inner = best[1:].tolist()
-        tip = self._tips[int(best[SCOPE_POSE])]
+        tip = self._motions.tip(int(self._numbers[int(best[SCOPE_POSE])]))
         return self._evaluator.direct(tip, rotation % (2.0 * math.pi), outer, inner)
 
 

@@ -10,11 +10,10 @@ import numpy as np
 from anatomy.typed import Float, UInt64
 from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
-from lungaccess.coupled.search.scope_poses import ScopePoses
+from lungaccess.coupled.search.scope_poses import PoseRow, ScopePoses
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from stages.needle import ArcPath, direct_path
-from stages.scope import Sites
 from stages.tube import Deployment, tube_constants, tube_environment
 
 PERTURBATION = np.array([4.0, math.radians(15.0), 2.0, 2.0])
@@ -41,7 +40,7 @@ class LocalSearchRun:
         The estimated cost at which the choice was last evaluated in full.
     """
 
-    poses: ScopePoses
+    poses: PoseRow
     x: Float
     vias: Float
     count: int
@@ -54,8 +53,8 @@ class LocalSearch:
 
     Parameters
     ----------
-    sites : Sites
-        Where the scope passes.
+    scope_poses : ScopePoses
+        The tips that the scope can take.
 
     Attributes
     ----------
@@ -64,9 +63,11 @@ class LocalSearch:
     target : tuple of 3 floats
     """
 
-    def __init__(self, evaluator: CandidateEvaluator, sites: Sites, rng: np.random.Generator) -> None:
+    def __init__(
+        self, evaluator: CandidateEvaluator, scope_poses: ScopePoses, rng: np.random.Generator
+    ) -> None:
         task = evaluator.task
-        self._evaluator, self._sites, self._rng = evaluator, sites, rng
+        self._evaluator, self._poses, self._rng = evaluator, scope_poses, rng
         environment = tube_environment(task.lung, with_fissures=task.with_fissures)
         self.tube = (environment, tube_constants(task.system.tubes, task.system.margins))
         self.needle = evaluator.needle_arrays
@@ -77,11 +78,11 @@ class LocalSearch:
         """Return a run from a candidate; None without one, or if its needle has too many arcs."""
         if candidate is None:
             return None
-        task, deployment = self._evaluator.task, candidate.deployment
+        deployment = candidate.deployment
         points = candidate.path.frames()[1:-1, :3, 3]
-        if len(points) > MAX_VIAS:
+        poses = self._poses.around(candidate.tip)
+        if len(points) > MAX_VIAS or poses is None:
             return None
-        poses = ScopePoses(task.lung, task.system.scope, self._sites, candidate.tip, self._rng)
         vias = np.zeros((MAX_VIAS, 3))
         vias[: len(points)] = points
         x = np.array([poses.home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
@@ -107,7 +108,7 @@ class LocalSearch:
         """Move a run some distance away at random, and leave out some of its via points."""
         x, drawn = run.x, self._rng.standard_normal(N_CHOICE)
         x[:] = x + drawn * PERTURBATION
-        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(run.poses.tips) - 1)
+        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(run.poses.rows) - 1)
         x[OUTER] = max(x[OUTER], 0.0)
         x[INNER] = max(x[INNER], x[OUTER])
         run.count = min(run.count, int(self._rng.integers(MAX_VIAS)))
@@ -117,8 +118,8 @@ class LocalSearch:
     def candidate(self, run: LocalSearchRun) -> Candidate | None:
         """Return a run's best choice as a candidate, in the numbers of a plan."""
         index = int(run.x[SCOPE_POSE])
-        tip, (rotation, outer, inner) = run.poses.tips[index], run.x[1:].tolist()
-        rotation = run.poses.rotation_rad(index, rotation)
+        tip, (rotation, outer, inner) = self._poses.tip(run.poses, index), run.x[1:].tolist()
+        rotation = self._poses.rotation_rad(run.poses, index, tip, rotation)
         deployment = self._evaluator.tubes.validate(tip.lps_from_scope_tip, rotation, outer, inner)
         if isinstance(deployment, str):
             return None

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.problem.task import Task
-from stages.scope import MedialAxis, ScopeTip, looks_ahead
+from stages.scope import ScopeTip
 from stages.tube import tracking_length_mm
 
 
@@ -24,8 +24,6 @@ class Placement:
         Rotation and insertions of the tubes.
     needle_seed : int
         Seed of the needle's RRT from there.
-    looks_ahead : bool
-        Whether an airway in lung tissue lies ahead of the tip; it does not just behind some forks.
     """
 
     tip: ScopeTip
@@ -33,20 +31,19 @@ class Placement:
     outer_mm: float
     inner_mm: float
     needle_seed: int
-    looks_ahead: bool
 
 
 def random_placements(task: Task, atlas: Atlas) -> Iterator[Placement]:
     """Draw placements without end; there is none if the scope can take no pose.
 
-    The poses are uniform by arc length on the medial axis where the scope passes and an airway in lung tissue
-    lies ahead; of the atlas only the sites are used.
+    The poses are drawn from the atlas's tips that look along the airway, which lie evenly spaced by arc length
+    where a motion of the scope ends and an airway in lung tissue is ahead; nothing else of the atlas is used.
     """
     rng = np.random.Generator(np.random.PCG64(task.seed))
-    axis = MedialAxis(task.lung.tree, atlas.sites.passable & atlas.sites.exits_ahead)
+    along = np.flatnonzero(~atlas.motions.turned)
     longest_mm = tracking_length_mm(task.system.tubes)
-    while atlas.sites.count and axis.length_mm > 0.0:
-        tip = axis.sample(rng)
+    while len(along):
+        tip = atlas.motions.tip(int(rng.choice(along)))
         rotation = float(rng.uniform(0.0, 2.0 * math.pi))
         outer, inner = np.sort(rng.uniform(0.0, longest_mm, 2)).tolist()
         yield Placement(
@@ -55,5 +52,4 @@ def random_placements(task: Task, atlas: Atlas) -> Iterator[Placement]:
             outer_mm=outer,
             inner_mm=inner,
             needle_seed=int(rng.integers(2**63)),
-            looks_ahead=looks_ahead(task.lung.tree, tip),
         )

@@ -2,64 +2,92 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from anatomy import poses
-from anatomy.lung import Lung
-from anatomy.typed import Bool, Float
-from stages.scope import Bronchoscope, ScopeTip, Sites, tip_is_feasible, walk
+from anatomy.records import frozen_record
+from anatomy.typed import Bool, Float, Int
+from stages.scope import ScopeMotions, ScopeTip
 
-STEP_MM = 0.25
-"""Spacing of the poses: a fraction of the 1 mm between the sites of an atlas."""
 REACH_MM = 4.0
-"""Length of the row each way: several times as far as the next site of the atlas."""
-TURNED_STEP_MM = 0.5
-"""Spacing of turned poses, which take longer to validate."""
+"""How far from a tip its neighbours lie: several times as far as the next tip of the atlas."""
+MOST = 64
+"""So many neighbours at most, the nearest: about eight times the spread of a change of the local search."""
+MM_OF_TURN = 5.0
+"""A turn by one radian counts as so many mm: it moves the tip of the tubes by some times as much."""
 
 
-class ScopePoses:
-    """The scope tips up to REACH_MM behind and ahead of one; at each fork a random branch is taken.
+@frozen_record
+class PoseRow:
+    """Tips of an atlas near one of them, from behind it to ahead of it; K poses.
 
     Parameters
     ----------
-    places : Sites
-        Where the scope passes.
-
-    Attributes
-    ----------
-    tips : list of ScopeTip
+    numbers : (K,) int64
+        The tips by their numbers in the atlas.
     home : int
-        The index of the tip given.
+        Which of them is the one in whose neighbourhood they lie.
     rows : (K, 9) float64
-        Point, tangent, and the vector from which rotations count: the +x of the tip given, carried over to
-        each tip.
+        Point, direction, and the vector from which rotations count: the +x of the tip at home, carried over
+        to each tip, so that the tubes keep their direction from one tip to the next.
     allowed : (K,) bool
-        Which of these poses the scope can take.
+        Which of these poses the scope can take: all, as each has a proved motion.
     """
 
-    def __init__(
-        self, lung: Lung, scope: Bronchoscope, places: Sites, tip: ScopeTip, rng: np.random.Generator
-    ) -> None:
-        step = TURNED_STEP_MM if tip.turned else STEP_MM
-        self.home = round(REACH_MM / step)
-        behind = [walk(lung.tree, tip, -step * n, rng) for n in range(self.home, 0, -1)]
-        ahead = [tip]
-        for _ in range(self.home):
-            ahead.append(walk(lung.tree, ahead[-1], step, rng))
-        self.tips = [*behind, *ahead]
-        sideways = tip.lps_from_scope_tip[:3, 0]
-        self.rows: Float = np.zeros((len(self.tips), 9))
-        self.allowed: Bool = np.zeros(len(self.tips), dtype=np.bool_)
-        for n, each in enumerate(self.tips):
-            frame = each.lps_from_scope_tip
-            self.rows[n, :3], self.rows[n, 3:6] = frame[:3, 3], frame[:3, 2]
-            across = sideways - (sideways @ frame[:3, 2]) * frame[:3, 2]
-            size = float(np.linalg.norm(across))
-            self.rows[n, 6:] = across / size if size > 0.1 else frame[:3, 0]
-            self.allowed[n] = tip_is_feasible(lung, scope, places, each)
+    numbers: Int
+    home: int
+    rows: Float
+    allowed: Bool
 
-    def rotation_rad(self, index: int, rotation_rad: float) -> float:
+
+class ScopePoses:
+    """The tips of an atlas by neighbourhood."""
+
+    def __init__(self, motions: ScopeMotions) -> None:
+        self.motions = motions
+
+    @cached_property
+    def _places(self) -> Float:
+        """Points and scaled directions `(S, 6)`: near in them are tips that can replace each other."""
+        tips = self.motions.tips
+        return np.hstack([tips[:, :3], MM_OF_TURN * tips[:, 3:6]])
+
+    def around(self, tip: ScopeTip) -> PoseRow | None:
+        """Return the tips near one of the atlas, None for a tip of another origin."""
+        frame = tip.lps_from_scope_tip
+        here = np.concatenate([frame[:3, 3], MM_OF_TURN * frame[:3, 2]])
+        away = np.linalg.norm(self._places - here, axis=1)
+        home = int(np.argmin(away))
+        if away[home] > SAME_MM:
+            return None
+        near = np.flatnonzero(away <= REACH_MM)
+        near = near[np.argsort(away[near], kind="stable")][:MOST]
+        ahead = (self.motions.tips[near, :3] - frame[:3, 3]) @ frame[:3, 2]
+        near = near[np.argsort(ahead, kind="stable")]
+        rows = self.motions.tips[near].copy()
+        sideways = frame[:3, 0]
+        across = sideways - (rows[:, 3:6] @ sideways)[:, None] * rows[:, 3:6]
+        rows[:, 6:] = across / np.linalg.norm(across, axis=1, keepdims=True)
+        return PoseRow(
+            numbers=near,
+            home=int(np.flatnonzero(near == home)[0]),
+            rows=rows,
+            allowed=np.ones(len(near), dtype=np.bool_),
+        )
+
+    def tip(self, row: PoseRow, index: int) -> ScopeTip:
+        """Return a tip of a row."""
+        return self.motions.tip(int(row.numbers[index]))
+
+    @staticmethod
+    def rotation_rad(row: PoseRow, index: int, tip: ScopeTip, rotation_rad: float) -> float:
         """Return the rotation counted from the tip's own +x, from one counted from the row's vector."""
-        point, forward, sideways = np.split(self.rows[index], 3)
+        point, forward, sideways = np.split(row.rows[index], 3)
         bend = poses.bending_directions(poses.pose(point, forward, sideways), rotation_rad)[0]
-        return poses.roll_towards(self.tips[index].lps_from_scope_tip, bend)
+        return poses.roll_towards(tip.lps_from_scope_tip, bend)
+
+
+SAME_MM = 1e-6
+"""Tips that differ by less are one tip, read from a plan."""

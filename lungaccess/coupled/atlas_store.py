@@ -129,9 +129,7 @@ def _put_together(cls: Any, name: str, values: dict[str, Any]) -> Any:
     for field in fields(cls):
         key = f"{name}.{field.name}"
         value = (
-            _put_together(hints[field.name], key, values)
-            if is_dataclass(hints[field.name])
-            else values[key]
+            _put_together(hints[field.name], key, values) if is_dataclass(hints[field.name]) else values[key]
         )
         parts[field.name] = tuple(value) if isinstance(value, list) else value
     return cls(**parts)

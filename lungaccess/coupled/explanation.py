@@ -51,8 +51,8 @@ def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
         passages = atlas.motions.passages
         if (passages.passable & passages.exits_ahead).any():
             return (
-                "no motion brings the scope to a place from which tubes leave the airway: its bending section "
-                "does not pass the forks"
+                "no motion brings the scope to a place from which tubes leave the airway: its bending "
+                "section does not pass the forks"
             )
         generation, excess = atlas.motions.passages.narrowest
         if generation < 0:

@@ -13,6 +13,7 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Float, Float32, Int
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.costs import path_cost
+from lungaccess.plans.tip_rows import TipRows
 from lungaccess.problem.task import Task
 from stages.needle import (
     CURVATURE,
@@ -127,6 +128,11 @@ class CandidateEvaluator:
         labels, counts = np.unique(blockers, return_counts=True)
         for label, count in zip(labels, counts, strict=True):
             self.blocked[blocker_name(int(label))] += int(count)
+
+    @cached_property
+    def tip_rows(self) -> TipRows:
+        """Scope tips beside a tip."""
+        return TipRows(self.task.lung, self.task.system.scope)
 
     @property
     def objective(self) -> Objective:

@@ -1,4 +1,4 @@
-"""Joint refinement of a proved candidate: site, tubes and needle together."""
+"""Joint refinement of a proved candidate: scope, tubes and needle together."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from lungaccess.refinement.problem import ARC_COUNTS, Problem, program_weights
 from lungaccess.refinement.reconstruction import Reconstruction
-from stages.scope import Sites
 
 ITERATIONS = 40
 """Most steps of IPOPT by default; docs/explanation/refinement.md has what they save."""
@@ -17,19 +16,15 @@ BETTER = 1e-3
 """Share of the cost that an improvement must save."""
 
 
-def refine(
-    task: Task, atlas_sites: Sites, candidate: Candidate, *, iterations: int = ITERATIONS
-) -> Candidate | None:
+def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) -> Candidate | None:
     """Improve everything about a candidate together.
 
-    A nonlinear program moves the scope's site, the tubes and all arcs of the needle at once.  What it finds
-    is put back into the numbers of a plan and proved by the evaluator, so nothing is returned that it
-    refuses.  Called again with what it returned, it may find more.  Not for several threads at a time.
+    A nonlinear program moves the place where the scope stops, the tubes and all arcs of the needle at once.
+    What it finds is put back into the numbers of a plan and proved by the evaluator, so nothing is returned
+    that it refuses.  Called again with what it returned, it may find more.  Not for several threads at a time.
 
     Parameters
     ----------
-    atlas_sites : Sites
-        Where the scope passes.
     candidate : Candidate
         Proved by the evaluator.
     iterations : int
@@ -45,20 +40,16 @@ def refine(
     weights = program_weights(task)
     if len(candidate.path.arcs) > ARC_COUNTS[-1] or weights is None:
         return None
-    return _refined(CandidateEvaluator(task), atlas_sites, candidate, weights, iterations)
+    return _refined(CandidateEvaluator(task), candidate, weights, iterations)
 
 
 def _refined(
-    evaluator: CandidateEvaluator,
-    sites: Sites,
-    candidate: Candidate,
-    weights: tuple[float, float, float],
-    iterations: int,
+    evaluator: CandidateEvaluator, candidate: Candidate, weights: tuple[float, float, float], iterations: int
 ) -> Candidate | None:
     """Solve for everything, then for the needle alone from tubes that are proved."""
     from lungaccess.refinement.program import program
 
-    problem = Problem(evaluator.task, sites, candidate, weights)
+    problem = Problem(evaluator, candidate, weights)
     reconstruction = Reconstruction(evaluator, problem)
     limit = evaluator.cost(candidate.path) * (1.0 - BETTER)
     solver = program(problem.layout, iterations)

@@ -11,12 +11,13 @@ from scipy import ndimage
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
 from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from lungaccess.refinement import boxes as fields
-from lungaccess.refinement.axis import axis_of, one_tip
+from lungaccess.refinement.axis import LocalAxis, one_tip
 from lungaccess.refinement.curve import rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_CONTACT_MM, Layout, Numbers
-from stages.scope import ScopeTip, Sites
+from stages.scope import ScopeTip
 from stages.tube import centreline, tracking_length_mm, tube_constants
 from stages.tube import kernels as index
 
@@ -77,13 +78,13 @@ class Problem:
         The candidate as variables.
     numbers : Numbers
     boxes : tuple of FieldBox
-    axis : LocalAxis or FixedTip
+    axis : LocalAxis
     """
 
     def __init__(
-        self, task: Task, sites: Sites, candidate: Candidate, weights: tuple[float, float, float]
+        self, evaluator: CandidateEvaluator, candidate: Candidate, weights: tuple[float, float, float]
     ) -> None:
-        self.task = task
+        self.task = evaluator.task
         self._candidate, self._weights = candidate, weights
         needle, deployment = self.task.system.needle, candidate.deployment
         rows = rows_of(candidate.path)
@@ -91,7 +92,7 @@ class Problem:
         self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
         rows = split(rows, arcs, self._exempt_mm)
         self.layout = Layout(arcs=arcs, with_map=weights[2] > 0.0)
-        self.axis = axis_of(self.task.lung.tree, sites, candidate.tip, deployment.branch)
+        self.axis = LocalAxis(evaluator.tip_rows, candidate.tip)
         tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
         bends = rows[:, 1:].T / needle.max_curvature_per_mm
         self.start = np.concatenate([[0.0], tubes, rows[:, 0], *bends])

@@ -63,8 +63,8 @@ class Reconstruction:
         at = self._problem.layout.variables
         x = self._problem.start + share * (found - self._problem.start)
         tip = self._problem.axis.tip(float(x[at["site"]]))
-        deployment = self._deployment(tip, x)
-        if isinstance(deployment, str):
+        deployment = None if tip is None else self._deployment(tip, x)
+        if tip is None or deployment is None or isinstance(deployment, str):
             return None
         x[at["site"]] = 0.0
         x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy import poses as frames
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
@@ -119,9 +120,11 @@ class ScopeMotions:
 
     def tip(self, tip: int) -> ScopeTip:
         """Return a tip with its motion."""
-        motion = self.motion(tip)
+        point, forward, sideways = np.split(self.tips[tip], 3)
         return ScopeTip(
-            motion=motion, lps_from_scope_tip=motion.lps_from_tip, tree_point=int(self.tree_point[tip])
+            motion=self.motion(tip),
+            lps_from_scope_tip=frames.pose(point, forward, sideways),
+            tree_point=int(self.tree_point[tip]),
         )
 
     def nearest(self, point_lps: ArrayLike, forward: ArrayLike) -> int:

@@ -26,7 +26,7 @@ SCOPE_POSE_SPREAD = 8.0
 ROTATION_SPREAD_RAD = 0.14
 INSERTION_SPREAD_MM = 1.5
 VIA_SPREAD_MM = 3.0
-"""The largest standard deviations of a change.  Poses of a scope that is not turned lie 0.25 mm apart."""
+"""The largest standard deviations of a change.  The poses of a scope lie 0.25 mm of its motion apart."""
 SMALLEST_SPREAD = 0.005
 """The smallest standard deviation as a share of the largest: a change of about 0.01 mm."""
 ADD_SHARE = 0.12

@@ -18,7 +18,6 @@ from lungaccess.coupled.search.local_search import LocalSearch, LocalSearchRun
 from lungaccess.coupled.search.needle_planner import NamedNeedlePlanner
 from lungaccess.coupled.search.needle_search import PLANNER, needle_searches
 from lungaccess.coupled.search.rounds import LocalSearchRounds
-from lungaccess.coupled.search.scope_poses import ScopePoses
 from lungaccess.coupled.search.settings import SearchSettings
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.task import Task
@@ -87,7 +86,7 @@ class AtlasSearch:
         if not self.atlas.deployments.count:
             return
         settings, number = self.settings, self._share[0]
-        local_search = LocalSearch(self.evaluator, ScopePoses(self.atlas.motions), self._rng)
+        local_search = LocalSearch(self.evaluator, self._rng)
         rounds = LocalSearchRounds(local_search, self.evaluator, self.incumbent, settings)
         starts = self._starts(local_search)
         sampled = self._sampled(local_search)

@@ -7,15 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.typed import Float, UInt64
+from anatomy.typed import Bool, Float, UInt64
 from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
-from lungaccess.coupled.search.scope_poses import PoseRow, ScopePoses
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from stages.needle import ArcPath, direct_path
+from stages.scope import TipRow, evenly
 from stages.tube import Deployment, tube_constants, tube_environment
 
+SHIFTS_MM = evenly(0.25, 4.0)
+"""How much farther the scope may stop: a fraction of the 1 mm between the tips of an atlas, and several times
+as far as the next."""
 PERTURBATION = np.array([4.0, math.radians(15.0), 2.0, 2.0])
 """Standard deviations of a perturbation: scope pose (rows), rotation, and insertions in mm.  They are a few
 steps of the atlas, so that the search leaves the neighbourhood of where it was."""
@@ -40,7 +43,8 @@ class LocalSearchRun:
         The estimated cost at which the choice was last evaluated in full.
     """
 
-    poses: PoseRow
+    poses: TipRow
+    allowed: Bool
     x: Float
     vias: Float
     count: int
@@ -53,8 +57,6 @@ class LocalSearch:
 
     Parameters
     ----------
-    scope_poses : ScopePoses
-        The tips that the scope can take.
 
     Attributes
     ----------
@@ -63,11 +65,9 @@ class LocalSearch:
     target : tuple of 3 floats
     """
 
-    def __init__(
-        self, evaluator: CandidateEvaluator, scope_poses: ScopePoses, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, evaluator: CandidateEvaluator, rng: np.random.Generator) -> None:
         task = evaluator.task
-        self._evaluator, self._poses, self._rng = evaluator, scope_poses, rng
+        self._evaluator, self._rng = evaluator, rng
         environment = tube_environment(task.lung, with_fissures=task.with_fissures)
         self.tube = (environment, tube_constants(task.system.tubes, task.system.margins))
         self.needle = evaluator.needle_arrays
@@ -80,13 +80,14 @@ class LocalSearch:
             return None
         deployment = candidate.deployment
         points = candidate.path.frames()[1:-1, :3, 3]
-        poses = self._poses.around(candidate.tip)
-        if len(points) > MAX_VIAS or poses is None:
+        if len(points) > MAX_VIAS:
             return None
+        poses, allowed = self._evaluator.tip_rows.along(candidate.tip, SHIFTS_MM)
         vias = np.zeros((MAX_VIAS, 3))
         vias[: len(points)] = points
-        x = np.array([poses.home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
-        return LocalSearchRun(poses=poses, x=x, vias=vias, count=len(points))
+        home = float(len(SHIFTS_MM) // 2)
+        x = np.array([home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
+        return LocalSearchRun(poses=poses, allowed=allowed, x=x, vias=vias, count=len(points))
 
     def advance(self, run: LocalSearchRun, tries: int) -> None:
         """Evaluate so many variations of a run's choice, and keep the best."""
@@ -94,8 +95,8 @@ class LocalSearch:
         run.count, run.cost = improve(
             self.tube,
             self.needle,
-            run.poses.rows,
-            run.poses.allowed,
+            run.poses.tips,
+            run.allowed,
             run.x,
             run.vias,
             run.count,
@@ -108,7 +109,7 @@ class LocalSearch:
         """Move a run some distance away at random, and leave out some of its via points."""
         x, drawn = run.x, self._rng.standard_normal(N_CHOICE)
         x[:] = x + drawn * PERTURBATION
-        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(run.poses.rows) - 1)
+        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(SHIFTS_MM) - 1)
         x[OUTER] = max(x[OUTER], 0.0)
         x[INNER] = max(x[INNER], x[OUTER])
         run.count = min(run.count, int(self._rng.integers(MAX_VIAS)))
@@ -118,8 +119,8 @@ class LocalSearch:
     def candidate(self, run: LocalSearchRun) -> Candidate | None:
         """Return a run's best choice as a candidate, in the numbers of a plan."""
         index = int(run.x[SCOPE_POSE])
-        tip, (rotation, outer, inner) = self._poses.tip(run.poses, index), run.x[1:].tolist()
-        rotation = self._poses.rotation_rad(run.poses, index, tip, rotation)
+        tip, (rotation, outer, inner) = self._evaluator.tip_rows.tip(run.poses, index), run.x[1:].tolist()
+        rotation %= 2.0 * math.pi
         deployment = self._evaluator.tubes.validate(tip.lps_from_scope_tip, rotation, outer, inner)
         if isinstance(deployment, str):
             return None

@@ -36,8 +36,8 @@ class Placement:
 def random_placements(task: Task, atlas: Atlas) -> Iterator[Placement]:
     """Draw placements without end; there is none if the scope can take no pose.
 
-    The poses are drawn from the atlas's tips that look along the airway, which lie evenly spaced by arc length
-    where a motion of the scope ends and an airway in lung tissue is ahead; nothing else of the atlas is used.
+    The poses are drawn from the atlas's tips that look along the airway.  These lie evenly spaced by arc
+    length, where a motion of the scope ends and an airway in lung tissue is ahead.
     """
     rng = np.random.Generator(np.random.PCG64(task.seed))
     along = np.flatnonzero(~atlas.motions.turned)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lungaccess.coupled.search.scope_poses import ScopePoses
 
 import lungaccess as la
 from anatomy.errors import SettingsError, TargetError
@@ -31,7 +32,6 @@ from lungaccess.coupled import (
 from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND
 from lungaccess.coupled.search.entries import different
 from lungaccess.coupled.search.local_search import LocalSearch, path_through
-from lungaccess.coupled.search.scope_poses import ScopePoses
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target

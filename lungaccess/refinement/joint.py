@@ -21,7 +21,8 @@ def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) ->
 
     A nonlinear program moves the place where the scope stops, the tubes and all arcs of the needle at once.
     What it finds is put back into the numbers of a plan and proved by the evaluator, so nothing is returned
-    that it refuses.  Called again with what it returned, it may find more.  Not for several threads at a time.
+    that it refuses.  Called again with what it returned, it may find more.  It is not for several threads at
+    a time.
 
     Parameters
     ----------

@@ -8,10 +8,12 @@ its own arc, or twists and bends in place, both at a steady rate.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from anatomy.grid import read_only
-from anatomy.poses import poses_on_pieces
+from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.scope.device import laid_pieces
@@ -76,3 +78,33 @@ class ScopeMotion:
     def max_curvature_per_mm(self) -> float:
         """Largest curvature of the body in the last state, which tubes in the channel pass."""
         return float(np.abs(self.pieces[:, 2]).max())
+
+    @property
+    def tips(self) -> Float:
+        """Frames of the tip in every state, `(M, 4, 4)`, +x as in `body`."""
+        curvature = self.states[:, BEND] / self.bending_length_mm
+        advanced = np.diff(self.states[:, ADVANCE], append=self.states[-1, ADVANCE])
+        turned = np.diff(self.states[:, TWIST], prepend=0.0)
+        base, tips = self.lps_from_entry, []
+        for roll, bent, step in zip(turned, curvature, advanced, strict=True):
+            base, tip = poses_on_arc(base, roll, bent, [step, self.bending_length_mm])
+            tips.append(tip)
+        return np.array(tips)
+
+    def between(self, advance_mm: float, turn_rad: float) -> ScopeMotion:
+        """Return the same motion with states put between, so that none differs more from the one before it.
+
+        Parameters
+        ----------
+        advance_mm : float
+            Largest advance from one state to the next.
+        turn_rad : float
+            Largest change of twist or bend.
+        """
+        steps = np.diff(self.states, axis=0)
+        shares = np.abs(steps) / [advance_mm, turn_rad, turn_rad]
+        states = [self.states[:1]]
+        for before, step, most in zip(self.states[:-1], steps, shares.max(axis=1), strict=True):
+            count = max(1, int(np.ceil(most - 1e-9)))
+            states.append(before + np.arange(1, count + 1)[:, None] / count * step)
+        return replace(self, states=np.concatenate(states))

@@ -1,0 +1,146 @@
+"""What hands do with the bronchoscope of a plan: its states merged into steps that a person can follow."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+
+import numpy as np
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.records import frozen_value
+from anatomy.typed import Float, Int
+from stages.scope import ScopeMotion
+
+MERGED_RAD = math.radians(8.0)
+"""States are merged while an even motion is so near to them: hands are not steadier [assumption]."""
+AHEAD_MM = 12.0
+"""Where the way goes on is told by the place of the tip after so much more advance: the next airway's mouth."""
+STRAIGHT_RAD = math.radians(4.0)
+"""What lies nearer to the middle of the picture is straight ahead."""
+ROUNDED_MM, ROUNDED_DEG = 0.5, 0.5
+"""What is smaller is written as 0."""
+STILL = np.linspace(0.0, 1.0, 33)
+"""Shares of an even turn in place at which it is compared with the states between."""
+
+
+@frozen_value
+class ScopeStep:
+    """One step of a scope's insertion; all that changes changes evenly over its advance.
+
+    Parameters
+    ----------
+    advance_mm, inserted_mm : float
+        Advance in this step, and the whole advance at its end; 0 mm is where the motion begins.
+    twist_deg : float
+        Change of the twist; positive is clockwise seen from behind, as the picture sees it.
+    from_bend_deg, to_bend_deg : float
+        Bend at begin and end; positive is towards the top of the picture, and negative is down.
+    goes_on : str
+        Where in the picture the airway goes on as the step begins.
+    generation : int
+        Of the airway in which the tip is at the end.
+    first_state, last_state : int
+        The states of the plan that it merges.
+    """
+
+    advance_mm: float
+    inserted_mm: float
+    twist_deg: float
+    from_bend_deg: float
+    to_bend_deg: float
+    goes_on: str
+    generation: int
+    first_state: int
+    last_state: int
+
+    @property
+    def text(self) -> str:
+        """The step as a sentence."""
+        turns = " and ".join(words for words in (self._twist_words, self._bend_words) if words)
+        if self.advance_mm < ROUNDED_MM:
+            do = f"stand still and {turns}" if turns else "stand still"
+        elif turns:
+            do = f"advance {self.advance_mm:.0f} mm and on the way {turns}"
+        else:
+            do = f"advance {self.advance_mm:.0f} mm with the tip {bend_words(self.to_bend_deg)}"
+        return f"The airway goes on {self.goes_on}: {do}. Inserted: {self.inserted_mm:.0f} mm."
+
+    @property
+    def _twist_words(self) -> str:
+        if abs(self.twist_deg) < ROUNDED_DEG:
+            return ""
+        way = "clockwise" if self.twist_deg > 0.0 else "counterclockwise"
+        return f"turn the scope {abs(self.twist_deg):.0f}° {way} (seen from behind)"
+
+    @property
+    def _bend_words(self) -> str:
+        if abs(self.to_bend_deg - self.from_bend_deg) < ROUNDED_DEG:
+            return ""
+        return f"bring the tip from {bend_words(self.from_bend_deg)} to {bend_words(self.to_bend_deg)}"
+
+    def as_json(self) -> dict[str, object]:
+        """Return the step as plain values, with its sentence."""
+        return {**asdict(self), "text": self.text}
+
+
+def bend_words(bend_deg: float) -> str:
+    """Return a bend in words, such as "20° up"."""
+    if abs(bend_deg) < ROUNDED_DEG:
+        return "straight"
+    return f"{abs(bend_deg):.0f}° {'up' if bend_deg > 0.0 else 'down'}"
+
+
+def scope_steps(motion: ScopeMotion, tree: AirwayTree) -> tuple[ScopeStep, ...]:
+    """Return a motion as steps."""
+    tips, states = motion.tips, motion.states
+    ends = merged_states(states)
+    places = np.linalg.norm(tips[ends, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
+    generations = tree.generation[tree.branch_of_point[places]]
+    angles = np.degrees(states)
+    return tuple(
+        ScopeStep(
+            advance_mm=float(states[last, 0] - states[first, 0]),
+            inserted_mm=float(states[last, 0]),
+            twist_deg=float(angles[last, 1] - angles[first, 1]),
+            from_bend_deg=float(angles[first, 2]),
+            to_bend_deg=float(angles[last, 2]),
+            goes_on=_goes_on(tips, states[:, 0], first),
+            generation=int(generation),
+            first_state=int(first),
+            last_state=int(last),
+        )
+        for first, last, generation in zip(ends[:-1], ends[1:], generations[1:], strict=True)
+    )
+
+
+def merged_states(states: Float) -> Int:
+    """Return the states `(K,)` between which all others lie near an even motion, the first and last among them."""
+    ends = [0]
+    while ends[-1] < len(states) - 1:
+        last = ends[-1] + 1
+        while last + 1 < len(states) and _is_even(states[ends[-1] : last + 2]):
+            last += 1
+        ends.append(last)
+    return np.array(ends)
+
+
+def _is_even(states: Float) -> bool:
+    """Tell whether all states are near those of an even motion from the first to the last."""
+    advance = states[:, 0] - states[0, 0]
+    still = advance[-1] <= 0.0
+    share = STILL if still else advance / advance[-1]
+    twist, bend = (states[0, 1:] + share[:, None] * (states[-1, 1:] - states[0, 1:])).T
+    true, even = states[:, 2] * np.exp(1j * states[:, 1]), bend * np.exp(1j * twist)
+    away = np.abs(true[:, None] - even).min(axis=1) if still else np.abs(true - even)
+    return bool(away.max() <= MERGED_RAD)
+
+
+def _goes_on(tips: Float, advance: Float, state: int) -> str:
+    """Say where in the picture of a state the tip will be after some more advance."""
+    later = min(int(np.searchsorted(advance, advance[state] + AHEAD_MM)), len(tips) - 1)
+    up, right, ahead = tips[state, :3, :3].T @ (tips[later, :3, 3] - tips[state, :3, 3])
+    if math.atan2(math.hypot(up, right), ahead) < STRAIGHT_RAD:
+        return "straight ahead"
+    hour = round(math.degrees(math.atan2(right, up)) / 30.0) % 12
+    return f"towards {hour or 12} o'clock in the picture"

@@ -80,12 +80,11 @@ def from_json(cls: type[P], text: str) -> P:
 def _require_schema(schema: object) -> None:
     if schema == SCHEMA:
         return
-    old = " in which the scope has a line and no motion: nobody can tell how it would get there"
-    raise PlanFileError(
-        f"The plan has the schema {schema!r},{old}" if schema == LINES else f"The plan has the schema {schema!r}",
-        expected=SCHEMA,
-        remedy=f"{_REMEDY} for the same patient, target and system" if schema == LINES else _REMEDY,
-    )
+    found, remedy = f"The plan has the schema {schema!r}", _REMEDY
+    if schema == LINES:
+        found += ", in which the scope has a line but no motion: it does not say how the scope gets there"
+        remedy += " for the same patient, target and system"
+    raise PlanFileError(found, expected=SCHEMA, remedy=remedy)
 
 
 def save(plan: Record, path: str | os.PathLike[str]) -> None:

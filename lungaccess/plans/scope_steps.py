@@ -15,7 +15,7 @@ from stages.scope import ScopeMotion
 MERGED_RAD = math.radians(8.0)
 """States are merged while an even motion is so near to them: hands are not steadier [assumption]."""
 AHEAD_MM = 12.0
-"""Where the way goes on is told by the place of the tip after so much more advance: the next airway's mouth."""
+"""Where the way goes on is told by the place of the tip after so much more advance: about a branch on."""
 STRAIGHT_RAD = math.radians(4.0)
 """What lies nearer to the middle of the picture is straight ahead."""
 ROUNDED_MM, ROUNDED_DEG = 0.5, 0.5
@@ -115,7 +115,7 @@ def scope_steps(motion: ScopeMotion, tree: AirwayTree) -> tuple[ScopeStep, ...]:
 
 
 def merged_states(states: Float) -> Int:
-    """Return the states `(K,)` between which all others lie near an even motion, the first and last among them."""
+    """Return the states `(K,)` between which all others lie near an even motion, with the first and last."""
     ends = [0]
     while ends[-1] < len(states) - 1:
         last = ends[-1] + 1

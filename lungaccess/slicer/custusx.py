@@ -34,7 +34,5 @@ def _with_flags(scope: DeviceCurve, plan: Plan, tree: AirwayTree) -> list[tuple[
     way = np.flatnonzero(np.isin(tree.branch_of_point, plan.scope.branches))
     away = np.linalg.norm(scope.points_lps[:, None] - tree.points_lps[way], axis=2)
     branch = tree.branch_of_point[way[away.argmin(axis=1)]]
-    ends = np.append(np.diff(branch) != 0, False)
-    return [
-        (point, BRANCHING if end else ROUTE) for point, end in zip(scope.points_lps.tolist(), ends, strict=True)
-    ]
+    flags = np.where(np.append(np.diff(branch) != 0, False), BRANCHING, ROUTE)
+    return list(zip(scope.points_lps.tolist(), flags.tolist(), strict=True))

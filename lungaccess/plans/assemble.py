@@ -14,12 +14,13 @@ from anatomy.structures import BITS
 from anatomy.typed import Float
 from lungaccess.plans import costs
 from lungaccess.plans.candidate import Candidate
-from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.insertion import scope_insertion
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath
-from stages.scope import ScopeTip, Sites, approach, approach_depth_mm, leaving_point
+from stages.scope import ScopeTip, prove_motion
 from stages.tube import centreline
 
 CLEARANCE_CAP_MM = 5.0
@@ -28,9 +29,7 @@ SAMPLE_MM = 0.05
 """Spacing of the samples of a clearance, which is lowered by half of it to hold between them."""
 
 
-def assemble(
-    task: Task, sites: Sites, candidate: Candidate, *, iteration: int, timing: Mapping[str, float]
-) -> Plan:
+def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mapping[str, float]) -> Plan:
     """Return the plan of a candidate."""
     system, lung = task.system, task.lung
     margin = system.margins.total_mm
@@ -46,7 +45,7 @@ def assemble(
         target_origin=task.target.origin,
         fissures_are_obstacles=task.with_fissures,
         objective=str(task.objective),
-        scope=_scope_route(task, sites, candidate.tip),
+        scope=_scope(task, candidate.tip),
         tube=_tube(task, candidate),
         needle=_needle(candidate.path),
         exemption=Exemption(
@@ -80,58 +79,13 @@ def software_version() -> str:
         return "unknown"
 
 
-def _scope_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
-    tree = task.lung.tree
-    if tip.turned:
-        return _turned_route(task, sites, tip)
-    points = tree.route(tip.tree_point)
-    position = tip.lps_from_scope_tip[:3, 3]
-    route, radius = tree.points_lps[points].copy(), tree.radius_mm[points].copy()
-    if tip.back_mm > 0.0:
-        route[-1] = position
-        radius[-1] = task.lung.lumen_depth.lower_bound_mm(position)[0]
-    branches = tree.branch_of_point[points]
-    length = float(tree.distance_from_root_mm[tip.tree_point] - tip.back_mm)
-    carina = float(tree.distance_from_root_mm[tree.carina_point])
-    return ScopeRoute(
-        points_lps=route,
-        lumen_radius_mm=radius,
-        branches=branches,
-        lps_from_scope_tip=tip.lps_from_scope_tip,
-        site_point=tip.tree_point if tip.back_mm == 0.0 else -1,
-        generation=int(tree.generation[branches[-1]]),
-        length_mm=length,
-        length_from_carina_mm=length - carina,
-        min_lumen_margin_mm=float(sites.lumen_radius_mm[tip.tree_point]) - task.system.scope.radius_mm,
-    )
-
-
-def _turned_route(task: Task, sites: Sites, tip: ScopeTip) -> ScopeRoute:
-    """Return the route of a scope whose tip is turned aside: it leaves the medial axis before the tip."""
-    from scipy.spatial import cKDTree  # Here: the import takes longer than a short search.
-
-    lung, tree = task.lung, task.lung.tree
-    on_axis = tree.route(leaving_point(tree, tip))
-    aside = approach(tree, tip)
-    if aside is None:
-        raise AnatomyError("The scope's tip is turned farther than the scope bends")
-    route = np.concatenate([tree.points_lps[on_axis], aside[1:]])
-    nearest = cKDTree(tree.points_lps).query(aside[1:])[1]
-    branches = np.concatenate([tree.branch_of_point[on_axis], tree.branch_of_point[nearest]])
-    branches[-1] = tree.branch_of_point[tip.tree_point]
-    length = float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
-    depth = min(float(sites.lumen_radius_mm[on_axis[-1]]), approach_depth_mm(lung, tip))
-    return ScopeRoute(
-        points_lps=route,
-        lumen_radius_mm=np.concatenate([tree.radius_mm[on_axis], lung.lumen_depth.lower_bound_mm(aside[1:])]),
-        branches=branches,
-        lps_from_scope_tip=tip.lps_from_scope_tip,
-        site_point=tip.tree_point if tip.back_mm == 0.0 else -1,
-        generation=int(tree.generation[branches[-1]]),
-        length_mm=length,
-        length_from_carina_mm=length - float(tree.distance_from_root_mm[tree.carina_point]),
-        min_lumen_margin_mm=depth - task.system.scope.radius_mm,
-    )
+def _scope(task: Task, tip: ScopeTip) -> ScopeInsertion:
+    """Return the motion to a tip, with the room that its proof finds."""
+    room = prove_motion(task.lung, task.system.scope, tip.motion)
+    if isinstance(room, str):
+        raise AnatomyError(f"The scope cannot move to the tip of a plan: {room}")
+    margin = task.system.scope.lumen_margin_mm + room
+    return scope_insertion(tip.motion, task.lung.tree, tip.tree_point, margin)
 
 
 def _tube(task: Task, candidate: Candidate) -> TubeDeployment:

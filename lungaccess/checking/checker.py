@@ -11,7 +11,7 @@ from lungaccess.checking.deployment import check_deployment
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import CheckReport, Findings
 from lungaccess.checking.record import check_record
-from lungaccess.checking.route import check_route
+from lungaccess.checking.scope import check_scope
 from lungaccess.checking.steering import check_needle
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
@@ -39,7 +39,7 @@ class Checker:
         found = Findings()
         target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
         if check_record(plan, self._environment.lung, found, system, target):
-            check_route(plan, self._environment, found)
+            check_scope(plan.scope, plan.system, self._environment, found)
             curve = check_deployment(plan, self._environment, found)
             check_needle(plan, self._environment, None if curve is None else curve.end, found)
         return found.report()

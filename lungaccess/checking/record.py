@@ -27,6 +27,7 @@ STRUCTURES = {"airway", "vessel", "outside", "fissure"}
 MAX_NUMBER = 1e5
 MAX_TOTAL_MM = 2000.0
 MAX_CURVATURE_PER_MM = 1.0
+MAX_STATES, MAX_ANGLE_RAD = 10_000, 100.0
 """No plan goes beyond these: they keep the check short on an absurd one."""
 
 
@@ -128,10 +129,11 @@ def _check_lengths(plan: Plan, found: Findings) -> bool:
     lengths = [tube.inner_insertion_mm, *(arc.length_mm for arc in arcs)]
     usable = bool(arcs) and min(lengths) > 0.0 and sum(lengths) <= MAX_TOTAL_MM
     usable &= 0.0 <= tube.outer_insertion_mm <= tube.inner_insertion_mm
-    usable &= len(plan.scope.points_lps) >= 2
-    route_shape = len(plan.scope.points_lps) == len(plan.scope.lumen_radius_mm) == len(plan.scope.branches)
+    states = plan.scope.states
+    usable &= 0 < len(states) <= MAX_STATES and float(np.abs(states[:, 1:]).max()) <= MAX_ANGLE_RAD
+    usable &= float(np.abs(states[:, 0]).max()) <= MAX_TOTAL_MM
     curvatures = [arc.curvature_per_mm for arc in arcs]
-    usable &= route_shape and float(np.abs(curvatures).max(initial=0.0)) <= MAX_CURVATURE_PER_MM
+    usable &= float(np.abs(curvatures).max(initial=0.0)) <= MAX_CURVATURE_PER_MM
     geometry = (plan.scope, plan.tube, plan.needle, plan.exemption, plan.target_lps)
     usable &= all(size <= MAX_NUMBER for part in geometry for _, size in _sizes(part, ""))
     return found.true("record.lengths", usable, "lengths positive, in order and not absurd")

@@ -60,18 +60,20 @@ class Cells:
         )
 
 
-def least_gap_mm(motion: Motion, boxes: Boxes, enough_mm: float) -> float:
-    """Return how near the axis of the body comes to a structure during a motion.
+def least_gap_mm(motion: Motion, boxes: Boxes, needed_mm: float, stated_mm: float) -> float:
+    """Return a distance of the axis of the body from a structure that occurs during a motion.
 
-    What is `enough_mm` or more is not told apart from it by more than the cells needed; a result below it is
-    a distance that is there.
+    It is below `needed_mm` if any is, and below `stated_mm` if any is; else there may be smaller ones.
     """
     cells, least = first_cells(motion), np.inf
     while len(cells.state):
         gaps = boxes.distance_mm(places(motion, cells))
         least = min(least, float(gaps.min()))
+        kept = [limit for limit in (needed_mm, stated_mm) if limit <= least]
+        if not kept:
+            break
         arc, swept = cells.half_mm, swept_mm(motion, cells)
-        open_ = (gaps - arc - swept < enough_mm) & (arc + swept > SURE_MM) & (least >= enough_mm)
+        open_ = (gaps - arc - swept < max(kept)) & (arc + swept > SURE_MM)
         cells = cells.pick(open_).halves(swept[open_] > arc[open_])
     return least
 

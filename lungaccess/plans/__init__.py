@@ -11,7 +11,14 @@ if TYPE_CHECKING:
     from lungaccess.plans.curves import DeviceCurve, DeviceCurves
     from lungaccess.plans.file import SCHEMA
     from lungaccess.plans.no_plan import NoPlan
-    from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+    from lungaccess.plans.parts import (
+        Exemption,
+        NeedleArc,
+        NeedlePath,
+        ScopeInsertion,
+        TubeDeployment,
+        WallExit,
+    )
     from lungaccess.plans.plan import Plan
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -13,15 +13,19 @@ from anatomy.grid import freeze_arrays
 from anatomy.poses import poses_on_pieces
 from anatomy.records import frozen_record
 from anatomy.typed import Float
-from lungaccess.plans.parts import NeedlePath, ScopeRoute, TubeDeployment
+from lungaccess.plans.parts import NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.problem.system import System
+from stages.scope.device import laid_pieces
 from stages.tube.device import ConcentricTubes
 
 STEP_MM = 0.25
 """Largest distance between the poses of tubes and needle: the chord of a 40 mm arc is off by 0.2 um."""
 
+SCOPE_STEP_MM = 1.0
+"""Largest distance between the poses of the scope: the chord of its tightest arcs is off by 0.01 mm."""
+
 SHORTEST_MM = 1e-6
-"""Two points that are nearer to each other than this have no direction between them."""
+"""Lengths that differ by less are one."""
 
 SHORTEST_ARC_MM = 1e-9
 """A piece of tube that is shorter than this is only the rounding of its neighbours' lengths."""
@@ -60,19 +64,27 @@ class DeviceCurves(NamedTuple):
 
 
 def device_curves(
-    scope: ScopeRoute, tube: TubeDeployment, needle: NeedlePath, system: System, step_mm: float = STEP_MM
+    scope: ScopeInsertion, tube: TubeDeployment, needle: NeedlePath, system: System, step_mm: float = STEP_MM
 ) -> DeviceCurves:
     """Return the curves of the three devices, poses of tubes and needle at most `step_mm` apart.
 
-    Poses turn as little as possible along the scope; on tubes and needle +x is the direction of the bend.
-    Where two arcs of the needle meet, the pose is that at the end of the first, before the turn.
+    +x is the direction of the bend.  Where two arcs meet, the pose is that at the end of the first, before
+    the turn; the last pose of the scope is that of its tip.
     """
     tubes = system.tubes
+    laid = laid_pieces(scope.states, system.scope.bending_length_mm)
+    scope_poses, scope_mm = poses_on_pieces(scope.lps_from_entry, laid, SCOPE_STEP_MM)
     tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube, tubes), step_mm)
     needle_poses, needle_mm = poses_on_pieces(needle.lps_from_start, needle_pieces(needle), step_mm)
     in_outer = tube_mm <= tube.outer_insertion_mm + SHORTEST_MM
     return DeviceCurves(
-        scope=_scope_curve(scope, system.scope.radius_mm),
+        scope=DeviceCurve(
+            name="scope",
+            lps_from_device=scope_poses,
+            radius_mm=np.full(len(scope_mm), system.scope.radius_mm),
+            arc_length_mm=scope_mm,
+            colour=(0.12, 0.47, 0.71),
+        ),
         tubes=DeviceCurve(
             name="tubes",
             lps_from_device=tube_poses,
@@ -87,19 +99,6 @@ def device_curves(
             arc_length_mm=needle_mm,
             colour=(0.1, 0.1, 0.1),
         ),
-    )
-
-
-def _scope_curve(scope: ScopeRoute, radius_mm: float) -> DeviceCurve:
-    points = np.asarray(scope.points_lps)
-    distinct = np.linalg.norm(np.diff(points, axis=0), axis=1) > SHORTEST_MM
-    points = points[np.append(distinct, True)]
-    return DeviceCurve(
-        name="scope",
-        lps_from_device=_carried_back(points, np.asarray(scope.lps_from_scope_tip)),
-        radius_mm=np.full(len(points), radius_mm),
-        arc_length_mm=arc_lengths(points),
-        colour=(0.12, 0.47, 0.71),
     )
 
 
@@ -121,22 +120,3 @@ def needle_pieces(needle: NeedlePath) -> Float:
 def arc_lengths(points: Float) -> Float:
     """Return the length in mm `(N,)` along a polyline `(N, 3)` up to each of its points."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-
-
-def _carried_back(points: Float, lps_from_tip: Float) -> Float:
-    """Carry the pose of the tip back along a polyline `(N, 3)` by the least turns; +z stays along it."""
-    ahead = np.diff(points, axis=0)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    frames = np.tile(np.eye(4), (len(points), 1, 1))
-    frames[:, :3, 3] = points
-    frames[-1, :3, :3] = lps_from_tip[:3, :3]
-    for n in range(len(points) - 2, -1, -1):
-        frames[n, :3, :3] = _turn(frames[n + 1, :3, 2], ahead[n]) @ frames[n + 1, :3, :3]
-    return frames
-
-
-def _turn(before: Float, after: Float) -> Float:
-    """Return the least rotation `(3, 3)` that takes one unit vector to another, not its opposite."""
-    axis, cosine = np.cross(before, after), float(before @ after)
-    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    return np.asarray(np.eye(3) + cross + cross @ cross / max(1.0 + cosine, SHORTEST_MM))

@@ -21,8 +21,10 @@ from anatomy.settings import parse, to_mapping
 from lungaccess.plans.record import LEFT_OUT_IF_EMPTY, Record
 from lungaccess.problem.system import System
 
-SCHEMA = "lungaccess-plan-1"
+SCHEMA = "lungaccess-plan-2"
 """Name and version of the file format; a reader refuses any other."""
+LINES = "lungaccess-plan-1"
+"""The format whose plans state a line for the scope."""
 
 P = TypeVar("P", bound=Record)
 _REMEDY = "Run `lungaccess plan` again"
@@ -63,10 +65,7 @@ def from_json(cls: type[P], text: str) -> P:
             remedy=_REMEDY,
             expected="a plan.json as `lungaccess plan` writes it",
         )
-    if content.get("schema") != SCHEMA:
-        raise PlanFileError(
-            f"The plan has the schema {content.get('schema')!r}", expected=SCHEMA, remedy=_REMEDY
-        )
+    _require_schema(content.get("schema"))
     stated = content.pop("digest", None)
     plan = _decode(cls, content, "plan")
     if stated != digest(plan):
@@ -76,6 +75,16 @@ def from_json(cls: type[P], text: str) -> P:
             remedy=_REMEDY,
         )
     return typing.cast(P, plan)
+
+
+def _require_schema(schema: object) -> None:
+    if schema == SCHEMA:
+        return
+    found, remedy = f"The plan has the schema {schema!r}", _REMEDY
+    if schema == LINES:
+        found += ", in which the scope has a line but no motion: it does not say how the scope gets there"
+        remedy += " for the same patient, target and system"
+    raise PlanFileError(found, expected=SCHEMA, remedy=remedy)
 
 
 def save(plan: Record, path: str | os.PathLike[str]) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.typed import Float
 from lungaccess.plans.parts import ScopeInsertion
+from lungaccess.plans.plan import Plan
 from stages.scope import ScopeMotion
 
 PASSING_STEP_MM = 0.25
@@ -39,6 +40,15 @@ def scope_insertion(
         length_from_carina_mm=length - _passes_mm(motion, tree.carina_lps),
         min_lumen_margin_mm=min_lumen_margin_mm,
         max_curvature_per_mm=motion.max_curvature_per_mm,
+    )
+
+
+def scope_motion(plan: Plan) -> ScopeMotion:
+    """Return the motion of a plan's bronchoscope."""
+    return ScopeMotion(
+        lps_from_entry=plan.scope.lps_from_entry,
+        states=plan.scope.states,
+        bending_length_mm=plan.system.scope.bending_length_mm,
     )
 
 

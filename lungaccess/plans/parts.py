@@ -12,41 +12,6 @@ from lungaccess.plans.record import Record, shaped
 
 
 @frozen_record
-class ScopeRoute(Record):
-    """Where the bronchoscope runs and the pose of its tip.
-
-    Parameters
-    ----------
-    points_lps : (M, 3) float64, LPS mm
-        Route along the airway tree from its root in the trachea to the site.
-    lumen_radius_mm : (M,) float64
-        Distance from each point to the border of the lumen.
-    branches : (M,) int64
-        Branch of the airway tree at each point.
-    lps_from_scope_tip : (4, 4) float64
-        Pose of the tip at the last point; +z is forward.
-    site_point : int
-        Index of the tree point of the site, -1 if it lies between tree points.
-    generation : int
-        Generation of the last branch; the trachea is 0.
-    length_mm, length_from_carina_mm : float
-        Length of the route, in all and beyond the carina.
-    min_lumen_margin_mm : float
-        Smallest lumen radius along the route minus the radius of the scope.
-    """
-
-    points_lps: Float = field(metadata=shaped(None, 3))
-    lumen_radius_mm: Float = field(metadata=shaped(None))
-    branches: Int = field(metadata=shaped(None, dtype=np.int64))
-    lps_from_scope_tip: Float = field(metadata=shaped(4, 4))
-    site_point: int
-    generation: int
-    length_mm: float
-    length_from_carina_mm: float
-    min_lumen_margin_mm: float
-
-
-@frozen_record
 class ScopeInsertion(Record):
     """How the bronchoscope gets from the trachea to where it stops, and the frame of its tip there.
 

@@ -16,7 +16,7 @@ from anatomy.typed import Float
 from anatomy.words import plural
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
-from lungaccess.plans.parts import Exemption, NeedlePath, ScopeRoute, TubeDeployment
+from lungaccess.plans.parts import Exemption, NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.plans.record import LEFT_OUT_IF_EMPTY, Record, shaped
 from lungaccess.problem.system import System
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @frozen_record
 class Plan(Record):
-    """One plan: scope route, tube deployment and needle arcs, with costs, margins and provenance.
+    """One plan: scope motion, tube deployment and needle arcs, with costs, margins and provenance.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Plan(Record):
     target_origin: str
     fissures_are_obstacles: bool
     objective: str
-    scope: ScopeRoute
+    scope: ScopeInsertion
     tube: TubeDeployment
     needle: NeedlePath
     exemption: Exemption

@@ -66,7 +66,7 @@ def overview_png(
 def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
     """Draw anatomy and all three stages as seen along a view."""
     frame = layers.footprint("lung", view) or layers.footprint("airway", view)
-    scope = view.project(np.asarray(plan.scope.points_lps))
+    scope = view.project(plan.curves().scope.points_lps)
     if frame is None:
         low, high = scope.min(axis=0), scope.max(axis=0)
     else:

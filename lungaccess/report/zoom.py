@@ -79,8 +79,8 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     """Draw scope, tubes and needle as bands of their own width."""
     system = plan.system
     limits = axes.get_xlim(), axes.get_ylim()
-    _scope, tube, needle = plan.curves()
-    scope = view.project(np.asarray(plan.scope.points_lps))
+    body, tube, needle = plan.curves()
+    scope = view.project(body.points_lps)
     tube_uv, needle_uv = view.project(tube.points_lps), view.project(needle.points_lps)
     outer = tube_uv[tube.arc_length_mm <= plan.tube.outer_insertion_mm + SHORTEST_MM]
     drawing.ribbon(axes, scope, system.scope.radius_mm, style.SCOPE, fill=0.35, order=6)

@@ -92,7 +92,7 @@ def export_slicer(
     items = _write_devices(plan, devices, target, refused=not report.accepted)
     items += _write_anatomy(lung, target, tell)
     _write_text(target / SCENE_FILE, scene(items))
-    _write_text(target / ROUTE_FILE, route_text(plan, devices))
+    _write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
     plan.save(target / PLAN_FILE)
     files = (SCENE_FILE, *(item.file for item in items), ROUTE_FILE, PLAN_FILE, README_FILE)
     _write_text(target / README_FILE, readme(plan, report, files))

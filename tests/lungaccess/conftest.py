@@ -15,10 +15,11 @@ from scipy import ndimage
 from anatomy.grid import Grid, Volume
 from anatomy.structures import BITS
 from lungaccess.cli import terminal
-from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 from stages.needle import arc_transform
+from tests.lungaccess.pursuit import pursued
 
 LEFT_LUNG_LPS = np.array([60.0, 0.0, 0.0])
 RIGHT_LUNG_LPS = np.array([-60.0, 0.0, 0.0])
@@ -145,7 +146,8 @@ def make_plan() -> Plan:
     route = np.concatenate(
         [np.linspace([0, 10, 95], [0, 5, 30], 40), np.linspace([0, 5, 30], [46, 0.4, 2.4], 40)]
     )
-    tip = _pose(route[-1], route[-1] - route[-2])
+    motion = pursued(route, 118.0, system.scope.bending_length_mm)
+    tip = motion.lps_from_tip
     exit_point = tip[:3, 3] + 8 * tip[:3, 2]
     # The tubes are moved together: the overlap is bent by the share of the inner tube's stiffness.
     inner, outer = system.tubes.inner, system.tubes.outer
@@ -170,16 +172,16 @@ def make_plan() -> Plan:
         target_origin="point",
         fissures_are_obstacles=True,
         objective="inverse_clearance",
-        scope=ScopeRoute(
-            points_lps=route,
-            lumen_radius_mm=np.full(80, 6.0),
-            branches=np.repeat([0, 1], 40),
+        scope=ScopeInsertion(
+            lps_from_entry=motion.lps_from_entry,
+            states=motion.states,
             lps_from_scope_tip=tip,
-            site_point=-1,
+            branches=np.array([0, 1]),
             generation=1,
-            length_mm=118.0,
+            length_mm=motion.length_mm,
             length_from_carina_mm=53.0,
             min_lumen_margin_mm=3.9,
+            max_curvature_per_mm=motion.max_curvature_per_mm,
         ),
         tube=TubeDeployment(
             rotation_rad=bend,

@@ -1,4 +1,4 @@
-"""Routes, deployments and needles that are not what is stated about them."""
+"""Deployments and needles that are not what is stated about them."""
 
 from __future__ import annotations
 
@@ -14,74 +14,6 @@ from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath
 from stages.tube.shape import centreline
-
-
-def route_cut(case: Case, rng: Rng) -> Mutant | None:
-    """The first or the last points of the route are missing, or some between."""
-    scope = case.plan.scope
-    count = len(scope.points_lps)
-    many = int(rng.integers(1, max(count // 2, 2)))
-    kind = int(rng.integers(3))
-    kept = np.arange(many, count) if kind == 0 else np.arange(count - many)
-    if kind == 2:
-        before_tip = np.linalg.norm(scope.points_lps - scope.points_lps[-1], axis=1)
-        kept = np.append(np.flatnonzero(before_tip > rng.uniform(6.0, 40.0)), count - 1)
-    if not 2 <= len(kept) < count:
-        return None
-    return Mutant(
-        plan=changed(
-            case.plan,
-            scope__points_lps=scope.points_lps[kept],
-            scope__lumen_radius_mm=scope.lumen_radius_mm[kept],
-            scope__branches=scope.branches[kept],
-        )
-    )
-
-
-def route_moved(case: Case, rng: Rng) -> Mutant | None:
-    """The route, or one point of it, lies beside the axis."""
-    points = case.plan.scope.points_lps.copy()
-    if rng.integers(2):
-        points += signed(rng, 0.03, 20.0) * direction(rng)
-    else:
-        n = int(rng.integers(1, len(points) - 1))
-        along = points[n + 1] - points[n - 1]
-        aside = np.cross(along, direction(rng))
-        points[n] += far(rng, 0.4, 10.0) * aside / np.linalg.norm(aside)
-    return Mutant(plan=changed(case.plan, scope__points_lps=points))
-
-
-def route_statement_edited(case: Case, rng: Rng) -> Mutant | None:
-    """A number about the route that is not so."""
-    scope, tree = case.plan.scope, case.lung.tree
-    radii, branches = scope.lumen_radius_mm.copy(), scope.branches.copy()
-    n = int(rng.integers(len(radii)))
-    radii[n] = 0.0 if rng.integers(2) and radii[n] > 2.5 else min(radii[n] + far(rng, 1.5, 5.0), 14.9)
-    at = int(np.linalg.norm(tree.points_lps - scope.points_lps[n], axis=1).argmin())
-    strangers = np.setdiff1d(np.arange(tree.n_branches), branch_and_kin(tree, int(tree.branch_of_point[at])))
-    if not len(strangers) or radii[n] == scope.lumen_radius_mm[n]:
-        return None
-    branches[n] = rng.choice(strangers)
-    over = next(each.value for each in case.report.findings if each.name == "scope.margin") or 0.0
-    distant = np.flatnonzero(np.linalg.norm(tree.points_lps - scope.points_lps[-1], axis=1) > 0.01)
-    edits: dict[str, Any] = {
-        "scope__lumen_radius_mm": radii,
-        "scope__branches": branches,
-        "scope__min_lumen_margin_mm": scope.min_lumen_margin_mm - over + far(rng, 0.1, 10.0),
-        "scope__generation": scope.generation + int(rng.choice([-1, 1, 2])),
-        "scope__length_mm": scope.length_mm + signed(rng, 0.01, 50.0),
-        "scope__length_from_carina_mm": scope.length_from_carina_mm + far(rng, 0.05, 50.0),
-        "scope__site_point": int(rng.choice(distant)),
-    }
-    key = str(rng.choice(list(edits)))
-    return Mutant(plan=changed(case.plan, **{key: edits[key]}))
-
-
-def branch_and_kin(tree: Any, branch: int) -> list[int]:
-    """Return a branch, its parent, its children and its siblings."""
-    parent = int(tree.branch_parent[branch])
-    kin = [n for n, p in enumerate(tree.branch_parent) if p in (branch, parent)]
-    return [branch, parent, *kin]
 
 
 def tube_edited(case: Case, rng: Rng) -> Mutant | None:
@@ -210,9 +142,6 @@ def needle_statement_edited(case: Case, rng: Rng) -> Mutant | None:
 
 
 MUTATIONS: tuple[Mutation, ...] = (
-    route_cut,
-    route_moved,
-    route_statement_edited,
     tube_edited,
     exit_edited,
     exit_at_a_corner,

@@ -14,6 +14,7 @@ from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 
+POSES = ["scope__lps_from_entry", "scope__lps_from_scope_tip", "tube__lps_from_tip", "needle__lps_from_start"]
 PIECES = ("scope", "tube", "needle", "exit", "target")
 
 
@@ -31,7 +32,8 @@ def moved(plan: Plan, pieces: tuple[str, ...], matrix: Float, turn: float = 1.0)
     arcs = tuple(replace(arc, roll_rad=turn * arc.roll_rad) for arc in needle.arcs)
     edits: dict[str, dict[str, Any]] = {
         "scope": {
-            "scope__points_lps": point(scope.points_lps),
+            "scope__lps_from_entry": pose(scope.lps_from_entry),
+            "scope__states": scope.states * [1.0, turn, 1.0],
             "scope__lps_from_scope_tip": pose(scope.lps_from_scope_tip),
         },
         "tube": {
@@ -106,7 +108,7 @@ def other_units(case: Case, rng: Rng) -> Mutant | None:
         {"needle__arcs": arcs(0.1, 1.0, 1.0)},
         {"needle__arcs": arcs(0.1, 1.0, 10.0), "needle__length_mm": 0.1 * needle.length_mm},
         {"tube__inner_insertion_mm": 0.1 * tube.inner_insertion_mm},
-        {"scope__points_lps": 0.1 * plan.scope.points_lps},
+        {"scope__states": plan.scope.states * [0.1, 1.0, 1.0]},
         {"target_lps": plan.target_lps * [-1.0, -1.0, 1.0]},
         {"scope__length_mm": 0.1 * plan.scope.length_mm},
     ]
@@ -122,7 +124,7 @@ def other_units(case: Case, rng: Rng) -> Mutant | None:
 
 def pose_edited(case: Case, rng: Rng) -> Mutant | None:
     """A pose turned by a few degrees, rolled, moved, inverted, mirrored or scaled."""
-    name = str(rng.choice(["scope__lps_from_scope_tip", "tube__lps_from_tip", "needle__lps_from_start"]))
+    name = str(rng.choice(POSES))
     stage, field = name.split("__")
     pose = getattr(getattr(case.plan, stage), field).copy()
     kind = int(rng.integers(6))
@@ -141,18 +143,9 @@ def pose_edited(case: Case, rng: Rng) -> Mutant | None:
         pose[:3, int(rng.integers(3))] *= -1.0
     else:
         pose[:3, :3] *= 1.0 + signed(rng, 1e-4, 0.5)
+    if np.abs(pose - getattr(getattr(case.plan, stage), field)).max() < 1e-6:
+        return None
     return Mutant(plan=changed(case.plan, **{name: pose}))
-
-
-def tip_turned_with_its_route(case: Case, rng: Rng) -> Mutant | None:
-    """A tip turned aside by an angle, the last point of its route moved so that it looks along its end."""
-    scope = case.plan.scope
-    pose, points = scope.lps_from_scope_tip.copy(), scope.points_lps.copy()
-    aside = np.append(rng.standard_normal(2), 0.0)
-    angle = np.deg2rad(signed(rng, 2.0, 60.0))
-    pose[:3, :3] = pose[:3, :3] @ rotation(aside / np.linalg.norm(aside), angle)
-    points[-2] = points[-1] - np.linalg.norm(points[-1] - points[-2]) * pose[:3, 2]
-    return Mutant(plan=changed(case.plan, scope__lps_from_scope_tip=pose, scope__points_lps=points))
 
 
 def stage_of_another_plan(case: Case, rng: Rng) -> Mutant | None:
@@ -166,6 +159,6 @@ def stage_of_another_plan(case: Case, rng: Rng) -> Mutant | None:
 
 
 MUTATIONS: tuple[Mutation, ...] = (
-    shifted_by_a_voxel, mirrored, rotated, other_units, pose_edited, tip_turned_with_its_route,
+    shifted_by_a_voxel, mirrored, rotated, other_units, pose_edited,
     stage_of_another_plan,
 )  # fmt: skip

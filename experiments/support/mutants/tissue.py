@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from anatomy import structures
 from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng, direction
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
+from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath, direct_path
@@ -130,8 +132,10 @@ def voxel_at_the_tube(case: Case, rng: Rng) -> Mutant | None:
 
 
 def voxel_at_the_scope(case: Case, rng: Rng) -> Mutant | None:
-    """A voxel of the lumen became wall, within the radius of the scope and its margin."""
-    points, scope = case.plan.scope.points_lps, case.plan.system.scope
+    """A voxel of the lumen became wall, within the radius and margin of the scope on its way."""
+    scope, motion = case.plan.system.scope, scope_motion(case.plan).between(1.0, 0.1)
+    until = replace(motion, states=motion.states[: 1 + int(rng.integers(len(motion.states)))])
+    points = until.body(0.2)[-int(scope.bending_length_mm / 0.2) :, :3, 3]
     within = scope.radius_mm + scope.lumen_margin_mm - 0.002
     point = beside(points, np.gradient(points, axis=0), 1, within, rng)
     return with_voxel(case, point, lambda label: label & ~structures.LUMEN)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,9 +14,11 @@ from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume, transform_points
 from experiments.support.mutants.mutant import changed
-from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, load_system, system_fingerprint
+from stages.scope import ScopeMotion
+from tests.lungaccess.pursuit import pursued
 from tests.lungaccess.rigid import arc, turned
 from tests.stages.scenes import forked_tree
 
@@ -34,7 +37,10 @@ BRANCHES = (
 """From, to, radius (mm) and parent of trachea, two main bronchi, and a lobar bronchus."""
 LOBAR = 3
 SITE_STEP = 20
-OUTER_MM, INNER_MM, ROTATION_RAD = 20.0, 38.0, 0.7
+OUTER_MM, INNER_MM = 20.0, 38.0
+LAST_TWIST_RAD = 0.7
+TOWARDS = np.array([1.0, 0.0, 0.0])
+"""Where the tubes bend to."""
 ARCS = ((6.0, 0.4, 0.0), (10.0, 1.1, 0.008), (9.0, -2.0, 0.004))
 EXEMPT_MM = 5.0
 
@@ -127,7 +133,7 @@ def is_airway_of(labels: np.ndarray, branch: int) -> np.ndarray:
 
 def toy_plan(lung: Any, system: System, outer_mm: float, inner_mm: float, arcs: Any = ARCS) -> Plan:
     """The plan, every stated value from closed forms and brute force."""
-    scope = toy_route(lung, system)
+    scope = toy_scope(lung, system)
     tube, tube_points, exit_at = toy_tube(lung, system, scope.lps_from_scope_tip, outer_mm, inner_mm)
     frames, at = follow(tube.lps_from_tip, list(arcs), 0.1)
     points, tangents = frames[:, :3, 3], frames[:, :3, 2]
@@ -187,30 +193,39 @@ def toy_plan(lung: Any, system: System, outer_mm: float, inner_mm: float, arcs: 
     )
 
 
-def toy_route(lung: Any, system: System) -> ScopeRoute:
-    """Down the trachea and some way into the lobar bronchus."""
+def toy_scope(lung: Any, system: System) -> ScopeInsertion:
+    """Down the trachea and some way into the lobar bronchus, by pursuit; at last the scope twists."""
     tree: AirwayTree = lung.tree
     site = int(tree.branch_start[LOBAR]) + SITE_STEP
-    index = tree.route(site)
-    points = tree.points_lps[index]
-    radius = brute_distance(lung, (lung.labels & structures.LUMEN) == 0, points)
-    z = tree.tangents[site]
-    b = np.cross([0.0, 1, 0], z)
-    frame = np.eye(4)
-    frame[:3, :3] = np.column_stack([b / np.linalg.norm(b), np.cross(z, b / np.linalg.norm(b)), z])
-    frame[:3, 3] = points[-1]
-    length = float(tree.distance_from_root_mm[site])
-    return ScopeRoute(
-        points_lps=points,
-        lumen_radius_mm=radius,
-        branches=tree.branch_of_point[index],
-        lps_from_scope_tip=turned(frame, np.pi - ROTATION_RAD),
-        site_point=site,
+    length, section = float(tree.distance_from_root_mm[site]), system.scope.bending_length_mm
+    led = pursued(tree.points_lps[tree.route(site)], length, section, np.array([1.0, 0.3, 0.0]))
+    advance, twist, bend = led.states[-1]
+    motion = replace(led, states=np.append(led.states, [[advance, twist + LAST_TWIST_RAD, bend]], axis=0))
+    margin = float(brute_depth(lung, motion).min()) - system.scope.radius_mm
+    points = motion.body(0.05)[:, :3, 3]
+    passed = 0.05 * float(np.linalg.norm(points - CARINA, axis=1).argmin())
+    return ScopeInsertion(
+        lps_from_entry=motion.lps_from_entry,
+        states=motion.states,
+        lps_from_scope_tip=motion.lps_from_tip,
+        branches=np.array([0, 1, LOBAR]),
         generation=2,
-        length_mm=length,
-        length_from_carina_mm=length - float(tree.distance_from_root_mm[tree.carina_point]),
-        min_lumen_margin_mm=float(radius.min()) - system.scope.radius_mm,
+        length_mm=advance + section,
+        length_from_carina_mm=advance + section - passed,
+        min_lumen_margin_mm=margin - 0.02,
+        max_curvature_per_mm=motion.max_curvature_per_mm,
     )
+
+
+def brute_depth(lung: Any, motion: ScopeMotion) -> np.ndarray:
+    """Depths in the lumen of the sections in all states."""
+    advance = motion.states[:, 0]
+    points = []
+    for n in range(len(motion.states)):
+        until = replace(motion, states=motion.states[: n + 1])
+        points.append(until.body(0.5)[-31:, :3, 3])
+    assert advance[0] == 0.0
+    return brute_distance(lung, (lung.labels & structures.LUMEN) == 0, np.concatenate(points))
 
 
 def toy_tube(
@@ -225,11 +240,10 @@ def toy_tube(
     kappa = tubes.inner.precurvature_per_mm
     overlap = kappa * stiff[0] / sum(stiff)
     curved = max(inner_mm - tubes.inner.curved_length_mm, 0.0)
-    pieces = [(curved, ROTATION_RAD, 0.0)] if curved else []
-    pieces += [
-        (outer_mm - curved, 0.0 if curved else ROTATION_RAD, overlap),
-        (inner_mm - outer_mm, 0.0, kappa),
-    ]
+    across = tip[:3, :3].T @ TOWARDS
+    rotation = float(np.arctan2(across[1], across[0]))
+    pieces = [(curved, rotation, 0.0)] if curved else []
+    pieces += [(outer_mm - curved, 0.0 if curved else rotation, overlap), (inner_mm - outer_mm, 0.0, kappa)]
     frames, at = follow(tip, pieces, 0.005)
     points = frames[:, :3, 3]
     index = np.rint(lung.grid.ijk(points)).astype(int)
@@ -249,7 +263,7 @@ def toy_tube(
         wall_run_mm=float(np.diff(at[last:])[behind < radius].sum()),
     )
     tube = TubeDeployment(
-        rotation_rad=ROTATION_RAD,
+        rotation_rad=rotation,
         outer_insertion_mm=outer_mm,
         inner_insertion_mm=inner_mm,
         lps_from_tip=frames[-1],

@@ -90,7 +90,7 @@ def test_the_least_gap_is_that_of_brute_force(seed: int, enough: float) -> None:
     motion = motion_of(ENTRY, random_states(rng, 6), SECTION_MM)
     beside = rng.uniform(1.0, 8.0) * rng.standard_normal(3)
     ball = Ball(motion.tip[:3, 3] - rng.uniform(0.0, 14.0) * motion.tip[:3, 2] + beside, 1.0)
-    true, found = by_brute_force(motion, ball), least_gap_mm(motion, ball, enough)  # type: ignore[arg-type]
+    true, found = by_brute_force(motion, ball), least_gap_mm(motion, ball, enough, 0.5)  # type: ignore[arg-type]
     assert found > true - 2e-3
     assert (found < enough) == (true < enough) or abs(true - enough) < 2e-3
 
@@ -100,16 +100,16 @@ def test_what_is_hit_between_two_free_states_only_is_found() -> None:
     motion = motion_of(np.eye(4), states, SECTION_MM)
     middle = motion_of(np.eye(4), np.array([[0.0, 0.0, 1.2]]), SECTION_MM).tip[:3, 3]
     ball = Ball(middle, 0.5)
-    ends = [least_gap_mm(motion_of(np.eye(4), states[[n]], SECTION_MM), ball, 2.0) for n in (0, 1)]  # type: ignore[arg-type]
+    ends = [least_gap_mm(motion_of(np.eye(4), states[[n]], SECTION_MM), ball, 2.0, 2.0) for n in (0, 1)]  # type: ignore[arg-type]
     assert min(ends) > 2.0
-    assert least_gap_mm(motion, ball, 2.0) < 1.0  # type: ignore[arg-type]
+    assert least_gap_mm(motion, ball, 2.0, 2.0) < 1.0  # type: ignore[arg-type]
 
 
 def test_many_states_need_few_distances() -> None:
     states = random_states(np.random.default_rng(1), 300)
     states[:, 1:] *= 0.02
     ball = Ball(np.array([1e3, 0.0, 0.0]), 1.0)
-    assert least_gap_mm(motion_of(ENTRY, states, SECTION_MM), ball, 3.0) > 3.0  # type: ignore[arg-type]
+    assert least_gap_mm(motion_of(ENTRY, states, SECTION_MM), ball, 3.0, 3.0) > 3.0  # type: ignore[arg-type]
     assert ball.asked < 300 * 12
 
 

@@ -23,12 +23,10 @@ TUBE_STEP_MM = 1.0
 """Insertion between two stored shapes of the tubes; the page interpolates, and the bend opens slowly."""
 TUBE_POINTS = 40
 """Points of a stored shape: 1 to 2 mm apart on tubes of a usual length, too near to see the corners."""
-SCOPE_POINTS_SHOWN = 20
-"""Points of the route before the tip that a view of the devices shows: about 15 mm."""
-SMOOTH_MM = 3.0
-"""Smoothing of the camera's direction: a few points of the route, so that the picture does not shake."""
-BLEND_MM = 8.0
-"""Over this last length the camera turns into the direction of the tip; about the bending part of a scope."""
+SCOPE_SHOWN_MM = 15.0
+"""Length of the scope behind its tip that a view of the devices shows: about its bending section."""
+CAMERA_STEP_MM = 1.0
+"""Distance between two places of the camera; the page interpolates between them."""
 CAP_MM = 15.0
 """Clearances are measured up to this distance: farther than any margin, and where the plot ends."""
 NOT_MEASURED = -1.0
@@ -49,7 +47,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.needle.radius_mm,
         },
-        "scope": _scope(plan),
+        "scope": _scope(plan, lung),
         "tubes": _tubes(plan),
         "needle": _needle(plan),
         "profile": profile(plan, lung),
@@ -61,51 +59,30 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
 
 def device_points(plan: Plan) -> Float:
     """Return points `(N, 3)`, LPS mm, of the last part of the scope, the tubes and the needle."""
-    scope = np.asarray(plan.scope.points_lps)[-SCOPE_POINTS_SHOWN:]
-    _scope, tubes, needle = plan.curves()
-    return np.concatenate([scope, tubes.points_lps, needle.points_lps])
+    scope, tubes, needle = plan.curves()
+    near = scope.arc_length_mm >= scope.arc_length_mm[-1] - SCOPE_SHOWN_MM
+    return np.concatenate([scope.points_lps[near], tubes.points_lps, needle.points_lps])
 
 
-def _scope(plan: Plan) -> Packed:
-    points = np.asarray(plan.scope.points_lps)
-    forward, up = camera_axes(points, plan.scope.lps_from_scope_tip)
+def _scope(plan: Plan, lung: Lung) -> Packed:
+    frames = camera_frames(plan)
+    points = frames[:, :3, 3]
     return {
         "points": pack(points, "f4"),
         "arc_length_mm": pack(arc_lengths(points), "f4"),
-        "forward": pack(forward, "f4"),
-        "up": pack(up, "f4"),
-        "lumen_radius_mm": pack(plan.scope.lumen_radius_mm, "f4"),
+        "forward": pack(frames[:, :3, 2], "f4"),
+        "up": pack(frames[:, :3, 0], "f4"),
+        "lumen_radius_mm": pack(lung.lumen_depth.lower_bound_mm(points), "f4"),
         "from_carina_mm": float(plan.scope.length_from_carina_mm),
     }
 
 
-def camera_axes(points: Float, lps_from_scope_tip: Float) -> tuple[Float, Float]:
-    """Return forward and up `(N, 3)` of the camera along a route: the patient's front is up at its beginning.
+def camera_frames(plan: Plan) -> Float:
+    """Return frames `(N, 4, 4)` of the camera along the body of the scope, from the entry to the tip.
 
-    Forward is the tangent of the smoothed route and turns into that of the tip over the last millimetres;
-    up is carried along without roll.
+    +z is forward and +x is up in the picture, as the twist of the scope has turned it there.
     """
-    from scipy.ndimage import gaussian_filter1d
-
-    along = arc_lengths(points)
-    spacing = max(along[-1] / max(len(points) - 1, 1), 1e-6)
-    smooth = gaussian_filter1d(points, SMOOTH_MM / spacing, axis=0, mode="nearest")
-    tangent = np.gradient(smooth, axis=0) if len(points) > 1 else np.zeros_like(points)
-    tip = np.asarray(lps_from_scope_tip)[:3, 2]
-    share = np.clip(1.0 - (along[-1] - along) / BLEND_MM, 0.0, 1.0)[:, None]
-    forward = _unit((1.0 - share) * _unit(tangent, tip) + share * tip, tip)
-    up = np.zeros_like(forward)
-    held = np.array([0.0, -1.0, 0.0])
-    for n, ahead in enumerate(forward):
-        aside = held - (held @ ahead) * ahead
-        held = aside / max(float(np.linalg.norm(aside)), 1e-9)
-        up[n] = held
-    return forward, up
-
-
-def _unit(vectors: Float, otherwise: Float) -> Float:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), otherwise))
+    return plan.curves(CAMERA_STEP_MM).scope.lps_from_device
 
 
 def _tubes(plan: Plan) -> Packed:

@@ -12,7 +12,7 @@ from anatomy.io.files import atomic_write
 from anatomy.structures import LUMEN
 from anatomy.typed import Array, Float, UInt8
 from lungaccess.plans.curves import arc_lengths
-from lungaccess.report.html.deployment import camera_axes
+from lungaccess.report.html.deployment import camera_frames
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -42,7 +42,7 @@ def bronchoscopy_webp(
 ) -> Path:
     """Write what the scope's camera sees on its route to the plan's site as an animated WebP.
 
-    The patient's front is up in the trachea, and the camera does not roll.  The wall is where the blurred
+    Up is where a positive bend turns the tip, so the picture rolls with the twist.  The wall is where the blurred
     lumen is half full, so that voxels do not show; no device is drawn.
 
     Parameters
@@ -58,7 +58,7 @@ def bronchoscopy_webp(
     """
     from PIL import Image
 
-    lumen = SmoothLumen(lung, np.asarray(plan.scope.points_lps))
+    lumen = SmoothLumen(lung, camera_frames(plan)[:, :3, 3])
     pictures = [Image.fromarray(view(lumen, pose, pixels)) for pose in camera_poses(plan, frames)]
     target = Path(path)
     with atomic_write(target) as temporary:
@@ -70,9 +70,9 @@ def bronchoscopy_webp(
 
 
 def camera_poses(plan: Plan, frames: int) -> list[Float]:
-    """Return `lps_from_camera` (4, 4) at even distances along the route; +z forward, -y up."""
-    points = np.asarray(plan.scope.points_lps)
-    forward, up = camera_axes(points, plan.scope.lps_from_scope_tip)
+    """Return `lps_from_camera` (4, 4) at even distances along the scope; +z forward, -y up."""
+    frames_along = camera_frames(plan)
+    points, forward, up = (frames_along[:, :3, column] for column in (3, 2, 0))
     along = arc_lengths(points)
     poses = []
     for place in np.linspace(0.0, along[-1], max(frames, 1)):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import lungaccess as la
@@ -28,7 +29,7 @@ from lungaccess.reachability.kernels import deployment_boxes as boxes
 from lungaccess.reachability.kernels import unreachable as kernel
 from lungaccess.reachability.tip_places import PlacePiece
 from lungaccess.reachability.unreachable import UnreachableProof, _may_be_left
-from stages.scope import MAX_OFF_AXIS_MM, in_tip_region
+from stages.scope import MAX_OFF_AXIS_MM, find_motions, in_tip_region
 from stages.tube import tube_constants, tube_environment
 from stages.tube.kernels import (
     ACCEPTED,
@@ -299,6 +300,7 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
             n_blocked += all_blocked(environment, tubes, piece.frame, box_around(piece.frame, place, values))
             continue
         other = values + rng.normal(0.0, 1.0, 5) * [0.3, 0.3, 1.0, 5.0, 5.0]
+        other[3:] = np.maximum(other[3:], 0.0)
         why = judged(piece.frame, place, other)
         for _ in range(25 if why != ACCEPTED else 0):
             middle = 0.5 * (values + other)
@@ -340,40 +342,51 @@ def test_what_a_plan_reaches_is_never_ruled_out(
         assert tested >= 6
 
 
-def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
-    small_lung: Lung, tubes: Float, system: System, proof: UnreachableProof
-) -> None:
-    """Tips drawn at random, wherever the lumen holds the scope and they may look, and boxes with them."""
-    rng = np.random.default_rng(7)
-    least = system.scope.radius_mm + system.scope.lumen_margin_mm
-    tree, depth = small_lung.tree, small_lung.lumen_depth
-    n = 30_000
+def holds(environment, piece: PlacePiece, tip: Float, rng: np.random.Generator) -> bool:  # type: ignore[no-untyped-def]
+    """Tell whether a box around a tip may hold tips, and the piece's first box holds this one."""
+    at = piece.frame @ tip[:3]
+    values = np.array([*rotation_vector(piece.frame, tip[3:6]), 0.0, 10.0, 20.0, *at])
+    halves = 10.0 ** rng.uniform(-4.0, 0.0) * HALVES * rng.uniform(0.0, 1.0, 8)
+    box = np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves])
+    inside = (at >= piece.places[0]).all() and (at <= piece.places[1]).all()
+    looks = np.abs(values[:2]).max() <= piece.wide
+    return bool(inside and looks and tips_may_be(environment, piece.frame, piece.cones, box))
+
+
+def random_tips_of_the_region(lung: Lung, least_mm: float, rng: np.random.Generator, n: int) -> Float:
+    """Draw tips `(S, 6)` near the axis, in a lumen so deep, that look ahead, as `in_tip_region` has it."""
+    tree = lung.tree
     points = tree.points_lps[rng.integers(tree.n_points, size=n)]
     points = points + MAX_OFF_AXIS_MM * rng.uniform(-1.0, 1.0, (n, 3))
-    points = points[depth.lower_bound_mm(points) >= least]
+    points = points[lung.lumen_depth.lower_bound_mm(points) >= least_mm]
     forward = tree.tangents[in_tip_region(tree, np.hstack([points, points]))[0]]
     forward = forward + rng.normal(0.0, 0.5, forward.shape)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    _nearest, inside = in_tip_region(tree, np.hstack([points, forward]))
-    exits = small_lung.grid.lps(np.argwhere(_may_be_left(small_lung)))
+    tips = np.hstack([points, forward])
+    return np.asarray(tips[in_tip_region(tree, tips)[1]])
+
+
+def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
+    small_lung: Lung, system: System, proof: UnreachableProof
+) -> None:
+    """Tips of motions, and tips drawn at random wherever a scope fits that comes from the trachea."""
+    rng = np.random.default_rng(7)
+    tree, least = small_lung.tree, system.scope.radius_mm + system.scope.lumen_margin_mm
+    exits = cKDTree(small_lung.grid.lps(np.argwhere(_may_be_left(small_lung))))
     environment = proof._environment(tree.points_lps[-1])
-    aside = 0
-    for place, ahead in zip(points[inside], forward[inside], strict=True):
-        if np.linalg.norm(exits - place, axis=1).min() > proof._insertions.max():
+    motions = find_motions(small_lung, system.scope, reach_mm=float(proof._insertions.max())).tips[:, :6]
+    drawn = random_tips_of_the_region(small_lung, least, rng, 20_000)
+    counted = aside = 0
+    for tip, moved in [*((tip, True) for tip in motions), *((tip, False) for tip in drawn)]:
+        if exits.query(tip[:3])[0] > proof._insertions.max():
             continue
-        held = 0
-        for piece in pieces_of(proof, small_lung, place):
-            at = piece.frame @ place
-            assert (at >= piece.places[0]).all()
-            assert (at <= piece.places[1]).all()
-            values = np.array([*rotation_vector(piece.frame, ahead), 0.0, 10.0, 20.0, *at])
-            assert np.abs(values[:2]).max() <= piece.wide
-            halves = 10.0 ** rng.uniform(-4.0, 0.0) * HALVES * rng.uniform(0.0, 1.0, 8)
-            box = np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves])
-            assert tips_may_be(environment, piece.frame, piece.cones, box), (place, ahead, box)
-            held += 1
-        assert held
-        aside += np.linalg.norm(tree.points_lps - place, axis=1).min() > 1.0
+        pieces = pieces_of(proof, small_lung, tip[:3])
+        assert all(holds(environment, piece, tip, rng) for piece in pieces)
+        assert pieces or not moved
+        counted += len(pieces)
+        aside += bool(pieces) and np.linalg.norm(tree.points_lps - tip[:3], axis=1).min() > 1.0
+    assert len(motions) > 100
+    assert counted > 0.5 * len(drawn)
     assert aside > 30
 
 

@@ -92,10 +92,10 @@ def deep_enough(depth, depth_geometry, not_lumen, geometry, points, needed, out)
 
 
 @inner_kernel
-def no_tip_near(environment, place, apart):
-    """Tell whether no tip of the scope may be within `apart` of a place."""
+def no_tip_near(environment, place, away):
+    """Tell whether no tip of the scope may be within `away` of a place."""
     geometry = environment.depth_geometry
-    if distance_bound(environment.tips, geometry, place[0], place[1], place[2]) > apart:
+    if distance_bound(environment.tips, geometry, place[0], place[1], place[2]) > away:
         return True
     return not _is_deep(
         environment.depth,
@@ -103,7 +103,7 @@ def no_tip_near(environment, place, apart):
         environment.not_lumen,
         environment.geometry,
         place,
-        environment.least_depth_mm - apart,
+        environment.least_depth_mm - away,
     )
 
 

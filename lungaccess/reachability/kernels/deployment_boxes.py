@@ -184,7 +184,7 @@ def target_seen(tubes, kappa, target, frame, box, sums, costs):
     roll = box[HALF + ROTATION]
     bent = tubes[INNER_CURVATURE]
     unlike = tubes[OVERLAP_CURVATURE] - bent
-    middle, apart = place_of(frame, box)
+    middle, away = place_of(frame, box)
     forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)
     normal = turned_vector(
         frame, box[EAST], box[NORTH], math.cos(box[ROTATION]), math.sin(box[ROTATION]), 0.0
@@ -210,11 +210,11 @@ def target_seen(tubes, kappa, target, frame, box, sums, costs):
     rho = _norm(aside)
 
     # How far the target moves: the motions from the first that moves it, as the tip sees it, to the last.
-    moved = apart
+    moved = away
     second, moved = _turned_by(0.0, moved, 1.0, far + moved, tilt, 0.0)
     along = _dot(from_place, forward)
     beside = math.sqrt(max(far * far - along * along, 0.0))
-    second, moved = _turned_by(second, moved, 1.0, min(far + apart, beside + moved), roll, 0.0)
+    second, moved = _turned_by(second, moved, 1.0, min(far + away, beside + moved), roll, 0.0)
     shape = _shape_of(tubes, box)
     costs[OUTER] = costs[INNER] = 0.0
     if shape == BENT_THROUGHOUT:
@@ -231,7 +231,7 @@ def target_seen(tubes, kappa, target, frame, box, sums, costs):
     elif shape == OUTER_STRAIGHT:
         moved += half_inner
     else:
-        lever = far + apart + inner + half_inner
+        lever = far + away + inner + half_inner
         costs[OUTER] = abs(unlike) * lever * half_outer
         costs[INNER] = (1.0 + max(abs(unlike), abs(bent)) * lever) * half_inner
         moved += costs[OUTER] + costs[INNER]
@@ -278,7 +278,7 @@ def tubes_of(tubes, frame, box):
     the outer tube and that of the straight part may
     differ: see `sample_of`.
     """
-    middle, apart = place_of(frame, box)
+    middle, away = place_of(frame, box)
     forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)
     normal = turned_vector(
         frame, box[EAST], box[NORTH], math.cos(box[ROTATION]), math.sin(box[ROTATION]), 0.0
@@ -287,7 +287,7 @@ def tubes_of(tubes, frame, box):
     unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
     longest = box[INNER] + box[HALF + INNER]
     bounds = (
-        apart,
+        away,
         math.hypot(box[HALF + EAST], box[HALF + NORTH]),
         box[HALF + ROTATION],
         unlike * box[HALF + OUTER],

@@ -81,15 +81,15 @@ def _away_from_point(cones, m, place):
 
 
 @inner_kernel
-def _may_look(cones, place, apart, forward, tilt):
-    """Tell whether a tip within `apart` of a place may look to within `tilt` of a direction."""
+def _may_look(cones, place, away, forward, tilt):
+    """Tell whether a tip within `away` of a place may look to within `tilt` of a direction."""
     nearest = np.inf
     for m in range(len(cones)):
         nearest = min(nearest, _away_from_point(cones, m, place))
     for m in range(len(cones)):
         cosine = forward[0] * cones[m, 3] + forward[1] * cones[m, 4] + forward[2] * cones[m, 5]
         may_look = math.acos(min(max(cosine, -1.0), 1.0)) - tilt <= cones[m, 6]
-        if may_look and _away_from_point(cones, m, place) <= nearest + 2.0 * apart + SPARE_MM:
+        if may_look and _away_from_point(cones, m, place) <= nearest + 2.0 * away + SPARE_MM:
             return True
     return False
 
@@ -97,12 +97,12 @@ def _may_look(cones, place, apart, forward, tilt):
 @inner_kernel
 def tips_may_be(environment, frame, cones, box):
     """Tell whether a tip of the scope may be in a box: its lumen is wide enough, and it looks ahead."""
-    place, apart = place_of(frame, box)
-    if no_tip_near(environment, place, apart):
+    place, away = place_of(frame, box)
+    if no_tip_near(environment, place, away):
         return False
     forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)
     tilt = math.hypot(box[HALF + EAST], box[HALF + NORTH])
-    return _may_look(cones, place, apart, forward, tilt)
+    return _may_look(cones, place, away, forward, tilt)
 
 
 @inner_kernel

@@ -26,6 +26,7 @@ EXAMPLES = MappingProxyType(
         "tour": "lungaccess tour PATIENT --no-require-plan --out tour",
         "route": "lungaccess route PATIENT --goal lps:22.9,9,-23.9 --curvature 0.1 --tolerance 5",
         "tubes": "lungaccess tubes --outer 10 --inner 40 --out tubes.png",
+        "shapes": "lungaccess shapes --system ultrathin --out shapes.csv",
         "reach": "lungaccess reach PATIENT --spacing 10 --out reach",
         "segment": "lungaccess segment PATIENT/ct.nii.gz --out SEGMENTED",
         "study run": "lungaccess study run study.toml --out results.db",

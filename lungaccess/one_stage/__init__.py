@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     )
     from lungaccess.one_stage.route import RouteSource, open_source, read_drawing, route_record, widest_end
     from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, ScopeAdvice, advise_scope, save_advice
+    from lungaccess.one_stage.shapes import design_shapes, save_shapes, shapes_record
     from lungaccess.one_stage.tour import (
         TourAnswer,
         coupled_plan_test,
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
         tour_record,
     )
     from lungaccess.one_stage.tubes import (
+        BareTubes,
         TubeAnswer,
-        TubePair,
         compare_sequences,
         deploy_tubes,
         design_choices,

@@ -41,18 +41,18 @@ BEND_RAD = 0.5 * math.pi
 
 
 @settings
-class TubePair:
-    """The inner and the outer tube without the rest of a system, both of which may be curved.
+class BareTubes:
+    """One to three tubes without the rest of a system, all of which may be curved.
 
-    SettingsError is raised if there are not two tubes, or they do not nest.
+    SettingsError is raised if there are none or more, or they do not nest.
     """
 
     name: Annotated[str, text("name of the tubes")]
-    tubes: Annotated[tuple[Tube, ...], Field(description="inner and outer tube, in this order")]
+    tubes: Annotated[tuple[Tube, ...], Field(description="the tubes, the innermost first")]
 
     def __post_init__(self) -> None:
-        if len(self.tubes) != 2:
-            raise impossible("tubes", len(self.tubes), "two tables [[tubes]], the inner tube first")
+        if not 1 <= len(self.tubes) <= 3:
+            raise impossible("tubes", len(self.tubes), "one to three tables [[tubes]], the innermost first")
         try:
             check_nesting(self.tubes)
         except SettingsError as error:
@@ -66,7 +66,7 @@ class TubeAnswer:
     Parameters
     ----------
     system : System or None
-        None for a bare pair of tubes.
+        None for bare tubes.
     outer_mm, inner_mm, rotation_rad, relative_rad : float
         What was asked for.
     final : Equilibrium
@@ -113,8 +113,8 @@ class TubeAnswer:
         return not self.refusals
 
 
-def load_tubes(name_or_path: str | os.PathLike[str]) -> System | TubePair:
-    """Read a system, or a TOML file that holds just a name and two tables `[[tubes]]`, the inner tube first.
+def load_tubes(name_or_path: str | os.PathLike[str]) -> System | BareTubes:
+    """Read a system, or a TOML file that holds just a name and tables `[[tubes]]`, the innermost first.
 
     Raises
     ------
@@ -128,12 +128,12 @@ def load_tubes(name_or_path: str | os.PathLike[str]) -> System | TubePair:
         except tomllib.TOMLDecodeError:
             mapping = {}  # load_system says what is wrong with the file
         if isinstance(mapping.get("tubes"), list):
-            return parse(TubePair, mapping, given, remedy=_REMEDY)
+            return parse(BareTubes, mapping, given, remedy=_REMEDY)
     return load_system(given)
 
 
 def deploy_tubes(
-    device: System | TubePair,
+    device: System | BareTubes,
     outer_mm: float,
     inner_mm: float,
     *,
@@ -156,7 +156,13 @@ def deploy_tubes(
     SettingsError
         If the insertions are impossible, nothing comes out, or an angle is not finite.
     """
-    tubes = _tubes(device)
+    tubes = tubes_of(device)
+    if len(tubes) != 2:
+        raise SettingsError(
+            f"{device.name} has {len(tubes)} tube{'s' if len(tubes) > 1 else ''}",
+            expected="two, of which one is inserted beyond the other",
+            remedy="`lungaccess shapes --system FILE` takes one to three tubes",
+        )
     if inner_mm == 0.0:
         raise SettingsError(
             "The inner tube stays in the scope",
@@ -207,9 +213,9 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
     system = answer.system
     if system is None:
         raise SettingsError(
-            f"{answer.name} is a pair of tubes without a system",
+            f"{answer.name} is just tubes without a system",
             expected="a system, whose channel and limits say what can be made",
-            remedy="Give a system, not just two tubes",
+            remedy="Give a system, not just tubes",
         )
     limits = MakerLimits(channel_diameter_mm=system.scope.channel_diameter_mm)
     present = evaluate_design(system.tubes, answer.outer_mm, answer.inner_mm)
@@ -260,7 +266,8 @@ def tubes_record(answer: TubeAnswer) -> dict[str, Any]:
     }
 
 
-def _tubes(device: System | TubePair) -> tuple[Tube, ...]:
+def tubes_of(device: System | BareTubes) -> tuple[Tube, ...]:
+    """Return the tubes, the innermost first."""
     if isinstance(device, System):
         return device.tubes.inner, device.tubes.outer
     return device.tubes

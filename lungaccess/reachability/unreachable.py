@@ -17,9 +17,8 @@ from anatomy.records import frozen_record
 from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Float, Int32, Mask
 from lungaccess.problem.system import System
-from lungaccess.reachability.axis_pieces import axis_pieces
 from lungaccess.reachability.kernels.blocked import ProofEnvironment
-from lungaccess.reachability.kernels.deployment_boxes import BOX_COLUMNS, FIRST_KNOT, LAST_KNOT
+from lungaccess.reachability.kernels.deployment_boxes import BOX_COLUMNS, PLACE_X
 from lungaccess.reachability.kernels.unreachable import (
     INSERTION_STEP_MM,
     MOST_WAITING,
@@ -27,6 +26,7 @@ from lungaccess.reachability.kernels.unreachable import (
     greatest_insertions,
     rule_out,
 )
+from lungaccess.reachability.tip_places import place_pieces, places_of_tips
 from stages.needle import needle_environment
 from stages.tube import tube_constants
 from stages.tube.kernels import MAX_EXTENSION
@@ -59,11 +59,11 @@ class ReachVerdict:
 class UnreachableProof:
     """Tries to prove targets of one patient unreachable for one system, with fissures as obstacles or not.
 
-    What is ruled out is every place of the scope tip on the medial axis to which the scope fits, every
-    direction that a tip can have there, and every rotation and insertion of the tubes, such that the tubes
-    leave an airway outside the mediastinum, keep clear of vessels and pleura from there on, and sweep little,
-    and a needle from their tip reaches the target.  That needle heeds no obstacle, but its tip and the
-    target must lie in the same free region.
+    What is ruled out is every place of the scope tip near the medial axis where the scope fits, every
+    direction that it can have there (`stages.scope.in_tip_region`), and every rotation and insertion of the
+    tubes, such that the tubes leave an airway outside the mediastinum, keep clear of vessels and pleura from
+    there on, and sweep little, and a needle from their tip reaches the target.  That needle heeds no
+    obstacle, but its tip and the target must lie in the same free region.
 
     Parameters
     ----------
@@ -89,7 +89,9 @@ class UnreachableProof:
         self._hazard_bits = hazards
         leaving = _may_be_left(lung)
         masks = []
-        for mask in ((lung.labels & LUMEN) != 0, leaving, (lung.labels & hazards) != 0):
+        lumen = (lung.labels & LUMEN) != 0
+        self._not_lumen = np.asfortranarray(~lumen).view(np.uint8)
+        for mask in (lumen, leaving, (lung.labels & hazards) != 0):
             pause()
             masks.append(distance_corners(mask, spacing_mm))
         self._masks = tuple(masks)
@@ -97,8 +99,11 @@ class UnreachableProof:
         # Corners are rounded down, and between them a bound lacks at most half a diagonal of a voxel.
         self._loss_mm = 0.5 * float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
         self._free = _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)
-        reach_mm = float(self._insertions.max())
-        self._pieces = list(axis_pieces(lung, system, leaving, reach_mm))
+        self._least_depth_mm = system.scope.radius_mm + system.scope.lumen_margin_mm
+        tips, centres = places_of_tips(lung, self._not_lumen, self._least_depth_mm)
+        self._tips = distance_corners(tips, spacing_mm)
+        pause()
+        self._pieces = place_pieces(lung, centres, leaving, float(self._insertions.max()))
 
     def prove(
         self,
@@ -132,17 +137,18 @@ class UnreachableProof:
         environment = self._environment(target)
         boxes = np.zeros((MOST_WAITING, BOX_COLUMNS))
         looked_at = 0
-        order = np.argsort([np.linalg.norm(piece.knots[0] - target) for piece in self._pieces], kind="stable")
+        away = [np.linalg.norm(piece.cones[0, :3] - target) for piece in self._pieces]
+        order = np.argsort(away, kind="stable")
         for done, n in enumerate(order):
             piece = self._pieces[n]
             outcome, looked = rule_out(
                 environment, self._tubes, self._insertions, self._limits, target,
-                piece.frame, piece.knots, piece.cones, piece.wide, most_boxes, boxes,
+                piece.frame, piece.places, piece.cones, piece.wide, most_boxes, boxes,
             )  # fmt: skip
             looked_at += looked
             if outcome != RULED_OUT:
-                middle = int(0.5 * (boxes[0, FIRST_KNOT] + boxes[0, LAST_KNOT]))
-                return ReachVerdict(proved=False, boxes=looked_at, open_lps=piece.knots[middle])
+                place = boxes[0, PLACE_X : PLACE_X + 3] @ piece.frame
+                return ReachVerdict(proved=False, boxes=looked_at, open_lps=place)
             if progress is not None:
                 progress((done + 1) / len(order))
         return ReachVerdict(proved=True, boxes=looked_at)
@@ -165,12 +171,15 @@ class UnreachableProof:
             may_be_left=leaving,
             hazards=hazards,
             depth=depth.corners,
+            tips=self._tips,
             passable=distance_corners(passable, lung.grid.spacing_mm),
             labels=lung.labels,
+            not_lumen=self._not_lumen,
             geometry=lung.geometry,
             depth_geometry=depth.geometry,
             hazard_bits=self._hazard_bits,
             loss_mm=self._loss_mm,
+            least_depth_mm=self._least_depth_mm,
         )
 
 

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from anatomy.lung import Lung
 from anatomy.typed import Float
 from stages.scope.device import SHORTEST_MM, Bronchoscope
-from stages.scope.kernels.body import motion_room
+from stages.scope.kernels.body import MOST_TWIST_RAD, motion_room
 from stages.scope.kernels.shifting import shifted_tips
 from stages.scope.lumen_walls import kernel_device, walls_of
-from stages.scope.motion import ADVANCE, BEND, ScopeMotion
+from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
 from stages.scope.passages import find_passages
 from stages.scope.shifting import TipRow, as_shifts
 from stages.scope.tip_region import in_tip_region
@@ -104,6 +104,9 @@ def broken_limit(scope: Bronchoscope, motion: ScopeMotion) -> str:
         return "the scope is pulled back"
     if ((advance > SHORTEST_MM) & turned).any():
         return "the scope advances and turns at once"
+    twist = float(np.abs(states[:, TWIST]).max())
+    if twist > MOST_TWIST_RAD * (1.0 + ROUNDING):
+        return f"the scope is twisted by {math.degrees(twist):.1f} degrees, more than half a turn"
     least, most = scope.bends_rad
     bends, slack = states[:, BEND], 1.0 + ROUNDING
     if bends.min() < least * slack or bends.max() > most * slack:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
@@ -40,29 +41,70 @@ class ProofEnvironment(NamedTuple):
     ----------
     lumen, may_be_left, hazards : (ni + 1, nj + 1, nk + 1) uint16
         Distance to the lumen, to the lumen that tubes may leave, and to what they keep clear of.
-    depth : (ni + 1, nj + 1, nk + 1) uint16
-        Depth in the lumen.
+    depth, tips : (ni + 1, nj + 1, nk + 1) uint16
+        Depth in the lumen, and distance to where the tip of the scope may be.
     passable : (ni + 1, nj + 1, nk + 1) uint16
         Distance to where the needle may pass before the target.
     labels : (ni, nj, nk) uint16
+    not_lumen : (ni, nj, nk) uint8
+        1 outside the lumen.
     geometry, depth_geometry : (3, 5) float64
-        Of the labels and the distances, and of the depth.
+        Of the labels and the other distances, and of `depth` and `tips`.
     hazard_bits : int
         Structures that tubes keep clear of.
     loss_mm : float
         By so much a bound of these fields may fall short of the distance.
+    least_depth_mm : float
+        Of a scope tip in the lumen.
     """
 
     lumen: np.ndarray
     may_be_left: np.ndarray
     hazards: np.ndarray
     depth: np.ndarray
+    tips: np.ndarray
     passable: np.ndarray
     labels: np.ndarray
+    not_lumen: np.ndarray
     geometry: np.ndarray
     depth_geometry: np.ndarray
     hazard_bits: int
     loss_mm: float
+    least_depth_mm: float
+
+
+@inner_kernel
+def _is_deep(depth, depth_geometry, not_lumen, geometry, place, needed):
+    """Tell whether the lumen is so deep at a place; beyond the grid of `not_lumen` nothing is a wall."""
+    if distance_bound(depth, depth_geometry, place[0], place[1], place[2]) >= needed:
+        return True
+    _exact, wall = exact_distance(not_lumen, geometry, place[0], place[1], place[2], 1, -1, needed)
+    return wall == 0
+
+
+@numba.njit(cache=True, nogil=True)
+def deep_enough(depth, depth_geometry, not_lumen, geometry, points, needed, out):
+    """Tell of points `(N, P, 3)`, LPS mm, where the lumen is so deep; `out` (N, P) bool receives it."""
+    for n in range(points.shape[0]):
+        for p in range(points.shape[1]):
+            place = (points[n, p, 0], points[n, p, 1], points[n, p, 2])
+            out[n, p] = _is_deep(depth, depth_geometry, not_lumen, geometry, place, needed)
+
+
+@inner_kernel
+def no_tip_near(environment, place, away):
+    """Tell whether no tip of the scope may be within `away` of a place."""
+    geometry = environment.depth_geometry
+    if distance_bound(environment.tips, geometry, place[0], place[1], place[2]) > away:
+        return True
+    return not _is_deep(
+        environment.depth,
+        geometry,
+        environment.not_lumen,
+        environment.geometry,
+        place,
+        environment.least_depth_mm - away,
+    )
 
 
 @inner_kernel

@@ -1,11 +1,10 @@
 """Boxes of deployments: the one in the middle, and by how much the others of a box differ from it.
 
-A deployment has a place of the scope tip on the medial axis, a direction, a rotation of the tubes about it,
-and the insertions of both tubes.  A box is a range of each, a `(BOX_COLUMNS,)` float64 array.
+A deployment has a place of the scope tip, a direction, a rotation of the tubes about it, and the insertions
+of both tubes.  A box is a range of each, a `(BOX_COLUMNS,)` float64 array.
 
-A direction is the axis of a piece of the airway turned by the rotation vector `EAST X + NORTH Y`, with X and
-Y across the axis; `frame` (3, 3) has X, Y and the axis as rows.  `knots` (N + 1, 3) is the medial axis of the
-piece, LPS mm.
+`frame` (3, 3) has X, Y and the axis of a piece of the airway as rows.  A place is given by its coordinates
+along them in mm, a direction is the axis turned by the rotation vector `EAST X + NORTH Y`.
 """
 
 from __future__ import annotations
@@ -15,14 +14,10 @@ import math
 from anatomy.kernels.compiling import inner_kernel
 from stages.tube.kernels import CURVED_LENGTH, INNER_CURVATURE, OVERLAP_CURVATURE, planar_point
 
-# Columns of a box: middles, half widths, and the first and last knot of the place.
-EAST, NORTH, ROTATION, OUTER, INNER = range(5)
-HALF = 5
-FIRST_KNOT, LAST_KNOT = 10, 11
-BOX_COLUMNS = 12
-# What each side of a box costs: the five above, and the place.
-PLACE = 5
-SIDES = 6
+# Columns of a box: the middles of its sides, and their half widths.
+EAST, NORTH, ROTATION, OUTER, INNER, PLACE_X, PLACE_Y, PLACE_Z, SIDES = range(9)
+HALF = SIDES
+BOX_COLUMNS = 2 * SIDES
 
 SPARE_MM = 1e-6
 """For rounding."""
@@ -97,21 +92,15 @@ def heading(tubes, outer, inner):
 
 
 @inner_kernel
-def place_of(knots, first, last):
-    """Return the middle of a piece of the axis, half its chord, and how far it strays from the chord."""
+def place_of(frame, box):
+    """Return the place in the middle of a box, LPS mm, and how far from it those of others are at most."""
+    x, y, z = box[PLACE_X], box[PLACE_Y], box[PLACE_Z]
     middle = (
-        0.5 * (knots[first, 0] + knots[last, 0]),
-        0.5 * (knots[first, 1] + knots[last, 1]),
-        0.5 * (knots[first, 2] + knots[last, 2]),
+        x * frame[0, 0] + y * frame[1, 0] + z * frame[2, 0],
+        x * frame[0, 1] + y * frame[1, 1] + z * frame[2, 1],
+        x * frame[0, 2] + y * frame[1, 2] + z * frame[2, 2],
     )
-    chord = (knots[last, 0] - middle[0], knots[last, 1] - middle[1], knots[last, 2] - middle[2])
-    size2 = max(_dot(chord, chord), SPARE_MM)
-    astray = 0.0
-    for m in range(first + 1, last):
-        off = (knots[m, 0] - middle[0], knots[m, 1] - middle[1], knots[m, 2] - middle[2])
-        share = min(max(_dot(off, chord) / size2, -1.0), 1.0)
-        astray = max(astray, _norm(_from(off, chord, share)))
-    return middle, chord, astray
+    return middle, _norm((box[HALF + PLACE_X], box[HALF + PLACE_Y], box[HALF + PLACE_Z]))
 
 
 @inner_kernel
@@ -160,7 +149,7 @@ def _project(line, tangent, change, half, sums):
 
 
 @inner_kernel
-def target_seen(tubes, kappa, target, frame, knots, box, sums, costs):
+def target_seen(tubes, kappa, target, frame, box, sums, costs):
     """Bound how far the target moves as the tips of a box see it, and where their tightest circle is.
 
     Every deployment moves the tip by a chain of motions: to its place, by its direction, its rotation, and
@@ -175,7 +164,7 @@ def target_seen(tubes, kappa, target, frame, knots, box, sums, costs):
         kappa in 1/mm.
     target : tuple of 3 float
         LPS mm.
-    frame, knots, box
+    frame, box
         See the module.
     sums : (3,) float64
         Receives by how much, to first order, the target may move along the line from the centre of the
@@ -195,7 +184,7 @@ def target_seen(tubes, kappa, target, frame, knots, box, sums, costs):
     roll = box[HALF + ROTATION]
     bent = tubes[INNER_CURVATURE]
     unlike = tubes[OVERLAP_CURVATURE] - bent
-    middle, chord, astray = place_of(knots, int(box[FIRST_KNOT]), int(box[LAST_KNOT]))
+    middle, away = place_of(frame, box)
     forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)
     normal = turned_vector(
         frame, box[EAST], box[NORTH], math.cos(box[ROTATION]), math.sin(box[ROTATION]), 0.0
@@ -221,14 +210,11 @@ def target_seen(tubes, kappa, target, frame, knots, box, sums, costs):
     rho = _norm(aside)
 
     # How far the target moves: the motions from the first that moves it, as the tip sees it, to the last.
-    moved = _norm(chord) + astray
-    second = astray
-    second, moved = _turned_by(second, moved, 1.0, far + moved, tilt, 0.0)
+    moved = away
+    second, moved = _turned_by(0.0, moved, 1.0, far + moved, tilt, 0.0)
     along = _dot(from_place, forward)
     beside = math.sqrt(max(far * far - along * along, 0.0))
-    second, moved = _turned_by(
-        second, moved, 1.0, min(far + _norm(chord) + astray, beside + moved), roll, 0.0
-    )
+    second, moved = _turned_by(second, moved, 1.0, min(far + away, beside + moved), roll, 0.0)
     shape = _shape_of(tubes, box)
     costs[OUTER] = costs[INNER] = 0.0
     if shape == BENT_THROUGHOUT:
@@ -245,7 +231,7 @@ def target_seen(tubes, kappa, target, frame, knots, box, sums, costs):
     elif shape == OUTER_STRAIGHT:
         moved += half_inner
     else:
-        lever = far + _norm(chord) + astray + inner + half_inner
+        lever = far + away + inner + half_inner
         costs[OUTER] = abs(unlike) * lever * half_outer
         costs[INNER] = (1.0 + max(abs(unlike), abs(bent)) * lever) * half_inner
         moved += costs[OUTER] + costs[INNER]
@@ -262,7 +248,9 @@ def target_seen(tubes, kappa, target, frame, knots, box, sums, costs):
     )
     for m in range(len(sums)):
         sums[m] = 0.0
-    costs[PLACE] = _project(line, tangent, chord, 1.0, sums) + 1.5 * astray
+    for m in range(3):
+        axis = (frame[m, 0], frame[m, 1], frame[m, 2])
+        costs[PLACE_X + m] = _project(line, tangent, axis, box[HALF + PLACE_X + m], sums)
     east = _cross(_turning(frame, box[EAST], box[NORTH], 1.0, 0.0), from_place)
     costs[EAST] = _project(line, tangent, east, box[HALF + EAST], sums)
     north = _cross(_turning(frame, box[EAST], box[NORTH], 0.0, 1.0), from_place)
@@ -283,14 +271,14 @@ def target_seen(tubes, kappa, target, frame, knots, box, sums, costs):
 
 
 @inner_kernel
-def tubes_of(tubes, knots, frame, box):
+def tubes_of(tubes, frame, box):
     """Return what the samples of a box's tubes need: the middle one, and how the others differ.
 
     Place, direction and bending direction; and how much the place, the direction, the rotation, the share of
     the outer tube and that of the straight part may
     differ: see `sample_of`.
     """
-    middle, chord, astray = place_of(knots, int(box[FIRST_KNOT]), int(box[LAST_KNOT]))
+    middle, away = place_of(frame, box)
     forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)
     normal = turned_vector(
         frame, box[EAST], box[NORTH], math.cos(box[ROTATION]), math.sin(box[ROTATION]), 0.0
@@ -299,7 +287,7 @@ def tubes_of(tubes, knots, frame, box):
     unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
     longest = box[INNER] + box[HALF + INNER]
     bounds = (
-        _norm(chord) + astray,
+        away,
         math.hypot(box[HALF + EAST], box[HALF + NORTH]),
         box[HALF + ROTATION],
         unlike * box[HALF + OUTER],

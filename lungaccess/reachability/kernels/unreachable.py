@@ -3,7 +3,8 @@
 What all deployments of a box have in common follows from the one in its middle and from bounds of how far the
 others differ.  A box that cannot be ruled out is halved; see docs/explanation/unreachable.md.
 
-`cones` (N, 4) is, for a tip between two knots, the middle of what it may look to and the angle (rad) from it.
+`cones` (N, 7) holds tree points, LPS mm; for the tips that have one of them as the nearest, the middle of the
+directions that they may have; and the greatest angle (rad) from it.
 """
 
 from __future__ import annotations
@@ -14,20 +15,21 @@ import numba
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from lungaccess.reachability.kernels.blocked import sweep_slope, tips_blocked, tubes_blocked
+from lungaccess.reachability.kernels.blocked import no_tip_near, sweep_slope, tips_blocked, tubes_blocked
 from lungaccess.reachability.kernels.deployment_boxes import (
     BOX_COLUMNS,
     EAST,
-    FIRST_KNOT,
     HALF,
     INNER,
-    LAST_KNOT,
     NORTH,
     OUTER,
-    PLACE,
+    PLACE_X,
+    PLACE_Y,
+    PLACE_Z,
     ROTATION,
     SIDES,
     SPARE_MM,
+    place_of,
     target_seen,
     tubes_of,
     turned_vector,
@@ -72,13 +74,35 @@ def _insertions_exist(tubes, insertions, box):
 
 
 @inner_kernel
-def _may_look(cones, first, last, forward, tilt):
-    """Tell whether a tip of the piece may look to within `tilt` of a direction."""
-    for m in range(first, last):
-        cosine = forward[0] * cones[m, 0] + forward[1] * cones[m, 1] + forward[2] * cones[m, 2]
-        if math.acos(min(max(cosine, -1.0), 1.0)) - tilt <= cones[m, 3]:
+def _away_from_point(cones, m, place):
+    return math.sqrt(
+        (place[0] - cones[m, 0]) ** 2 + (place[1] - cones[m, 1]) ** 2 + (place[2] - cones[m, 2]) ** 2
+    )
+
+
+@inner_kernel
+def _may_look(cones, place, away, forward, tilt):
+    """Tell whether a tip within `away` of a place may look to within `tilt` of a direction."""
+    nearest = np.inf
+    for m in range(len(cones)):
+        nearest = min(nearest, _away_from_point(cones, m, place))
+    for m in range(len(cones)):
+        cosine = forward[0] * cones[m, 3] + forward[1] * cones[m, 4] + forward[2] * cones[m, 5]
+        may_look = math.acos(min(max(cosine, -1.0), 1.0)) - tilt <= cones[m, 6]
+        if may_look and _away_from_point(cones, m, place) <= nearest + 2.0 * away + SPARE_MM:
             return True
     return False
+
+
+@inner_kernel
+def tips_may_be(environment, frame, cones, box):
+    """Tell whether a tip of the scope may be in a box: its lumen is wide enough, and it looks ahead."""
+    place, away = place_of(frame, box)
+    if no_tip_near(environment, place, away):
+        return False
+    forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)
+    tilt = math.hypot(box[HALF + EAST], box[HALF + NORTH])
+    return _may_look(cones, place, away, forward, tilt)
 
 
 @inner_kernel
@@ -99,21 +123,17 @@ def _outside_workspace(limits, seen, sums):
 
 
 @inner_kernel
-def may_reach(environment, tubes, insertions, limits, target, frame, knots, cones, box, sums, costs):
+def may_reach(environment, tubes, insertions, limits, target, frame, cones, box, sums, costs):
     """Tell whether a deployment of a box may be one with the target in its workspace: False if none can.
 
     Returns that, and how far tips, and the target as they see it, may differ from the middle ones, mm.
     """
-    if not _insertions_exist(tubes, insertions, box):
+    if not _insertions_exist(tubes, insertions, box) or not tips_may_be(environment, frame, cones, box):
         return False, 0.0, 0.0
-    forward = turned_vector(frame, box[EAST], box[NORTH], 0.0, 0.0, 1.0)
-    tilt = math.hypot(box[HALF + EAST], box[HALF + NORTH])
-    if not _may_look(cones, int(box[FIRST_KNOT]), int(box[LAST_KNOT]), forward, tilt):
-        return False, 0.0, 0.0
-    seen = target_seen(tubes, limits.kappa, target, frame, knots, box, sums, costs)
+    seen = target_seen(tubes, limits.kappa, target, frame, box, sums, costs)
     if _outside_workspace(limits, seen, sums):
         return False, 0.0, 0.0
-    family = tubes_of(tubes, knots, frame, box)
+    family = tubes_of(tubes, frame, box)
     blocked, away = tips_blocked(environment, tubes, limits, seen, family, box)
     if blocked or (away <= FOLLOWED_MM and tubes_blocked(environment, tubes, family, box)):
         return False, away, seen[4]
@@ -126,7 +146,8 @@ def _add_tip_costs(tubes, family, box, costs):
     """Add half of what each side displaces the tip."""
     _middle, _forward, _normal, bounds, _outer, _inner = family
     x, z = planar_point(tubes, box[OUTER], box[INNER], box[INNER])
-    costs[PLACE] += 0.5 * bounds[0]
+    for m in (PLACE_X, PLACE_Y, PLACE_Z):
+        costs[m] += 0.5 * box[HALF + m]
     costs[EAST] += 0.5 * box[HALF + EAST] * math.hypot(x, z)
     costs[NORTH] += 0.5 * box[HALF + NORTH] * math.hypot(x, z)
     costs[ROTATION] += 0.5 * box[HALF + ROTATION] * abs(x)
@@ -138,16 +159,11 @@ def _add_tip_costs(tubes, family, box, costs):
 def _halve(boxes, row, costs):
     """Halve a box on the side that costs most; the second half becomes the row after it."""
     side = 0
-    for m in range(1, HALF):
+    for m in range(1, SIDES):
         if costs[m] > costs[side]:
             side = m
     for n in range(BOX_COLUMNS):
         boxes[row + 1, n] = boxes[row, n]
-    first, last = boxes[row, FIRST_KNOT], boxes[row, LAST_KNOT]
-    if costs[PLACE] > costs[side] and last - first > 1.5:
-        middle = np.floor(0.5 * (first + last))
-        boxes[row, LAST_KNOT] = boxes[row + 1, FIRST_KNOT] = middle
-        return
     half = 0.5 * boxes[row, HALF + side]
     boxes[row, HALF + side] = boxes[row + 1, HALF + side] = half
     boxes[row, side] -= half
@@ -155,7 +171,7 @@ def _halve(boxes, row, costs):
 
 
 @inner_kernel
-def _begin(boxes, tubes, longest, wide, n_knots):
+def _begin(boxes, tubes, longest, wide, places):
     """Write the boxes that hold everything, up to the curved length and beyond; return how many they are."""
     curved = min(tubes[CURVED_LENGTH], longest)
     waiting = 0
@@ -171,18 +187,20 @@ def _begin(boxes, tubes, longest, wide, n_knots):
         box[HALF + INNER] = 0.5 * (high - low)
         box[HALF + EAST] = box[HALF + NORTH] = wide
         box[HALF + ROTATION] = math.pi
-        box[LAST_KNOT] = n_knots - 1
+        for m in range(3):
+            box[PLACE_X + m] = 0.5 * (places[0, m] + places[1, m])
+            box[HALF + PLACE_X + m] = 0.5 * (places[1, m] - places[0, m])
         waiting += 1
     return waiting
 
 
 @numba.njit(cache=True, nogil=True)
-def rule_out(environment, tubes, insertions, limits, target, frame, knots, cones, wide, most, boxes):
+def rule_out(environment, tubes, insertions, limits, target, frame, places, cones, wide, most, boxes):
     """Try to rule out all deployments from one piece of the airway.
 
     Parameters
     ----------
-    environment, frame, knots, cones
+    environment, frame, cones
         See the module.
     tubes : (N_TUBES,) float64
     limits : Limits
@@ -190,6 +208,8 @@ def rule_out(environment, tubes, insertions, limits, target, frame, knots, cones
         See `greatest_insertions`.
     target : (3,) float64
         LPS mm.
+    places : (2, 3) float64
+        Least and greatest coordinates of the places of tips along the rows of `frame`, mm.
     wide : float
         Greatest angle (rad) from the axis in `frame` to where a tip may look.
     most : int
@@ -205,13 +225,13 @@ def rule_out(environment, tubes, insertions, limits, target, frame, knots, cones
     """
     sums, costs = np.zeros(3), np.zeros(SIDES)
     there = (target[0], target[1], target[2])
-    waiting = _begin(boxes, tubes, np.max(insertions), wide, len(knots))
+    waiting = _begin(boxes, tubes, np.max(insertions), wide, places)
     looked = 0
     while waiting > 0:
         row = waiting - 1
         looked += 1
         may, away, moved = may_reach(
-            environment, tubes, insertions, limits, there, frame, knots, cones, boxes[row], sums, costs
+            environment, tubes, insertions, limits, there, frame, cones, boxes[row], sums, costs
         )
         if not may:
             waiting -= 1

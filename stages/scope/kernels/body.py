@@ -23,6 +23,8 @@ STRAIGHT_RAD = 1e-4
 """Below this angle the series of an arc is exact in double precision."""
 FINEST_MM = 0.02
 """A change in place is cut into pieces until the tip moves by less than this; then it is given up."""
+MOST_TWIST_RAD = math.pi
+"""A scope is twisted by at most half a turn each way: more than that a hand and its cables do not follow."""
 BLOCKED = -1.0
 """The room of what is not proved to be free."""
 
@@ -171,8 +173,8 @@ def turn_room(walls, radius, length, base, twist, bend, to_twist, to_bend, by_st
 def nearest_setting(twist, bend, u, v, length, least_bend, most_bend):
     """Return twist and bend of a curvature vector, and whether to change to them by the straight section.
 
-    The bend may be up or down, with the twist turned by half a turn; the change is the smallest that there
-    is.  The bend is infinite if the section can bend to it neither way.
+    The bend may be up or down, with the twist turned by half a turn; the change is the smallest that keeps
+    the twist within MOST_TWIST_RAD.  The bend is infinite if the section can bend to it neither way.
     """
     size = math.hypot(u, v) * length
     turn = 2.0 * math.pi
@@ -183,12 +185,14 @@ def nearest_setting(twist, bend, u, v, length, least_bend, most_bend):
         to_bend = -size if down else size
         if not least_bend <= to_bend <= most_bend:
             continue
-        away = angle + down * math.pi - twist
-        away -= turn * math.floor(away / turn + 0.5)
-        change = math.hypot(to_bend - bend, max(abs(bend), size) * away)
+        to_twist = angle + down * math.pi
+        to_twist -= turn * math.floor((to_twist - twist) / turn + 0.5)
+        if abs(to_twist) > MOST_TWIST_RAD:
+            to_twist -= math.copysign(turn, to_twist)
+        change = math.hypot(to_bend - bend, max(abs(bend), size) * (to_twist - twist))
         if change < best:
             best = change
-            found_twist = twist + away
+            found_twist = to_twist
             found_bend = to_bend
     return found_twist, found_bend, best > abs(bend) + size
 

@@ -22,6 +22,8 @@ MEMORY = 0.5
 """Share of the cost of the state before that is added: a good state does not make up for a bad way."""
 CHANGE_COST = 0.3
 """Cost of a change in place for each mm that the tip moves: as bad as half the room off the axis."""
+HOLD_COST = 0.05
+"""Cost of any change: small, so that twist and bend are held where that does."""
 WIDE_ANGLE = 0.06
 """1 - cos of 20 degrees: a tip that looks so far aside costs as much as one that is at the wall."""
 
@@ -169,7 +171,7 @@ def candidates(device, route, states, offsets, step, found, by_straight):
             state[CURVATURE] = max(before[CURVATURE], math.hypot(u, v))
             change = 0.5 * math.hypot(u - before[U], v - before[V]) * device.length**2
             state[COST] = settle(route, device.length, state, scratch)
-            state[COST] += MEMORY * before[COST] + CHANGE_COST * change
+            state[COST] += MEMORY * before[COST] + CHANGE_COST * change + (HOLD_COST if c > 0 else 0.0)
             if not math.isfinite(bend):
                 state[COST] = math.inf
             by_straight[n * count + c] = straight

@@ -23,7 +23,7 @@ from lungaccess.one_stage import load_tubes, read_lesions
 from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.study import read_study
 
-QUICK = ("presets", "template", "tubes", "doctor", "completion")
+QUICK = ("presets", "template", "tubes", "shapes", "doctor", "completion")
 """Examples that need no patient."""
 MAY_SAY_NO = ("advise", "certify", "benchmark med-rad")
 """Commands that end with 1 where a device does not get there, which depends on the patient."""

@@ -13,7 +13,7 @@ import pytest
 from anatomy.errors import SettingsError
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.one_stage.tubes import TubePair, compare_sequences, deploy_tubes, design_choices, load_tubes
+from lungaccess.one_stage.tubes import BareTubes, compare_sequences, deploy_tubes, design_choices, load_tubes
 from lungaccess.problem.system import load_system
 from stages.tube.shape import centreline
 
@@ -174,7 +174,7 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("content", "message"),
         [
-            ('name = "x"\ntubes = []\n', "two tables"),
+            ('name = "x"\ntubes = []\n', "one to three tables"),
             (CURVED_PAIR.format(curvature=0.01).replace("1.65", "1.45"), "tubes"),
             (CURVED_PAIR.format(curvature=0.01).replace("length_mm = 680.0", "length_mm = 600.0"), "tubes"),
             (CURVED_PAIR.format(curvature=-1.0), "precurvature_per_mm"),
@@ -193,7 +193,7 @@ class TestFiles:
         file = tmp_path / "tubes.toml"
         file.write_text(CURVED_PAIR.format(curvature=0.01))
         pair = load_tubes(file)
-        assert isinstance(pair, TubePair) and pair.tubes[0].precurvature_per_mm == 0.01
+        assert isinstance(pair, BareTubes) and pair.tubes[0].precurvature_per_mm == 0.01
         assert load_tubes("ultrathin") == load_system("ultrathin")
 
 

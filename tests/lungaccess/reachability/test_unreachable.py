@@ -6,12 +6,12 @@ import json
 import math
 from collections import Counter
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import lungaccess as la
@@ -27,7 +27,9 @@ from lungaccess.problem.target import point_target
 from lungaccess.reachability.kernels import blocked
 from lungaccess.reachability.kernels import deployment_boxes as boxes
 from lungaccess.reachability.kernels import unreachable as kernel
-from lungaccess.reachability.unreachable import UnreachableProof
+from lungaccess.reachability.tip_places import PlacePiece
+from lungaccess.reachability.unreachable import UnreachableProof, _may_be_left
+from stages.scope import MAX_OFF_AXIS_MM, find_motions, in_tip_region
 from stages.tube import tube_constants, tube_environment
 from stages.tube.kernels import (
     ACCEPTED,
@@ -44,18 +46,18 @@ KAPPA = 1.0 / 50.0
 
 
 @numba.njit
-def seen_from_middle(tubes, kappa, target, frame, knots, box, sums, costs):  # type: ignore[no-untyped-def]
-    return boxes.target_seen(tubes, kappa, (target[0], target[1], target[2]), frame, knots, box, sums, costs)
+def seen_from_middle(tubes, kappa, target, frame, box, sums, costs):  # type: ignore[no-untyped-def]
+    return boxes.target_seen(tubes, kappa, (target[0], target[1], target[2]), frame, box, sums, costs)
 
 
 @numba.njit
-def sampled(tubes, frame, knots, box, s):  # type: ignore[no-untyped-def]
-    return boxes.sample_of(tubes, boxes.tubes_of(tubes, knots, frame, box), s)
+def sampled(tubes, frame, box, s):  # type: ignore[no-untyped-def]
+    return boxes.sample_of(tubes, boxes.tubes_of(tubes, frame, box), s)
 
 
 @numba.njit
-def not_ruled_out(environment, tubes, insertions, limits, target, frame, knots, cones, box):  # type: ignore[no-untyped-def]
-    sums, costs = np.zeros(3), np.zeros(6)
+def not_ruled_out(environment, tubes, insertions, limits, target, frame, cones, box):  # type: ignore[no-untyped-def]
+    sums, costs = np.zeros(3), np.zeros(boxes.SIDES)
     return kernel.may_reach(
         environment,
         tubes,
@@ -63,7 +65,6 @@ def not_ruled_out(environment, tubes, insertions, limits, target, frame, knots, 
         limits,
         (target[0], target[1], target[2]),
         frame,
-        knots,
         cones,
         box,
         sums,
@@ -72,8 +73,13 @@ def not_ruled_out(environment, tubes, insertions, limits, target, frame, knots, 
 
 
 @numba.njit
-def all_blocked(environment, tubes, frame, knots, box):  # type: ignore[no-untyped-def]
-    return blocked.tubes_blocked(environment, tubes, boxes.tubes_of(tubes, knots, frame, box), box)
+def all_blocked(environment, tubes, frame, box):  # type: ignore[no-untyped-def]
+    return blocked.tubes_blocked(environment, tubes, boxes.tubes_of(tubes, frame, box), box)
+
+
+@numba.njit
+def tips_may_be(environment, frame, cones, box):  # type: ignore[no-untyped-def]
+    return kernel.tips_may_be(environment, frame, cones, box)
 
 
 @pytest.fixture(scope="module")
@@ -105,32 +111,25 @@ def tip_frame(tubes: Float, frame: Float, place: Float, values: Float) -> Float:
     return pose
 
 
-def random_case(rng: np.random.Generator, tubes: Float) -> tuple[Float, Float, Float, Float]:
-    """Return frame, knots, a box of any size, and a target."""
+def random_case(rng: np.random.Generator) -> tuple[Float, Float, Float]:
+    """Return frame, a box of any size, and a target."""
     frame = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
-    steps = 0.5 * Rotation.from_rotvec(rng.normal(0.0, 0.2, (5, 3))).apply(frame[2])
-    knots = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    first = int(rng.integers(5))
     scale = 10.0 ** rng.uniform(-3.0, 0.0)
     inner = rng.uniform(2.0, 50.0)
-    middles = [*rng.uniform(-0.7, 0.7, 2), rng.uniform(-3.0, 3.0), rng.uniform(0.0, inner), inner]
-    halves = scale * np.array([0.5, 0.5, 1.0, 10.0, 10.0]) * rng.uniform(0.0, 1.0, 5)
-    halves[3:] = np.minimum(halves[3:], np.array(middles[3:]))
-    box = np.array([*middles, *halves, first, rng.integers(first + 1, 6)])
-    target = rng.normal(0.0, 40.0, 3)
-    return frame, knots, box, target
+    angles = [*rng.uniform(-0.7, 0.7, 2), rng.uniform(-3.0, 3.0)]
+    middles = np.array([*angles, rng.uniform(0.0, inner), inner, *rng.normal(0.0, 3.0, 3)])
+    halves = scale * np.array([0.5, 0.5, 1.0, 10.0, 10.0, 2.0, 2.0, 3.0]) * rng.uniform(0.0, 1.0, 8)
+    halves[3:5] = np.minimum(halves[3:5], middles[3:5])
+    return frame, np.concatenate([middles, halves]), rng.normal(0.0, 40.0, 3)
 
 
-def draw(rng: np.random.Generator, knots: Float, box: Float) -> tuple[Float, Float]:
+def draw(rng: np.random.Generator, frame: Float, box: Float) -> tuple[Float, Float]:
     """Return a place and numbers of a deployment of a box that can be, often at its corners."""
     while True:
-        share = np.clip(rng.uniform(-1.6, 1.6, 5), -1.0, 1.0)
-        values = box[:5] + share * box[5:10]
+        share = np.clip(rng.uniform(-1.6, 1.6, 8), -1.0, 1.0)
+        values = box[:8] + share * box[8:]
         if 0.0 <= values[3] <= values[4] and values[4] > 0.01:
-            break
-    m = int(rng.integers(box[10], box[11]))
-    part = rng.uniform()
-    return (1.0 - part) * knots[m] + part * knots[m + 1], values
+            return values[5:] @ frame, values[:5]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -138,17 +137,16 @@ def test_no_deployment_of_a_box_sees_the_target_farther_off_than_its_bounds(tube
     rng = np.random.default_rng(seed)
     tight = 0
     for _ in range(300):
-        frame, knots, box, target = random_case(rng, tubes)
-        if box[3] - box[8] > box[4] + box[9] - 0.02:
+        frame, box, target = random_case(rng)
+        if box[3] - box[11] > box[4] + box[12] - 0.02:
             continue
-        sums, costs = np.zeros(3), np.zeros(6)
+        sums, costs = np.zeros(3), np.zeros(boxes.SIDES)
         pose, rho, ahead, size, moved, second = seen_from_middle(
-            tubes, KAPPA, target, frame, knots, box, sums, costs
+            tubes, KAPPA, target, frame, box, sums, costs
         )
-        centre = 0.5 * (knots[int(box[10])] + knots[int(box[11])])
-        middle = tip_frame(tubes, frame, centre, box[:5]) if box[3] <= box[4] else None
+        middle = tip_frame(tubes, frame, box[5:8] @ frame, box[:5]) if box[3] <= box[4] else None
         for _ in range(40):
-            place, values = draw(rng, knots, box)
+            place, values = draw(rng, frame, box)
             there = tip_frame(tubes, frame, place, values)
             seen = there[:3, :3].T @ (target - there[:3, 3])
             if middle is None:
@@ -172,13 +170,13 @@ def test_no_deployment_of_a_box_sees_the_target_farther_off_than_its_bounds(tube
 def test_no_tube_of_a_box_is_farther_from_its_samples_than_they_say(tubes: Float, seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
     for _ in range(200):
-        frame, knots, box, _target = random_case(rng, tubes)
-        if box[3] - box[8] > box[4] + box[9] - 0.02:
+        frame, box, _target = random_case(rng)
+        if box[3] - box[11] > box[4] + box[12] - 0.02:
             continue
         for _ in range(20):
-            place, values = draw(rng, knots, box)
+            place, values = draw(rng, frame, box)
             s = rng.uniform(0.0, values[4])
-            point, away = sampled(tubes, frame, knots, box, s)
+            point, away = sampled(tubes, frame, box, s)
             x, z = planar_point(tubes, values[3], values[4], s)
             turned = Rotation.from_rotvec(values[0] * frame[0] + values[1] * frame[1]).as_matrix()
             turned = turned @ frame.T @ Rotation.from_euler("z", values[2]).as_matrix()
@@ -233,14 +231,38 @@ def plans(small_lung: Lung, system: System) -> list[la.Plan]:
     return found
 
 
+HALVES = np.array([0.7, 0.7, 3.0, 20.0, 20.0, 2.0, 2.0, 2.0])
+"""Half widths of a large box, rad and mm."""
+
+
+def random_tips(proof: UnreachableProof, rng: np.random.Generator, n: int) -> list[tuple[PlacePiece, Float]]:
+    """Draw places of the scope tip, with their pieces; some are not in the lumen."""
+    chosen = [proof._pieces[m] for m in rng.integers(len(proof._pieces), size=n)]
+    return [(piece, rng.uniform(*piece.places) @ piece.frame) for piece in chosen]
+
+
+def pieces_of(proof: UnreachableProof, lung: Lung, place: Float) -> list[PlacePiece]:
+    """Return the pieces that hold the tree point nearest to a place."""
+    nearest = lung.tree.points_lps[np.linalg.norm(lung.tree.points_lps - place, axis=1).argmin()]
+    return [
+        piece
+        for piece in proof._pieces
+        if ((piece.cones[:, :3] == nearest).all(axis=1) & (piece.cones[:, 6] > 0.0)).any()
+    ]
+
+
+def rotation_vector(frame: Float, forward: Float) -> tuple[float, float]:
+    """Return the vector, which lies across, that turns the frame's axis towards a direction."""
+    seen = frame @ forward
+    angle = math.acos(min(max(float(seen[2]), -1.0), 1.0))
+    aside = math.hypot(seen[0], seen[1])
+    return (-seen[1] / aside * angle, seen[0] / aside * angle) if aside > 1e-12 else (0.0, 0.0)
+
+
 def deployment_of(frame: Float, plan: la.Plan) -> Float:
     """Return direction, rotation and insertions of a plan as the middles of a box."""
     pose, tube = plan.scope.lps_from_scope_tip, plan.tube
-    seen = frame @ pose[:3, 2]
-    angle = math.acos(min(max(float(seen[2]), -1.0), 1.0))
-    aside = math.hypot(seen[0], seen[1])
-    # The rotation vector lies across: it turns the axis towards the direction.
-    east, north = (-seen[1] / aside * angle, seen[0] / aside * angle) if aside > 1e-12 else (0.0, 0.0)
+    east, north = rotation_vector(frame, pose[:3, 2])
     turned = Rotation.from_rotvec(east * frame[0] + north * frame[1]).as_matrix() @ frame.T
     normal = turned.T @ bending_directions(pose, tube.rotation_rad)[0]
     rotation = math.atan2(normal[1], normal[0])
@@ -264,22 +286,21 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
         base = np.concatenate([place, turned @ frame[2]])
         return int(validate_deployment(deploying, tubes, base, normal, values[3], values[4], trace, tip))
 
-    def box_around(values: Float, m: int) -> Float:
+    def box_around(frame: Float, place: Float, values: Float) -> Float:
         scale = 10.0 ** rng.uniform(-5.0, -1.0)
-        halves = scale * np.array([0.7, 0.7, 3.0, 20.0, 20.0]) * rng.uniform(0.1, 1.0, 5)
-        return np.array([*(values + rng.uniform(-1.0, 1.0, 5) * halves), *halves, m, m + 1])
+        halves = scale * HALVES * rng.uniform(0.1, 1.0, 8)
+        middles = np.concatenate([values, frame @ place])
+        return np.concatenate([middles + rng.uniform(-1.0, 1.0, 8) * halves, halves])
 
-    for _ in range(20_000):
-        piece = proof._pieces[int(rng.integers(len(proof._pieces)))]
-        m = int(rng.integers(len(piece.cones)))
-        share = rng.uniform()
-        place = (1.0 - share) * piece.knots[m] + share * piece.knots[m + 1]
+    tips = random_tips(proof, rng, 20_000)
+    for piece, place in tips:
         inner = rng.uniform(2.0, 46.0)
         values = np.array([*rng.normal(0.0, 0.4, 2), rng.uniform(-3.1, 3.1), rng.uniform(0.0, inner), inner])
         if judged(piece.frame, place, values) != ACCEPTED:
-            n_blocked += all_blocked(environment, tubes, piece.frame, piece.knots, box_around(values, m))
+            n_blocked += all_blocked(environment, tubes, piece.frame, box_around(piece.frame, place, values))
             continue
         other = values + rng.normal(0.0, 1.0, 5) * [0.3, 0.3, 1.0, 5.0, 5.0]
+        other[3:] = np.maximum(other[3:], 0.0)
         why = judged(piece.frame, place, other)
         for _ in range(25 if why != ACCEPTED else 0):
             middle = 0.5 * (values + other)
@@ -290,48 +311,93 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
                 other, why = middle, reason
         at_limits[why] += 1
         for _ in range(8):
-            box = box_around(values, m)
-            assert not all_blocked(environment, tubes, piece.frame, piece.knots, box), (values, box, why)
+            box = box_around(piece.frame, place, values)
+            assert not all_blocked(environment, tubes, piece.frame, box), (place, values, box, why)
     assert n_blocked > 3000
     assert sum(at_limits.values()) > 100
     assert at_limits[NEAR_VESSEL] > 30
 
 
-def test_what_a_plan_reaches_is_never_ruled_out(proof: UnreachableProof, plans: list[la.Plan]) -> None:
+def test_what_a_plan_reaches_is_never_ruled_out(
+    small_lung: Lung, proof: UnreachableProof, plans: list[la.Plan]
+) -> None:
     """Not as a whole, and no box that holds the plan's deployment, of whatever size."""
     rng = np.random.default_rng(5)
     assert len(plans) >= 6
     for plan in plans:
-        target, place = plan.target_lps, plan.scope.lps_from_scope_tip[:3, 3]
+        target, pose = plan.target_lps, plan.scope.lps_from_scope_tip
         assert not proof.prove(target, most_boxes=3000).proved
         environment = proof._environment(target)
         tested = 0
-        for piece in proof._pieces:
-            for m, (begin, end) in enumerate(pairwise(piece.knots)):
-                along = end - begin
-                share = float(np.clip((place - begin) @ along / (along @ along), 0.0, 1.0))
-                if np.linalg.norm(begin + share * along - place) > 1e-6:
-                    continue
-                values = deployment_of(piece.frame, plan)
-                for scale in (1e-4, 1e-3, 1e-2, 0.05, 0.2, 1.0):
-                    halves = scale * np.array([0.7, 0.7, 3.0, 20.0, 20.0]) * rng.uniform(0.1, 1.0, 5)
-                    middles = values + rng.uniform(-1.0, 1.0, 5) * halves
-                    box = np.array([*middles, *halves, m, m + 1])
-                    assert not_ruled_out(
-                        environment, proof._tubes, proof._insertions, proof._limits, target,
-                        piece.frame, piece.knots, piece.cones, box,
-                    ), (values, box)  # fmt: skip
-                    tested += 1
+        for piece in pieces_of(proof, small_lung, pose[:3, 3]):
+            values = np.concatenate([deployment_of(piece.frame, plan), piece.frame @ pose[:3, 3]])
+            for scale in (1e-4, 1e-3, 1e-2, 0.05, 0.2, 1.0):
+                halves = scale * HALVES * rng.uniform(0.1, 1.0, 8)
+                box = np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves])
+                assert not_ruled_out(
+                    environment, proof._tubes, proof._insertions, proof._limits, target,
+                    piece.frame, piece.cones, box,
+                ), (values, box)  # fmt: skip
+                tested += 1
         assert tested >= 6
 
 
+def holds(environment, piece: PlacePiece, tip: Float, rng: np.random.Generator) -> bool:  # type: ignore[no-untyped-def]
+    """Tell whether a box around a tip may hold tips, and the piece's first box holds this one."""
+    at = piece.frame @ tip[:3]
+    values = np.array([*rotation_vector(piece.frame, tip[3:6]), 0.0, 10.0, 20.0, *at])
+    halves = 10.0 ** rng.uniform(-4.0, 0.0) * HALVES * rng.uniform(0.0, 1.0, 8)
+    box = np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves])
+    inside = (at >= piece.places[0]).all() and (at <= piece.places[1]).all()
+    looks = np.abs(values[:2]).max() <= piece.wide
+    return bool(inside and looks and tips_may_be(environment, piece.frame, piece.cones, box))
+
+
+def random_tips_of_the_region(lung: Lung, least_mm: float, rng: np.random.Generator, n: int) -> Float:
+    """Draw tips `(S, 6)` near the axis, in a lumen so deep, that look ahead, as `in_tip_region` has it."""
+    tree = lung.tree
+    points = tree.points_lps[rng.integers(tree.n_points, size=n)]
+    points = points + MAX_OFF_AXIS_MM * rng.uniform(-1.0, 1.0, (n, 3))
+    points = points[lung.lumen_depth.lower_bound_mm(points) >= least_mm]
+    forward = tree.tangents[in_tip_region(tree, np.hstack([points, points]))[0]]
+    forward = forward + rng.normal(0.0, 0.5, forward.shape)
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    tips = np.hstack([points, forward])
+    return np.asarray(tips[in_tip_region(tree, tips)[1]])
+
+
+def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
+    small_lung: Lung, system: System, proof: UnreachableProof
+) -> None:
+    """Tips of motions, and tips drawn at random wherever a scope fits that comes from the trachea."""
+    rng = np.random.default_rng(7)
+    tree, least = small_lung.tree, system.scope.radius_mm + system.scope.lumen_margin_mm
+    exits = cKDTree(small_lung.grid.lps(np.argwhere(_may_be_left(small_lung))))
+    environment = proof._environment(tree.points_lps[-1])
+    motions = find_motions(small_lung, system.scope, reach_mm=float(proof._insertions.max())).tips[:, :6]
+    drawn = random_tips_of_the_region(small_lung, least, rng, 20_000)
+    counted = aside = 0
+    for tip, moved in [*((tip, True) for tip in motions), *((tip, False) for tip in drawn)]:
+        if exits.query(tip[:3])[0] > proof._insertions.max():
+            continue
+        pieces = pieces_of(proof, small_lung, tip[:3])
+        assert all(holds(environment, piece, tip, rng) for piece in pieces)
+        assert pieces or not moved
+        counted += len(pieces)
+        aside += bool(pieces) and np.linalg.norm(tree.points_lps - tip[:3], axis=1).min() > 1.0
+    assert len(motions) > 100
+    assert counted > 0.5 * len(drawn)
+    assert aside > 30
+
+
 def test_a_weak_system_is_proved_not_to_reach_what_it_does_not(small_lung: Lung, system: System) -> None:
-    """Tubes that hardly leave the scope, and a short needle that hardly bends."""
+    """A thicker scope, tubes that hardly leave it, and a short needle that hardly bends."""
     weak = replace(
         system,
         name="weak",
-        needle=replace(system.needle, max_curvature_per_mm=1.0 / 5000.0, max_length_mm=20.0),
-        tubes=replace(system.tubes, max_extension_mm=6.0),
+        scope=replace(system.scope, outer_diameter_mm=2.8),
+        needle=replace(system.needle, max_curvature_per_mm=1.0 / 5000.0, max_length_mm=10.0),
+        tubes=replace(system.tubes, max_extension_mm=4.0),
     )
     proof = UnreachableProof(small_lung, weak, with_fissures=False)
     atlas = la.build_atlas(small_lung, weak)

@@ -169,7 +169,7 @@ def test_the_tip_nearest_to_a_measured_pose(motions: ScopeMotions) -> None:
     assert motions.nearest(pose[:3] + [0.01, 0.0, 0.0], pose[3:6]) == motions.count // 2
 
 
-@pytest.mark.parametrize("fault", ["bend", "advance", "both", "back", "shaft", "length", "wall"])
+@pytest.mark.parametrize("fault", ["bend", "twist", "advance", "both", "back", "shaft", "length", "wall"])
 def test_tampered_motions_have_no_proof(lung: Lung, motions: ScopeMotions, fault: str) -> None:
     from dataclasses import replace
 
@@ -177,6 +177,9 @@ def test_tampered_motions_have_no_proof(lung: Lung, motions: ScopeMotions, fault
     states = motion.states.copy()
     if fault == "bend":
         states[-1, 2] = 2.0
+    elif fault == "twist":
+        states = np.vstack([states, states[-1]])
+        states[-1, 1] = 3.3
     elif fault == "advance":
         states = np.vstack([states, states[-1] + [30.0, 0.0, 0.0]])
         states[-2, 2] = states[-1, 2] = 0.0

@@ -97,7 +97,7 @@ def _save(atlas: Atlas, path: Path) -> None:
     rest: dict[str, Any] = {"with_fissures": atlas.with_fissures, "build_s": atlas.build_s}
     rest |= {"format": FORMAT, "name": atlas.lung.name}
     for name, part in (("motions", atlas.motions), ("deployments", atlas.deployments)):
-        _take_apart(part, name, arrays, rest)
+        _flatten(part, name, arrays, rest)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary, open(temporary, "wb") as stream:
@@ -110,27 +110,25 @@ def _save(atlas: Atlas, path: Path) -> None:
         ) from error
 
 
-def _take_apart(record: Any, name: str, arrays: dict[str, Any], rest: dict[str, Any]) -> None:
+def _flatten(record: Any, name: str, arrays: dict[str, Any], rest: dict[str, Any]) -> None:
     """Add the fields of a record by dotted names: arrays to one mapping, what is plain to the other."""
     for field in fields(record):
         value, key = getattr(record, field.name), f"{name}.{field.name}"
         if is_dataclass(value):
-            _take_apart(value, key, arrays, rest)
+            _flatten(value, key, arrays, rest)
         elif isinstance(value, np.ndarray):
             arrays[key] = value
         else:
             rest[key] = value
 
 
-def _put_together(cls: Any, name: str, values: dict[str, Any]) -> Any:
-    """Return the record that was taken apart."""
+def _rebuilt(cls: Any, name: str, values: dict[str, Any]) -> Any:
+    """Return the record that `_flatten` wrote."""
     hints = get_type_hints(cls)
     parts: dict[str, Any] = {}
     for field in fields(cls):
         key = f"{name}.{field.name}"
-        value = (
-            _put_together(hints[field.name], key, values) if is_dataclass(hints[field.name]) else values[key]
-        )
+        value = _rebuilt(hints[field.name], key, values) if is_dataclass(hints[field.name]) else values[key]
         parts[field.name] = tuple(value) if isinstance(value, list) else value
     return cls(**parts)
 
@@ -142,12 +140,12 @@ def _load(path: Path, lung: Lung, system: System) -> Atlas | None:
             arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
             rest = json.loads(str(stored["rest"]))
         values = arrays | rest
-        deployments = _put_together(Deployments, "deployments", values)
+        deployments = _rebuilt(Deployments, "deployments", values)
         return Atlas(
             lung=lung,
             system=system,
             with_fissures=rest["with_fissures"],
-            motions=_put_together(ScopeMotions, "motions", values),
+            motions=_rebuilt(ScopeMotions, "motions", values),
             deployments=deployments,
             index=StartIndex(deployments.positions, deployments.tangents),
             build_s=rest["build_s"],

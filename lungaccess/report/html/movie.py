@@ -42,7 +42,7 @@ def bronchoscopy_webp(
 ) -> Path:
     """Write what the scope's camera sees on its route to the plan's site as an animated WebP.
 
-    Up is where a positive bend turns the tip: the picture rolls with the twist.  The wall is where the blurred
+    Up is where a positive bend turns the tip: the picture rolls with the twist.  The wall is where blurred
     lumen is half full, so that voxels do not show; no device is drawn.
 
     Parameters

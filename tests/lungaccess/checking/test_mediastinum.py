@@ -33,7 +33,7 @@ def plans_through(lung: Lung, branches: np.ndarray) -> list[Plan]:
             task = Task(lung=lung, system=atlas.system, target=point_target(lung, point), objective=SHORTEST)
             found = DirectArcs(task, atlas).proved(entry)
             if found is not None:
-                plans.append(assemble(task, atlas.sites, found, iteration=0, timing={}))
+                plans.append(assemble(task, found, iteration=0, timing={}))
         if len(plans) == WANTED:
             break
     return plans

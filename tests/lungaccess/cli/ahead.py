@@ -21,7 +21,7 @@ ASIDE_MM = 3.0
 def turned_candidates(lung: Lung, atlas: la.Atlas) -> Iterator[tuple[AtlasSearch, Candidate]]:
     """Yield searches for points ahead of tubes from turned tips, each with the direct arc from there."""
     entries, rng = atlas.deployments, np.random.default_rng(0)
-    turned = np.flatnonzero(atlas.sites.turned[entries.site])
+    turned = np.flatnonzero(atlas.motions.turned[entries.site])
     for entry in rng.permutation(turned):
         point = entries.positions[entry] + AHEAD_MM * entries.tangents[entry]
         point = point + rng.uniform(-ASIDE_MM, ASIDE_MM, 3)

@@ -26,23 +26,31 @@ def atlas(small_lung: Lung) -> la.Atlas:
 def test_counts_add_up(atlas: la.Atlas) -> None:
     stops = len(insertion_stops(SYSTEM.tubes))
     found = atlas.deployments
-    turned = int(atlas.sites.turned.sum())
+    turned = int(atlas.motions.turned.sum())
     fewer = len(insertion_stops(SYSTEM.tubes, 4.0))
-    even = (atlas.sites.count - turned) * DEFAULT_ROTATIONS * (stops * (stops + 1) // 2 - 1)
+    even = (atlas.motions.count - turned) * DEFAULT_ROTATIONS * (stops * (stops + 1) // 2 - 1)
     even += turned * (DEFAULT_ROTATIONS // 2) * (fewer * (fewer + 1) // 2 - 1)
     assert even < found.candidates < 2 * even
     assert found.count + sum(found.refused.values()) == found.candidates
-    assert found.count > 5000 and atlas.sites.count > 50
+    assert found.count > 5000 and atlas.motions.count > 50
     assert atlas.build_s > 0.0
 
 
-def test_sites_index_the_tree(atlas: la.Atlas, small_lung: Lung) -> None:
-    assert found_sites(atlas) <= set(range(atlas.sites.count))
-    for site in (0, atlas.sites.count - 1):
-        assert np.array_equal(
-            atlas.sites.poses[site, :3], small_lung.tree.points_lps[atlas.sites.tree_point[site]]
-        )
+def test_deployments_index_the_tips(atlas: la.Atlas, small_lung: Lung) -> None:
+    motions, tree = atlas.motions, small_lung.tree
+    assert found_sites(atlas) <= set(range(motions.count))
+    for site in (0, motions.count - 1):
+        away = np.linalg.norm(tree.points_lps - motions.tips[site, :3], axis=1)
+        assert away[motions.tree_point[site]] == away.min()
+        tip = motions.tip(site)
+        assert np.allclose(tip.motion.lps_from_tip, tip.lps_from_scope_tip, atol=1e-9)
     assert (np.diff(atlas.deployments.site) >= 0).all()
+
+
+def test_the_body_keeps_the_curvature_of_the_channel(atlas: la.Atlas) -> None:
+    for site in range(0, atlas.motions.count, 40):
+        body = atlas.motions.motion(site).max_curvature_per_mm
+        assert body == pytest.approx(float(atlas.motions.max_curvature_per_mm[site]), abs=1e-9)
 
 
 def found_sites(atlas: la.Atlas) -> set[int]:
@@ -55,10 +63,12 @@ def test_tubes_are_clear_behind_the_exit(atlas: la.Atlas, small_lung: Lung) -> N
 
     found, tubes, margin = atlas.deployments, SYSTEM.tubes, SYSTEM.margins.total_mm
     for n in np.random.default_rng(0).choice(found.count, 60, replace=False):
-        site = atlas.sites.poses[found.site[n]]
+        site = atlas.motions.tips[found.site[n]]
         outer, inner = float(found.outer_mm[n]), float(found.inner_mm[n])
         s = np.linspace(0.0, inner, round(inner / 0.05) + 1)
-        points = centreline(tubes, pose(site[:3], site[3:]), float(found.rotation_rad[n]), outer, inner, s)
+        points = centreline(
+            tubes, pose(site[:3], site[3:6], site[6:]), float(found.rotation_rad[n]), outer, inner, s
+        )
         assert np.allclose(points[-1], found.positions[n], atol=1e-9)
         behind = s > found.exit_mm[n]
         radius = np.where(s[behind] < outer, tubes.outer.radius_mm, tubes.inner.radius_mm)
@@ -81,7 +91,7 @@ def test_no_tube_leaves_trachea_or_main_bronchi(atlas: la.Atlas, small_lung: Lun
 
     def enumerated(lung: Lung) -> tuple[set[tuple[float, ...]], set[tuple[float, ...]]]:
         """Return the deployments from the first sites at whole steps, those through the mediastinum apart."""
-        tips = atlas.sites.poses[:150]
+        tips = atlas.motions.tips[:150]
         found = enumerate_deployments(
             lung, SYSTEM.tubes, SYSTEM.margins, tips, with_fissures=True, rotations=8
         )
@@ -114,13 +124,21 @@ def test_fissures(atlas: la.Atlas, small_lung: Lung) -> None:
 def test_finer_is_more(atlas: la.Atlas, small_lung: Lung) -> None:
     coarse = la.build_atlas(small_lung, SYSTEM, rotations=9, stop_spacing_mm=4.0, site_spacing_mm=3.0)
     assert 0 < coarse.deployments.count < 0.2 * atlas.deployments.count
-    assert coarse.sites.count < 0.7 * atlas.sites.count
+    assert coarse.motions.count < 0.7 * atlas.motions.count
 
 
 def test_a_scope_too_thick(small_lung: Lung) -> None:
-    atlas = la.build_atlas(small_lung, replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=15.0)))
-    assert atlas.sites.count == atlas.deployments.count == atlas.deployments.candidates == 0
-    assert not atlas.sites.passable.any()
+    atlas = la.build_atlas(
+        small_lung,
+        replace(
+            SYSTEM,
+            scope=replace(
+                SYSTEM.scope, outer_diameter_mm=15.0, min_bending_radius_mm=20.0, min_shaft_radius_mm=20.0
+            ),
+        ),
+    )
+    assert atlas.motions.count == atlas.deployments.count == atlas.deployments.candidates == 0
+    assert not atlas.motions.passages.passable.any()
 
 
 def test_progress(small_lung: Lung) -> None:
@@ -131,7 +149,7 @@ def test_progress(small_lung: Lung) -> None:
 
 def test_further_rotations_lie_between_unlike_ones_and_only_there(atlas: la.Atlas, small_lung: Lung) -> None:
     """Against an enumeration at all of them."""
-    tips = atlas.sites.poses[~atlas.sites.turned][:40]
+    tips = atlas.motions.tips[~atlas.motions.turned][:40]
     tubes, margins, turn = SYSTEM.tubes, SYSTEM.margins, 2 * np.pi
 
     def enumerated(rotations: int) -> dict[tuple[int, float], set[tuple[float, float]]]:

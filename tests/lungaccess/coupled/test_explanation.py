@@ -59,15 +59,19 @@ def random_targets(lung: Lung, count: int, seed: int) -> list[Target]:
     return found
 
 
+BENDS_WIDELY = {"min_bending_radius_mm": 20.0, "min_shaft_radius_mm": 20.0}
+"""No scope bends tighter than half its diameter."""
+
+
 class TestScope:
     """The bronchoscope does not fit."""
 
-    THICK_SCOPE = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=15.0))
+    THICK_SCOPE = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=15.0, **BENDS_WIDELY))
 
     def test_it_fits_nowhere(self, small_lung: Lung) -> None:
         error = explained(small_lung, self.THICK_SCOPE, la.resolve_target(small_lung))
         assert "the scope (15 mm) fits nowhere" in str(error)
-        assert error.reasons["scope: sites"] == 0
+        assert error.reasons["scope: tips with a proved motion"] == 0
         generation = int(re.search(r"too narrow at generation (\d+)", str(error))[1])
         closed = next(count for reason, count in error.reasons.items() if "too narrow" in reason)
         assert generation == 0 and closed == small_lung.tree.n_points
@@ -76,11 +80,11 @@ class TestScope:
         advice = explained(small_lung, self.THICK_SCOPE, la.resolve_target(small_lung)).advice
         widest = float(re.search(r"of ([\d.]+) mm or less", advice)[1])
         for diameter, fits in ((widest, True), (widest + 0.11, False)):
-            scope = replace(SYSTEM.scope, outer_diameter_mm=diameter)
+            scope = replace(SYSTEM.scope, outer_diameter_mm=diameter, **BENDS_WIDELY)
             atlas = la.build_atlas(
                 small_lung, replace(SYSTEM, scope=scope), rotations=1, stop_spacing_mm=20.0
             )
-            assert (atlas.sites.count > 0) == fits
+            assert (atlas.motions.count > 0) == fits
 
     def test_no_airway_in_lung_tissue(self, small_lung: Lung) -> None:
         """The lung is far from every airway: a thinner scope is no help, and none is advised."""
@@ -92,14 +96,14 @@ class TestScope:
         lung = lung_of(labels, small_lung.grid, small_lung.tree)
         error = explained(lung, replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=1.8)), target)
         assert "fits nowhere" in str(error)
-        assert error.reasons["scope: sites"] == 0 and error.advice == ""
+        assert error.reasons["scope: tips with a proved motion"] == 0 and error.advice == ""
 
 
 def test_tubes_that_never_leave(small_lung: Lung) -> None:
     system = replace(SYSTEM, tubes=replace(SYSTEM.tubes, min_wall_angle_deg=90.0))
     error = explained(small_lung, system, la.resolve_target(small_lung))
     assert "the tubes cannot leave the airway safely" in str(error)
-    assert error.reasons["scope: sites"] > 0
+    assert error.reasons["scope: tips with a proved motion"] > 0
     refused = {k: v for k, v in error.reasons.items() if k.startswith("tube: the tube")}
     assert sum(refused.values()) == error.reasons["tube: deployments looked at"]
     assert refused["tube: the tube meets the airway wall at too flat an angle"] > 0

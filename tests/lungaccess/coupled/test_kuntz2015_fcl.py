@@ -30,7 +30,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle.device import Needle
-from stages.scope.tips import MedialAxis
 from stages.tube import Deployment, DeploymentValidator, tracking_length_mm
 from tests.lungaccess.resample import problems
 
@@ -157,11 +156,12 @@ class TestTubes:
         proof = DeploymentValidator(
             small_lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=atlas.with_fissures
         )
-        axis = MedialAxis(small_lung.tree, atlas.sites.passable & atlas.sites.exits_ahead)
+        tips = np.flatnonzero(~atlas.motions.turned)
         rng = np.random.default_rng(0)
         both, only_meshes, only_proof = 0, 0, 0
         for _ in range(1500):
-            frame, rotation = axis.sample(rng).lps_from_scope_tip, float(rng.uniform(0.0, 2.0 * math.pi))
+            frame = atlas.motions.tip(int(rng.choice(tips))).lps_from_scope_tip
+            rotation = float(rng.uniform(0.0, 2.0 * math.pi))
             outer, inner = np.sort(rng.uniform(0.0, tracking_length_mm(SYSTEM.tubes), 2))
             ours = validator.validate(validator.shape(frame, rotation, float(outer), float(inner)))
             theirs = proof.validate(frame, rotation, float(outer), float(inner))

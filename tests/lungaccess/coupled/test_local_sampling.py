@@ -38,7 +38,7 @@ def sampling_of(search: AtlasSearch) -> tuple[LocalSampling, np.ndarray]:
     outside = nearly_reaching(search.atlas, needle, target, MOST)
     chosen = np.concatenate([search.arcs.in_workspace[:MOST], outside])
     rng = np.random.default_rng(search.task.seed)
-    local_search = LocalSearch(search.evaluator, search.atlas.sites, rng)
+    local_search = LocalSearch(search.evaluator, rng)
     return LocalSampling(local_search, search.arcs, chosen, rng), chosen
 
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lungaccess.coupled.search.scope_poses import ScopePoses
 
 import lungaccess as la
 from anatomy.errors import SettingsError, TargetError
@@ -31,12 +30,13 @@ from lungaccess.coupled import (
 )
 from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND
 from lungaccess.coupled.search.entries import different
-from lungaccess.coupled.search.local_search import LocalSearch, path_through
+from lungaccess.coupled.search.local_search import SHIFTS_MM, LocalSearch, path_through
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle import OUR_PLANNERS, TERMS, Objective
+from stages.scope import MotionProver, in_tip_region
 from tests.lungaccess.cli.ahead import turned_candidates
 from tests.lungaccess.resample import needle_walk, problems
 
@@ -505,7 +505,7 @@ class TestDirectArcs:
 
 
 def local_search_of(search: AtlasSearch) -> LocalSearch:
-    return LocalSearch(search.evaluator, search.atlas.sites, np.random.default_rng(0))
+    return LocalSearch(search.evaluator, np.random.default_rng(0))
 
 
 class TestLocalSearch:
@@ -529,7 +529,7 @@ class TestLocalSearch:
             local_search.advance(run, 50)
             costs.append(run.cost)
             found = local_search.candidate(run)
-            assert found is not None and found.tip.turned == turned
+            assert found is not None
             assert search.evaluator.evaluate(found) == pytest.approx(run.cost, rel=0.05)
         assert costs == sorted(costs, reverse=True)
         assert costs[-1] < 0.99 * search.evaluator.cost(begun.path)
@@ -547,14 +547,17 @@ class TestLocalSearch:
                 assert found is not None and math.isfinite(search.evaluator.evaluate(found))
         assert finite >= 1
 
-    def test_rows_hold_the_tips(self, search: AtlasSearch, small_lung: Lung) -> None:
-        tip = search.atlas.sites.tip(small_lung.tree, 0)
-        poses = ScopePoses(small_lung, SYSTEM.scope, search.atlas.sites, tip, np.random.default_rng(0))
-        assert poses.allowed[poses.home] and poses.rotation_rad(poses.home, 0.7) == pytest.approx(0.7)
-        for row, each in zip(poses.rows, poses.tips, strict=True):
-            frame = each.lps_from_scope_tip
-            assert np.allclose(row[:6], [*frame[:3, 3], *frame[:3, 2]])
-            assert abs(row[3:6] @ row[6:]) < 1e-9 and np.linalg.norm(row[6:]) == pytest.approx(1.0)
+    def test_rows_hold_tips_with_proved_motions(self, search: AtlasSearch, small_lung: Lung) -> None:
+        prover = MotionProver(small_lung, SYSTEM.scope)
+        for site in range(0, search.atlas.motions.count, 60):
+            row, allowed = search.evaluator.tip_rows.along(search.atlas.motions.tip(site), SHIFTS_MM)
+            assert allowed[len(SHIFTS_MM) // 2]
+            for index in np.flatnonzero(allowed)[::4].tolist():
+                tip = search.evaluator.tip_rows.tip(row, index)
+                assert isinstance(prover.prove(tip.motion), float)
+                assert np.allclose(tip.motion.lps_from_tip, tip.lps_from_scope_tip, atol=1e-9)
+            inside = in_tip_region(small_lung.tree, row.tips)[1]
+            assert inside[allowed & (SHIFTS_MM != 0.0)].all()
 
     def test_paths_lead_through_their_points(self, search: AtlasSearch) -> None:
         begun = first_clear(search)

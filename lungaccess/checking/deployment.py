@@ -10,6 +10,7 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float, Labels
 from lungaccess.checking import shapes
+from lungaccess.checking.channel import check_channel, deployed_strain_factor
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
@@ -17,6 +18,7 @@ from lungaccess.checking.poses import check_rigid, check_same_pose
 from lungaccess.checking.shapes import Curve
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
 from lungaccess.checking.wall_exit import Exit, check_exit, check_wall_run
+from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.plans.plan import Plan
 
 if TYPE_CHECKING:
@@ -46,6 +48,8 @@ def check_deployment(plan: Plan, environment: Environment, found: Findings) -> C
     curve = shapes.tube_curve(plan.scope.lps_from_scope_tip, tube.rotation_rad, bend)
     check_same_pose("tube.tip", tube.lps_from_tip, curve.end, found)
     _check_limits(plan, bend, found)
+    if isinstance(plan.scope, ScopeInsertion):
+        check_channel(plan, plan.scope, found)
     sweep_mm = _check_sweep(plan, found)
     way_out = check_exit(plan, lung, curve, found)
     if way_out is not None:
@@ -73,9 +77,12 @@ def _check_limits(plan: Plan, bend: shapes.Bend, found: Findings) -> None:
     ahead = tubes.inner.length_mm - tubes.outer.length_mm
     found.at_most("tube.protrusion", inner - outer, ahead, "mm", "inner beyond outer tube")
     # Straightened in the scope the inner tube is bent by its whole precurvature; the outer one bends with it.
-    strains = [tubes.inner.precurvature_per_mm * tubes.inner.outer_diameter_mm / 2]
+    factors = [
+        deployed_strain_factor(tube, length) for tube, length in ((tubes.outer, outer), (tubes.inner, inner))
+    ]
+    strains = [factors[1] * tubes.inner.precurvature_per_mm * tubes.inner.outer_diameter_mm / 2]
     in_overlap = [k for k, end in zip(bend.per_mm, bend.edges_mm[1:], strict=True) if end <= outer]
-    strains += [k * tubes.outer.outer_diameter_mm / 2 for k in in_overlap]
+    strains += [factors[0] * k * tubes.outer.outer_diameter_mm / 2 for k in in_overlap]
     found.at_most("tube.strain", max(strains), tubes.max_strain, "", "largest strain of the tube material")
 
 

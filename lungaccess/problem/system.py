@@ -73,6 +73,17 @@ class System:
                 self.needle.diameter_mm,
                 f"less than tubes.inner.inner_diameter_mm = {bore:g}",
             )
+        bent = max(self.tubes.channel_curvature_per_mm, self.tubes.inner.max_precurvature_per_mm)
+        most = self.needle.most_bent_per_mm
+        if bent > most:
+            raise impossible(
+                "needle.diameter_mm",
+                self.needle.diameter_mm,
+                f"at most {self.needle.diameter_mm * most / bent:.3g}: channel and tubes bend the needle by "
+                f"{bent:.4g} / mm, so that its strain exceeds needle.max_strain = "
+                f"{self.needle.max_strain:g}. A smaller needle.strain_factor (slots) or "
+                "tubes.max_channel_curvature_per_mm allows more",
+            )
 
 
 def preset_names() -> tuple[str, ...]:

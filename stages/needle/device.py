@@ -32,6 +32,18 @@ class Needle:
         float, quantity("needle length that may lie in the pierced wall", at_least=0.0, at_most=30.0)
     ] = 5.0
 
+    max_strain: Annotated[
+        float, quantity("largest strain of the needle's shaft in a bend", above=0.0, at_most=0.2)
+    ] = 0.08
+    strain_factor: Annotated[
+        float, quantity("strain as a share of a plain shaft's: slots lower it", above=0.0, at_most=2.0)
+    ] = 1.0
+
+    @property
+    def most_bent_per_mm(self) -> float:
+        """How bent a channel may be that the needle passes, 1/mm."""
+        return self.max_strain / (self.radius_mm * self.strain_factor)
+
     @property
     def radius_mm(self) -> float:
         """Outer radius, mm."""

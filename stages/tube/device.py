@@ -11,7 +11,12 @@ from pydantic import Field
 
 from anatomy.settings import impossible, quantity, settings
 from anatomy.typed import Float
+from stages.tube.parts import Bend, SlottedSegment, TubeParts, tube_parts
 
+ROUNDING = 1e-9
+"""Share of a limit by which a value may seem to break it that was computed from it."""
+AIRWAY_MM = 300.0
+"""From the larynx on no airway is longer; before it the channel is in throat and mouth, no part of a plan."""
 DEFAULT_WALL_RUN_MM = 5.0
 """A straight tube of radius r has (t + r) / sin(a) of its length in a wall of thickness t that it meets at
 the angle a: so much do 1.9 mm tubes at 30 degrees need for 1.5 mm, the wall of a segmental bronchus."""
@@ -26,15 +31,6 @@ class BentPiece:
     direction_deg: Annotated[
         float, quantity("direction of the bend about the axis", at_least=-360.0, at_most=360.0)
     ] = 0.0
-
-
-class Bend(NamedTuple):
-    """A piece of a tube of one precurvature, by arc lengths from the tube's rear end."""
-
-    from_mm: float
-    to_mm: float
-    curvature_per_mm: float
-    direction_rad: float
 
 
 @settings
@@ -60,6 +56,9 @@ class Tube:
     ] = 0.0
     bent_pieces: Annotated[
         tuple[BentPiece, ...], Field(description="pieces of the distal part, if it is no single arc")
+    ] = ()
+    slotted_segments: Annotated[
+        tuple[SlottedSegment, ...], Field(description="stretches with slots, the foremost first")
     ] = ()
     youngs_modulus_gpa: Annotated[float, quantity("Young's modulus", above=0.0, at_most=1000.0)] = 60.0
     poisson_ratio: Annotated[float, quantity("Poisson's ratio", at_least=0.0, below=0.5)] = 0.3
@@ -90,6 +89,37 @@ class Tube:
                 f"curved_length_mm = {self.curved_length_mm:g}",
             )
 
+        self._check_slots()
+
+    def _check_slots(self) -> None:
+        at = 0.0
+        for n, segment in enumerate(self.slotted_segments):
+            end = segment.from_tip_mm + segment.length_mm
+            if segment.from_tip_mm < at or end > self.length_mm:
+                raise impossible(
+                    f"slotted_segments[{n}].from_tip_mm",
+                    segment.from_tip_mm,
+                    f"at least {at:g}, where the segment before ends, and such that the segment ends within "
+                    f"length_mm = {self.length_mm:g}",
+                )
+            at = end
+
+    @property
+    def parts(self) -> TubeParts:
+        """The tube cut where its precurvature or its slots change."""
+        return tube_parts(
+            self.length_mm, self.bends, self.slotted_segments, self.bending_stiffness_n_mm2, self.radius_mm
+        )
+
+    def most_bent_per_mm(self, max_strain: float, passing_mm: float) -> float:
+        """Return how bent a channel may be that the first `passing_mm` of the tube pass, 1/mm.
+
+        At worst the channel bends the tube against its precurvature.  Below 0 the tube cannot be straight.
+        """
+        parts = self.parts
+        most = max_strain / parts.strained_radius_mm - parts.curvature_per_mm
+        return float(most[parts.begin_mm <= passing_mm].min())
+
     @property
     def radius_mm(self) -> float:
         """Outer radius, mm."""
@@ -102,7 +132,7 @@ class Tube:
 
     @property
     def bending_stiffness_n_mm2(self) -> float:
-        """Bending stiffness E I, N mm^2 [Rucker2010]."""
+        """Bending stiffness E I where the tube is plain, N mm^2 [Rucker2010]."""
         return 1e3 * self.youngs_modulus_gpa * self.second_moment_mm4
 
     @property
@@ -134,7 +164,7 @@ class Tube:
     @property
     def rest_strain(self) -> float:
         """Largest strain when the precurved part is held straight (dimensionless)."""
-        return self.max_precurvature_per_mm * self.radius_mm
+        return float((self.parts.curvature_per_mm * self.parts.strained_radius_mm).max())
 
 
 class TubeArcs(NamedTuple):
@@ -161,7 +191,8 @@ class ConcentricTubes:
 
     The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
     perpendicular; the extension counts along the tubes.  In the worst case the working channel bends the tube
-    that it holds against its precurvature.
+    that it holds against its precurvature.  Where no largest curvature of the channel is stated, it is what
+    `max_strain` allows.
 
     Raises
     ------
@@ -190,8 +221,9 @@ class ConcentricTubes:
         float, quantity("least difference of diameters of nested tubes", at_least=0.0, at_most=2.0)
     ] = 0.0
     max_channel_curvature_per_mm: Annotated[
-        float, quantity("largest curvature of the channel that holds the tubes", at_least=0.0, at_most=0.2)
-    ] = 0.0
+        float | None,
+        quantity("largest curvature of the channel that the tubes pass", at_least=0.0, at_most=0.5),
+    ] = None
 
     def __post_init__(self) -> None:
         self._check_nesting()
@@ -205,16 +237,59 @@ class ConcentricTubes:
             raise impossible(
                 "inner.bent_pieces", len(self.inner.bent_pieces), "none; plans need an inner tube of one arc"
             )
+        self._check_strain()
+        self._check_slots()
+
+    def _check_strain(self) -> None:
         for name, tube in (("outer", self.outer), ("inner", self.inner)):
-            strain = tube.rest_strain + self.max_channel_curvature_per_mm * tube.radius_mm
-            if strain > self.max_strain:
-                most = self.max_strain / tube.radius_mm - self.max_channel_curvature_per_mm
+            if tube.rest_strain > self.max_strain:
                 raise impossible(
                     f"{name}.precurvature_per_mm",
                     tube.max_precurvature_per_mm,
-                    f"at most 2 max_strain / outer_diameter_mm - max_channel_curvature_per_mm = {most:.6g}; "
-                    f"the strain is {strain:.4g}, max_strain is {self.max_strain:g}",
+                    f"2 max_strain / outer_diameter_mm = {self.max_strain / tube.radius_mm:.6g} without "
+                    f"slots: held straight its strain is {tube.rest_strain:.4g}, max_strain is "
+                    f"{self.max_strain:g}",
                 )
+            most = tube.most_bent_per_mm(self.max_strain, self.passing_mm)
+            if (self.max_channel_curvature_per_mm or 0.0) > most * (1.0 + ROUNDING) + ROUNDING:
+                raise impossible(
+                    "max_channel_curvature_per_mm",
+                    self.max_channel_curvature_per_mm,
+                    f"at most {most:.4g}: there the strain of the {name} tube reaches max_strain = "
+                    f"{self.max_strain:g}. A thinner tube, less precurvature or slotted_segments allow more",
+                )
+
+    def _check_slots(self) -> None:
+        """Where tubes are deployed their stiffness changes nowhere, and slots change that of both alike."""
+        for name, tube in (("outer", self.outer), ("inner", self.inner)):
+            parts, other = (
+                tube.parts,
+                self.inner.parts.stiffness_n_mm2[0] / self.inner.bending_stiffness_n_mm2,
+            )
+            deployed = parts.stiffness_n_mm2[parts.begin_mm < self.max_extension_mm]
+            share = deployed / tube.bending_stiffness_n_mm2
+            if np.ptp(share) > 0.0 or abs(share[0] - other) > ROUNDING:
+                raise impossible(
+                    f"{name}.slotted_segments",
+                    len(tube.slotted_segments),
+                    "the same stiffness_factor for both tubes over the whole max_extension_mm = "
+                    f"{self.max_extension_mm:g} from their tips: plans assume that they share their bend as "
+                    "plain tubes do",
+                )
+
+    @property
+    def passing_mm(self) -> float:
+        """Length of tube, from its tip, that passes bends of the airways when it is inserted farthest."""
+        return self.max_extension_mm + AIRWAY_MM
+
+    @property
+    def channel_curvature_per_mm(self) -> float:
+        """Largest curvature of channel that the tubes may pass, 1/mm: as stated, or what strain allows."""
+        if self.max_channel_curvature_per_mm is not None:
+            return self.max_channel_curvature_per_mm
+        return min(
+            tube.most_bent_per_mm(self.max_strain, self.passing_mm) for tube in (self.outer, self.inner)
+        )
 
     def _check_nesting(self) -> None:
         clearance = self.outer.inner_diameter_mm - self.inner.outer_diameter_mm

@@ -96,29 +96,34 @@ def room_at(walls, radius, x, y, z):
 
 @inner_kernel
 def room_along(walls, radius, base, u, v, begin, end, growth, longest_step):
-    """Return the least room met along an arc from `begin` to `end` mm, BLOCKED if it is not proved free.
+    """Return a room that is there all along an arc from `begin` to `end` mm, BLOCKED if none is proved.
 
     At `s` mm from the base, `growth * s * s` mm more are asked for, and the room is what is beyond that.  It
     changes by no more than one walks, and what is asked for shrinks on the way back to the base: the walk
-    begins at the far end, where most arcs touch, and goes as far as the room allows.  Between two places
-    there may be less room than met, by half of `longest_step`, but always some.
+    begins at the far end, where most arcs touch, and goes as far as the room allows, at most `longest_step`.
     """
     at = end
     least = math.inf
+    before = math.inf
+    step = 0.0
     while True:
         x, y, z = point_along(base, u, v, at)
         room = room_at(walls, radius, x, y, z) - growth * at * at
         if room < MIN_GAP_MM:
             return BLOCKED
-        least = min(least, room)
+        # It falls by no more than x on x mm back, and by no more than x (1 + steeper) on x mm ahead.
+        steeper = 2.0 * growth * (at + step)
+        least = min(least, room, max(before - step, 0.5 * (before + room - step * (1.0 + steeper))))
         if at <= begin:
             return least
-        at = max(at - min(room, longest_step), begin)
+        before = room
+        step = min(room, longest_step, at - begin)
+        at -= step
 
 
 @inner_kernel
 def change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, finest, longest_step):
-    """Return the least room met along a steady change of twist and bend, BLOCKED if it is not proved free.
+    """Return a room that is there all along a steady change of twist and bend, BLOCKED if none is proved.
 
     A point `s` mm from the base moves by at most D s^2 / 2 where the curvature vector moves by D.  So the
     change is free if both its ends have D s^2 / 4 to spare at every s: each place is nearer than that to the
@@ -159,7 +164,7 @@ def change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, fin
 
 @inner_kernel
 def turn_room(walls, radius, length, base, twist, bend, to_twist, to_bend, by_straight):
-    """Return the least room met along a change in place, which may go by the straight section."""
+    """Return a room that is there all along a change in place, which may go by the straight section."""
     if not by_straight:
         return change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, math.inf, math.inf)
     room = change_room(walls, radius, length, base, twist, bend, twist, 0.0, math.inf, math.inf)
@@ -199,7 +204,7 @@ def nearest_setting(twist, bend, u, v, length, least_bend, most_bend):
 
 @numba.njit(cache=True)
 def motion_room(walls, radius, length, entry, states, finest, longest_step, where):
-    """Return the least room met by a whole motion; `where` (1,) is set to the state from which it is BLOCKED.
+    """Return a room that is there during a whole motion; `where` (1,) becomes the state where it is BLOCKED.
 
     states : (M, 3) advance, twist and bend.  Steps that both advance and turn are not looked for here.
     """

@@ -15,7 +15,7 @@ from stages.scope.kernels.body import move_along, nearest_setting, point_along, 
 BASE, U, V, TWIST, BEND, TIP, HEADING, NEAR, COST, ROOM, CURVATURE = 0, 12, 13, 14, 15, 16, 19, 22, 23, 24, 25
 COLUMNS = 26
 """Columns of a state: base frame, curvature vector, twist, bend, tip and its direction, the route point
-nearest to the tip, cost, least room met on the way, largest curvature of the body."""
+nearest to the tip, cost, room on the whole way, largest curvature of the body."""
 TIP_MM, TIP_RAD = 0.15, 0.06
 """States whose tips and bases are nearer than this together count as the same."""
 MEMORY = 0.5

@@ -45,7 +45,7 @@ def shifted_tips(walls, device, entry, states, shifts, tips, rooms):
     """Fill tips `(K, 9)` of motions whose base stops `shifts` (K,) mm beyond that of a proved one.
 
     The base stays on its way, or goes on along its last arc; there the section takes the last twist and bend.
-    `rooms` (K,) become the least room met by what is new in such a motion, BLOCKED if it is not proved.
+    `rooms` (K,) become the room on what is new in such a motion, BLOCKED if it is not proved.
     Where there is no such way, the tip is that of the motion itself.
     """
     length = device.length

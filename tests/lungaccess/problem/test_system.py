@@ -88,7 +88,7 @@ def test_file_and_preset_give_the_same_system(tmp_path: Path) -> None:
         ("max_length_mm = 150.0", "max_length_mm = inf", r"needle\.max_length_mm = inf"),
         ("channel_diameter_mm = 2.0", "channel_diameter_mm = 1.9", r"tubes\.outer\.outer_diameter_mm = 1\.9"),
         ("channel_diameter_mm = 2.0", "channel_diameter_mm = 5.0", r"scope\.channel_diameter_mm = 5\.0"),
-        ("max_strain = 0.04", "max_strain = 0.01", r"tubes\.inner\.precurvature_per_mm = 0\.025"),
+        ("max_strain = 0.08\n", "max_strain = 0.01\n", r"tubes\.inner\.precurvature_per_mm = 0\.025"),
         ("segmentation_margin_mm = 0.5", "segmentation_margin_mm = -0.5", "segmentation_margin_mm = -0.5"),
         ("[margins]", "[margin]", "margin is not a setting"),
         ("[needle]", "fissures_allowed = 'no'\n[needle]", "fissures_allowed"),

@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN, VESSEL
-from stages.scope import (
-    Bronchoscope,
-    MotionProver,
-    ScopeMotion,
-    ScopeMotions,
-    evenly,
-    find_motions,
-    prove_motion,
-)
+from stages.scope import MotionProver, ScopeMotions, evenly, find_motions, prove_motion
 from stages.scope.tip_region import in_tip_region
 from tests.stages.scenes import brute_clearance
 from tests.stages.scope.airways import forked_lung
-
-SCOPE = Bronchoscope(
-    name="thin", outer_diameter_mm=4.0, channel_diameter_mm=2.0, lumen_margin_mm=0.1,
-    bend_up_deg=180.0, bend_down_deg=60.0, bending_length_mm=15.0, min_bending_radius_mm=8.0,
-    min_shaft_radius_mm=10.0, bending_stiffness_n_mm2=1000.0,
-)  # fmt: skip
+from tests.stages.scope.sampled_motion import SCOPE, axis_places
 
 
 @pytest.fixture(scope="module")
@@ -39,57 +24,15 @@ def motions(lung: Lung) -> ScopeMotions:
     return find_motions(lung, SCOPE, reach_mm=60.0)
 
 
-def section(base: np.ndarray, twist: float, bend: float, lengths: np.ndarray) -> np.ndarray:
-    """Points of a section by 200 short straight links, each turned by its share of the bend."""
-    c, s = math.cos(twist), math.sin(twist)
-    towards = c * base[:3, 0] + s * base[:3, 1]
-    fine = np.linspace(0.0, lengths[-1], 201)
-    angles = bend / SCOPE.bending_length_mm * 0.5 * (fine[1:] + fine[:-1])
-    steps = np.cos(angles)[:, None] * base[:3, 2] + np.sin(angles)[:, None] * towards
-    points = base[:3, 3] + np.vstack([np.zeros(3), np.cumsum(steps * np.diff(fine)[:, None], axis=0)])
-    return np.stack([np.interp(lengths, fine, points[:, k]) for k in range(3)], axis=1)
-
-
-def slid(base: np.ndarray, twist: float, bend: float, advance: float) -> np.ndarray:
-    """The base moved along the section's arc, without roll: by the formula of Rodrigues."""
-    out = base.copy()
-    axis = -math.sin(twist) * base[:3, 0] + math.cos(twist) * base[:3, 1]
-    k = np.cross(np.eye(3), axis)
-    angle = bend / SCOPE.bending_length_mm * advance
-    turn = np.eye(3) + math.sin(angle) * k + (1.0 - math.cos(angle)) * k @ k
-    out[:3, :3] = turn @ base[:3, :3]
-    out[:3, 3] = section(base, twist, bend, np.array([0.0, advance]))[-1]
-    return out
-
-
-def places(motion: ScopeMotion) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the body's axis at many times of a motion, and its last tip."""
-    base, out = np.array(motion.lps_from_entry), []
-    length = SCOPE.bending_length_mm
-    lengths = np.linspace(0.0, length, 31)
-    for a, b in zip(motion.states[:-1], motion.states[1:], strict=True):
-        assert not (b[0] > a[0] and (b[1:] != a[1:]).any()), "it slides or turns, never both"
-        assert b[0] >= a[0]
-        if b[0] > a[0]:
-            ahead = np.linspace(0.0, length + b[0] - a[0], 2 + int(2 * (length + b[0] - a[0])))
-            out.append(section(base, a[1], a[2], ahead))
-            base = slid(base, a[1], a[2], b[0] - a[0])
-        else:
-            for t in np.linspace(0.0, 1.0, 7):
-                out.append(section(base, *(a[1:] + t * (b[1:] - a[1:])), lengths))
-    last = section(base, motion.states[-1, 1], motion.states[-1, 2], lengths)
-    return np.concatenate([*out, last]), last[-1]
-
-
 def test_bodies_stay_in_the_lumen_in_and_between_states(lung: Lung, motions: ScopeMotions) -> None:
     """Places all over the motion, measured to every voxel around the lumen."""
     outside = np.where(lung.labels & LUMEN, 0, VESSEL).astype(np.uint16)
     for tip in range(0, motions.count, max(motions.count // 8, 1)):
         motion = motions.motion(tip)
-        points, end = places(motion)
+        points = axis_places(motion)
         depth = brute_clearance(outside, lung.grid, points, VESSEL, 9.0).min()
         assert depth >= SCOPE.radius_mm + SCOPE.lumen_margin_mm
-        assert np.allclose(end, motions.tips[tip, :3], atol=2e-3)
+        assert np.allclose(points[-1], motions.tips[tip, :3], atol=2e-3)
         margin = prove_motion(lung, SCOPE, motion)
         assert isinstance(margin, float)
         assert margin <= depth - SCOPE.radius_mm - SCOPE.lumen_margin_mm + 1e-3

@@ -1,0 +1,34 @@
+"""What tubes in the working channel ask of the bronchoscope's handle."""
+
+from __future__ import annotations
+
+import math
+
+from lungaccess.problem.system import System
+from stages.tube import straightening
+
+
+def bend_factor(system: System, outer_mm: float, inner_mm: float) -> float:
+    """Return by how much more the handle must bend the section while the tubes are in it, 1 or more.
+
+    The tubes are inserted by so much beyond the tip; see `stages.tube.straightening`.
+    """
+    scope = system.scope
+    inserted = outer_mm, inner_mm
+    return 1.0 + straightening(system.tubes, inserted, scope.bending_length_mm, scope.bending_stiffness_n_mm2)
+
+
+def bends_with_tubes_rad(system: System) -> tuple[float, float]:
+    """Return the bends farthest down (0 or negative) and up that the section keeps with tubes in it, rad.
+
+    They hold for every insertion: for each tube the stiffest part counts that may come to lie in the section.
+    The handle bends an empty section up to `bend_down_deg` and `bend_up_deg`.
+    """
+    tubes, scope = system.tubes, system.scope
+    reach_mm = scope.bending_length_mm + tubes.max_extension_mm
+    factor = 1.0 + straightening(tubes, (0.0, 0.0), reach_mm, scope.bending_stiffness_n_mm2)
+    down, up = scope.bends_rad
+    return (
+        max(down, -math.radians(scope.bend_down_deg) / factor),
+        min(up, math.radians(scope.bend_up_deg) / factor),
+    )

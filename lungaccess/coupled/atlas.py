@@ -94,7 +94,13 @@ def build_atlas(
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)
     reach = tracking_length_mm(system.tubes)
-    motions = find_motions(lung, system.scope, reach_mm=reach, spacing_mm=site_spacing_mm)
+    motions = find_motions(
+        lung,
+        system.scope,
+        reach_mm=reach,
+        max_curvature_per_mm=system.tubes.channel_curvature_per_mm,
+        spacing_mm=site_spacing_mm,
+    )
     straight = int((~motions.turned).sum())
     share = straight / max(motions.count, 1)
     tell = progress or (lambda _share: None)

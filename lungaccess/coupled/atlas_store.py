@@ -23,10 +23,10 @@ from lungaccess.coupled.atlas import TIP_SPACING_MM, Atlas, build_atlas
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
-from stages.scope import ScopeMotions
+from stages.scope import ScopeMotions, prover_of
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
 
-FORMAT = 5
+FORMAT = 7
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 """What reading a damaged or foreign file raises; the atlas is then made anew."""
@@ -60,6 +60,7 @@ def open_atlas(
     resolution = {"rotations": rotations, "stop_mm": stop_spacing_mm, "site_mm": site_spacing_mm}
     path = (cache or default_cache()) / f"atlas-{_key(lung, system, resolution)}.npz"
     stored = _load(path, lung, system)
+    prover_of(lung, system.scope)  # Here: the first plan does not wait for it.
     if stored is not None:
         note_use(path)
         return stored

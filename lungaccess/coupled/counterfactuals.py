@@ -19,7 +19,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.task import Task
-from stages.scope import Bronchoscope, MotionProver
+from stages.scope import Bronchoscope, prover_of
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 TIGHTEST_RADIUS_MM = 20.0
@@ -151,7 +151,7 @@ def scope_changes(
     thin = DirectArcs(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), thin_atlas)
     near, site = thin.in_workspace, thin_atlas.deployments.site
     clear = near[thin.blockers(near)[0] == 0]
-    prover = MotionProver(task.lung, thin_atlas.system.scope)
+    prover = prover_of(task.lung, thin_atlas.system.scope)
     for entry in clear[np.argsort(-thin_atlas.motions.room_mm[site[clear]], kind="stable")]:
         candidate = thin.proved(int(entry))
         if candidate is None:

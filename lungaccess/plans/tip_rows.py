@@ -7,8 +7,7 @@ from numpy.typing import ArrayLike
 
 from anatomy import poses
 from anatomy.lung import Lung
-from anatomy.typed import Bool
-from stages.scope import Bronchoscope, MotionProver, ScopeTip, TipRow, in_tip_region
+from stages.scope import Bronchoscope, ScopeTip, TipRow, in_tip_region, prover_of
 
 
 class TipRows:
@@ -16,16 +15,11 @@ class TipRows:
 
     def __init__(self, lung: Lung, scope: Bronchoscope) -> None:
         self._tree = lung.tree
-        self._prover = MotionProver(lung, scope)
+        self._prover = prover_of(lung, scope)
 
-    def along(self, tip: ScopeTip, shifts_mm: ArrayLike) -> tuple[TipRow, Bool]:
-        """Return the tips whose base stops so much farther, and which of them the scope may take `(K,)`.
-
-        Those have a proved motion and lie in the region that proofs of unreachable targets rule out.
-        """
-        row = self._prover.row(tip.motion, shifts_mm)
-        _nearest, inside = in_tip_region(self._tree, row.tips)
-        return row, row.proved & (inside | (row.shifts_mm == 0.0))
+    def along(self, tip: ScopeTip, shifts_mm: ArrayLike) -> TipRow:
+        """Return the tips whose base stops so much farther, and which of them the scope may take."""
+        return self._prover.row(tip.motion, shifts_mm)
 
     def tip(self, row: TipRow, index: int) -> ScopeTip:
         """Return a tip of a row with its motion."""
@@ -41,5 +35,5 @@ class TipRows:
         """Return a tip moved along its motion, None if the scope may not take it."""
         if shift_mm == 0.0:
             return tip
-        row, allowed = self.along(tip, [shift_mm])
-        return self.tip(row, 0) if allowed[0] else None
+        row = self.along(tip, [shift_mm])
+        return self.tip(row, 0) if row.proved[0] else None

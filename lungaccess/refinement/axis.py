@@ -27,9 +27,9 @@ class LocalAxis:
     def __init__(self, rows: TipRows, tip: ScopeTip) -> None:
         self._rows, self._tip = rows, tip
         shifts = evenly(SAMPLE_MM, AXIS_SCALE_MM)
-        row, allowed = rows.along(tip, shifts)
+        row = rows.along(tip, shifts)
         home = len(shifts) // 2
-        refused = np.flatnonzero(~allowed)
+        refused = np.flatnonzero(~row.proved)
         low = int(refused[refused < home].max(initial=-1)) + 1
         high = int(refused[refused > home].min(initial=len(shifts))) - 1
         self.low_mm, self.high_mm = float(shifts[low]), float(shifts[high])

@@ -9,7 +9,7 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from stages.scope.device import Bronchoscope
     from stages.scope.motion import ScopeMotion
-    from stages.scope.motion_proof import MotionProver, prove_motion
+    from stages.scope.motion_proof import MotionProver, prove_motion, prover_of
     from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
     from stages.scope.passages import Passages, find_passages
     from stages.scope.shifting import TipRow, evenly, shifted

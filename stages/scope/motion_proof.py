@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,9 +27,21 @@ ROUNDING = 1e-9
 """Limits are kept up to this share of them: states were computed with rounding."""
 
 
+_PROVERS: WeakKeyDictionary[Lung, dict[Bronchoscope, MotionProver]] = WeakKeyDictionary()
+"""The provers of each lung: to make one takes a fraction of a second, to prove a motion milliseconds."""
+
+
+def prover_of(lung: Lung, scope: Bronchoscope) -> MotionProver:
+    """Return the prover of a scope's motions in a lung, made once."""
+    provers = _PROVERS.setdefault(lung, {})
+    if scope not in provers:
+        provers[scope] = MotionProver(lung, scope)
+    return provers[scope]
+
+
 def prove_motion(lung: Lung, scope: Bronchoscope, motion: ScopeMotion) -> float | str:
     """Prove one motion; see `MotionProver.prove`."""
-    return MotionProver(lung, scope).prove(motion)
+    return prover_of(lung, scope).prove(motion)
 
 
 class MotionProver:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.typed import Bool, Float, UInt64
+from anatomy.typed import Float, UInt64
 from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.plans.candidate import Candidate
@@ -44,7 +44,6 @@ class LocalSearchRun:
     """
 
     poses: TipRow
-    allowed: Bool
     x: Float
     vias: Float
     count: int
@@ -82,12 +81,12 @@ class LocalSearch:
         points = candidate.path.frames()[1:-1, :3, 3]
         if len(points) > MAX_VIAS:
             return None
-        poses, allowed = self._evaluator.tip_rows.along(candidate.tip, SHIFTS_MM)
+        poses = self._evaluator.tip_rows.along(candidate.tip, SHIFTS_MM)
         vias = np.zeros((MAX_VIAS, 3))
         vias[: len(points)] = points
         home = float(len(SHIFTS_MM) // 2)
         x = np.array([home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
-        return LocalSearchRun(poses=poses, allowed=allowed, x=x, vias=vias, count=len(points))
+        return LocalSearchRun(poses=poses, x=x, vias=vias, count=len(points))
 
     def advance(self, run: LocalSearchRun, tries: int) -> None:
         """Evaluate so many variations of a run's choice, and keep the best."""
@@ -96,7 +95,7 @@ class LocalSearch:
             self.tube,
             self.needle,
             run.poses.tips,
-            run.allowed,
+            run.poses.proved,
             run.x,
             run.vias,
             run.count,

@@ -35,7 +35,14 @@ if TYPE_CHECKING:
         plan_with_presets,
     )
     from lungaccess.explanation import Explanation, explain_no_plan, save_explanation
-    from lungaccess.one_stage import advise_scope, deploy_tubes, plan_needle, plan_tour
+    from lungaccess.one_stage import (
+        advise_scope,
+        deploy_tubes,
+        plan_needle,
+        plan_tour,
+        replan_from_scope,
+        replan_from_tube,
+    )
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
     from lungaccess.problem import (

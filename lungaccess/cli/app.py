@@ -28,6 +28,7 @@ from lungaccess.cli.commands.needle import needle
 from lungaccess.cli.commands.phantom import phantom
 from lungaccess.cli.commands.plan import plan
 from lungaccess.cli.commands.reach import reach
+from lungaccess.cli.commands.replan import replan
 from lungaccess.cli.commands.report import report
 from lungaccess.cli.commands.risk import risk
 from lungaccess.cli.commands.route import route
@@ -82,8 +83,8 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 
 
 for _command in (
-    plan, needle, certify, check, info, presets, template, phantom, demo, advise, alternatives, route, tour,
-    tubes, shapes, risk, reach, segment, report, export, doctor, completion,
+    plan, needle, replan, certify, check, info, presets, template, phantom, demo, advise, alternatives, route,
+    tour, tubes, shapes, risk, reach, segment, report, export, doctor, completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__))
 app.command(study)

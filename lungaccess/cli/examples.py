@@ -21,6 +21,7 @@ EXAMPLES = MappingProxyType(
         "export": "lungaccess export plan/plan.json PATIENT --slicer slicer",
         "alternatives": "lungaccess alternatives PATIENT --nodule --count 5 --out plans",
         "needle": "lungaccess needle PATIENT --start plan/plan.json --nodule",
+        "replan": "lungaccess replan PATIENT --scope plan/plan.json --nodule",
         "advise": "lungaccess advise PATIENT --nodule --lesion-radius 8",
         "certify": "lungaccess certify PATIENT --nodule --system ultrathin --most-boxes 100000",
         "tour": "lungaccess tour PATIENT --no-require-plan --out tour",

@@ -21,7 +21,7 @@ from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath
 from stages.scope import ScopeTip, prove_motion
-from stages.tube import centreline
+from stages.tube import Deployment, centreline
 
 CLEARANCE_CAP_MM = 5.0
 """Clearances below this are stated exactly: larger ones never limit a plan."""
@@ -39,6 +39,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
     """
     system, lung = task.system, task.lung
     margin = system.margins.total_mm
+    frame, deployment = candidate.tip.lps_from_scope_tip, candidate.deployment
     return Plan(
         software_version=software_version(),
         patient_name=lung.name,
@@ -52,11 +53,11 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         fissures_are_obstacles=task.with_fissures,
         objective=str(task.objective),
         scope=_scope(task, candidate.tip),
-        tube=_tube(task, candidate),
-        needle=_needle(candidate.path),
+        tube=tube_part(task, frame, deployment),
+        needle=needle_part(candidate.path),
         exemption=Exemption(
-            branch=candidate.deployment.branch,
-            exit_point_lps=_exit_point(task, candidate),
+            branch=deployment.branch,
+            exit_point_lps=_exit_point(task, frame, deployment),
             needle_length_mm=system.needle.exit_exemption_mm,
         ),
         required_clearance_mm={
@@ -64,7 +65,10 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
             "inner_tube": system.tubes.inner.radius_mm + margin,
             "needle": system.needle.radius_mm + margin,
         },
-        clearance_mm={"tube": _tube_clearance(task, candidate), "needle": _needle_clearance(task, candidate)},
+        clearance_mm={
+            "tube": tube_clearance_mm(task, frame, deployment),
+            "needle": needle_clearance_mm(task, candidate.path, deployment.branch),
+        },
         costs=task.objective.stated(costs.path_costs(lung, candidate.path, with_fissures=task.with_fissures)),
         method=task.method,
         needle_planner=task.needle_planner,
@@ -93,8 +97,8 @@ def _scope(task: Task, tip: ScopeTip) -> ScopeInsertion:
     return scope_insertion(tip.motion, lung.tree, tip.tree_point, margin_mm + scope.lumen_margin_mm)
 
 
-def _tube(task: Task, candidate: Candidate) -> TubeDeployment:
-    deployment = candidate.deployment
+def tube_part(task: Task, lps_from_scope_tip: Float, deployment: Deployment) -> TubeDeployment:
+    """Return the part of a plan that a deployment from a scope tip makes."""
     return TubeDeployment(
         rotation_rad=deployment.rotation_rad,
         outer_insertion_mm=deployment.outer_mm,
@@ -102,7 +106,7 @@ def _tube(task: Task, candidate: Candidate) -> TubeDeployment:
         lps_from_tip=deployment.lps_from_tip,
         exit=WallExit(
             branch=deployment.branch,
-            point_lps=_exit_point(task, candidate),
+            point_lps=_exit_point(task, lps_from_scope_tip, deployment),
             arc_length_mm=deployment.exit_mm,
             wall_angle_rad=deployment.wall_angle_rad,
             wall_run_mm=deployment.wall_run_mm,
@@ -112,23 +116,17 @@ def _tube(task: Task, candidate: Candidate) -> TubeDeployment:
     )
 
 
-def _exit_point(task: Task, candidate: Candidate) -> Float:
-    return np.asarray(_tube_points(task, candidate, np.array([candidate.deployment.exit_mm]))[0])
+def _exit_point(task: Task, frame: Float, deployment: Deployment) -> Float:
+    return np.asarray(_tube_points(task, frame, deployment, np.array([deployment.exit_mm]))[0])
 
 
-def _tube_points(task: Task, candidate: Candidate, arc_lengths: Float) -> Float:
-    deployment = candidate.deployment
-    return centreline(
-        task.system.tubes,
-        candidate.tip.lps_from_scope_tip,
-        deployment.rotation_rad,
-        deployment.outer_mm,
-        deployment.inner_mm,
-        arc_lengths,
-    )
+def _tube_points(task: Task, frame: Float, deployment: Deployment, arc_lengths: Float) -> Float:
+    rotation, outer, inner = deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm
+    return centreline(task.system.tubes, frame, rotation, outer, inner, arc_lengths)
 
 
-def _needle(path: ArcPath) -> NeedlePath:
+def needle_part(path: ArcPath) -> NeedlePath:
+    """Return the part of a plan that a path makes."""
     return NeedlePath(
         lps_from_start=path.lps_from_start,
         arcs=tuple(
@@ -142,27 +140,25 @@ def _needle(path: ArcPath) -> NeedlePath:
     )
 
 
-def _tube_clearance(task: Task, candidate: Candidate) -> dict[str, float]:
+def tube_clearance_mm(task: Task, lps_from_scope_tip: Float, deployment: Deployment) -> dict[str, float]:
     """Return the smallest distance of the tube's axis from each structure, beyond the exit."""
-    begin, end = candidate.deployment.exit_mm, candidate.deployment.inner_mm
+    begin, end = deployment.exit_mm, deployment.inner_mm
     count = max(2, math.ceil((end - begin) / SAMPLE_MM) + 1)
-    points = _tube_points(task, candidate, np.linspace(begin, end, count))
-    branch = candidate.deployment.branch
-    return {name: _least_clearance(task.lung, points, name, branch) for name in _structures(task)}
+    points = _tube_points(task, lps_from_scope_tip, deployment, np.linspace(begin, end, count))
+    return {name: _least_clearance(task.lung, points, name, deployment.branch) for name in _structures(task)}
 
 
-def _needle_clearance(task: Task, candidate: Candidate) -> dict[str, float]:
+def needle_clearance_mm(task: Task, path: ArcPath, branch: int) -> dict[str, float]:
     """Return the smallest distance of the needle's axis from each structure.
 
     From the airway beyond the exempt length; where the needle ends before that, only other branches count.
     """
-    points, lengths = candidate.path.sample(SAMPLE_MM)
+    points, lengths = path.sample(SAMPLE_MM)
     beyond = lengths >= task.system.needle.exit_exemption_mm - 0.5 * SAMPLE_MM
     out = {}
     for name in _structures(task):
         if name == "airway":
-            exempt = candidate.deployment.branch
-            parts = [_least_clearance(task.lung, points, name, exempt)]
+            parts = [_least_clearance(task.lung, points, name, branch)]
             if beyond.any():
                 parts.append(_least_clearance(task.lung, points[beyond], name, -1))
             out[name] = min(parts)

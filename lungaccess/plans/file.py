@@ -87,6 +87,11 @@ def _require_schema(schema: object) -> None:
     raise PlanFileError(found, expected=SCHEMA, remedy=remedy)
 
 
+def plain(part: Record) -> Any:
+    """Return a part of a plan as plain JSON types."""
+    return _encode(part, "part")
+
+
 def save(plan: Record, path: str | os.PathLike[str]) -> None:
     """Write `plan` beside `path` under a temporary name, then put it in place."""
     from anatomy.io.files import atomic_write

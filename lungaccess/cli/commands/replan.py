@@ -1,0 +1,129 @@
+"""The command `lungaccess replan`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from cyclopts import Parameter
+from rich.table import Table
+
+from anatomy.errors import SettingsError
+from anatomy.io.frames import Frame
+from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Seed
+from lungaccess.cli.options import (
+    ObjectiveText,
+    PatientFolder,
+    PatientOptions,
+    SystemOptions,
+    TargetOptions,
+    require_map,
+)
+from lungaccess.cli.progress import progress
+from stages.needle import Objective
+
+if TYPE_CHECKING:
+    from anatomy.typed import Float
+    from lungaccess.one_stage import RestOfPlan
+
+
+def replan(
+    patient: PatientFolder,
+    *,
+    scope: Annotated[
+        str | None,
+        Parameter(
+            help="Where the tip of the bronchoscope really is: a text file with a 4x4 pose, +z forward and "
+            "+x up in the camera's picture; or a plan.json, whose scope ends there."
+        ),
+    ] = None,
+    tube: Annotated[
+        str | None,
+        Parameter(
+            help="Where the tip of the tubes really is, instead: a text file with a 4x4 pose, +z forward; or "
+            "a plan.json."
+        ),
+    ] = None,
+    frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
+    target: TargetOptions = TargetOptions(),
+    system: SystemOptions = SystemOptions(),
+    objective: Annotated[
+        ObjectiveText, Parameter(help="What to make small, as for `plan`.")
+    ] = "inverse-clearance",
+    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
+    """Plan the rest from a measured pose: tubes and needle from the scope's tip, or the needle alone."""
+    from lungaccess.cli.plan_tables import no_plan_record
+    from lungaccess.one_stage import replan_from_scope, replan_from_tube
+    from lungaccess.plans.no_plan import NoPlan
+
+    stated, weighed, device = target.stated(), Objective.of(objective), system.load()
+    pose = _measured(scope, tube, frame)
+    lung = output.load(patient)
+    require_map(lung, weighed)
+    aim, ask = stated.resolve(lung), replan_from_tube if scope is None else replan_from_scope
+    try:
+        with progress("planning the rest"):
+            found = ask(lung, device, pose, aim, objective=weighed, seed=seed)
+    except NoPlan as failure:
+        if not output.json:
+            raise
+        terminal.show_json(no_plan_record(failure))
+        return ExitCode.NEGATIVE
+    if output.json:
+        terminal.show_json(found.record())
+    else:
+        terminal.show(_tables(found, has_map=lung.cost is not None))
+    return ExitCode.OK
+
+
+def _measured(scope: str | None, tube: str | None, frame: Frame) -> Float:
+    from anatomy.io.frames import read_pose
+    from lungaccess.plans.plan import Plan
+
+    given = scope if tube is None else tube
+    if given is None or (scope is not None and tube is not None):
+        raise SettingsError(
+            "Both --scope and --tube are given" if given else "Neither --scope nor --tube is given",
+            expected="one of them: where the tip of the scope or of the tubes really is",
+            remedy="`lungaccess template pose` prints a file to start from",
+        )
+    if not given.endswith(".json"):
+        return read_pose(given, frame)
+    plan = Plan.load(given)
+    return plan.tube.lps_from_tip if scope is None else plan.scope.lps_from_scope_tip
+
+
+def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
+    from lungaccess.plans.costs import costs_in_words, known_costs
+
+    rows, tube, needle = [], found.tube, found.needle
+    if tube is not None:
+        rows += [
+            ("turn the tubes, from +x of the scope", f"{np.degrees(tube.rotation_rad):.1f} deg"),
+            ("outer tube", f"{tube.outer_insertion_mm:.1f} mm"),
+            ("inner tube", f"{tube.inner_insertion_mm:.1f} mm"),
+            ("exit through branch", f"{tube.exit.branch}"),
+        ]
+    rows += [("needle", f"{needle.length_mm:.1f} mm")]
+    rows += [
+        (f"least clearance of the {name}", f"{min(each.values()):.2f} mm")
+        for name, each in found.clearance_mm.items()
+    ]
+    rows += costs_in_words(known_costs(found.costs, has_map=has_map))
+    arcs = [
+        (
+            f"{n}",
+            f"{np.degrees(arc.roll_rad):.1f}",
+            f"{arc.length_mm:.2f}",
+            f"{1.0 / arc.curvature_per_mm:.1f}" if arc.curvature_per_mm else "straight",
+        )
+        for n, arc in enumerate(needle.arcs, start=1)
+    ]
+    return [
+        terminal.table("the rest, proved", ("", ""), rows),
+        terminal.table("arcs of the needle", ("", "roll first, deg", "insert, mm", "radius, mm"), arcs),
+    ]

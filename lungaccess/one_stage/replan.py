@@ -1,0 +1,331 @@
+"""Plan the rest from a measured pose: tubes and needle from a scope's tip, or a needle from a tube's tip."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy import poses
+from anatomy.errors import FrameError, TargetError
+from anatomy.lung import Lung
+from anatomy.records import frozen_record
+from anatomy.typed import Float, Int
+from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
+from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
+from lungaccess.coupled.search.local_search import path_through
+from lungaccess.one_stage.needle import needle_question
+from lungaccess.one_stage.obstruction import reason_in_words
+from lungaccess.plans.assemble import needle_clearance_mm, needle_part, tube_clearance_mm, tube_part
+from lungaccess.plans.costs import path_costs
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.parts import NeedlePath, TubeDeployment
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
+from stages.needle import (
+    ArcPath,
+    Objective,
+    OptimalSearch,
+    easiest_obstruction,
+    find_obstruction,
+    map_integral,
+    violation,
+    workspace_lengths,
+)
+from stages.tube import Deployment, enumerate_deployments, tube_constants, tube_environment
+
+SKEW = 0.02
+"""A measured rotation may be off by so much, about a degree; it is replaced by the nearest rotation."""
+SEARCHED = 30
+"""So many deployments get a search of the needle where no direct arc is clear: some ten milliseconds."""
+SEARCH_ITERATIONS = 300
+"""Iterations of such a search, as the first of the coupled search."""
+TRIES = 400
+"""Variations of rotation, insertions and needle that improve the first answer: some milliseconds."""
+NEEDLE_ITERATIONS = 1500
+"""Iterations of the needle's search from a measured tip, as in a replan during insertion."""
+
+
+@frozen_record
+class RestOfPlan:
+    """What is left to do from a measured pose: proved clear and within all limits.
+
+    Parameters
+    ----------
+    lps_from_measured : (4, 4) float64
+        The pose as it was taken: that of the scope's tip, or of the tube's tip where `tube` is None.
+    tube : TubeDeployment or None
+    needle : NeedlePath
+    branch : int
+        Branch whose wall is exempt at the exit; -1 for none.
+    clearance_mm : mapping
+        As that of a plan, for "tube" and "needle".
+    costs : mapping of str to float
+        As those of a plan.
+    objective : str
+    """
+
+    lps_from_measured: Float
+    tube: TubeDeployment | None
+    needle: NeedlePath
+    branch: int
+    clearance_mm: Mapping[str, Mapping[str, float]]
+    costs: Mapping[str, float]
+    objective: str
+
+    @property
+    def cost(self) -> float:
+        """Cost under the objective."""
+        return float(self.costs[self.objective])
+
+    def record(self) -> dict[str, Any]:
+        """Return plain JSON values; poses in LPS mm, angles in rad."""
+        from lungaccess.plans.file import plain
+
+        return {
+            "found": True,
+            "lps_from_measured": self.lps_from_measured.tolist(),
+            "tube": None if self.tube is None else plain(self.tube),
+            "needle": plain(self.needle),
+            "pierced_branch": self.branch,
+            "clearance_mm": {name: dict(each) for name, each in self.clearance_mm.items()},
+            "objective": self.objective,
+            "costs": dict(self.costs),
+        }
+
+
+def replan_from_scope(
+    lung: Lung,
+    system: System,
+    lps_from_scope_tip: ArrayLike,
+    target: Target,
+    *,
+    objective: str | Objective = "inverse_clearance",
+    seed: int = 0,
+) -> RestOfPlan:
+    """Plan tubes and needle from where the tip of the scope really is.
+
+    The deployments from this one pose are enumerated as in an atlas; the cheapest clear direct arc is the
+    first answer, or what the needle's own search finds, and a local search improves it.  The same input and
+    seed give the same answer.
+
+    Parameters
+    ----------
+    lps_from_scope_tip : (4, 4) float64
+        The pose as measured: +z forward, +x the way a positive bend turns the tip, up in the picture.
+
+    Raises
+    ------
+    NoPlan
+        If there is none; counts the reasons.
+    FrameError
+        If the pose is not one, within SKEW.
+    TargetError
+        If pose or target lie outside the images, or the target in an obstacle.
+    """
+    frame = _rigid(lung, lps_from_scope_tip, "scope")
+    task = Task(
+        lung=lung, system=system, target=target, objective=Objective.of(objective), method="replan", seed=seed
+    )
+    search = _FromScope(CandidateEvaluator(task), frame)
+    found = search.best()
+    if found is None:
+        raise NoPlan(f"No plan from the scope's tip as measured: {search.why}", reasons=search.reasons)
+    deployment, path = found
+    return _rest(task, frame, path, deployment.branch, deployment)
+
+
+def replan_from_tube(
+    lung: Lung,
+    system: System,
+    lps_from_tip: ArrayLike,
+    target: Target,
+    *,
+    objective: str | Objective = "inverse_clearance",
+    seed: int = 0,
+) -> RestOfPlan:
+    """Plan the needle from where the tip of the tubes really is; see `replan_from_scope`.
+
+    A tip near an airway is taken to have pierced its wall, as `plan_needle` does.
+
+    Parameters
+    ----------
+    lps_from_tip : (4, 4) float64
+        The pose as measured; +z is the direction of insertion.
+    """
+    frame = _rigid(lung, lps_from_tip, "tube")
+    task = Task(
+        lung=lung, system=system, target=target, objective=Objective.of(objective), method="replan", seed=seed
+    )
+    asked = needle_question(lung, system, frame, target.lps_mm)
+    blocked = find_obstruction(asked.environment, asked.query)
+    path = None
+    if blocked is None or not blocked.proved:
+        weighed = task.objective if lung.cost is not None else task.objective.without_map
+        search = OptimalSearch(asked.environment, asked.query, seed=seed, objective=weighed)
+        while search.iterations < NEEDLE_ITERATIONS:
+            before = search.iterations
+            search.advance(NEEDLE_ITERATIONS - before)
+            if search.iterations == before:
+                break
+        path = search.path
+    allowed = path is not None and math.isfinite(map_integral(lung.cost, path))
+    if path is None or not allowed or violation(asked.environment, asked.query, path):
+        blocked = blocked or easiest_obstruction(asked.environment, asked.query)
+        why = "the search found no clear path" if blocked is None else reason_in_words(blocked)
+        raise NoPlan(f"No needle path from the tube's tip as measured: {why}", reasons={f"needle: {why}": 1})
+    return _rest(task, frame, path, asked.query.branch, None)
+
+
+class _FromScope:
+    """The search from one pose of the scope."""
+
+    def __init__(self, evaluator: CandidateEvaluator, frame: Float) -> None:
+        self._evaluator, self._frame, self._task = evaluator, frame, evaluator.task
+        system, self._target = self._task.system, self._task.target.lps_mm
+        self._row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
+        self.entries = enumerate_deployments(
+            self._task.lung, system.tubes, system.margins, self._row, with_fissures=self._task.with_fissures
+        )
+        lengths = workspace_lengths(
+            evaluator.environment, self.entries.positions, self.entries.tangents, self._target
+        )
+        near = np.flatnonzero(np.isfinite(lengths))
+        self._near: Int = near[np.argsort(lengths[near], kind="stable")]
+
+    def best(self) -> tuple[Deployment, ArcPath] | None:
+        """Return the cheapest deployment and path found, None if there is none."""
+        first = self._direct() or self._searched()
+        return None if first is None else self._improved(*first)
+
+    def _direct(self) -> tuple[Deployment, ArcPath] | None:
+        """Return the proved direct arc of least estimated cost."""
+        near, entries = self._near, self.entries
+        blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
+        x, y, z = self._target.tolist()
+        evaluate_arcs(
+            self._evaluator.needle_arrays, entries.positions[near], entries.tangents[near],
+            entries.branch[near], (x, y, z), math.inf, math.inf, blockers, costs,
+        )  # fmt: skip
+        self._evaluator.count_blockers(blockers)
+        clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
+        for n in clear[np.argsort(costs[clear], kind="stable")].tolist():
+            deployment = self._deployment(int(near[n]))
+            path = path_through(deployment, np.zeros((0, 3)), self._target)
+            if self._evaluator.proves(deployment, path):
+                return deployment, path
+        return None
+
+    def _searched(self) -> tuple[Deployment, ArcPath] | None:
+        """Return the first path that the needle's own search finds, the nearest deployments first."""
+        for entry in self._near[:SEARCHED].tolist():
+            deployment = self._deployment(int(entry))
+            search = OptimalSearch(
+                self._evaluator.environment,
+                self._evaluator.query(deployment),
+                seed=self._task.seed,
+                objective=self._evaluator.objective,
+            )
+            search.advance(SEARCH_ITERATIONS)
+            if search.path is not None and self._evaluator.proves(deployment, search.path):
+                return deployment, search.path
+        return None
+
+    def _improved(self, deployment: Deployment, path: ArcPath) -> tuple[Deployment, ArcPath]:
+        """Return what a local search makes of it, if that is cheaper and proved."""
+        vias, points = np.zeros((MAX_VIAS, 3)), path.frames()[1:-1, :3, 3]
+        if len(points) > MAX_VIAS:
+            return deployment, path
+        vias[: len(points)] = points
+        choice = np.array([0.0, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
+        task, (x, y, z) = self._task, self._target.tolist()
+        tube = (
+            tube_environment(task.lung, with_fissures=task.with_fissures),
+            tube_constants(task.system.tubes, task.system.margins),
+        )
+        state = np.array([task.seed], dtype=np.uint64)
+        count, cost = improve(
+            tube, self._evaluator.needle_arrays, self._row, np.ones(1, dtype=np.bool_), choice, vias,
+            len(points), (x, y, z), TRIES, state,
+        )  # fmt: skip
+        if not math.isfinite(cost):
+            return deployment, path
+        rotation, outer, inner = choice[1:].tolist()
+        found = self._evaluator.tubes.validate(self._frame, rotation % (2.0 * math.pi), outer, inner)
+        if isinstance(found, str):
+            return deployment, path
+        better = path_through(found, vias[:count], self._target)
+        cheaper = self._evaluator.cost(better) < self._evaluator.cost(path)
+        return (found, better) if cheaper and self._evaluator.proves(found, better) else (deployment, path)
+
+    def _deployment(self, entry: int) -> Deployment:
+        entries = self.entries
+        numbers = (entries.rotation_rad[entry], entries.outer_mm[entry], entries.inner_mm[entry])
+        found = self._evaluator.tubes.validate(self._frame, *(float(each) for each in numbers))
+        if isinstance(found, str):
+            raise NoPlan(f"The tubes are refused on a second look: {found}", reasons={f"tube: {found}": 1})
+        return found
+
+    @property
+    def why(self) -> str:
+        """What prevents a plan, in words."""
+        if not self.entries.count:
+            most = max(self.entries.refused, key=lambda name: self.entries.refused[name], default="")
+            return f"no deployment of the tubes is allowed there, mostly because {most}"
+        if not len(self._near):
+            return "the target lies outside the needle's workspace for every deployment of the tubes"
+        return "every needle path tried from the tubes is blocked"
+
+    @property
+    def reasons(self) -> dict[str, int]:
+        """How many deployments and arcs each reason ruled out."""
+        reasons = {f"tube: {why}": count for why, count in self.entries.refused.items()}
+        reasons["needle: deployments whose workspace does not hold the target"] = self.entries.count - len(
+            self._near
+        )
+        named = self._evaluator.blocked.items()
+        return reasons | {f"needle: arcs stopped by {name}": n for name, n in named if name != "nothing"}
+
+
+def _rigid(lung: Lung, pose: ArrayLike, what: str) -> Float:
+    """Return the nearest rigid pose to a measured one."""
+    matrix = np.array(pose, dtype=np.float64)
+    good = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all())
+    turn = matrix[:3, :3] if good else np.zeros((3, 3))
+    left, _sizes, right = np.linalg.svd(turn)
+    nearest = left @ right
+    if not good or np.linalg.det(turn) <= 0.0 or np.abs(nearest - turn).max() > SKEW:
+        raise FrameError(
+            f"The measured pose of the {what}'s tip is not a rigid pose",
+            expected=f"a 4x4 matrix with a right-handed rotation (off by at most {SKEW:g}) and mm",
+            remedy="Check that the matrix is neither transposed, scaled nor mirrored",
+        )
+    if not lung.grid.contains(matrix[:3, 3]).all():
+        raise TargetError(
+            f"The {what}'s tip as measured lies outside the images, at LPS {matrix[:3, 3].round(1).tolist()}",
+            expected="a pose inside the lung",
+            remedy="Check the frame of its numbers, RAS or LPS, and the registration",
+        )
+    return poses.pose(matrix[:3, 3], nearest[:, 2], nearest[:, 0])
+
+
+def _rest(task: Task, frame: Float, path: ArcPath, branch: int, deployment: Deployment | None) -> RestOfPlan:
+    clearance = {"needle": needle_clearance_mm(task, path, branch)}
+    tube = None
+    if deployment is not None:
+        tube = tube_part(task, frame, deployment)
+        clearance["tube"] = tube_clearance_mm(task, frame, deployment)
+    return RestOfPlan(
+        lps_from_measured=frame,
+        tube=tube,
+        needle=needle_part(path),
+        branch=branch,
+        clearance_mm=clearance,
+        costs=task.objective.stated(path_costs(task.lung, path, with_fissures=task.with_fissures)),
+        objective=str(task.objective),
+    )

@@ -121,6 +121,12 @@ class TubeShapes:
         """Number of deployments, S."""
         return len(self.insertions_mm)
 
+    @property
+    def stop_mm(self) -> float:
+        """Spacing of the insertions, mm."""
+        longest = min(self.limits.max_extension_mm, self.tubes[0].length_mm)
+        return longest / _n_stops(longest, self.grid)
+
     def arcs_of(self, shape: int) -> Float:
         """Return the arcs `(a, 4)` of one deployment."""
         return self.arcs[self.first_arc[shape] : self.first_arc[shape + 1]]
@@ -194,7 +200,12 @@ def _free_rotations(tubes: Sequence[Tube]) -> int:
 def _stops(mechanics: TubeMechanics, limits: ShapeLimits, grid: ShapeGrid) -> Float:
     """Return the insertions of any tube, from 0 on."""
     longest = min(limits.max_extension_mm, float(mechanics.lengths_mm[0]))
-    return np.linspace(0.0, longest, max(round(longest / grid.stop_mm), 1) + 1)
+    return np.linspace(0.0, longest, _n_stops(longest, grid) + 1)
+
+
+def _n_stops(longest_mm: float, grid: ShapeGrid) -> int:
+    """Return the number of stops up to the longest insertion."""
+    return max(round(longest_mm / grid.stop_mm), 1)
 
 
 def _states(mechanics: TubeMechanics, stops: Float) -> tuple[Int, Int]:

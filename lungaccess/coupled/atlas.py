@@ -9,6 +9,7 @@ from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Float
+from lungaccess.problem.channel import bends_with_tubes_rad
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
@@ -99,6 +100,7 @@ def build_atlas(
         system.scope,
         reach_mm=reach,
         max_curvature_per_mm=system.tubes.channel_curvature_per_mm,
+        tip_bends_rad=bends_with_tubes_rad(system),
         spacing_mm=site_spacing_mm,
     )
     straight = int((~motions.turned).sum())

@@ -163,6 +163,7 @@ def find_motions(
     *,
     reach_mm: float,
     max_curvature_per_mm: float = math.inf,
+    tip_bends_rad: tuple[float, float] | None = None,
     spacing_mm: float = 1.0,
 ) -> ScopeMotions:
     """Find scope tips from which tubes can leave the airway, each with a proved motion of the scope.
@@ -173,6 +174,9 @@ def find_motions(
         How far ahead of the scope tip the airway may be left.
     max_curvature_per_mm : float
         Largest curvature of the body that the tubes in its channel can stand.
+    tip_bends_rad : (float, float), optional
+        Bends farthest down and up of the section at the tip, where tubes in it take some; those of the scope
+        by default.
     spacing_mm : float
         Distance between tips along a branch.
     """
@@ -180,7 +184,8 @@ def find_motions(
     walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)
     states = Growth(walls, lung.tree, passages.passable, device).grow()
     found = _Tips(lung, passages, states, device, spacing_mm)
-    found.turn(max_curvature_per_mm)
+    least, most = tip_bends_rad or scope.bends_rad
+    found.turn(device._replace(least_bend=least, most_bend=most), max_curvature_per_mm)
     kept, rooms = found.prove(walls)
     return found.motions(kept, rooms)
 
@@ -194,12 +199,12 @@ class _Tips:
         self._tree, self._passages, self._states, self._device = lung.tree, passages, states, device
         self._spacing_mm = spacing_mm
 
-    def turn(self, max_curvature_per_mm: float) -> None:
+    def turn(self, device: kernel.Device, max_curvature_per_mm: float) -> None:
         """Make the candidates."""
         tree, rows = self._tree, self._states.states[self._states.turned_from]
         offsets = rings(TURN_RINGS_PER_MM, TURN_SPOKES)[1:]
         out = np.zeros((len(rows), len(offsets), 11))
-        turning.tips_beside(self._device, max_curvature_per_mm, rows, offsets, out)
+        turning.tips_beside(device, max_curvature_per_mm, rows, offsets, out)
         candidates = out.reshape(-1, 11)
         source = np.repeat(self._states.turned_from, len(offsets))
         possible = np.flatnonzero(np.isfinite(candidates[:, 9]))

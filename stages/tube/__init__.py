@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from stages.tube.mechanics import Batch, TubeMechanics
     from stages.tube.nesting import check_nesting
     from stages.tube.parts import SlottedSegment, opposite_slots
+    from stages.tube.placing import PlacedShapes, place_shapes
     from stages.tube.proposals import (
         DesignProposal,
         MakerLimits,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from stages.tube.sequences import Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape import centreline
     from stages.tube.shape_store import SHAPES_FORMAT, open_shapes
+    from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
     from stages.tube.strain import channel_curvature_limit, straightening, transit_strain
     from stages.tube.validation import REASONS, Deployment, DeploymentValidator

@@ -243,13 +243,14 @@ class ConcentricTubes:
     def _check_strain(self) -> None:
         for name, tube in (("outer", self.outer), ("inner", self.inner)):
             if tube.rest_strain > self.max_strain:
+                most = self.max_strain / tube.radius_mm
                 raise impossible(
                     f"{name}.precurvature_per_mm",
                     tube.max_precurvature_per_mm,
-                    f"2 max_strain / outer_diameter_mm = {self.max_strain / tube.radius_mm:.6g} without "
-                    f"slots: held straight its strain is {tube.rest_strain:.4g}, max_strain is "
-                    f"{self.max_strain:g}",
+                    f"at most 2 max_strain / outer_diameter_mm = {most:.6g} without slots: held straight its "
+                    f"strain is {tube.rest_strain:.4g}, max_strain is {self.max_strain:g}",
                 )
+        for name, tube in (("outer", self.outer), ("inner", self.inner)):
             most = tube.most_bent_per_mm(self.max_strain, self.passing_mm)
             if (self.max_channel_curvature_per_mm or 0.0) > most * (1.0 + ROUNDING) + ROUNDING:
                 raise impossible(
@@ -261,11 +262,9 @@ class ConcentricTubes:
 
     def _check_slots(self) -> None:
         """Where tubes are deployed their stiffness changes nowhere, and slots change that of both alike."""
+        other = float(self.inner.parts.stiffness_n_mm2[0] / self.inner.bending_stiffness_n_mm2)
         for name, tube in (("outer", self.outer), ("inner", self.inner)):
-            parts, other = (
-                tube.parts,
-                self.inner.parts.stiffness_n_mm2[0] / self.inner.bending_stiffness_n_mm2,
-            )
+            parts = tube.parts
             deployed = parts.stiffness_n_mm2[parts.begin_mm < self.max_extension_mm]
             share = deployed / tube.bending_stiffness_n_mm2
             if np.ptp(share) > 0.0 or abs(share[0] - other) > ROUNDING:

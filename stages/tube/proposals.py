@@ -212,7 +212,12 @@ def propose_designs(
         )
     longest = limits.longest_curve_mm or max(inner_mm, tubes.inner.curved_length_mm)
     shortest = min(max(0.5 * tubes.inner.curved_length_mm, longest / LENGTHS), longest)
-    steepest = tubes.max_strain / tubes.inner.radius_mm * (1.0 - ROUNDING)
+    bent = tubes.max_channel_curvature_per_mm or 0.0
+    straight = tubes.outer.most_bent_per_mm(tubes.max_strain, tubes.passing_mm) * tubes.outer.radius_mm
+    if bent > 0.0:
+        thickest = min(thickest, straight / bent * (1.0 - ROUNDING) - 0.5 * bore)
+    uncurved = replace(tubes.inner, curved_length_mm=0.0, precurvature_per_mm=0.0, bent_pieces=())
+    steepest = (uncurved.most_bent_per_mm(tubes.max_strain, tubes.passing_mm) - bent) * (1.0 - ROUNDING)
     variants = product(
         np.linspace(limits.thinnest_wall_mm, thickest, WALLS).tolist(),
         np.linspace(shortest, longest, LENGTHS).tolist(),

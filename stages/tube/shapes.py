@@ -32,6 +32,8 @@ BEND_RAD = 0.5 * math.pi
 SNAPS = "the tubes would snap on the way"
 SWEEPS = "the tubes would sweep tissue sideways"
 STRAINS = "a tube would be strained too much"
+SAME_SHARE = 1e-9
+"""Rounding of stiffness factors."""
 ARCS_A_DEPLOYMENT = 16
 """Room for arcs at first; it is doubled where that is too little."""
 
@@ -121,6 +123,12 @@ class TubeShapes:
         """Number of deployments, S."""
         return len(self.insertions_mm)
 
+    @property
+    def stop_mm(self) -> float:
+        """Spacing of the insertions, mm."""
+        longest = min(self.limits.max_extension_mm, self.tubes[0].length_mm)
+        return longest / _n_stops(longest, self.grid)
+
     def arcs_of(self, shape: int) -> Float:
         """Return the arcs `(a, 4)` of one deployment."""
         return self.arcs[self.first_arc[shape] : self.first_arc[shape + 1]]
@@ -142,7 +150,8 @@ def tube_shapes(
     Raises
     ------
     SettingsError
-        If there are more than three tubes, or they do not nest.
+        If there are more than three tubes, they do not nest, or slots make them other than plain tubes
+        scaled: several of them are bent, or not all are equally softened.
     """
     if len(tubes) > 3:
         raise SettingsError(
@@ -155,10 +164,10 @@ def tube_shapes(
     stops = _stops(mechanics, limits, grid)
     states, parents = _states(mechanics, stops)
     rotations = _rotations(mechanics.tubes, grid)
-    radii = np.array([tube.radius_mm for tube in tubes])
+    strained = _strained_radii(mechanics.tubes, float(stops[-1]))
 
     def with_rotations(base: Float) -> tuple[Float, Int, Float]:
-        return _follow(mechanics, radii, base + BEND_RAD, stops, states, parents)
+        return _follow(mechanics, strained, base + BEND_RAD, stops, states, parents)
 
     with ThreadPoolExecutor(THREADS) as pool:
         found = list(pool.map(with_rotations, rotations))
@@ -186,6 +195,28 @@ def tube_shapes(
     )
 
 
+def _strained_radii(tubes: Sequence[Tube], longest_mm: float) -> Float:
+    """Return the strain of each tube for each 1/mm `(n,)`, mm, and check that slots change no shape."""
+    softened, strained = [], []
+    for tube in tubes:
+        bent_mm = tube.length_mm - min((bend.from_mm for bend in tube.bends), default=tube.length_mm)
+        parts = tube.parts
+        out = parts.begin_mm < max(longest_mm, bent_mm)
+        softened.append(parts.stiffness_n_mm2[out] / tube.bending_stiffness_n_mm2)
+        strained.append(float(parts.strained_radius_mm[out].max()))
+    factors = np.concatenate(softened)
+    slotted = any(tube.slotted_segments for tube in tubes)
+    if np.ptp(factors) > SAME_SHARE or (slotted and _free_rotations(tubes) > 0):
+        raise SettingsError(
+            f"{sum(bool(tube.slotted_segments) for tube in tubes)} of {len(tubes)} tubes have slots, with "
+            f"{factors.min():g} to {factors.max():g} of the plain stiffness, and "
+            f"{sum(bool(tube.bends) for tube in tubes)} are bent",
+            expected="slots of one stiffness_factor in all tubes, where they come out, and one bent tube",
+            remedy="Leave out slotted_segments: how slots soften a tube that is twisted is not modelled",
+        )
+    return np.array(strained)
+
+
 def _free_rotations(tubes: Sequence[Tube]) -> int:
     """Return how many tubes can be turned against another so that the shape changes."""
     return max(sum(bool(tube.bends) for tube in tubes) - 1, 0)
@@ -194,7 +225,12 @@ def _free_rotations(tubes: Sequence[Tube]) -> int:
 def _stops(mechanics: TubeMechanics, limits: ShapeLimits, grid: ShapeGrid) -> Float:
     """Return the insertions of any tube, from 0 on."""
     longest = min(limits.max_extension_mm, float(mechanics.lengths_mm[0]))
-    return np.linspace(0.0, longest, max(round(longest / grid.stop_mm), 1) + 1)
+    return np.linspace(0.0, longest, _n_stops(longest, grid) + 1)
+
+
+def _n_stops(longest_mm: float, grid: ShapeGrid) -> int:
+    """Return the number of stops up to the longest insertion."""
+    return max(round(longest_mm / grid.stop_mm), 1)
 
 
 def _states(mechanics: TubeMechanics, stops: Float) -> tuple[Int, Int]:
@@ -227,17 +263,19 @@ def _rotations(tubes: Sequence[Tube], grid: ShapeGrid) -> Float:
 
 
 def _follow(
-    mechanics: TubeMechanics, radii: Float, base: Float, stops: Float, states: Int, parents: Int
+    mechanics: TubeMechanics, strained: Float, base: Float, stops: Float, states: Int, parents: Int
 ) -> tuple[Float, Int, Float]:
     """Return results, first arcs and arcs of all deployments with given rotations of the rear ends."""
     results = np.zeros((len(states), kernel.SHAPE_COLUMNS))
     first = np.zeros(len(states) + 1, dtype=np.int64)
+    radii = np.array([tube.radius_mm for tube in mechanics.tubes])
     room = ARCS_A_DEPLOYMENT * len(states)
     while True:
         arcs = np.zeros((room, kernel.ARC_COLUMNS))
         count = kernel.follow_all(
-            mechanics.design, radii, base, stops, states, parents, mechanics.step_rad, results, first, arcs
-        )
+            mechanics.design, radii, strained, base, stops, states, parents, mechanics.step_rad, results,
+            first, arcs,
+        )  # fmt: skip
         if count >= 0:
             return results, first, arcs[:count].copy()
         room *= 2

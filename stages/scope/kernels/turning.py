@@ -28,10 +28,12 @@ def tips_beside(device, most_curvature, states, offsets, out):
             twist, bend, straight = nearest_setting(
                 states[n, TWIST], states[n, BEND], u, v, device.length, device.least_bend, device.most_bend
             )
-            if math.hypot(u, v) > most_curvature:
-                bend = math.inf
             if c == 0:
                 twist, bend, straight = states[n, TWIST], states[n, BEND], False
+                if not device.least_bend <= bend <= device.most_bend:
+                    bend = math.inf
+            if math.hypot(u, v) > most_curvature:
+                bend = math.inf
             move_along(states[n], u, v, device.length, scratch)
             for k in range(3):
                 row[k] = scratch[9 + k]

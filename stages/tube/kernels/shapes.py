@@ -100,7 +100,7 @@ def _reach(design, base_angles, begin, end, step, tip_angles):
 
 
 @inner_kernel
-def _largest_strain(design, radii, beta, cutting, nodes, steps):
+def _largest_strain(design, strained, beta, cutting, nodes, steps):
     """Return the largest strain of bending ahead of the scope tip."""
     pieces, moments, directions, _count = cutting
     psi, rate = nodes[1], nodes[2]
@@ -110,13 +110,13 @@ def _largest_strain(design, radii, beta, cutting, nodes, steps):
         middle = 0.5 * (pieces[k, NEAR] + pieces[k, FAR])
         for end in range(2):
             x, y = curvature(cutting, k, float(end), steps[0][at], psi, rate, at)
-            for i in range(radii.shape[0]):
+            for i in range(strained.shape[0]):
                 if beta[i] + design[1][i] < middle:
                     continue
                 own = moments[k, i] / design[0][i, 0]
                 angle = psi[at + end, i] + directions[k, i]
                 off = math.hypot(x - own * math.cos(angle), y - own * math.sin(angle))
-                worst = max(worst, radii[i] * off)
+                worst = max(worst, strained[i] * off)
     return worst
 
 
@@ -291,15 +291,17 @@ def _sweep(bodies, states, parents, state, sagitta):
 
 
 @numba.njit(cache=True, nogil=True)
-def follow_all(design, radii, base_angles, stops, states, parents, step, results, first, arcs):
+def follow_all(design, radii, strained, base_angles, stops, states, parents, step, results, first, arcs):
     """Follow all deployments with given rotations of the rear ends.
 
     Parameters
     ----------
     design : tuple
         See `assembly`.
-    radii, base_angles : (n,) float64
-        Outer radius of each tube, mm, and rotation of its rear end, rad.
+    radii, strained : (n,) float64
+        Outer radius of each tube, and its strain for each 1/mm of change of curvature, mm.
+    base_angles : (n,) float64
+        Rotation of the rear ends, rad.
     stops : (K,) float64
         Insertions, rising from 0, mm.
     states : (S, n) int64
@@ -332,7 +334,7 @@ def follow_all(design, radii, base_angles, stops, states, parents, step, results
     results[0] = 0.0
     results[0, LEAST] = 1.0
     for b in range(design[2].shape[0]):
-        results[0, STRAIN] = max(results[0, STRAIN], radii[int(design[2][b, 0])] * design[2][b, 3])
+        results[0, STRAIN] = max(results[0, STRAIN], strained[int(design[2][b, 0])] * design[2][b, 3])
     for m in (0, 4, 8):
         results[0, TIP + m] = 1.0
     sagitta = 0.0
@@ -356,7 +358,7 @@ def follow_all(design, radii, base_angles, stops, states, parents, step, results
         out = states[state, 0] + 1
         frames_at(cutting, nodes, steps, poses, stops[:out], found, angles, rates)
         bodies[state, :out] = found[:out, 9:]
-        strain = _largest_strain(design, radii, end, cutting, nodes, steps)
+        strain = _largest_strain(design, strained, end, cutting, nodes, steps)
         results[state, STRAIN] = max(results[parent, STRAIN], strain)
         number, between = _lay_arcs(design, radii, end, cutting, nodes, steps, arcs, first[state], places)
         if number < 0:

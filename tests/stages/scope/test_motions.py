@@ -76,6 +76,13 @@ def test_bodies_keep_the_curvature_that_tubes_stand(lung: Lung) -> None:
     assert worst <= 0.04 + 1e-12
 
 
+def test_tips_bend_as_far_as_tubes_in_them_let(lung: Lung) -> None:
+    found = find_motions(lung, SCOPE, reach_mm=60.0, tip_bends_rad=(-0.1, 0.4))
+    bends = np.array([found.motion(tip).states[-1, 2] for tip in range(found.count)])
+    assert found.count and bends.min() >= -0.1 and bends.max() <= 0.4
+    assert bends.min() < -0.05 and bends.max() > 0.35
+
+
 def test_bends_stay_within_the_device(motions: ScopeMotions) -> None:
     low, high = SCOPE.bends_rad
     for tip in range(0, motions.count, 11):

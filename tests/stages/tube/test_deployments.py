@@ -35,8 +35,7 @@ TIPS = np.array(
 TIPS[:, 3:] /= np.linalg.norm(TIPS[:, 3:], axis=1, keepdims=True)
 
 
-@pytest.fixture(scope="module")
-def lung() -> Lung:
+def scene() -> Lung:
     """A lumen below x = 0 with a flat wall above, some vessels, a fissure far on."""
     canvas = Canvas.empty([-12, -14, -20], [14, 14, 20], 0.6)
     x = canvas.points[..., 0]
@@ -47,6 +46,11 @@ def lung() -> Lung:
     canvas.add(np.abs(x - 7) < 0.4, FISSURE)
     assert not (canvas.labels[(canvas.labels & LUMEN) != 0] & VESSEL).any()
     return canvas.lung()
+
+
+@pytest.fixture(scope="module")
+def lung() -> Lung:
+    return scene()
 
 
 def test_constants() -> None:

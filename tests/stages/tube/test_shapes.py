@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from stages.tube import (
     BentPiece,
     ShapeGrid,
     ShapeLimits,
+    SlottedSegment,
     SnapError,
     Tube,
     TubeMechanics,
@@ -213,6 +215,21 @@ def test_bad_designs_are_explained() -> None:
         tube_shapes((tube(0, 0.0), tube(1, 0.0), tube(2, 0.0), tube(2, 0.0)))
     with pytest.raises(SettingsError, match="outer diameter"):
         tube_shapes((tube(2, 0.0), tube(1, 0.0)))
+
+
+def test_equal_slots_change_strain_alone_and_twisted_slots_are_refused() -> None:
+    slots = (SlottedSegment(length_mm=200.0, stiffness_factor=0.04, strain_factor=0.75),)
+    plain = (WIDE.inner, WIDE.outer)
+    slotted = tuple(dataclasses.replace(each, slotted_segments=slots) for each in plain)
+    one, other = (tube_shapes(tubes, ANY, COARSE) for tubes in (plain, slotted))
+    assert np.array_equal(one.arcs, other.arcs)
+    assert other.strain == pytest.approx(0.75 * one.strain)
+    for tubes in (
+        (slotted[0], plain[1]),
+        tuple(dataclasses.replace(each, slotted_segments=slots) for each in PAIR),
+    ):
+        with pytest.raises(SettingsError, match="have slots"):
+            tube_shapes(tubes, ANY, COARSE)
 
 
 def test_shapes_are_kept_by_design(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

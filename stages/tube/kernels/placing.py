@@ -1,0 +1,235 @@
+"""Shapes with equal beginnings as a tree, and where they fit in a patient: each beginning is followed once.
+
+A node is a stretch of tube between two stops.  It lies where its first shape has it, in the frame of the
+scope tip; the others that it stands for are within its `error`, which enters the clearance.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from anatomy.kernels.arcs import point_on_arc
+from anatomy.kernels.compiling import inner_kernel
+from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
+from stages.tube.kernels.wall_exit import (
+    ACCEPTED,
+    BRANCH,
+    IN_TISSUE,
+    LEFT_AT,
+    NO_EXIT,
+    PHASE,
+    WALL_ANGLE,
+    WALL_RUN,
+    march,
+    reset,
+)
+
+SAME_MM = 1e-9
+# Columns of a stretch: point, tangent and normal where it begins, curvature, length, arc length there.
+POINT, TANGENT, NORMAL, KAPPA, STRETCH_LENGTH, BEGINS, STRETCH_COLUMNS = 0, 3, 6, 9, 10, 11, 12
+# Columns of a placed shape: shape, pierced branch, arc length at the exit (mm), wall angle (rad), run in the
+# wall (mm).
+PLACED_SHAPE, PLACED_BRANCH, PLACED_EXIT, PLACED_ANGLE, PLACED_RUN, PLACED_COLUMNS = range(6)
+
+
+@numba.njit(cache=True)
+def cut_at_stops(arcs, stop, stretches, ends, middles, radii):
+    """Cut one shape into stretches between stops; return how many stretches there are.
+
+    Parameters
+    ----------
+    arcs : (a, ARC_COLUMNS) float64
+    stop : float
+        Spacing of the stops, mm.
+    stretches : (rows, STRETCH_COLUMNS) float64
+        Is filled; a stop may have several.
+    ends, middles : (K + 1, 3) float64
+        Are filled: where the stretch before each stop ends, and its middle.
+    radii : (K + 1,) float64
+        Is filled: the outermost radius of the stretch before each stop.
+    """
+    pose, across = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+    rows, at, place = 0, 0.0, 1
+    for a in range(arcs.shape[0]):
+        bend = bend_towards(pose, across, arcs[a, DIRECTION], arcs[a, CURVATURE])
+        done, left = 0.0, arcs[a, LENGTH]
+        here, sideways = pose, across
+        while left > SAME_MM:
+            half = (place - 0.5) * stop
+            if at <= half <= at + left:
+                middles[place, 0], middles[place, 1], middles[place, 2] = point_on_arc(here, bend, half - at)
+                radii[place] = arcs[a, RADIUS]
+            length = min(left, place * stop - at)
+            if length > SAME_MM:
+                row = stretches[rows]
+                for m in range(6):
+                    row[POINT + m] = here[m]
+                for m in range(3):
+                    row[NORMAL + m] = bend[1 + m]
+                row[KAPPA], row[STRETCH_LENGTH], row[BEGINS] = bend[0], length, at
+                rows += 1
+            here, sideways = carried(here, sideways, bend, arcs[a, DIRECTION], length)
+            bend = bend_towards(here, sideways, arcs[a, DIRECTION], arcs[a, CURVATURE])
+            at += length
+            done += length
+            left = arcs[a, LENGTH] - done
+            if at >= place * stop - SAME_MM:
+                for m in range(3):
+                    ends[place, m] = here[m]
+                at = place * stop
+                place += 1
+        pose, across = here, sideways
+    return rows
+
+
+@inner_kernel
+def _off(ends, middles, one, other, place):
+    """Return how far two shapes are from each other between two stops, at most."""
+    worst = bow = 0.0
+    begin2 = middle2 = end2 = 0.0
+    for m in range(3):
+        begin = ends[one, place - 1, m] - ends[other, place - 1, m]
+        middle = middles[one, place, m] - middles[other, place, m]
+        end = ends[one, place, m] - ends[other, place, m]
+        begin2 += begin * begin
+        middle2 += middle * middle
+        end2 += end * end
+        bow += (begin - 2.0 * middle + end) ** 2
+    worst = math.sqrt(max(begin2, middle2, end2))
+    return worst + 0.25 * math.sqrt(bow)
+
+
+@numba.njit(cache=True)
+def grow(places, groups, ends, middles, radii, tolerance, nodes, errors, leaf):
+    """Sort shapes into a tree of stretches that they share within a tolerance.
+
+    Parameters
+    ----------
+    places : (S,) int64
+        At which stop each shape ends, 1 or more.
+    groups : (S,) int64
+        Shapes of different groups share nothing.
+    ends, middles, radii : (S, K + 1, 3), (S, K + 1, 3), (S, K + 1) float64
+        See `cut_at_stops`.
+    tolerance : float
+        mm.
+    nodes : (N, 4) int64
+        Is filled: parent, stop at its end, first shape, the next one with the same parent; N nodes at most.
+    errors : (N,) float64
+        Is filled: how far others are from the first shape.
+    leaf : (S,) int64
+        Is filled: the node at which each shape ends.
+
+    Returns
+    -------
+    int
+        Number of nodes, -1 if there is no room.
+    """
+    count = 0
+    youngest = np.full(nodes.shape[0] + 1, -1)  # of the root first, then of each node
+    for shape in range(places.shape[0]):
+        parent = -1
+        for place in range(1, places[shape] + 1):
+            child, found, off = youngest[parent + 1], -1, 0.0
+            while child >= 0 and found < 0:
+                first = nodes[child, 2]
+                if groups[first] == groups[shape] and radii[first, place] == radii[shape, place]:
+                    off = _off(ends, middles, first, shape, place)
+                    if off <= tolerance:
+                        found = child
+                child = nodes[child, 3]
+            if found < 0:
+                if count == nodes.shape[0]:
+                    return -1
+                found = count
+                nodes[count, 0], nodes[count, 1], nodes[count, 2] = parent, place, shape
+                nodes[count, 3] = youngest[parent + 1]
+                youngest[parent + 1] = count
+                errors[count] = 0.0
+                count += 1
+            else:
+                errors[found] = max(errors[found], off)
+            parent = found
+        leaf[shape] = parent
+    return count
+
+
+@inner_kernel
+def _seen(base, forward, row, at):
+    """Return a vector of a stretch in the frame of the patient: `base` (9,) is +x, +y and +z of the scope."""
+    x, y, z = row[at], row[at + 1], row[at + 2]
+    return (
+        base[0] * x + base[3] * y + forward[0] * z,
+        base[1] * x + base[4] * y + forward[1] * z,
+        base[2] * x + base[5] * y + forward[2] * z,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def place_tree(environment, tubes, frame, tree, reasons, traces, placed):
+    """Follow all shapes from one scope tip with one rotation of all tubes together.
+
+    Parameters
+    ----------
+    environment : TubeEnvironment
+    tubes : (N_TUBES,) float64
+        See `planar`; only the limits at the wall are looked at.
+    frame : (4, 4) float64
+        The scope tip, with +x where the tubes are turned to.
+    tree : tuple
+        Nodes in the order in which they are followed, M of them: `depth` (M,) int64 from 1 on, `skip` (M,)
+        int64 the node to go on with if this one is refused, `beneath` (M,) int64 how many shapes end in it or
+        beyond, `first` (M + 1,) int64 where its `stretches` (R, STRETCH_COLUMNS) begin, `radius` and
+        `clearance` (M,) float64, `first_shape` (M + 1,) int64 where the `shapes` (S,) int64 begin that end
+        there.
+    reasons : (N_REASONS,) int64
+        Counts refused shapes by reason.
+    traces : (depths + 1, N_TRACE) float64
+        Scratch.
+    placed : (S, PLACED_COLUMNS) float64
+        Is filled.
+
+    Returns
+    -------
+    int
+        Number of shapes that fit.
+    """
+    depth, skip, beneath, first, stretches, radius, clearance, first_shape, shapes = tree
+    across = (frame[0, 0], frame[1, 0], frame[2, 0], frame[0, 1], frame[1, 1], frame[2, 1])
+    forward = (frame[0, 2], frame[1, 2], frame[2, 2])
+    reset(traces[0])
+    count, node = 0, 0
+    while node < depth.shape[0]:
+        trace = traces[depth[node]]
+        for m in range(trace.shape[0]):
+            trace[m] = traces[depth[node] - 1, m]
+        reason = ACCEPTED
+        for r in range(first[node], first[node + 1]):
+            row = stretches[r]
+            x, y, z = _seen(across, forward, row, POINT)
+            tx, ty, tz = _seen(across, forward, row, TANGENT)
+            nx, ny, nz = _seen(across, forward, row, NORMAL)
+            pose = (frame[0, 3] + x, frame[1, 3] + y, frame[2, 3] + z, tx, ty, tz)
+            reason = march(
+                environment, tubes, trace, pose, (row[KAPPA], nx, ny, nz), row[BEGINS], row[STRETCH_LENGTH],
+                radius[node], clearance[node],
+            )  # fmt: skip
+            if reason != ACCEPTED:
+                break
+        if reason != ACCEPTED:
+            reasons[reason] += beneath[node]
+            node = skip[node]
+            continue
+        for e in range(first_shape[node], first_shape[node + 1]):
+            if trace[PHASE] != IN_TISSUE:
+                reasons[NO_EXIT] += 1
+                continue
+            row = placed[count]
+            row[PLACED_SHAPE], row[PLACED_BRANCH], row[PLACED_EXIT] = shapes[e], trace[BRANCH], trace[LEFT_AT]
+            row[PLACED_ANGLE], row[PLACED_RUN] = trace[WALL_ANGLE], trace[WALL_RUN]
+            count += 1
+        node += 1
+    return count

@@ -18,6 +18,8 @@ from stages.needle.environment import needle_environment, workspace_lengths
 
 SYSTEM = "ultrathin"
 SEED = 3
+TARGET_LPS = (-45.6, 47.0, -65.1)
+"""A point of the small patient to which many direct arcs are clear."""
 
 
 class Anatomy:
@@ -60,9 +62,8 @@ class Planning:
     timeout = 300
 
     def setup_cache(self) -> Any:
-        """Find a target that can be reached."""
-        lung = build_lung(make_phantom(seed=SEED, size="small").images)
-        return lung.targets_lps[0].tolist()
+        """Return a target that can be reached."""
+        return list(TARGET_LPS)
 
     def setup(self, target: list[float]) -> None:
         """Make lung, atlas and plan."""
@@ -79,7 +80,7 @@ class Planning:
         return la.plan(self.lung, self.system, self.target, atlas=self.atlas)
 
     def time_atlas(self, target: list[float]) -> None:
-        """Enumerate sites and deployments."""
+        """Find motions of the scope, enumerate deployments."""
         la.build_atlas(self.lung, self.system)
 
     def track_atlas_entries(self, target: list[float]) -> int:
@@ -99,6 +100,14 @@ class Planning:
         """Test every deployment for the target."""
         entries = self.atlas.deployments
         workspace_lengths(self.environment, entries.positions, entries.tangents, self.target.lps_mm)
+
+    def time_replan_from_scope(self, target: list[float]) -> None:
+        """Plan tubes and needle from the scope's tip as measured."""
+        la.replan_from_scope(self.lung, self.system, self.found.scope.lps_from_scope_tip, self.target)
+
+    def time_replan_from_tube(self, target: list[float]) -> None:
+        """Plan the needle from the tubes' tip as measured."""
+        la.replan_from_tube(self.lung, self.system, self.found.tube.lps_from_tip, self.target)
 
     def time_check(self, target: list[float]) -> None:
         """Check a plan."""

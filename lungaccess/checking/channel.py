@@ -9,7 +9,6 @@ import numpy as np
 from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.scope_motion import motion_of
-from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.plans.plan import Plan
 from stages.tube.device import Tube
 
@@ -17,14 +16,13 @@ STEP_MM = 0.5
 """Spacing of the places of channel and tube that are looked at; what is between two is counted with both."""
 
 
-def check_channel(plan: Plan, scope: ScopeInsertion, found: Findings) -> None:
+def check_channel(plan: Plan, found: Findings) -> None:
     """Record strain of tubes and needle all along the channel, and the bend that the handle must set."""
-    device, tubes = plan.system.scope, plan.system.tubes
+    scope, device, tubes = plan.scope, plan.system.scope, plan.system.tubes
     motion = motion_of(scope.lps_from_entry, scope.states, device.bending_length_mm)
     which, lengths_mm = motion.body_pieces()
     behind_mm, bent = np.cumsum(lengths_mm[::-1])[::-1], np.linalg.norm(motion.bends[which], axis=1)
     tightest = float(bent.max(initial=0.0))
-    found.agrees("scope.curvature", scope.max_curvature_per_mm, tightest, 1e-6, "1/mm")
     limit = tubes.max_channel_curvature_per_mm
     if limit is not None:
         detail = "curvature of the channel that the tubes pass"
@@ -38,7 +36,7 @@ def check_channel(plan: Plan, scope: ScopeInsertion, found: Findings) -> None:
     strain = 0.5 * needle.diameter_mm * needle.strain_factor * max(tightest, _bend_at_rest(tubes.inner, 0.0))
     detail = "largest strain of the needle on its way through channel and tubes"
     found.at_most("needle.strain", strain, needle.max_strain, "", detail, 1e-9)
-    _check_handle(plan, scope, inserted, found)
+    _check_handle(plan, inserted, found)
 
 
 def _strains(tube: Tube, behind_mm: Float, bent: Float, inserted_mm: float) -> Iterator[float]:
@@ -65,9 +63,7 @@ def _slots(tube: Tube, from_tip_mm: float) -> tuple[float, float]:
     return 1.0, 1.0
 
 
-def _check_handle(
-    plan: Plan, scope: ScopeInsertion, inserted_mm: tuple[float, float], found: Findings
-) -> None:
+def _check_handle(plan: Plan, inserted_mm: tuple[float, float], found: Findings) -> None:
     """Section and tubes share the bending moment that the handle sets: it must be set to bend both."""
     device, tubes = plan.system.scope, plan.system.tubes
     stiffness = device.bending_stiffness_n_mm2
@@ -76,7 +72,7 @@ def _check_handle(
         plain *= tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4
         inside = np.append(np.arange(inserted, inserted + device.bending_length_mm, STEP_MM), inserted)
         stiffness += plain * max(_slots(tube, float(at))[0] for at in inside)
-    bend = float(scope.states[-1, 2])
+    bend = float(plan.scope.states[-1, 2])
     limit = np.deg2rad(device.bend_up_deg if bend >= 0.0 else device.bend_down_deg)
     detail = "bend that the handle sets so that section and tubes bend as planned"
     wanted = abs(bend) * stiffness / device.bending_stiffness_n_mm2

@@ -18,7 +18,6 @@ from lungaccess.checking.poses import check_rigid, check_same_pose
 from lungaccess.checking.shapes import Curve
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
 from lungaccess.checking.wall_exit import Exit, check_exit, check_wall_run
-from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.plans.plan import Plan
 
 if TYPE_CHECKING:
@@ -48,8 +47,7 @@ def check_deployment(plan: Plan, environment: Environment, found: Findings) -> C
     curve = shapes.tube_curve(plan.scope.lps_from_scope_tip, tube.rotation_rad, bend)
     check_same_pose("tube.tip", tube.lps_from_tip, curve.end, found)
     _check_limits(plan, bend, found)
-    if isinstance(plan.scope, ScopeInsertion):
-        check_channel(plan, plan.scope, found)
+    check_channel(plan, found)
     sweep_mm = _check_sweep(plan, found)
     way_out = check_exit(plan, lung, curve, found)
     if way_out is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import tomllib
 from pathlib import Path
@@ -17,6 +16,7 @@ from anatomy.records import frozen_value
 from anatomy.settings import impossible, parse, settings, text, to_mapping
 from lungaccess.problem.system import System, load_system
 from stages.tube import (
+    BEND_RAD,
     DeployedSequence,
     DesignProposal,
     Equilibrium,
@@ -36,8 +36,6 @@ from stages.tube import (
 _REMEDY = "`lungaccess template tubes` prints a complete file to start from"
 AS_FAR = 0.95
 """Share of the present reach that counts as about as far."""
-BEND_RAD = 0.5 * math.pi
-"""Base angle at which a tube bends towards +x of the scope tip."""
 
 
 @settings

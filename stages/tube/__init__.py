@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.tube.casadi_model import CasadiTubes
+    from stages.tube.casadi_shape import DerivedShape, derive_shape
     from stages.tube.deployments import (
         DEFAULT_ROTATIONS,
         DEFAULT_STOP_MM,
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from stages.tube.device import BentPiece, ConcentricTubes, Tube
     from stages.tube.environment import tracking_length_mm, tube_constants, tube_environment
     from stages.tube.equilibrium import Equilibrium
+    from stages.tube.errors import ConvergenceError
     from stages.tube.following import DeployedSequence, SnapError, deploy
     from stages.tube.inverse import inverse_kinematics
     from stages.tube.kernels import TubeEnvironment
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
         least_sweep_sequence,
         propose_designs,
     )
-    from stages.tube.sequences import Sequence, alternating, inner_first, kuntz2015, together
+    from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape import centreline
     from stages.tube.shape_store import SHAPES_FORMAT, open_shapes
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes

@@ -188,8 +188,21 @@ class OrderedTubes:
         """Return the arc lengths of the landmarks, and of the plate."""
         return [beta[tube] + self._marks[tube][index] for tube, index in self._order.landmarks] + [0.0]
 
-    def _integrate(self, tip: Any, beta: Any) -> tuple[Any, Any, Any]:
-        """Return the base angles, and position and rotation of the tip."""
+    @cached_property
+    def body(self) -> Any:
+        """Function: tip angles (n,) rad, beta (n,) mm -> (4, N) arc lengths and points, from the tip, mm."""
+        tip, beta = self._symbols("tip_angles_rad")
+        passed: list[Any] = []
+        _, position, rotation = self._integrate(tip, beta, passed)
+        from_tip = casadi.horzcat(casadi.MX.zeros(3), *(states[POSITION, :] for states in passed))
+        gaps = [(far - near) / self._steps for far, near in itertools.pairwise(self._places(beta))]
+        spacing = casadi.vertcat(0, *(casadi.repmat(gap, self._steps) for gap in gaps))
+        s = self._places(beta)[0] - casadi.cumsum(spacing)
+        points = casadi.repmat(position, 1, from_tip.shape[1]) + rotation @ from_tip
+        return casadi.Function("body", [tip, beta], [casadi.vertcat(s.T, points)])
+
+    def _integrate(self, tip: Any, beta: Any, states: list[Any] | None = None) -> tuple[Any, Any, Any]:
+        """Return the base angles, and position and rotation of the tip; list all states of each piece."""
         n = len(self._tubes)
         state = casadi.vertcat(0, 0, 0, 1, 0, 0, 0, tip[0], casadi.MX.zeros(2 * n - 1))
         gaps = itertools.pairwise(self._places(beta))
@@ -198,7 +211,12 @@ class OrderedTubes:
             passed[tube] += 1
             if tube > 0 and passed[tube] == 1:
                 state[FIRST_ANGLE + tube] = tip[tube] - state[FIRST_ANGLE]
-            state = self._step(passed).fold(self._steps)(state, (near - far) / self._steps)
+            step, length = self._step(passed), (near - far) / self._steps
+            if states is None:
+                state = step.fold(self._steps)(state, length)
+                continue
+            states.append(step.mapaccum(self._steps)(state, casadi.repmat(length, 1, self._steps)))
+            state = states[-1][:, -1]
         first = state[FIRST_ANGLE]
         others = [first + state[FIRST_ANGLE + i] if passed[i] else tip[i] for i in range(1, n)]
         angles = casadi.vertcat(first, *others)
@@ -308,6 +326,14 @@ class CasadiTubes:
             base_from_tip=read_only(base_from_tip),
             determinant=float(determinant),
         )
+
+    def body(self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike) -> Float:
+        """Return arc lengths and points `(N, 4)` mm of the centreline, from the front plate to the tip.
+
+        Parameters and errors are those of `given_tip_angles`; something has to be ahead of the plate.
+        """
+        tip, beta = self._vector(tip_angles_rad, "tip angles"), self._vector(beta_mm, "beta")
+        return read_only(np.array(self.ordered(self.order_at(beta)).body(tip, beta).full()).T[::-1].copy())
 
     def solve(
         self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, guess_rad: ArrayLike | None = None

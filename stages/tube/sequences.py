@@ -14,6 +14,8 @@ from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.tube.device import Tube
 
+BEND_RAD = 0.5 * np.pi
+"""Rotation of a rear end at which the tube bends towards +x of the scope tip."""
 ROUNDING_MM = 1e-9
 """Rounding forgiven where lengths are compared."""
 

@@ -24,11 +24,10 @@ from stages.tube.equilibrium import matrices
 from stages.tube.kernels import shapes as kernel
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.nesting import SAME_MM
+from stages.tube.sequences import BEND_RAD
 
 THREADS = 2
 """The kernel runs without the interpreter's lock."""
-BEND_RAD = 0.5 * math.pi
-"""Base angle at which a tube bends towards +x of the scope tip."""
 SNAPS = "the tubes would snap on the way"
 SWEEPS = "the tubes would sweep tissue sideways"
 STRAINS = "a tube would be strained too much"

@@ -29,7 +29,8 @@ from stages.tube import (
 )
 from stages.tube import shapes as shapes_module
 from stages.tube.kernels.planar import tube_pieces
-from stages.tube.shapes import BEND_RAD, SNAPS, STRAINS, SWEEPS, TubeShapes
+from stages.tube.sequences import BEND_RAD
+from stages.tube.shapes import SNAPS, STRAINS, SWEEPS, TubeShapes
 from tests.stages.tube.pairs import WIDE
 
 ANY = ShapeLimits(max_lateral_sweep_mm=20.0, max_strain=0.1)

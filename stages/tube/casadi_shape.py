@@ -1,0 +1,95 @@
+"""The shape of one deployment of any design, derived by the CasADi model alone: a second opinion for checks.
+
+Nothing of the kernels takes part: neither their integration nor their judgement of stability.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.grid import read_only
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+from stages.tube.casadi_model import CasadiTubes
+from stages.tube.device import Tube
+from stages.tube.errors import ConvergenceError
+from stages.tube.sequences import BEND_RAD, joint_steps, together
+
+STEP_MM = 1.0
+"""Largest motion between two steps."""
+LARGEST_TURN_RAD = 0.2
+"""Largest turn of a tip in a step that is no jump: where the tubes are about to snap they turn faster."""
+
+
+@frozen_record
+class DerivedShape:
+    """One deployment, followed from the scope tip on.
+
+    Parameters
+    ----------
+    arc_lengths_mm : (N,) float64
+        From the scope tip, rising from 0.
+    points_mm : (N, 3) float64
+        Of the centreline, in the frame of the scope tip.
+    base_from_tip : (4, 4) float64
+        Material frame of the innermost tube at its end.
+    least_determinant : float
+        Least on the way of the derivative of base angles by tip angles: above 0 the tubes nowhere snap.
+    """
+
+    arc_lengths_mm: Float
+    points_mm: Float
+    base_from_tip: Float
+    least_determinant: float
+
+    def at(self, arc_lengths_mm: ArrayLike) -> Float:
+        """Return points `(M, 3)` mm at arc lengths `(M,)`, straight between those that were derived."""
+        s = np.asarray(arc_lengths_mm, dtype=np.float64)
+        return np.stack([np.interp(s, self.arc_lengths_mm, axis) for axis in self.points_mm.T], axis=1)
+
+
+def derive_shape(tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm: ArrayLike) -> DerivedShape:
+    """Follow the tubes to a deployment by the sequence `together`, with the CasADi model.
+
+    Parameters
+    ----------
+    tubes : sequence of Tube
+        The innermost first.
+    rotations_rad, insertions_mm : (n,) float64
+        As in `stages.tube.shapes.TubeShapes`.
+
+    Raises
+    ------
+    ConvergenceError
+        If the tubes snap on the way: their equilibrium loses stability or jumps.
+    SettingsError
+        If the insertions are impossible.
+    """
+    turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
+    sequence = together(tubes, turned, insertions_mm)
+    angles, betas, moves = joint_steps(sequence, tubes, step_mm=STEP_MM, step_rad=np.pi)
+    model = CasadiTubes(tubes)
+    tips, least = turned, 1.0
+    for base, beta in zip(angles[moves > 0], betas[moves > 0], strict=True):
+        found = model.solve(base, beta, tips)
+        least = min(least, found.determinant)
+        jumped = float(np.abs(found.tip_angles_rad - tips).max())
+        if least <= 0.0 or jumped > LARGEST_TURN_RAD:
+            out = ", ".join(f"{length:.2f}" for length in beta + [tube.length_mm for tube in tubes])
+            raise ConvergenceError(
+                f"At insertions of {out} mm the tips turn by {jumped:.3g} rad and the determinant is "
+                f"{found.determinant:.3g}",
+                expected=f"at most {LARGEST_TURN_RAD:g} rad in {STEP_MM:g} mm, and a determinant above 0",
+                remedy="Turn the tubes less against each other, or insert them less far",
+            )
+        tips = found.tip_angles_rad
+    body = model.body(tips, betas[-1])
+    return DerivedShape(
+        arc_lengths_mm=read_only(body[:, 0].copy()),
+        points_mm=read_only(body[:, 1:].copy()),
+        base_from_tip=model.given_tip_angles(tips, betas[-1]).base_from_tip,
+        least_determinant=least,
+    )

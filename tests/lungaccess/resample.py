@@ -41,7 +41,7 @@ def rolled(frame: Float, angle: float) -> Float:
 
 def arc(kappa: float, length: float) -> Float:
     a = kappa * length
-    x, z = ((1 - math.cos(a)) / kappa, math.sin(a) / kappa) if kappa > 1e-9 else (0.0, length)
+    x, z = ((1 - math.cos(a)) / kappa, math.sin(a) / kappa) if abs(kappa) > 1e-9 else (0.0, length)
     return np.array(
         [[math.cos(a), 0, math.sin(a), x], [0, 1, 0, 0], [-math.sin(a), 0, math.cos(a), z], [0, 0, 0, 1.0]]
     )
@@ -101,14 +101,27 @@ def problems(plan: Plan, lung: Lung) -> list[str]:
 
 
 def _scope(plan: Plan, lung: Lung) -> list[str]:
-    route, out = plan.scope.points_lps, []
-    share = np.linspace(0.0, 1.0, 12)[:, None, None]
-    dense = (route[:-1] + share * (route[1:] - route[:-1])).reshape(-1, 3)
-    if not (labels_at(lung, dense) & LUMEN).all():
-        out.append("the route leaves the lumen")
-    if not np.allclose(route[-1], plan.scope.lps_from_scope_tip[:3, 3]):
-        out.append("the scope tip is not at the end of the route")
+    walk, out, scope = scope_walk(plan), [], plan.system.scope
+    if not (labels_at(lung, walk.points) & LUMEN).all():
+        out.append("the scope's axis leaves the lumen")
+    if not np.allclose(walk.frames[-1], plan.scope.lps_from_scope_tip, atol=1e-6):
+        out.append("the scope's tip is not at the end of its body")
+    bends = np.abs(plan.scope.states[:, 2]) / scope.bending_length_mm
+    if bends.max() > 1.0 / scope.min_bending_radius_mm + 1e-9:
+        out.append("the section bends too tightly")
     return out
+
+
+def scope_walk(plan: Plan) -> Walk:
+    """The body in the last state: the shaft lies where the section led it, the section is the last arc."""
+    states, length = plan.scope.states, plan.system.scope.bending_length_mm
+    arcs, twist = [], 0.0
+    for before, after in zip(states[:-1], states[1:], strict=True):
+        if after[0] > before[0]:
+            arcs.append((after[0] - before[0], after[1] - twist, after[2] / length))
+            twist = after[1]
+    arcs.append((length, states[-1, 1] - twist, states[-1, 2] / length))
+    return follow(plan.scope.lps_from_entry, arcs, 0.2)
 
 
 def _tubes(plan: Plan, lung: Lung) -> list[str]:

@@ -334,9 +334,8 @@ def kuntz_plans(small_lung: Lung, atlas: la.Atlas) -> list[Plan]:
 class TestKuntz2015:
     """Algorithm 1 of the paper."""
 
-    def test_it_finds_plans_between_the_points_of_the_atlas(self, kuntz_plans: list[Plan]) -> None:
+    def test_it_finds_better_and_better_plans(self, kuntz_plans: list[Plan]) -> None:
         assert len(kuntz_plans) >= 2 and all(plan.method == "kuntz2015" for plan in kuntz_plans)
-        assert all(plan.scope.site_point == -1 for plan in kuntz_plans)
         assert max(len(plan.needle.arcs) for plan in kuntz_plans) >= 2
         costs = [plan.costs["inverse_clearance"] for plan in kuntz_plans]
         assert costs == sorted(costs, reverse=True)

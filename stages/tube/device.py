@@ -251,7 +251,7 @@ class ConcentricTubes:
                     f"at most 2 max_strain / outer_diameter_mm = {most:.6g} without slots: held straight its "
                     f"strain is {tube.rest_strain:.4g}, max_strain is {self.max_strain:g}",
                 )
-        for name, tube in (("outer", self.outer), ("inner", self.inner)):
+        for name, tube in self._named:
             most = tube.most_bent_per_mm(self.max_strain, self.passing_mm)
             if (self.max_channel_curvature_per_mm or 0.0) > most * (1.0 + ROUNDING) + ROUNDING:
                 raise impossible(

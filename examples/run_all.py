@@ -14,7 +14,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 NAMES = (
     "patient",
-    "sites",
+    "scope_motions",
     "advisor",
     "tubes",
     "needle",

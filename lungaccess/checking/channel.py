@@ -29,6 +29,8 @@ def check_channel(plan: Plan, found: Findings) -> None:
         found.at_most("tube.channel", tightest, limit, "1/mm", detail, 1e-9)
     inserted = (plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm)
     for name, tube, length in zip(("outer", "inner"), (tubes.outer, tubes.inner), inserted, strict=True):
+        if tube is None:
+            continue
         strain = max(_strains(tube, behind_mm, bent, length))
         detail = f"largest strain of the {name} tube on its way through the channel"
         found.at_most(f"tube.strain.{name}", strain, tubes.max_strain, "", detail, 1e-9)
@@ -68,6 +70,8 @@ def _check_handle(plan: Plan, inserted_mm: tuple[float, float], found: Findings)
     device, tubes = plan.system.scope, plan.system.tubes
     stiffness = device.bending_stiffness_n_mm2
     for tube, inserted in zip((tubes.outer, tubes.inner), inserted_mm, strict=True):
+        if tube is None:
+            continue
         plain = 1e3 * tube.youngs_modulus_gpa * np.pi / 64.0
         plain *= tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4
         inside = np.append(np.arange(inserted, inserted + device.bending_length_mm, STEP_MM), inserted)

@@ -70,17 +70,19 @@ def _check_limits(plan: Plan, bend: shapes.Bend, found: Findings) -> None:
     tube, tubes = plan.tube, plan.system.tubes
     outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
     found.at_most("tube.extension", inner, tubes.max_extension_mm, "mm", "tip beyond the scope tip")
-    found.at_most("tube.outer_length", outer, tubes.outer.length_mm, "mm")
+    outer_length = tubes.outer.length_mm if tubes.outer is not None else 0.0
+    found.at_most("tube.outer_length", outer, outer_length, "mm")
     found.at_most("tube.inner_length", inner, tubes.inner.length_mm, "mm")
-    ahead = tubes.inner.length_mm - tubes.outer.length_mm
+    ahead = tubes.inner.length_mm - outer_length
     found.at_most("tube.protrusion", inner - outer, ahead, "mm", "inner beyond outer tube")
     # Straightened in the scope the inner tube is bent by its whole precurvature; the outer one bends with it.
     factors = [
-        deployed_strain_factor(tube, length) for tube, length in ((tubes.outer, outer), (tubes.inner, inner))
+        deployed_strain_factor(tube, length)
+        for tube, length in ((tubes.outermost, outer), (tubes.inner, inner))
     ]
     strains = [factors[1] * tubes.inner.precurvature_per_mm * tubes.inner.outer_diameter_mm / 2]
     in_overlap = [k for k, end in zip(bend.per_mm, bend.edges_mm[1:], strict=True) if end <= outer]
-    strains += [factors[0] * k * tubes.outer.outer_diameter_mm / 2 for k in in_overlap]
+    strains += [factors[0] * k * tubes.outermost.outer_diameter_mm / 2 for k in in_overlap]
     found.at_most("tube.strain", max(strains), tubes.max_strain, "", "largest strain of the tube material")
 
 
@@ -137,7 +139,7 @@ def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:
     device, frames = plan.system.tubes, curve.frames[: way_out.frame + 1, None, :3]
     radius = 0.5 * np.where(
         curve.arc_mm[: way_out.frame + 1] <= plan.tube.outer_insertion_mm,
-        device.outer.outer_diameter_mm,
+        device.outermost.outer_diameter_mm,
         device.inner.outer_diameter_mm,
     )
     across = np.cos(phi)[:, None] * frames[..., 0] + np.sin(phi)[:, None] * frames[..., 1]
@@ -155,7 +157,7 @@ def _check_clearance(
     tubes = plan.system.tubes
     radius = np.where(
         curve.arc_mm[:-1] < plan.tube.outer_insertion_mm,
-        0.5 * tubes.outer.outer_diameter_mm,
+        0.5 * tubes.outermost.outer_diameter_mm,
         0.5 * tubes.inner.outer_diameter_mm,
     )
     needed = radius + margin + curve.sagitta_mm

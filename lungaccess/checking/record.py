@@ -109,7 +109,7 @@ def _check_required(plan: Plan, found: Findings) -> None:
     tubes, margin = plan.system.tubes, plan.system.margins
     extra = margin.segmentation_margin_mm + margin.registration_margin_mm
     wanted = {
-        "outer_tube": 0.5 * tubes.outer.outer_diameter_mm + extra,
+        "outer_tube": 0.5 * tubes.outermost.outer_diameter_mm + extra,
         "inner_tube": 0.5 * tubes.inner.outer_diameter_mm + extra,
         "needle": 0.5 * plan.system.needle.diameter_mm + extra,
     }

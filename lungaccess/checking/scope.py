@@ -21,8 +21,10 @@ from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.problem.system import System
 from stages.scope.device import Bronchoscope
 
-START_MM = 10.0
-"""A motion begins at most so far from the root of the airway tree: within the first stretch of a trachea."""
+START_MM = 30.0
+"""A motion begins at most so far from the root of the airway tree: a trachea is about 100 mm long."""
+AXIS_TOLERANCE_MM = 0.01
+"""Entries are points of the airway tree, so that only rounding lies between them."""
 MAX_ANGLE_RAD = np.deg2rad(45.0)
 """A scope looks along the airway, within so much: more means sideways."""
 MAX_OFF_AXIS_MM = 3.0
@@ -88,12 +90,14 @@ def _check_limits(motion: Motion, system: System, found: Findings) -> None:
 
 
 def _check_start(motion: Motion, environment: Environment, found: Findings) -> None:
-    """The motion begins in the trachea, near the root of the airway tree, and looks down it."""
+    """The motion begins on the axis of the trachea, near its beginning, and looks down it."""
     tree, entry = environment.lung.tree, motion.bases[0]
     nearest = int(environment.nearest_tree_points(entry[:3, 3], 1)[0])
     found.true("scope.start.trachea", tree.branch_of_point[nearest] == 0, "branch at the entry")
-    gap = float(np.linalg.norm(entry[:3, 3] - tree.points_lps[0]))
-    found.at_most("scope.start", gap, START_MM, "mm", "entry to the root of the airway tree")
+    gap = float(np.linalg.norm(entry[:3, 3] - tree.points_lps[nearest]))
+    found.at_most("scope.start", gap, AXIS_TOLERANCE_MM, "mm", "entry to the axis of the trachea")
+    depth = float(tree.distance_from_root_mm[nearest])
+    found.at_most("scope.start.depth", depth, START_MM, "mm", "root of the airway tree to the entry")
     tilt = float(angle_between(entry[:3, 2], tree.tangents[nearest]))
     found.at_most("scope.start.direction", tilt, float(MAX_ANGLE_RAD), "rad", "entry to the trachea")
 
@@ -118,7 +122,8 @@ def _check_fit(
     found.at_most(
         "scope.margin", stated - gap, 0.0, "mm", "stated beyond recomputed margin", MARGIN_TOLERANCE_MM
     )
-    found.at_least("scope.margin.limit", scope.min_lumen_margin_mm, device.lumen_margin_mm, "mm")
+    detail = "stated margin between scope and wall"
+    found.at_least("scope.margin.limit", scope.min_lumen_margin_mm, device.lumen_margin_mm, "mm", detail)
 
 
 def _check_end(motion: Motion, environment: Environment, found: Findings) -> None:

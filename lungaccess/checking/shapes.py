@@ -141,8 +141,10 @@ def bend_of(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> Bend:
     stiffness.  The outer tube never bends alone.
     """
     inner, outer = tubes.inner, tubes.outer
+    stiffness_outer = 0.0
     stiffness_inner = inner.youngs_modulus_gpa * (inner.outer_diameter_mm**4 - inner.inner_diameter_mm**4)
-    stiffness_outer = outer.youngs_modulus_gpa * (outer.outer_diameter_mm**4 - outer.inner_diameter_mm**4)
+    if outer is not None:
+        stiffness_outer = outer.youngs_modulus_gpa * (outer.outer_diameter_mm**4 - outer.inner_diameter_mm**4)
     share = stiffness_inner / (stiffness_inner + stiffness_outer)
     curved_from = max(0.0, inner_mm - inner.curved_length_mm)
     edges = sorted({0.0, min(curved_from, inner_mm), outer_mm, inner_mm})

@@ -85,9 +85,8 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
         ),
         (
             "tubes",
-            f"turn to {np.degrees(tube.rotation_rad):.1f}°, outer tube {tube.outer_insertion_mm:.1f} mm, "
-            f"inner tube {tube.inner_insertion_mm:.1f} mm beyond the scope; through the wall of branch "
-            f"{tube.exit.branch}",
+            f"turn to {np.degrees(tube.rotation_rad):.1f}°, {plan.insertions} beyond the scope; "
+            f"through the wall of branch {tube.exit.branch}",
         ),
         (
             "needle",

@@ -32,6 +32,6 @@ def tube_stability(atlas: Atlas) -> Float:
     insertions, which = np.unique(
         np.stack([entries.inner_mm, entries.outer_mm], axis=1), axis=0, return_inverse=True
     )
-    rear_ends = insertions - np.array([tubes.inner.length_mm, tubes.outer.length_mm])
-    solved = TubeMechanics((tubes.inner, tubes.outer)).batch(np.zeros_like(rear_ends), rear_ends)
+    rear_ends = insertions[:, : len(tubes.nested)] - np.array([tube.length_mm for tube in tubes.nested])
+    solved = TubeMechanics(tubes.nested).batch(np.zeros_like(rear_ends), rear_ends)
     return np.asarray(np.where(solved.converged, solved.least_determinant, -np.inf)[which.ravel()])

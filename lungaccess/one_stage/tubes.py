@@ -267,5 +267,5 @@ def tubes_record(answer: TubeAnswer) -> dict[str, Any]:
 def tubes_of(device: System | BareTubes) -> tuple[Tube, ...]:
     """Return the tubes, the innermost first."""
     if isinstance(device, System):
-        return device.tubes.inner, device.tubes.outer
+        return device.tubes.nested
     return device.tubes

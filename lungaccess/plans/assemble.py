@@ -61,7 +61,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
             needle_length_mm=system.needle.exit_exemption_mm,
         ),
         required_clearance_mm={
-            "outer_tube": system.tubes.outer.radius_mm + margin,
+            "outer_tube": system.tubes.outermost.radius_mm + margin,
             "inner_tube": system.tubes.inner.radius_mm + margin,
             "needle": system.needle.radius_mm + margin,
         },
@@ -101,7 +101,7 @@ def tube_part(task: Task, lps_from_scope_tip: Float, deployment: Deployment) -> 
     """Return the part of a plan that a deployment from a scope tip makes."""
     return TubeDeployment(
         rotation_rad=deployment.rotation_rad,
-        outer_insertion_mm=deployment.outer_mm,
+        outer_insertion_mm=0.0 if task.system.tubes.outer is None else deployment.outer_mm,
         inner_insertion_mm=deployment.inner_mm,
         lps_from_tip=deployment.lps_from_tip,
         exit=WallExit(

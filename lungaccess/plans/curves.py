@@ -88,7 +88,7 @@ def device_curves(
         tubes=DeviceCurve(
             name="tubes",
             lps_from_device=tube_poses,
-            radius_mm=np.where(in_outer, tubes.outer.radius_mm, tubes.inner.radius_mm),
+            radius_mm=np.where(in_outer, tubes.outermost.radius_mm, tubes.inner.radius_mm),
             arc_length_mm=tube_mm,
             colour=(1.0, 0.5, 0.05),
         ),

@@ -97,6 +97,15 @@ class Plan(Record):
         heading = f"Plan for {self.patient_name}, {self.system.name}"
         return plan_html(heading, self.figures(), self.curves(), self.tube.exit.point_lps, self.target_lps)
 
+    @property
+    def insertions(self) -> str:
+        """How far each tube goes beyond the tip of the scope, in words."""
+        tube = self.tube
+        inner = f"{tube.inner_insertion_mm:.1f} mm"
+        if self.system.tubes.outer is None:
+            return f"tube {inner}"
+        return f"outer tube {tube.outer_insertion_mm:.1f} mm, inner tube {inner}"
+
     def figures(self) -> list[tuple[str, str]]:
         """Return what the plan says of devices, distances and costs, as names and values with units."""
         tube, needle = self.tube, self.needle
@@ -108,11 +117,7 @@ class Plan(Record):
                 f"{self.scope.length_from_carina_mm:.1f} mm beyond the carina, to generation "
                 f"{self.scope.generation}",
             ),
-            (
-                "tubes",
-                f"turn to {np.degrees(tube.rotation_rad):.1f}°, outer {tube.outer_insertion_mm:.1f} mm, "
-                f"inner {tube.inner_insertion_mm:.1f} mm",
-            ),
+            ("tubes", f"turn to {np.degrees(tube.rotation_rad):.1f}°, {self.insertions}"),
             (
                 "exit",
                 f"branch {tube.exit.branch}, at {np.degrees(tube.exit.wall_angle_rad):.0f}° to the wall",

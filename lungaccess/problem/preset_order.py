@@ -51,7 +51,7 @@ def invasiveness(system: System) -> Invasiveness:
     """
     return Invasiveness(
         fissures_allowed=system.fissures_allowed,
-        hole_mm2=_area_mm2(system.tubes.outer.outer_diameter_mm),
+        hole_mm2=_area_mm2(system.tubes.outermost.outer_diameter_mm),
         needle_mm2=_area_mm2(system.needle.diameter_mm),
         scope_diameter_mm=float(system.scope.outer_diameter_mm),
         needle_curvature_per_mm=float(system.needle.max_curvature_per_mm),

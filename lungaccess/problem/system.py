@@ -37,7 +37,7 @@ class System:
     sources : tuple of str
         Where the numbers come from; what has no source says "assumption".
     tubes : ConcentricTubes
-        The outer tube runs in the channel of the scope.
+        The outer tube, or the only one, runs in the channel of the scope.
     needle : Needle
         Runs inside the inner tube.
     margins : Margins, optional
@@ -61,10 +61,11 @@ class System:
     fissures_allowed: Annotated[bool, switch("whether a fissure may be crossed")] = False
 
     def __post_init__(self) -> None:
-        outer, channel = self.tubes.outer.outer_diameter_mm, self.scope.channel_diameter_mm
+        outer, channel = self.tubes.outermost.outer_diameter_mm, self.scope.channel_diameter_mm
+        name = "inner" if self.tubes.outer is None else "outer"
         if outer >= channel:
             raise impossible(
-                "tubes.outer.outer_diameter_mm", outer, f"less than scope.channel_diameter_mm = {channel:g}"
+                f"tubes.{name}.outer_diameter_mm", outer, f"less than scope.channel_diameter_mm = {channel:g}"
             )
         bore = self.tubes.inner.inner_diameter_mm
         if self.needle.diameter_mm >= bore:

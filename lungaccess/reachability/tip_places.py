@@ -11,7 +11,7 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Array, Float, Int, Mask
 from lungaccess.reachability.kernels.blocked import deep_enough
-from stages.scope import LEAVING_MM, MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD
+from stages.scope import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD
 
 PARTS = 3
 """A voxel has so many parts to a side, so that narrow airways hold few places besides those of tips."""
@@ -21,8 +21,6 @@ NOWHERE = -4.0
 """An angle (rad) so far below 0 that no direction of any box lies within it."""
 SPARE_RAD = 1e-6
 """More than the rounding of any angle here, so that no direction is lost by it."""
-NEIGHBOURS_MM = 3.0
-"""More than two points of the tree are apart."""
 
 
 @frozen_record
@@ -116,7 +114,8 @@ def place_pieces(lung: Lung, centres: Float, leaving: Mask, reach_mm: float) -> 
 def _piece(tree: AirwayTree, points: Int, centres: Float, half_mm: float) -> PlacePiece:
     from scipy.spatial import cKDTree
 
-    own = np.array([np.append(tree.points_lps[p], _cone(tree, int(p))) for p in points])
+    turns = np.full((len(points), 1), MAX_TURN_AT_TIP_RAD + SPARE_RAD)
+    own = np.hstack([tree.points_lps[points], tree.tangents[points], turns])
     axis = _unit(own[:, 3:6].sum(axis=0))
     frame = frames.pose(own[0, :3], axis)[:3, :3].T
     seen = centres @ frame.T
@@ -130,32 +129,6 @@ def _piece(tree: AirwayTree, points: Int, centres: Float, half_mm: float) -> Pla
         places=np.stack([seen.min(axis=0) - half_mm, seen.max(axis=0) + half_mm]),
         wide=float((from_axis + own[:, 6]).max()) + SPARE_RAD,
     )
-
-
-def _cone(tree: AirwayTree, point: int) -> Float:
-    """Return where the airway leads at a tree point, and the greatest angle of a tip from there.
-
-    A tip on the axis may also be turned from the chord between where the scope leaves the axis and its
-    place; see `stages.scope.tips`.
-    """
-    along, inserted_mm = tree.tangents[point], tree.distance_from_root_mm
-    before_mm = float(inserted_mm[point]) - LEAVING_MM
-    chords: list[Float] = []
-    for place in (point, *_neighbours(tree, point)):
-        left = place
-        while tree.parent_point[left] >= 0 and inserted_mm[left] > before_mm - NEIGHBOURS_MM:
-            left = int(tree.parent_point[left])
-            if inserted_mm[left] < before_mm + NEIGHBOURS_MM or tree.parent_point[left] < 0:
-                chords.append(tree.points_lps[place] - tree.points_lps[left])
-    seen = [float(_unit(chord) @ along) for chord in chords if np.any(chord)]
-    farthest = float(np.arccos(np.clip(seen, -1.0, 1.0)).max(initial=0.0))
-    return np.append(along, farthest + MAX_TURN_AT_TIP_RAD + SPARE_RAD)
-
-
-def _neighbours(tree: AirwayTree, point: int) -> list[int]:
-    children = np.flatnonzero(tree.parent_point == point)
-    parent = tree.parent_point[point]
-    return [int(p) for p in (*children, parent) if p >= 0]
 
 
 def _unit(vector: Float) -> Float:

@@ -200,7 +200,7 @@ class Problem:
             "inner_curvature_per_mm": constants[index.INNER_CURVATURE],
             "curved_length_mm": constants[index.CURVED_LENGTH],
             "straight_out": float(self._straight_out),
-            "outer_radius_step_mm": tubes.outer.radius_mm - tubes.inner.radius_mm,
+            "outer_radius_step_mm": tubes.outermost.radius_mm - tubes.inner.radius_mm,
             "exempt_mm": self._exempt_mm,
             "weigh_clear": clear,
             "weigh_length": length,

@@ -52,14 +52,16 @@ def _fissures(plan: Plan) -> str:
 
 def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
     scope, tube, needle = plan.scope, plan.tube, plan.needle
-    insertions_mm = f"{tube.outer_insertion_mm:.1f} / {tube.inner_insertion_mm:.1f} mm"
+    names, insertions = "outer / inner", f"{tube.outer_insertion_mm:.1f} / {tube.inner_insertion_mm:.1f} mm"
+    if plan.system.tubes.outer is None:
+        names, insertions = "length", f"{tube.inner_insertion_mm:.1f} mm"
     scope_rows = [
         ("airway generation at the tip", f"{scope.generation}"),
         ("advance beyond the carina", f"{scope.length_from_carina_mm:.1f} mm"),
     ]
     tube_rows = [
         ("rotation", f"{np.degrees(tube.rotation_rad):.1f}°"),
-        ("outer / inner beyond scope", insertions_mm),
+        (f"{names} beyond scope", insertions),
         ("pierced branch", f"{tube.exit.branch}"),
     ]
     needle_rows = [

@@ -84,7 +84,7 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     tube_uv, needle_uv = view.project(tube.points_lps), view.project(needle.points_lps)
     outer = tube_uv[tube.arc_length_mm <= plan.tube.outer_insertion_mm + SHORTEST_MM]
     drawing.ribbon(axes, scope, system.scope.radius_mm, style.SCOPE, fill=0.35, order=6)
-    drawing.ribbon(axes, outer, system.tubes.outer.radius_mm, style.TUBE, fill=0.45, order=7)
+    drawing.ribbon(axes, outer, system.tubes.outermost.radius_mm, style.TUBE, fill=0.45, order=7)
     drawing.ribbon(axes, tube_uv, system.tubes.inner.radius_mm, style.TUBE, fill=0.9, order=8)
     drawing.ribbon(axes, needle_uv, system.needle.radius_mm, style.NEEDLE, fill=0.9, order=9)
     required = plan.required_clearance_mm

@@ -1,4 +1,4 @@
-"""The bronchoscope: the device, its sites and its tip poses; see also `advisor`, `route` and `tour`."""
+"""The bronchoscope: the device and its motions; see also `advisor`, `route` and `tour`."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
     from stages.scope.passages import Passages, find_passages
     from stages.scope.shifting import TipRow, evenly, shifted
-    from stages.scope.sites import find_sites
     from stages.scope.tip_region import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD, in_tip_region
-    from stages.scope.tips import LEAVING_MM
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

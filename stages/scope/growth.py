@@ -87,13 +87,13 @@ class Growth:
 
     Parameters
     ----------
-    passable : (N,) bool
-        Tree points that the scope can pass; routes end at the last of them.
+    tried : (N,) bool
+        Tree points that the scope might get to; routes end at the last of them.
     """
 
-    def __init__(self, walls: Walls, tree: AirwayTree, passable: Bool, device: Device) -> None:
+    def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, device: Device) -> None:
         self._walls, self._tree, self._device = walls, tree, device
-        self._passable = passable
+        self._tried = tried
         self._offsets = rings(RINGS_PER_MM, SPOKES)
         self._rows: list[Float] = []
         self._parents: list[Int] = []
@@ -107,7 +107,7 @@ class Growth:
         """Grow along all branches, parents first."""
         for branch in range(self._tree.n_branches):
             points = self._tree.branch_points(branch)
-            points = points[self._passable[points]]
+            points = points[self._tried[points]]
             if len(points):
                 self._grow_branch(branch, self._tree.route(int(points[-1])))
         return self._result()

@@ -15,7 +15,6 @@ from stages.scope.kernels.body import MOST_TWIST_RAD, motion_room
 from stages.scope.kernels.shifting import shifted_tips
 from stages.scope.lumen_walls import kernel_device, walls_of
 from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
-from stages.scope.passages import find_passages
 from stages.scope.shifting import TipRow, as_shifts
 from stages.scope.tip_region import in_tip_region
 
@@ -50,7 +49,6 @@ class MotionProver:
     def __init__(self, lung: Lung, scope: Bronchoscope) -> None:
         self._scope, self._walls = scope, walls_of(lung)
         self._device, self._tree = kernel_device(scope, math.inf), lung.tree
-        self._passable = find_passages(lung, scope, reach_mm=0.0).passable
 
     def prove(self, motion: ScopeMotion) -> float | str:
         """Prove a motion: return its margin in mm, or say in words why there is no proof.
@@ -81,8 +79,7 @@ class MotionProver:
     def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> TipRow:
         """Return tips along the motion to one of them, and which of them may be tips of a plan.
 
-        Those have a proved motion, lie in the region of scope tips, and near a tree point that the scope
-        passes, as all tips of `find_motions` do.
+        Those have a proved motion and lie in the region of scope tips, as all tips of `find_motions` do.
 
         Parameters
         ----------
@@ -94,8 +91,8 @@ class MotionProver:
         shifts = as_shifts(shifts_mm)
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
         shifted_tips(self._walls, self._device, _entry(motion), motion.states, shifts, tips, rooms)
-        nearest, inside = in_tip_region(self._tree, tips)
-        proved = (rooms >= 0.0) & inside & self._passable[nearest]
+        _nearest, inside = in_tip_region(self._tree, tips)
+        proved = (rooms >= 0.0) & inside
         return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=proved | (shifts == 0.0))
 
 

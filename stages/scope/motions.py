@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
+from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
@@ -31,6 +32,8 @@ POLAR_RAD = math.radians(15.0)
 AZIMUTHS = 8
 SIDES = 3
 """And by whether they lie on the axis, or beside it before or behind the direction they are turned to."""
+BESIDE_AXIS_MM = 0.5
+"""The lumen may be wider by so much, half a voxel or more, beside the axis than on it."""
 TRIES = 12
 """So many of a kind are tried before a kind is given up: most are refused for the same wall."""
 OFF_AXIS_MM = 1.0
@@ -182,12 +185,20 @@ def find_motions(
     """
     passages = find_passages(lung, scope, reach_mm=reach_mm)
     walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)
-    states = Growth(walls, lung.tree, passages.passable, device).grow()
+    states = Growth(walls, lung.tree, _worth_a_try(lung.tree, device.radius), device).grow()
     found = _Tips(lung, passages, states, device, spacing_mm)
     least, most = tip_bends_rad or scope.bends_rad
     found.turn(device._replace(least_bend=least, most_bend=most), max_curvature_per_mm)
     kept, rooms = found.prove(walls)
     return found.motions(kept, rooms)
+
+
+def _worth_a_try(tree: AirwayTree, radius_mm: float) -> Bool:
+    """Tell which tree points are not too narrow on the way to them, nor would be a little beside the axis."""
+    wide = tree.radius_mm >= radius_mm - BESIDE_AXIS_MM
+    for point in range(1, tree.n_points):
+        wide[point] &= wide[tree.parent_point[point]]
+    return wide
 
 
 class _Tips:
@@ -209,7 +220,7 @@ class _Tips:
         source = np.repeat(self._states.turned_from, len(offsets))
         possible = np.flatnonzero(np.isfinite(candidates[:, 9]))
         nearest, inside = in_tip_region(tree, candidates[possible])
-        inside &= self._passages.exits_ahead[nearest] & self._passages.passable[nearest]
+        inside &= self._passages.exits_ahead[nearest]
         self._source, self._tips, self._near = (
             source[possible[inside]], candidates[possible[inside]], nearest[inside],
         )  # fmt: skip

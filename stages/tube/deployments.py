@@ -110,12 +110,17 @@ def enumerate_deployments(
         Told the share of sites done.
     """
     tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 9)
+    rotations = rotations if tubes.inner.bends else 1
     coarse: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
     angles = np.concatenate([coarse, coarse + math.pi / rotations])
     stops = insertion_stops(tubes, stop_spacing_mm)
     environment = tube_environment(lung, with_fissures=with_fissures)
     constants = tube_constants(tubes, margins)
     most = len(stops) * (len(stops) + 1) // 2
+    if tubes.outer is None:
+        # One tube has the same shape wherever an outer one would end: only its own end is looked at.
+        constants[kernels.MAX_PROTRUSION] = 0.0
+        most = len(stops)
     done = 0
 
     def one_site(site: int) -> tuple[Float, Int, int]:
@@ -138,6 +143,8 @@ def enumerate_deployments(
         between = _between_unlike(found, rotations, stops)
         if len(between):
             found = np.concatenate([found, rows_of(rotations + between)])
+        if tubes.outer is None:
+            refused[kernels.PROTRUDES] = 0
         done += 1
         if progress and done % 50 == 0:
             progress(done / len(tips))

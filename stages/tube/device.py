@@ -187,8 +187,9 @@ class TubeArcs(NamedTuple):
 
 @settings
 class ConcentricTubes:
-    """A straight outer tube and a precurved inner tube, and the limits of their deployment.
+    """A straight outer tube and a precurved inner tube, or one tube, and the limits of their deployment.
 
+    Without an outer tube the inner one is alone, for instance as a straight stylet through the wall.
     The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
     perpendicular; the extension counts along the tubes.  In the worst case the working channel bends the tube
     that it holds against its precurvature.  Where no largest curvature of the channel is stated, it is what
@@ -197,11 +198,11 @@ class ConcentricTubes:
     Raises
     ------
     SettingsError
-        If a value is not finite or absurd, the tubes do not nest, the outer tube is curved, or a tube held
+        If a value is not finite or absurd, the tubes do not nest, an outer tube is curved, or a tube held
         straight exceeds `max_strain`.
     """
 
-    outer: Tube
+    outer: Tube | None = None
     inner: Tube
     max_lateral_sweep_mm: Annotated[
         float, quantity("largest sideways motion of the tubes in tissue", at_least=0.0, at_most=20.0)
@@ -227,7 +228,7 @@ class ConcentricTubes:
 
     def __post_init__(self) -> None:
         self._check_nesting()
-        if self.outer.bends:
+        if self.outer is not None and self.outer.bends:
             raise impossible(
                 "outer.precurvature_per_mm",
                 self.outer.max_precurvature_per_mm,
@@ -241,7 +242,7 @@ class ConcentricTubes:
         self._check_slots()
 
     def _check_strain(self) -> None:
-        for name, tube in (("outer", self.outer), ("inner", self.inner)):
+        for name, tube in self._named:
             if tube.rest_strain > self.max_strain:
                 most = self.max_strain / tube.radius_mm
                 raise impossible(
@@ -250,7 +251,7 @@ class ConcentricTubes:
                     f"at most 2 max_strain / outer_diameter_mm = {most:.6g} without slots: held straight its "
                     f"strain is {tube.rest_strain:.4g}, max_strain is {self.max_strain:g}",
                 )
-        for name, tube in (("outer", self.outer), ("inner", self.inner)):
+        for name, tube in self._named:
             most = tube.most_bent_per_mm(self.max_strain, self.passing_mm)
             if (self.max_channel_curvature_per_mm or 0.0) > most * (1.0 + ROUNDING) + ROUNDING:
                 raise impossible(
@@ -263,7 +264,7 @@ class ConcentricTubes:
     def _check_slots(self) -> None:
         """Where tubes are deployed their stiffness changes nowhere, and slots change that of both alike."""
         other = float(self.inner.parts.stiffness_n_mm2[0] / self.inner.bending_stiffness_n_mm2)
-        for name, tube in (("outer", self.outer), ("inner", self.inner)):
+        for name, tube in self._named:
             parts = tube.parts
             deployed = parts.stiffness_n_mm2[parts.begin_mm < self.max_extension_mm]
             share = deployed / tube.bending_stiffness_n_mm2
@@ -286,11 +287,17 @@ class ConcentricTubes:
         """Largest curvature of channel that the tubes may pass, 1/mm: as stated, or what strain allows."""
         if self.max_channel_curvature_per_mm is not None:
             return self.max_channel_curvature_per_mm
-        return min(
-            tube.most_bent_per_mm(self.max_strain, self.passing_mm) for tube in (self.outer, self.inner)
-        )
+        return min(tube.most_bent_per_mm(self.max_strain, self.passing_mm) for tube in self.nested)
 
     def _check_nesting(self) -> None:
+        if self.max_extension_mm > self.inner.length_mm:
+            raise impossible(
+                "max_extension_mm",
+                self.max_extension_mm,
+                f"at most inner.length_mm = {self.inner.length_mm:g}",
+            )
+        if self.outer is None:
+            return
         clearance = self.outer.inner_diameter_mm - self.inner.outer_diameter_mm
         if clearance <= 0.0 or clearance < self.min_clearance_mm - 1e-9:
             raise impossible(
@@ -305,17 +312,27 @@ class ConcentricTubes:
                 self.inner.length_mm,
                 f"at least outer.length_mm = {self.outer.length_mm:g}",
             )
-        if self.max_extension_mm > self.inner.length_mm:
-            raise impossible(
-                "max_extension_mm",
-                self.max_extension_mm,
-                f"at most inner.length_mm = {self.inner.length_mm:g}",
-            )
+
+    @property
+    def nested(self) -> tuple[Tube, ...]:
+        """The tubes, the innermost first."""
+        return (self.inner,) if self.outer is None else (self.inner, self.outer)
+
+    @property
+    def _named(self) -> tuple[tuple[str, Tube], ...]:
+        """The tubes with their names in a device file, the outermost first."""
+        inner = ("inner", self.inner)
+        return (inner,) if self.outer is None else (("outer", self.outer), inner)
+
+    @property
+    def outermost(self) -> Tube:
+        """The tube that lies in the channel of the scope."""
+        return self.nested[-1]
 
     @property
     def max_inner_protrusion_mm(self) -> float:
         """Length of inner tube that can be ahead of the outer one, mm, the rear ends being in order."""
-        return self.inner.length_mm - self.outer.length_mm
+        return self.inner.length_mm - (0.0 if self.outer is None else self.outer.length_mm)
 
     @property
     def overlap_curvature_per_mm(self) -> float:
@@ -323,8 +340,9 @@ class ConcentricTubes:
 
         The two share the precurvature in proportion to their bending stiffness [Rucker2010].
         """
-        inner, outer = self.inner.bending_stiffness_n_mm2, self.outer.bending_stiffness_n_mm2
-        return self.inner.precurvature_per_mm * (inner / (inner + outer))
+        stiffness = sum(tube.bending_stiffness_n_mm2 for tube in reversed(self.nested[1:]))
+        inner = self.inner.bending_stiffness_n_mm2
+        return self.inner.precurvature_per_mm * (inner / (inner + stiffness))
 
     def arcs(self, outer_mm: ArrayLike, inner_mm: ArrayLike) -> TubeArcs:
         """Return the arcs for insertions `(N,)` in mm, 0 <= outer <= inner [Kuntz2015, sec. IV-B]."""
@@ -335,5 +353,5 @@ class ConcentricTubes:
         return TubeArcs(
             length_mm=np.diff(ends, axis=1, prepend=0.0),
             curvature_per_mm=np.array([0.0, bent[0], 0.0, bent[1]]),
-            radius_mm=np.array([self.outer.radius_mm] * 2 + [self.inner.radius_mm] * 2),
+            radius_mm=np.array([self.outermost.radius_mm] * 2 + [self.inner.radius_mm] * 2),
         )

@@ -40,7 +40,7 @@ def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
 def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
     """Return the `(N_TUBES,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad."""
     constants = np.zeros(kernels.N_TUBES)
-    inner, outer = tubes.inner, tubes.outer
+    inner, outer = tubes.inner, tubes.outermost
     constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
     constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
     constants[kernels.CURVED_LENGTH] = inner.curved_length_mm

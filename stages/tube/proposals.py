@@ -195,9 +195,16 @@ def propose_designs(
     Raises
     ------
     SettingsError
-        If the insertions are impossible, the sweep is not finite, or no outer tube fits into the channel.
+        If there is one tube, the insertions are impossible, the sweep is not finite, or no outer tube fits
+        into the channel.
     """
-    together((tubes.inner, tubes.outer), 0.0, (inner_mm, outer_mm))
+    if tubes.outer is None:
+        raise SettingsError(
+            "The design has one tube",
+            expected="an outer and an inner tube, whose sizes are varied",
+            remedy="Add [tubes.outer] to the device file",
+        )
+    together(tubes.nested, 0.0, (inner_mm, outer_mm))
     if inner_mm == 0.0:
         raise SettingsError("The inner tube stays in the scope", expected="an insertion above 0")
     if not 0.0 <= max_sweep_mm < math.inf:
@@ -233,7 +240,7 @@ def _design(
 ) -> ConcentricTubes:
     return replace(
         tubes,
-        outer=replace(tubes.outer, inner_diameter_mm=bore_mm, outer_diameter_mm=bore_mm + 2.0 * wall_mm),
+        outer=replace(tubes.outermost, inner_diameter_mm=bore_mm, outer_diameter_mm=bore_mm + 2.0 * wall_mm),
         inner=replace(
             tubes.inner, curved_length_mm=curve_mm, precurvature_per_mm=curvature_per_mm, bent_pieces=()
         ),

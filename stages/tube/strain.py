@@ -29,7 +29,7 @@ def channel_curvature_limit(tubes: ConcentricTubes, behind_tip_mm: ArrayLike) ->
         [
             min(
                 tube.most_bent_per_mm(tubes.max_strain, tubes.max_extension_mm + behind)
-                for tube in (tubes.outer, tubes.inner)
+                for tube in tubes.nested
             )
             for behind in np.asarray(behind_tip_mm, dtype=np.float64).ravel().tolist()
         ]
@@ -39,6 +39,7 @@ def channel_curvature_limit(tubes: ConcentricTubes, behind_tip_mm: ArrayLike) ->
 def transit_strain(tubes: ConcentricTubes, channel_pieces: ArrayLike, insertions_mm: ArrayLike) -> Float:
     """Return the largest strain of outer and inner tube on their way to their place, (2,) float64.
 
+    That of a tube which the device lacks is 0.
     It counts the channel, the straight part of it and of the outer tube, and where both are bent beyond it.
 
     Parameters
@@ -54,6 +55,8 @@ def transit_strain(tubes: ConcentricTubes, channel_pieces: ArrayLike, insertions
     bent = np.append(np.abs(pieces[:, 2]), tubes.overlap_curvature_per_mm)
     out = np.zeros(2)
     for n, tube in enumerate((tubes.outer, tubes.inner)):
+        if tube is None:
+            continue
         parts = tube.parts
         inserted = float(np.asarray(insertions_mm, dtype=np.float64)[n])
         passes = parts.begin_mm <= inserted + far[:, None]
@@ -83,6 +86,8 @@ def straightening(
     for tube, inserted in zip(
         (tubes.outer, tubes.inner), np.asarray(insertions_mm, dtype=np.float64), strict=True
     ):
+        if tube is None:
+            continue
         parts = tube.parts
         inside = (parts.end_mm > inserted) & (parts.begin_mm < inserted + bending_length_mm)
         total += float(parts.stiffness_n_mm2[inside].max(initial=0.0))

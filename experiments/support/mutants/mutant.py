@@ -71,7 +71,7 @@ def with_system(plan: Plan, system: System) -> Plan:
         system=system,
         system_fingerprint=system_fingerprint(system),
         required_clearance_mm={
-            "outer_tube": system.tubes.outer.radius_mm + margin,
+            "outer_tube": system.tubes.outermost.radius_mm + margin,
             "inner_tube": system.tubes.inner.radius_mm + margin,
             "needle": system.needle.radius_mm + margin,
         },

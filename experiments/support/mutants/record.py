@@ -31,6 +31,8 @@ def device_edited(case: Case, rng: Rng) -> Mutant | None:
     values: Any = to_mapping(case.plan.system)
     for key in part.split("."):
         values = values[key]
+    if values is None:
+        return None
     names = [k for k, v in values.items() if isinstance(v, float) and v > 0.0]
     name = str(rng.choice(names))
     try:

@@ -17,8 +17,8 @@ from lungaccess.plans.insertion import scope_motion
 
 SEEN_MM, SEEN_RAD = 2e-3, 2e-4
 """Poses that differ by more are told apart."""
-ENTRY_MM = 10.1
-"""A motion that begins so far from the root of the tree leaves out a part of the way."""
+ON_AXIS_MM = 0.02
+"""A motion may begin on the axis of the trachea."""
 FORWARD = np.array([0.0, 0.0, 1.0])
 
 
@@ -131,7 +131,7 @@ def begins_deep_in_the_airway(case: Case, rng: Rng) -> Mutant | None:
     gone = float(scope.states[n, 0])
     twist, bend = scope.states[n, 1:]
     base = before.lps_from_tip @ np.linalg.inv(_section(twist, bend, motion.bending_length_mm))
-    if np.linalg.norm(base[:3, 3] - case.lung.tree.points_lps[0]) < ENTRY_MM:
+    if np.linalg.norm(case.lung.tree.points_lps - base[:3, 3], axis=1).min() < ON_AXIS_MM:
         return None
     edits: dict[str, Any] = {
         "scope__lps_from_entry": base,

@@ -84,7 +84,7 @@ def _preset_table(systems: Mapping[str, System]) -> Table:
         (
             name,
             f"{system.scope.outer_diameter_mm:g}",
-            f"{system.tubes.outer.outer_diameter_mm:g} / {system.tubes.inner.outer_diameter_mm:g}",
+            " / ".join(f"{tube.outer_diameter_mm:g}" for tube in reversed(system.tubes.nested)),
             f"{system.needle.diameter_mm:g}",
             f"{1.0 / system.needle.max_curvature_per_mm:.0f}",
             system.description,

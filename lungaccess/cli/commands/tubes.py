@@ -162,7 +162,7 @@ def _design_table(present: DesignProposal, choices: tuple[DesignProposal, ...]) 
             f"{math.degrees(each.tip_angle_rad):.1f}",
             f"{each.tubes.inner.curved_length_mm:.1f}",
             f"{each.tubes.inner.precurvature_per_mm:.4f}",
-            f"{0.5 * (each.tubes.outer.outer_diameter_mm - each.tubes.outer.inner_diameter_mm):.3f}",
+            f"{0.5 * (each.tubes.outermost.outer_diameter_mm - each.tubes.outermost.inner_diameter_mm):.3f}",
         )
         for name, each in [("present", present), *(("proposal", choice) for choice in choices)]
     ]

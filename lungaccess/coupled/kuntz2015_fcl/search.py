@@ -179,7 +179,7 @@ def obstacles_for(task: Task) -> Obstacles:
     """Return the solids that a task's tubes and needle may touch."""
     system = task.system
     reach = system.tubes.max_extension_mm + system.needle.exit_exemption_mm
-    widest = max(system.tubes.outer.radius_mm, system.needle.radius_mm)
+    widest = max(system.tubes.outermost.radius_mm, system.needle.radius_mm)
     return Obstacles(
         task.lung, with_fissures=task.with_fissures, reach_mm=reach + widest + system.margins.total_mm
     )

@@ -117,7 +117,7 @@ class TubeValidator:
         run, at = 0.0, exit_mm
         while at < shape.length_mm:
             in_outer = at < outer_mm
-            radius = tubes.outer.radius_mm if in_outer else tubes.inner.radius_mm
+            radius = tubes.outermost.radius_mm if in_outer else tubes.inner.radius_mm
             end = outer_mm if in_outer else shape.length_mm
             beyond = self._obstacles.airways.distance_mm(frame_at(shape, at)[:3, 3]) - radius
             step = min(max(abs(beyond), kernels.RUN_STEP_MM), end - at)
@@ -129,7 +129,7 @@ class TubeValidator:
         """Return the arc length from which on the tube is never clear of the wall, up to its exit."""
         tubes = self._system.tubes
         for n in range(len(points) - 1, 0, -SAMPLES_PER_CONTACT):
-            radius = tubes.outer.radius_mm if at_mm[n] <= outer_mm else tubes.inner.radius_mm
+            radius = tubes.outermost.radius_mm if at_mm[n] <= outer_mm else tubes.inner.radius_mm
             if self._obstacles.lumen.depth_mm(points[n]) >= radius:
                 return float(at_mm[n])
         return 0.0
@@ -138,7 +138,7 @@ class TubeValidator:
         """Return what the tubes touch from their contact with the wall on, or an empty text."""
         tubes, margin = self._system.tubes, self._system.margins.total_mm
         outer_mm, end_mm = float(shape.arcs[0, 0]), shape.length_mm
-        pieces = ((0.0, outer_mm, tubes.outer.radius_mm), (outer_mm, end_mm, tubes.inner.radius_mm))
+        pieces = ((0.0, outer_mm, tubes.outermost.radius_mm), (outer_mm, end_mm, tubes.inner.radius_mm))
         for begin, end, radius in pieces:
             distance = radius + margin + SAGITTA_MM
             if max(begin, contact_mm) < end:

@@ -43,7 +43,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
         "target_lps": plan.target_lps.tolist(),
         "radius_mm": {
             "scope": plan.system.scope.radius_mm,
-            "outer": plan.system.tubes.outer.radius_mm,
+            "outer": plan.system.tubes.outermost.radius_mm,
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.needle.radius_mm,
         },

@@ -147,9 +147,8 @@ def _summary(plan: Plan) -> str:
     x, y, z = (float(c) for c in plan.target_lps)
     facts = (
         f"{plan.system.name}; scope to generation {plan.scope.generation}, "
-        f"{plan.scope.length_from_carina_mm:.0f} mm beyond the carina; tubes "
-        f"{plan.tube.outer_insertion_mm:.1f} and {plan.tube.inner_insertion_mm:.1f} mm; needle "
-        f"{plan.needle.length_mm:.1f} mm in {plural(len(plan.needle.arcs), 'arc')}; target at LPS "
+        f"{plan.scope.length_from_carina_mm:.0f} mm beyond the carina; {plan.insertions}; "
+        f"needle {plan.needle.length_mm:.1f} mm in {plural(len(plan.needle.arcs), 'arc')}; target at LPS "
         f"{x:.1f}, {y:.1f}, {z:.1f} mm"
     )
     # Why this system, if it was chosen among several: the last sentence of its choice.

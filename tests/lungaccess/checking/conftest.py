@@ -38,8 +38,8 @@ BRANCHES = (
 LOBAR = 3
 SITE_STEP = 20
 OUTER_MM, INNER_MM = 20.0, 38.0
-LAST_TWIST_RAD = 0.7
-TOWARDS = np.array([1.0, 0.0, 0.0])
+STRAIGHTENED_RAD = 0.05
+TOWARDS = np.array([1.0, -0.2, 0.0])
 """Where the tubes bend to."""
 ARCS = ((6.0, 0.4, 0.0), (10.0, 1.1, 0.008), (9.0, -2.0, 0.004))
 EXEMPT_MM = 5.0
@@ -194,13 +194,14 @@ def toy_plan(lung: Any, system: System, outer_mm: float, inner_mm: float, arcs: 
 
 
 def toy_scope(lung: Any, system: System) -> ScopeInsertion:
-    """Down the trachea and some way into the lobar bronchus, by pursuit; at last the scope twists."""
+    """Down the trachea and some way into the lobar bronchus, by pursuit; at last the tip straightens."""
     tree: AirwayTree = lung.tree
     site = int(tree.branch_start[LOBAR]) + SITE_STEP
     length, section = float(tree.distance_from_root_mm[site]), system.scope.bending_length_mm
     led = pursued(tree.points_lps[tree.route(site)], length, section, np.array([1.0, 0.3, 0.0]))
     advance, twist, bend = led.states[-1]
-    motion = replace(led, states=np.append(led.states, [[advance, twist + LAST_TWIST_RAD, bend]], axis=0))
+    bend -= STRAIGHTENED_RAD
+    motion = replace(led, states=np.append(led.states, [[advance, twist, bend]], axis=0))
     margin = float(brute_depth(lung, motion).min()) - system.scope.radius_mm
     points = motion.body(0.05)[:, :3, 3]
     passed = 0.05 * float(np.linalg.norm(points - CARINA, axis=1).argmin())
@@ -248,7 +249,7 @@ def toy_tube(
     points = frames[:, :3, 3]
     index = np.rint(lung.grid.ijk(points)).astype(int)
     labels = lung.labels[tuple(index.T)]
-    last = int(np.flatnonzero((labels & structures.LUMEN) == 0)[0]) - 1
+    last = int(np.flatnonzero((labels & structures.LUMEN) != 0)[-1])
     centres = lung.grid.lps(np.argwhere((lung.labels & structures.LUMEN) != 0))
     near = centres[np.linalg.norm(centres - points[last], axis=1) <= 2.5]
     out = points[last] - near.mean(axis=0)

@@ -14,7 +14,6 @@ from scipy.linalg import expm
 from anatomy import structures
 from lungaccess.checking import shapes
 from lungaccess.checking.boxes import Boxes
-from lungaccess.checking.environment import AirwayAxis
 from lungaccess.checking.poses import angle_between
 from lungaccess.checking.space import Select, airway_except, has, labels_at, not_lumen
 from lungaccess.checking.tiles import Tiles
@@ -164,16 +163,3 @@ def test_beyond_the_grid_is_outside(lung: Any) -> None:
     assert (labels_at(lung, far) == structures.OUTSIDE).all()
     assert (Boxes(Tiles(lung), has(structures.OUTSIDE), 20.0).distance_mm(far) == 0.0).all()
     assert (Boxes(Tiles(lung), has(structures.VESSEL), 20.0).distance_mm(far)[1] == 20.0).all()
-
-
-@settings(max_examples=20)
-@given(data=st.data())
-def test_distance_to_the_airway_axis_against_all_edges(lung: Any, data: st.DataObject) -> None:
-    points, tree = drawn_points(data, 5), lung.tree
-    child = np.flatnonzero(tree.parent_point >= 0)
-    begin = tree.points_lps[tree.parent_point[child]]
-    step = tree.points_lps[child] - begin
-    away = points[:, None] - begin
-    share = np.clip((away * step).sum(axis=2) / (step**2).sum(axis=1), 0.0, 1.0)[..., None]
-    wanted = np.linalg.norm(away - share * step, axis=2).min(axis=1)
-    np.testing.assert_allclose(AirwayAxis(tree).distance_mm(points), wanted, atol=1e-9)

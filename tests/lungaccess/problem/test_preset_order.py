@@ -16,7 +16,7 @@ DEFAULT = la.load_system("lung-default")
 def test_every_preset_has_its_place_by_the_hole_it_makes() -> None:
     ordered = presets_by_invasiveness()
     assert sorted(system.name for system in ordered) == sorted(la.preset_names())
-    holes = [system.tubes.outer.outer_diameter_mm for system in ordered]
+    holes = [system.tubes.outermost.outer_diameter_mm for system in ordered]
     assert holes == sorted(holes)
     assert ordered[0].name == "ultrathin" and ordered[-1].name == "therapeutic-scope"
 

@@ -29,7 +29,13 @@ def write(folder: Path, content: str) -> Path:
 
 
 def test_presets_ship_with_the_package() -> None:
-    assert preset_names() == ("flexure-needle", "lung-default", "therapeutic-scope", "ultrathin")
+    assert preset_names() == (
+        "flexure-needle",
+        "lung-default",
+        "stylet-needle",
+        "therapeutic-scope",
+        "ultrathin",
+    )
     assert needle_preset_names() == ("med-rad-needle",)
 
 

@@ -74,7 +74,6 @@ def test_impossible_tubes_are_refused(changes: dict[str, float], key: str) -> No
         ({"max_lateral_sweep_mm": -1.0}, "max_lateral_sweep_mm"),
         ({"min_wall_angle_deg": 91.0}, "min_wall_angle_deg"),
         ({"max_strain": 0.5}, "max_strain"),
-        ({"outer": None}, "outer = None"),
     ],
 )
 def test_pairs_that_cannot_work_are_refused(changes: dict[str, Any], message: str) -> None:

@@ -14,7 +14,7 @@ from stages.scope.advisor.lumen import Lumen, lumen_of_lung
 from stages.scope.advisor.nf1 import navigation_field
 from stages.scope.advisor.orientability import BEND_STEP_RAD, Orientability, measure_orientability
 from stages.scope.device import Bronchoscope
-from stages.scope.sites import find_sites
+from stages.scope.passages import find_passages
 from tests.stages.scope.airways import tube
 
 RANGES = {"twist_low_deg": -90.0, "bend_low_deg": -120.0}
@@ -82,7 +82,7 @@ def test_a_wider_scope_points_nowhere_where_a_thinner_one_cannot(forked: tuple[L
     assert not nowhere.allows(nowhere.forward, math.pi)
 
 
-def test_the_tip_can_look_along_most_sites(small_lung: Lung) -> None:
+def test_the_tip_can_look_along_the_airway(small_lung: Lung) -> None:
     scope = Bronchoscope(
         name="thin",
         outer_diameter_mm=3.0,
@@ -95,13 +95,14 @@ def test_the_tip_can_look_along_most_sites(small_lung: Lung) -> None:
         min_shaft_radius_mm=10.0,
         bending_stiffness_n_mm2=1000.0,
     )
-    sites = find_sites(small_lung, scope, reach_mm=30.0, turning=False)
+    places = find_passages(small_lung, scope, reach_mm=30.0)
+    points = np.flatnonzero(places.passable & places.exits_ahead)
     field = navigation_field(lumen_of_lung(small_lung), 0)
     environment = ScopeEnvironment(model=model_of(scope), field=field)
     misses = []
-    for site in range(0, sites.count, max(1, sites.count // 12)):
-        found = measure_orientability(environment, small_lung.tree, int(sites.tree_point[site]))
-        misses.append(found.angle_rad(sites.poses[site, 3:]))
+    for point in points[:: max(1, len(points) // 12)]:
+        found = measure_orientability(environment, small_lung.tree, int(point))
+        misses.append(found.angle_rad(small_lung.tree.tangents[point]))
     assert np.median(misses) < math.radians(10.0)
     assert all(0.0 <= miss <= math.pi for miss in misses)
 

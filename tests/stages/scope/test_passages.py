@@ -1,4 +1,4 @@
-"""Sites, candidate scope poses, on a forked airway of known radii."""
+"""Where a scope passes along the axis of a forked airway of known radii, and where exits are ahead."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from scipy.ndimage import binary_dilation
 from anatomy.lung import Lung
 from anatomy.structures import BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 from stages.scope.device import Bronchoscope
-from stages.scope.sites import find_sites
-from stages.scope.tips import approach
+from stages.scope.passages import Passages, find_passages
 from tests.stages.scenes import Canvas, brute_clearance, forked_tree, lung_of
 
 CARINA, FORK = np.array([0.0, 0.0, 20.0]), np.array([26.0, 0.0, -4.0])
@@ -46,13 +45,16 @@ def scope(diameter_mm: float, margin_mm: float = 0.0) -> Bronchoscope:
     )  # fmt: skip
 
 
+def found_in(lung: Lung, diameter_mm: float, margin_mm: float = 0.0, reach_mm: float = 30.0) -> Passages:
+    return find_passages(lung, scope(diameter_mm, margin_mm), reach_mm=reach_mm)
+
+
 def branches_of(lung: Lung, diameter_mm: float, margin_mm: float = 0.0) -> set[int]:
-    """Branches with a site in their second half: near its root a branch is as wide as its parent."""
-    found = find_sites(lung, scope(diameter_mm, margin_mm), reach_mm=30.0)
+    """Branches that open in their second half: near its root a branch is as wide as its parent."""
+    found = found_in(lung, diameter_mm, margin_mm)
     halves = [lung.tree.branch_points(b) for b in range(len(LINES))]
-    return {
-        b for b, points in enumerate(halves) if np.isin(points[len(points) // 2 :], found.tree_point).any()
-    }
+    open_ = found.passable & found.exits_ahead
+    return {b for b, points in enumerate(halves) if open_[points[len(points) // 2 :]].any()}
 
 
 def test_each_branch_opens_at_its_own_diameter(lung: Lung) -> None:
@@ -78,14 +80,12 @@ def test_behind_a_narrow_place_nothing_is_passable(lung: Lung) -> None:
     in_left_bronchus = (labels >> BRANCH_SHIFT) == 2
     labels[in_left_bronchus & (np.abs(along - 20.0) < 1.0)] &= ~np.uint16(LUMEN)
     narrowed = lung_of(labels, lung.grid, lung.tree)
-    found = find_sites(narrowed, scope(2.0), reach_mm=30.0)
-    assert 4 not in set(narrowed.tree.branch_of_point[found.tree_point].tolist())
-    assert not found.passable[narrowed.tree.branch_points(4)].any()
+    assert not found_in(narrowed, 2.0).passable[narrowed.tree.branch_points(4)].any()
 
 
 def test_radius_of_the_way_is_proved(lung: Lung) -> None:
     """Never more than the distance to the nearest voxel that is not lumen, anywhere on the route."""
-    found = find_sites(lung, scope(3.0), reach_mm=30.0)
+    found = found_in(lung, 3.0)
     tree = lung.tree
     lumen = (lung.labels & LUMEN) != 0
     border = binary_dilation(lumen, np.ones((3, 3, 3))) & ~lumen
@@ -102,82 +102,42 @@ def test_radius_of_the_way_is_proved(lung: Lung) -> None:
 
 
 def test_airways_in_the_mediastinum_are_left_out(lung: Lung) -> None:
-    found = find_sites(lung, scope(2.0), reach_mm=1.0)
-    x = np.abs(found.poses[:, 0])
-    radius = lung.tree.radius_mm[found.tree_point]
+    ahead = found_in(lung, 2.0, reach_mm=1.0).exits_ahead
+    x, radius = np.abs(lung.tree.points_lps[ahead, 0]), lung.tree.radius_mm[ahead]
     # A probe reaches 2.5 mm beyond the lumen, and the point it is sent from may lie 1 mm ahead.
     assert (x + radius + 2.5 + 1.0 >= MEDIASTINUM_MM - 0.6).all()
     assert len(x) > 20
-    everywhere = find_sites(forked_lung(0.0), scope(2.0), reach_mm=1.0)
-    assert 0 in lung.tree.branch_of_point[everywhere.tree_point]
-    assert 0 not in lung.tree.branch_of_point[found.tree_point]
+    trachea = lung.tree.branch_points(0)
+    assert found_in(forked_lung(0.0), 2.0, reach_mm=1.0).exits_ahead[trachea].any()
+    assert not ahead[trachea].any()
 
 
 def test_reach_lets_the_tip_stand_before_the_lung(lung: Lung) -> None:
     distances = []
     for reach in (1.0, 10.0, 20.0):
-        found = find_sites(lung, scope(2.0), reach_mm=reach)
-        distances.append(float(np.abs(found.poses[:, 0]).min()))
-        assert found.exits_ahead[found.tree_point].all()
+        ahead = found_in(lung, 2.0, reach_mm=reach).exits_ahead
+        distances.append(float(np.abs(lung.tree.points_lps[ahead, 0]).min()))
     assert distances[0] > distances[1] >= distances[2] == 0.0
 
 
-def test_tips_look_along_the_airway(lung: Lung) -> None:
-    found = find_sites(lung, scope(2.0), reach_mm=30.0, turning=False)
-    assert np.array_equal(found.poses[:, :3], lung.tree.points_lps[found.tree_point])
-    assert np.array_equal(found.poses[:, 3:], lung.tree.tangents[found.tree_point])
-    assert found.count == len(found.poses) == len(found.tree_point)
-
-
-@pytest.mark.parametrize("spacing", [0.5, 1.0, 3.0])
-def test_spacing(lung: Lung, spacing: float) -> None:
-    found = find_sites(lung, scope(2.0), reach_mm=100.0, spacing_mm=spacing, turning=False)
-    depth_mm = lung.tree.distance_from_root_mm[found.tree_point]
-    for branch in range(5):
-        on_branch = np.sort(depth_mm[lung.tree.branch_of_point[found.tree_point] == branch])
-        assert np.diff(on_branch).mean() == pytest.approx(max(spacing, 0.5), rel=0.3)
-
-
 def test_why_the_others_are_closed(lung: Lung) -> None:
-    assert find_sites(lung, scope(2.4), reach_mm=30.0).narrowest == (-1, 0.0)
-    generation, excess = find_sites(lung, scope(3.3), reach_mm=30.0).narrowest
+    assert found_in(lung, 2.4).narrowest == (-1, 0.0)
+    generation, excess = found_in(lung, 3.3).narrowest
     assert generation == 2 and 0.0 < excess < 0.6
-    generation, excess = find_sites(lung, scope(13.0), reach_mm=30.0).narrowest
+    generation, excess = found_in(lung, 13.0).narrowest
     assert generation == 0 and 0.4 < excess < 1.5
 
 
-def test_the_widest_scope_that_has_a_site(lung: Lung) -> None:
+def test_the_widest_scope_that_passes_a_place_with_an_exit_ahead(lung: Lung) -> None:
     for margin in (0.0, 0.4):
-        widest = find_sites(lung, scope(14.0, margin), reach_mm=30.0).widest_scope_mm
+        widest = found_in(lung, 14.0, margin).widest_scope_mm
         assert 9.0 < widest < 12.0
-        assert find_sites(lung, scope(widest - 1e-6, margin), reach_mm=30.0).count > 0
-        assert find_sites(lung, scope(widest + 1e-6, margin), reach_mm=30.0).count == 0
+        for diameter, passes in ((widest - 1e-6, True), (widest + 1e-6, False)):
+            found = found_in(lung, diameter, margin)
+            assert (found.passable & found.exits_ahead).any() == passes
 
 
 def test_no_airway_in_lung_tissue() -> None:
-    found = find_sites(forked_lung(200.0), scope(2.0), reach_mm=30.0)
-    assert found.count == 0 and found.widest_scope_mm == 0.0
+    found = found_in(forked_lung(200.0), 2.0)
+    assert found.widest_scope_mm == 0.0
     assert found.passable.all() and not found.exits_ahead.any()
-    assert found.poses.shape == (0, 6)
-
-
-def test_bodies_of_turned_scopes_are_inside_the_lumen(lung: Lung) -> None:
-    """Every point of the polyline by which they leave the axis, measured to every voxel that is no lumen."""
-    device = scope(3.0)
-    found = find_sites(lung, device, reach_mm=30.0)
-    turned = np.flatnonzero(found.turned)
-    assert len(turned) > 20
-    assert (np.diff(found.turned.astype(int)) >= 0).all(), "those along the axis come first"
-    for site in turned[:: max(len(turned) // 25, 1)]:
-        line = approach(lung.tree, found.tip(lung.tree, int(site)))
-        assert line is not None
-        share = np.linspace(0.0, 1.0, 8)[:, None]
-        points = np.concatenate([a + share * (b - a) for a, b in zip(line[:-1], line[1:], strict=True)])
-        outside = np.where(lung.labels & LUMEN, 0, VESSEL).astype(np.uint16)
-        assert brute_clearance(outside, lung.grid, points, VESSEL, 6.0).min() >= device.radius_mm - 1e-6
-
-
-def test_without_turning_tips_look_along_the_axis(lung: Lung) -> None:
-    found = find_sites(lung, scope(3.0), reach_mm=30.0, turning=False)
-    assert found.count and not found.turned.any()
-    assert np.allclose(found.poses[:, 3:], lung.tree.tangents[found.tree_point])

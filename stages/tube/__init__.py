@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from stages.tube.inverse import inverse_kinematics
     from stages.tube.kernels import TubeEnvironment
     from stages.tube.mechanics import Batch, TubeMechanics
+    from stages.tube.nearby import NearbyShape, NearbyShapes
     from stages.tube.nesting import check_nesting
     from stages.tube.parts import SlottedSegment, opposite_slots
     from stages.tube.placing import PlacedShapes, place_shapes

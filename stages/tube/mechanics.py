@@ -191,7 +191,7 @@ class TubeMechanics(NestedTubes):
                     f"The {name} have the shape {values.shape}",
                     expected=f"({len(base)}, {self.count}), all finite",
                 )
-        self._check_shifts(beta)
+        self.check_shifts(beta)
         results = np.zeros((len(base), equilibrium.RESULT_COLUMNS))
         equilibrium.settle_many(self.design, base, beta, self.step_rad, True, tips, results)
         return Batch(
@@ -213,10 +213,11 @@ class TubeMechanics(NestedTubes):
 
     def _shifts(self, beta_mm: ArrayLike) -> Float:
         beta = self._joints(beta_mm, "rear ends")
-        self._check_shifts(beta[None])
+        self.check_shifts(beta[None])
         return beta
 
-    def _check_shifts(self, beta: Float) -> None:
+    def check_shifts(self, beta: Float) -> None:
+        """Raise SettingsError if rear ends `(M, n)` or the tubes' ends are out of order."""
         ends = beta + self.lengths_mm
         for wrong, what, expected in (
             (beta > 0.0, "A rear end is ahead of the front plate", "0 mm or less"),

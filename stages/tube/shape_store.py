@@ -21,7 +21,7 @@ from anatomy.settings import to_mapping
 from stages.tube.device import Tube
 from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
 
-SHAPES_FORMAT = 1
+SHAPES_FORMAT = 2
 """Raise it when shapes change: stored ones of another format are made anew."""
 DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
 """What reading a damaged or foreign file raises; the shapes are then made anew."""

@@ -80,6 +80,8 @@ class TubeShapes:
     ----------
     insertions_mm, rotations_rad : (S, n) float64
         How far each tube comes out, and how its rear end is turned; 0 bends towards +x of the scope tip.
+    tip_angles_rad : (S, n) float64
+        Rotation of each tube at its own end.
     arcs : (A, 4) float64
         Length in mm; direction of the bend in rad about the tangent, from +x of a frame that is carried along
         without turning; curvature in 1/mm; radius of the outermost tube in mm.
@@ -106,6 +108,7 @@ class TubeShapes:
     grid: ShapeGrid
     insertions_mm: Float
     rotations_rad: Float
+    tip_angles_rad: Float
     arcs: Float
     first_arc: Int
     scope_from_tip: Float
@@ -165,15 +168,16 @@ def tube_shapes(
     rotations = _rotations(mechanics.tubes, grid)
     strained = _strained_radii(mechanics.tubes, float(stops[-1]))
 
-    def with_rotations(base: Float) -> tuple[Float, Int, Float]:
+    def with_rotations(base: Float) -> tuple[Float, Int, Float, Float]:
         return _follow(mechanics, strained, base + BEND_RAD, stops, states, parents)
 
     with ThreadPoolExecutor(THREADS) as pool:
         found = list(pool.map(with_rotations, rotations))
-    results = np.concatenate([rows for rows, _, _ in found])
+    results = np.concatenate([rows for rows, _, _, _ in found])
+    tips = np.concatenate([tips for _, _, _, tips in found])
     kept, refused = _within(results, limits)
-    counts = np.concatenate([np.diff(first) for _, first, _ in found])
-    arcs = np.concatenate([arcs for _, _, arcs in found])[np.repeat(kept, counts)]
+    counts = np.concatenate([np.diff(first) for _, first, _, _ in found])
+    arcs = np.concatenate([arcs for _, _, arcs, _ in found])[np.repeat(kept, counts)]
     values = results[kept]
     return TubeShapes(
         tubes=mechanics.tubes,
@@ -181,6 +185,7 @@ def tube_shapes(
         grid=grid,
         insertions_mm=read_only(np.tile(stops[states], (len(rotations), 1))[kept]),
         rotations_rad=read_only(np.repeat(rotations, len(states), axis=0)[kept]),
+        tip_angles_rad=read_only(tips[kept]),
         arcs=read_only(arcs),
         first_arc=read_only(np.concatenate([[0], np.cumsum(counts[kept])])),
         scope_from_tip=read_only(matrices(values[:, kernel.TIP :])),
@@ -263,20 +268,20 @@ def _rotations(tubes: Sequence[Tube], grid: ShapeGrid) -> Float:
 
 def _follow(
     mechanics: TubeMechanics, strained: Float, base: Float, stops: Float, states: Int, parents: Int
-) -> tuple[Float, Int, Float]:
-    """Return results, first arcs and arcs of all deployments with given rotations of the rear ends."""
-    results = np.zeros((len(states), kernel.SHAPE_COLUMNS))
+) -> tuple[Float, Int, Float, Float]:
+    """Return results, first arcs, arcs and tip angles for given rotations of the rear ends."""
+    results, tips = np.zeros((len(states), kernel.SHAPE_COLUMNS)), np.zeros(states.shape)
     first = np.zeros(len(states) + 1, dtype=np.int64)
     radii = np.array([tube.radius_mm for tube in mechanics.tubes])
     room = ARCS_A_DEPLOYMENT * len(states)
     while True:
         arcs = np.zeros((room, kernel.ARC_COLUMNS))
         count = kernel.follow_all(
-            mechanics.design, radii, strained, base, stops, states, parents, mechanics.step_rad, results,
-            first, arcs,
+            mechanics.design, radii, strained, base, stops, states, parents, mechanics.step_rad, tips,
+            results, first, arcs,
         )  # fmt: skip
         if count >= 0:
-            return results, first, arcs[:count].copy()
+            return results, first, arcs[:count].copy(), tips
         room *= 2
 
 

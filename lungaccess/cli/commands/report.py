@@ -47,7 +47,7 @@ def report(
     ] = 2000,
     seed: Annotated[Seed, Parameter(help="Seed of that estimate.")] = 0,
     instructions: Annotated[
-        bool, Parameter(help="Whether instructions for the scope are searched and listed turn by turn.")
+        bool, Parameter(help="Whether instructions for the scope are listed step by step.")
     ] = True,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:

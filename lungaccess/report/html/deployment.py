@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
-from lungaccess.plans.curves import SHORTEST_MM, arc_lengths, needle_pieces, tube_pieces
+from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces
+from lungaccess.plans.insertion import scope_motion
 from lungaccess.report.pack import Packed, pack
 from stages.needle import Objective
+from stages.scope import ScopeMotion
 from stages.tube import centreline
 
 if TYPE_CHECKING:
@@ -25,8 +28,10 @@ TUBE_POINTS = 40
 """Points of a stored shape: 1 to 2 mm apart on tubes of a usual length, too near to see the corners."""
 SCOPE_SHOWN_MM = 15.0
 """Length of the scope behind its tip that a view of the devices shows: about its bending section."""
-CAMERA_STEP_MM = 1.0
-"""Distance between two places of the camera; the page interpolates between them."""
+CAMERA_STEP_MM, CAMERA_TURN_RAD = 1.0, 0.06
+"""Largest advance and turn between two states of the scope; the page interpolates between them."""
+SECTION_POINTS = 12
+"""Points of a stored bending section: 1 to 2 mm apart."""
 CAP_MM = 15.0
 """Clearances are measured up to this distance: farther than any margin, and where the plot ends."""
 NOT_MEASURED = -1.0
@@ -47,7 +52,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.needle.radius_mm,
         },
-        "scope": _scope(plan, lung),
+        "scope": _scope(plan),
         "tubes": _tubes(plan),
         "needle": _needle(plan),
         "profile": profile(plan, lung),
@@ -64,25 +69,37 @@ def device_points(plan: Plan) -> Float:
     return np.concatenate([scope.points_lps[near], tubes.points_lps, needle.points_lps])
 
 
-def _scope(plan: Plan, lung: Lung) -> Packed:
-    frames = camera_frames(plan)
-    points = frames[:, :3, 3]
+def _scope(plan: Plan) -> Packed:
+    """Return the scope in its states: tips, where the camera is, sections, and the shaft behind them."""
+    moving = dense_motion(plan)
+    tips, length = moving.tips, moving.bending_length_mm
+    back = np.linspace(-length, 0.0, SECTION_POINTS)
+    bends = moving.states[:, 2] / length
+    sections = [poses_on_arc(tip, 0.0, bend, back)[:, :3, 3] for tip, bend in zip(tips, bends, strict=True)]
+    shaft, shaft_mm = poses_on_pieces(moving.lps_from_entry, moving.pieces[:-1], CAMERA_STEP_MM)
     return {
-        "points": pack(points, "f4"),
-        "arc_length_mm": pack(arc_lengths(points), "f4"),
-        "forward": pack(frames[:, :3, 2], "f4"),
-        "up": pack(frames[:, :3, 0], "f4"),
-        "lumen_radius_mm": pack(lung.lumen_depth.lower_bound_mm(points), "f4"),
+        "points": pack(tips[:, :3, 3], "f4"),
+        "arc_length_mm": pack(moved_mm(moving), "f4"),
+        "forward": pack(tips[:, :3, 2], "f4"),
+        "up": pack(tips[:, :3, 0], "f4"),
+        "inserted_mm": pack(moving.states[:, 0] + length, "f4"),
+        "sections": pack(np.array(sections), "f4"),
+        "shaft": pack(shaft[:, :3, 3], "f4"),
+        "shaft_mm": pack(shaft_mm, "f4"),
         "from_carina_mm": float(plan.scope.length_from_carina_mm),
     }
 
 
-def camera_frames(plan: Plan) -> Float:
-    """Return frames `(N, 4, 4)` of the camera along the body of the scope, from the entry to the tip.
+def dense_motion(plan: Plan) -> ScopeMotion:
+    """Return the motion of the scope with so many states that a film of them is smooth."""
+    return scope_motion(plan).between(CAMERA_STEP_MM, CAMERA_TURN_RAD)
 
-    +z is forward and +x is up in the picture, as the twist of the scope has turned it there.
-    """
-    return plan.curves(CAMERA_STEP_MM).scope.lps_from_device
+
+def moved_mm(motion: ScopeMotion) -> Float:
+    """Return how far the tip has moved up to each state `(M,)`; a turn counts by half a section."""
+    steps = np.abs(np.diff(motion.states, axis=0))
+    lever = 0.5 * motion.bending_length_mm
+    return np.append(0.0, np.cumsum(steps[:, 0] + lever * steps[:, 1:].max(axis=1)))
 
 
 def _tubes(plan: Plan) -> Packed:

@@ -11,8 +11,7 @@ import numpy as np
 from anatomy.io.files import atomic_write
 from anatomy.structures import LUMEN
 from anatomy.typed import Array, Float, UInt8
-from lungaccess.plans.curves import arc_lengths
-from lungaccess.report.html.deployment import camera_frames
+from lungaccess.report.html.deployment import dense_motion, moved_mm
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -58,7 +57,7 @@ def bronchoscopy_webp(
     """
     from PIL import Image
 
-    lumen = SmoothLumen(lung, camera_frames(plan)[:, :3, 3])
+    lumen = SmoothLumen(lung, dense_motion(plan).tips[:, :3, 3])
     pictures = [Image.fromarray(view(lumen, pose, pixels)) for pose in camera_poses(plan, frames)]
     target = Path(path)
     with atomic_write(target) as temporary:
@@ -70,24 +69,13 @@ def bronchoscopy_webp(
 
 
 def camera_poses(plan: Plan, frames: int) -> list[Float]:
-    """Return `lps_from_camera` (4, 4) at even distances along the scope; +z forward, -y up."""
-    frames_along = camera_frames(plan)
-    points, forward, up = (frames_along[:, :3, column] for column in (3, 2, 0))
-    along = arc_lengths(points)
-    poses = []
-    for place in np.linspace(0.0, along[-1], max(frames, 1)):
-        eye, ahead, above = (
-            np.array([np.interp(place, along, values[:, axis]) for axis in range(3)])
-            for values in (points, forward, up)
-        )
-        ahead /= np.linalg.norm(ahead)
-        above -= (above @ ahead) * ahead
-        above /= np.linalg.norm(above)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([np.cross(ahead, above), -above, ahead], axis=1)
-        pose[:3, 3] = eye
-        poses.append(pose)
-    return poses
+    """Return `lps_from_camera` (4, 4) at states of the scope, evenly along its motion; +z forward, -y up."""
+    moving = dense_motion(plan)
+    moved, tips = moved_mm(moving), moving.tips
+    chosen = np.searchsorted(moved, np.linspace(0.0, moved[-1], max(frames, 1)))
+    # The top of the picture is +x of the tip, its right +y.
+    camera_from_tip = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    return [np.asarray(tips[n] @ camera_from_tip) for n in chosen]
 
 
 class SmoothLumen:

@@ -49,7 +49,7 @@ class PageOptions:
     risk_samples, risk_seed : int
         Draws of that estimate and their seed, see `lungaccess.appraisal.Appraiser`; 0 samples for none.
     instructions : bool
-        Whether the scope's route is searched, with instructions turn by turn.
+        Whether the steps that bring the scope to its place are listed.
     """
 
     alternatives: Sequence[Plan] = ()

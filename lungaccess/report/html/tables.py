@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from anatomy.errors import LungaccessError
+from anatomy.words import plural
 from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
 from lungaccess.report.html import words
 from lungaccess.report.key_numbers import figures_of_plan
@@ -20,8 +18,6 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
     from lungaccess.risk import RiskReport, Share
 
-GOAL_RADIUS_MM = 2.0
-"""Radius about the place of the plan's tip that counts as that place for the instructions."""
 AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
 
@@ -149,26 +145,18 @@ def key_section(plan: Plan, lung: Lung) -> str:
 
 
 def instructions_section(plan: Plan, lung: Lung) -> str:
-    """Return turn by turn how the scope gets to where the plan has its tip, or why that is not known."""
-    from lungaccess.one_stage import advise_scope
+    """Return step by step how hands bring the scope to where the plan has its tip."""
+    from lungaccess.plans.insertion import scope_motion
+    from lungaccess.plans.scope_steps import scope_steps
 
-    tip = np.array(plan.scope.lps_from_scope_tip[:3, 3])
-    try:
-        advice = advise_scope(lung, plan.system, tip, GOAL_RADIUS_MM)
-    except LungaccessError as error:
-        return f"<p>No instructions: {words.text(error)}</p>"
-    path = advice.path
-    steps = words.steps(one.text() for one in advice.instructions)
-    end = (
-        "This route reaches the place of the plan's tip."
-        if path.reached
-        else f"This route ends {path.distance_mm:.1f} mm before that place: {advice.why_stopped}"
-    )
+    steps = scope_steps(scope_motion(plan), lung.tree)
     note = (
-        f"Insertion {path.length_mm:.0f} mm, {path.retreats} retreats. Found by the search for the scope "
-        "alone, with its true radius clear of the wall; twist 0 is as the scope enters the trachea."
+        f"These steps merge the {plural(len(plan.scope.states), 'state')} of the plan, which are proved; "
+        "within a step all changes evenly. Up, down and o'clock are those of the scope's picture; twist 0 "
+        "is as the scope enters the trachea, and inserted lengths count from there. What the tubes "
+        "straighten comes on top of the last bend."
     )
-    return f"{steps}<p>{words.text(end)}</p><p class='note'>{words.text(note)}</p>"
+    return f"{words.steps(one.text for one in steps)}<p class='note'>{words.text(note)}</p>"
 
 
 def risk_section(report: RiskReport | None) -> str:

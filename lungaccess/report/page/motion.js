@@ -20,14 +20,16 @@ export class Motion {
     const { scope, tubes, needle, profile } = packed;
     [
       motion.route, motion.routeMm, motion.forward, motion.up, motion.tubes, motion.innerMm, motion.outerMm,
-      motion.needle, motion.needleMm, motion.margin,
+      motion.needle, motion.needleMm, motion.margin, motion.insertedMm, motion.sections, motion.shaft, motion.shaftMm,
     ] = await Promise.all([
       scope.points, scope.arc_length_mm, scope.forward, scope.up, tubes.points, tubes.inner_mm, tubes.outer_mm,
       needle.points, needle.arc_length_mm, profile.margin_mm,
+      scope.inserted_mm, scope.sections, scope.shaft, scope.shaft_mm,
     ].map(unpack));
     motion.tubePoints = tubes.points.shape[1];
+    motion.sectionPoints = scope.sections.shape[1];
     const last = (array) => array[array.length - 1];
-    motion.ends = { scope: last(motion.routeMm), outer: last(motion.outerMm), inner: last(motion.innerMm),
+    motion.ends = { scope: last(motion.insertedMm), outer: last(motion.outerMm), inner: last(motion.innerMm),
       needle: last(motion.needleMm) };
     motion.starts = stageStarts(motion.ends);
     return motion;
@@ -39,13 +41,14 @@ export class Motion {
     const share = STAGES.map((_, n) => clamp((position - starts[n]) / Math.max(starts[n + 1] - starts[n], 1e-9)));
     let stage = STAGES.length - 1;
     while (stage > 0 && (share[stage] <= 0 || starts[stage] === starts[stage + 1])) stage -= 1;
-    const scopeMm = ends.scope * share[0];
+    const moved = this.routeMm[this.routeMm.length - 1] * share[0];
+    const scopeMm = this.inserted(moved);
     const flush = ends.outer * (starts[1] === starts[2] ? 1 : share[1]);
     const innerMm = share[2] > 0 ? ends.outer + (ends.inner - ends.outer) * share[2] : flush;
     const needleMm = ends.needle * share[3];
     const state = { position, stage, scopeMm, outerMm: Math.min(flush, ends.outer), innerMm, needleMm };
-    state.scope = cut(this.route, this.routeMm, scopeMm);
-    state.camera = this.camera(scopeMm);
+    state.scope = this.body(moved, scopeMm);
+    state.camera = this.camera(moved);
     [state.outer, state.inner] = share[0] < 1 ? [[], []] : this.tube(innerMm);
     state.needle = needleMm > 0 ? cut(this.needle, this.needleMm, needleMm) : [];
     state.needleColours = state.needle.map((_, n) => marginColour(this.margin[Math.min(n, this.margin.length - 1)]));
@@ -55,8 +58,26 @@ export class Motion {
     return state;
   }
 
-  camera(scopeMm) {
-    const [n, share] = place(this.routeMm, scopeMm);
+  // Return how much of the scope is in, with its bending section, after so much motion.
+  inserted(moved) {
+    const [n, share] = place(this.routeMm, moved);
+    const next = Math.min(n + 1, this.insertedMm.length - 1);
+    return this.insertedMm[n] + share * (this.insertedMm[next] - this.insertedMm[n]);
+  }
+
+  // Return the points of the shaft and of the bending section before it.
+  body(moved, scopeMm) {
+    const [n, share] = place(this.routeMm, moved);
+    const count = this.sectionPoints, next = Math.min(n + 1, this.routeMm.length - 1);
+    const points = cut(this.shaft, this.shaftMm, scopeMm - this.insertedMm[0]);
+    for (let k = 0; k < count; k++) {
+      points.push(mix(point(this.sections, n * count + k), point(this.sections, next * count + k), share));
+    }
+    return points;
+  }
+
+  camera(moved) {
+    const [n, share] = place(this.routeMm, moved);
     const between = (array) => mix(point(array, n), point(array, Math.min(n + 1, this.routeMm.length - 1)), share);
     return { eye: between(this.route), forward: unit(between(this.forward)), up: unit(between(this.up)) };
   }

@@ -17,6 +17,7 @@ from anatomy.kernels.compiling import inner_kernel
 from stages.tube.kernels.assembly import BENT, FAR, NEAR, PIECE_COLUMNS, cut
 from stages.tube.kernels.equilibrium import TOLERANCE, least_determinant, newton, scratch_for
 from stages.tube.kernels.pose import GAUSS, curvature, frames_at, lay
+from stages.tube.kernels.sweep import sweep_of
 
 LARGEST_STRAY_RAD = 0.1
 """Largest turn of a tip against its rear end in one step."""
@@ -65,24 +66,29 @@ def _largest(one, other):
 
 
 @inner_kernel
-def _reach(design, base_angles, begin, end, step, tip_angles):
-    """Follow a branch of stable equilibria from rear ends `begin` to `end`, in smaller steps where needed.
+def _reach(design, base, turn, begin, end, step, tip_angles):
+    """Follow a branch of stable equilibria to rear ends at `end`, turned on by `turn`, in steps as needed.
 
-    `tip_angles` are those at `begin` and become those at `end`.  Returns the least determinant on the way, 0
-    or less if the branch ends there; and cutting, nodes and steps at `end`.
+    `tip_angles` are those at `begin`, where the rear ends are turned by `base`, and become those at the end.
+    Returns the least determinant on the way, 0 or less if the branch ends there; and cutting, nodes and steps
+    at the end.
     """
     done, stride, least = 0.0, 1.0, 1.0
     tips, back = tip_angles.copy(), tip_angles.copy()
-    worst, cutting, nodes, steps = _settled(design, base_angles, end, step, tips)
     while True:
         share = min(done + stride, 1.0)
+        moved = (share - done) * turn
+        beta = begin + share * (end - begin)
+        tips[:] = tip_angles + moved
+        worst, cutting, nodes, steps = _settled(design, base + share * turn, beta, step, tips)
         here = worst < TOLERANCE
-        determinant = least_determinant(nodes, begin + share * (end - begin)) if here else -math.inf
-        stray = _largest(tips, tip_angles)
+        determinant = least_determinant(nodes, beta) if here else -math.inf
+        back[:] = tips - moved
+        stray = _largest(back, tip_angles)
         here = here and determinant > 0.0 and stray <= LARGEST_STRAY_RAD
         if here and stray > UNSUSPICIOUS_RAD:
-            back[:] = tips
-            worst = _settled(design, base_angles, begin + done * (end - begin), step, back)[0]
+            there = begin + done * (end - begin)
+            worst = _settled(design, base + done * turn, there, step, back)[0]
             here = worst < TOLERANCE and _largest(back, tip_angles) <= SAME_BRANCH_RAD
         if here:
             done = share
@@ -94,9 +100,6 @@ def _reach(design, base_angles, begin, end, step, tip_angles):
             stride *= 0.5
             if stride < LEAST_SHARE:
                 return min(determinant, 0.0), cutting, nodes, steps
-            tips[:] = tip_angles
-        beta = begin + min(done + stride, 1.0) * (end - begin)
-        worst, cutting, nodes, steps = _settled(design, base_angles, beta, step, tips)
 
 
 @inner_kernel
@@ -192,6 +195,23 @@ def _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places):
 
 
 @inner_kernel
+def _lay_out(design, radii, beta, cutting, nodes, steps, poses, arcs, first, places, scratch):
+    """Write the arcs of a deployment; return their number, -1 if there is no room, and their error in mm."""
+    number, error = _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places)
+    if number < 0:
+        return -1, error
+    found, angles, rates = scratch
+    frames_at(cutting, nodes, steps, poses, places[: 2 * number, 0], found, angles, rates)
+    worst = 0.0
+    for m in range(2 * number):
+        off = 0.0
+        for axis in range(3):
+            off += (found[m, 9 + axis] - places[m, 1 + axis]) ** 2
+        worst = max(worst, off)
+    return number, math.sqrt(worst) + error
+
+
+@inner_kernel
 def bend_towards(pose, across, direction, kappa):
     """Return the bend of an arc towards a direction about the tangent, counted from the normal `across`."""
     _x, _y, _z, tx, ty, tz = pose
@@ -213,85 +233,10 @@ def carried(pose, across, bend, direction, length):
     return after, (c * nx - s * bx, c * ny - s * by, c * nz - s * bz)
 
 
-@inner_kernel
-def _distance(bodies, one, other, j):
-    x = bodies[one, j, 0] - bodies[other, j, 0]
-    y = bodies[one, j, 1] - bodies[other, j, 1]
-    z = bodies[one, j, 2] - bodies[other, j, 2]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@inner_kernel
-def _bow(bodies, a, i, b, j, c, k):
-    """Return the size of the second difference of three points."""
-    total = 0.0
-    for m in range(3):
-        bow = bodies[a, i, m] - 2.0 * bodies[b, j, m] + bodies[c, k, m]
-        total += bow * bow
-    return math.sqrt(total)
-
-
-@inner_kernel
-def _off_track(bodies, other, j, final, last):
-    """Return the distance of a point of a body to the final one, a polyline, near the same arc length."""
-    best = math.inf
-    for e in range(max(j - 3, 0), min(j + 3, last)):
-        along, off, long2, gap2 = 0.0, 0.0, 0.0, 0.0
-        for m in range(3):
-            a = bodies[final, e + 1, m] - bodies[final, e, m]
-            d = bodies[other, j, m] - bodies[final, e, m]
-            along += a * d
-            long2 += a * a
-            gap2 += d * d
-        share = min(max(along / long2, 0.0), 1.0)
-        off = gap2 - 2.0 * share * along + share * share * long2
-        best = min(best, off)
-    return math.sqrt(max(best, 0.0))
-
-
-@inner_kernel
-def _diagonal_bow(bodies, states, parents, state):
-    """Return the largest second difference, along the body, of how far points stray when the tip is there."""
-    worst = 0.0
-    ahead, at = state, parents[state]
-    while at >= 0 and parents[at] >= 0:
-        behind, j = parents[at], states[at, 0]
-        total = 0.0
-        for m in range(3):
-            bow = bodies[ahead, j + 1, m] - 2.0 * bodies[at, j, m] + bodies[behind, j - 1, m]
-            bow -= bodies[state, j + 1, m] - 2.0 * bodies[state, j, m] + bodies[state, j - 1, m]
-            total += bow * bow
-        worst = max(worst, math.sqrt(total))
-        ahead, at = at, behind
-    return worst
-
-
-@inner_kernel
-def _sweep(bodies, states, parents, state, sagitta):
-    """Return how far the body was from its final place, and from its final track, at any step.
-
-    Points and steps are stops apart; what lies between is bounded by second differences: between three
-    places a smooth curve strays from their chords by an eighth of it, and a kink by a quarter.
-    """
-    sweep = leader = bow = 0.0
-    at = parents[state]
-    later, latest = state, -1
-    while at >= 0:
-        for j in range(1, states[at, 0] + 1):
-            strayed = _distance(bodies, at, state, j)
-            sweep = max(sweep, strayed)
-            if strayed > leader:
-                off = _off_track(bodies, at, j, state, states[state, 0]) + sagitta
-                leader = max(leader, min(strayed, off))
-            if latest >= 0:
-                bow = max(bow, _bow(bodies, at, j, later, j, latest, j))
-        later, latest, at = at, later, parents[at]
-    bow = 0.25 * max(bow, _diagonal_bow(bodies, states, parents, state))
-    return sweep + bow, leader + bow
-
-
 @numba.njit(cache=True, nogil=True)
-def follow_all(design, radii, strained, base_angles, stops, states, parents, step, results, first, arcs):
+def follow_all(
+    design, radii, strained, base_angles, stops, states, parents, step, tips, results, first, arcs
+):
     """Follow all deployments with given rotations of the rear ends.
 
     Parameters
@@ -310,6 +255,8 @@ def follow_all(design, radii, strained, base_angles, stops, states, parents, ste
         Of each the deployment one stop before, -1 for the first; it is listed before.
     step : float
         See `assembly.cut`.
+    tips : (S, n) float64
+        Is filled with the angles at the tubes' own ends, rad.
     results : (S, SHAPE_COLUMNS) float64
         Is filled; a least determinant of 0 or less says that the tubes snap on the way.
     first : (S + 1,) int64
@@ -325,11 +272,10 @@ def follow_all(design, radii, strained, base_angles, stops, states, parents, ste
     n_states, n = states.shape
     n_stops = stops.shape[0]
     bodies = np.zeros((n_states, n_stops, 3))
-    tips = np.zeros((n_states, n))
+    still = np.zeros(n)
     found, angles, rates = np.zeros((n_stops, 12)), np.zeros((n_stops, n)), np.zeros((n_stops, n))
     places = np.zeros((2 * MOST_ARCS * (1 + n + 2 * design[2].shape[0]), 4))
-    at_places, more_angles = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n))
-    more_rates = np.zeros((places.shape[0], n))
+    scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
     tips[0] = base_angles
     results[0] = 0.0
     results[0, LEAST] = 1.0
@@ -348,7 +294,7 @@ def follow_all(design, radii, strained, base_angles, stops, states, parents, ste
             continue
         begin, end = stops[states[parent]] - design[1], stops[states[state]] - design[1]
         tips[state] = tips[parent]
-        least, cutting, nodes, steps = _reach(design, base_angles, begin, end, step, tips[state])
+        least, cutting, nodes, steps = _reach(design, base_angles, still, begin, end, step, tips[state])
         results[state, LEAST] = min(results[parent, LEAST], least)
         if least <= 0.0:
             continue
@@ -360,21 +306,54 @@ def follow_all(design, radii, strained, base_angles, stops, states, parents, ste
         bodies[state, :out] = found[:out, 9:]
         strain = _largest_strain(design, strained, end, cutting, nodes, steps)
         results[state, STRAIN] = max(results[parent, STRAIN], strain)
-        number, between = _lay_arcs(design, radii, end, cutting, nodes, steps, arcs, first[state], places)
+        number, error = _lay_out(
+            design, radii, end, cutting, nodes, steps, poses, arcs, first[state], places, scratch
+        )
         if number < 0:
             return -1
         first[state + 1] += number
-        frames_at(cutting, nodes, steps, poses, places[: 2 * number, 0], at_places, more_angles, more_rates)
-        worst = 0.0
-        for m in range(2 * number):
-            off = 0.0
-            for axis in range(3):
-                off += (at_places[m, 9 + axis] - places[m, 1 + axis]) ** 2
-            worst = max(worst, off)
-        results[state, ERROR] = math.sqrt(worst) + between
+        results[state, ERROR] = error
         bent = 0.0
         for m in range(first[state], first[state + 1]):
             bent = max(bent, arcs[m, CURVATURE])
         sagitta = max(sagitta, bent * (stops[1] - stops[0]) ** 2 / 8.0)
-        results[state, SWEEP], results[state, LEADER] = _sweep(bodies, states, parents, state, sagitta)
+        results[state, SWEEP], results[state, LEADER] = sweep_of(bodies, states, parents, state, sagitta)
     return first[n_states]
+
+
+@numba.njit(cache=True, nogil=True)
+def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, arcs):
+    """Lay the arcs of any joint values, reached straight from a deployment nearby.
+
+    Parameters
+    ----------
+    design, radii, step
+        See `follow_all`.
+    base, beta, tip_angles : (n,) float64
+        Rotation and place of the rear ends, and angles at the own ends, of the deployment nearby; the last
+        are changed to those of the new one.
+    turn, end : (n,) float64
+        By how much the rear ends turn on, and where they are then.
+    result : (SHAPE_COLUMNS,) float64
+        Is filled: the least determinant from there on, the error of the arcs, the length and the tip.
+    arcs : (rows, ARC_COLUMNS) float64
+        Is filled.
+
+    Returns
+    -------
+    int
+        Number of arcs, 0 if the tubes snap on the way, -1 if there is no room.
+    """
+    n = base.shape[0]
+    least, cutting, nodes, steps = _reach(design, base, turn, beta, end, step, tip_angles)
+    result[LEAST], result[EXTENSION] = least, end[0] + design[1][0]
+    if least <= 0.0:
+        return 0
+    poses = np.zeros((steps[0].shape[0] + 1, 12))
+    lay(cutting, nodes, steps, poses)
+    result[TIP:] = poses[-1]
+    places = np.zeros((2 * MOST_ARCS * (1 + n + 2 * design[2].shape[0]), 4))
+    scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
+    number, error = _lay_out(design, radii, end, cutting, nodes, steps, poses, arcs, 0, places, scratch)
+    result[ERROR] = error
+    return number

@@ -49,7 +49,7 @@ def moved(plan: la.Plan, lps_from_lps: Any) -> la.Plan:
         target_lps=point(plan.target_lps),
         scope=replace(
             plan.scope,
-            points_lps=point(plan.scope.points_lps),
+            lps_from_entry=pose(plan.scope.lps_from_entry),
             lps_from_scope_tip=pose(plan.scope.lps_from_scope_tip),
         ),
         tube=replace(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from anatomy.errors import FileError, PlanFileError
 from lungaccess.plans.file import SCHEMA
-from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeRoute, TubeDeployment, WallExit
+from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 
@@ -27,16 +27,16 @@ def make_plan(values: np.ndarray | None = None, **changes: Any) -> Plan:
     pose = v[:16].reshape(4, 4)
     system = load_system("lung-default")
     stages: dict[str, Any] = {
-        "scope": ScopeRoute(
-            points_lps=v[:9].reshape(3, 3),
-            lumen_radius_mm=v[:3],
-            branches=np.array([0, 0, 1]),
+        "scope": ScopeInsertion(
+            lps_from_entry=pose.T,
+            states=v[:9].reshape(3, 3),
             lps_from_scope_tip=pose,
-            site_point=7,
+            branches=np.array([0, 1]),
             generation=1,
             length_mm=v[3],
             length_from_carina_mm=v[4],
             min_lumen_margin_mm=v[5],
+            max_curvature_per_mm=v[9],
         ),
         "tube": TubeDeployment(
             rotation_rad=v[6],
@@ -186,14 +186,14 @@ def edited(change: Any) -> str:
     [
         lambda c: c.update(seed=1),
         lambda c: c["needle"]["arcs"][1].update(roll_rad=0.0),
-        lambda c: c["scope"]["points_lps"][0].__setitem__(0, 0.0),
+        lambda c: c["scope"]["states"][0].__setitem__(0, 0.0),
         lambda c: c["system"]["margins"].update(segmentation_margin_mm=0.1),
         lambda c: c.update(digest="0" * 64),
         lambda c: c.pop("digest"),
         lambda c: c.pop("exemption"),
         lambda c: c.update(extra=1),
         lambda c: c["needle"].update(extra=1),
-        lambda c: c.update(schema="lungaccess-plan-2"),
+        lambda c: c.update(schema="lungaccess-plan-1"),
         lambda c: c.update(seed="1"),
         lambda c: c.update(seed=True),
         lambda c: c.update(seed=1.5),
@@ -254,3 +254,10 @@ def test_missing_binary_or_unwritable_file(tmp_path: Path) -> None:
 def test_schema_is_stated() -> None:
     assert make_plan().schema == SCHEMA
     assert json.loads(make_plan().to_json())["schema"] == SCHEMA
+
+
+def test_a_plan_with_a_line_for_the_scope_says_what_it_lacks() -> None:
+    old = make_plan().to_json().replace(SCHEMA, "lungaccess-plan-1")
+    with pytest.raises(PlanFileError, match="a line but no motion") as refused:
+        Plan.from_json(old)
+    assert "again for the same patient, target and system" in str(refused.value)

@@ -116,15 +116,16 @@ def test_a_ct_in_the_patients_folder_is_found(tmp_path: Path) -> None:
 
 
 def test_rays_meet_the_wall_where_the_lumen_ends(small_lung: Lung, plans: tuple[Plan, ...]) -> None:
-    scope = plans[0].scope
-    lumen = movie.SmoothLumen(small_lung, np.asarray(scope.points_lps))
-    n = int(np.argmax(scope.lumen_radius_mm))
-    pose = movie.camera_poses(plans[0], len(scope.points_lps))[n]
+    poses = np.array(movie.camera_poses(plans[0], 100))
+    lumen = movie.SmoothLumen(small_lung, poses[:, :3, 3])
+    depths = small_lung.lumen_depth.lower_bound_mm(poses[:, :3, 3])
+    n = int(np.argmax(depths))
+    pose = poses[n]
     angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
     rays = np.cos(angles)[:, None] * pose[:3, 0] + np.sin(angles)[:, None] * pose[:3, 1]
     away = lumen.wall_distance(pose[:3, 3], rays)
     voxel = float(small_lung.grid.spacing_mm.max())
-    assert away.min() == pytest.approx(scope.lumen_radius_mm[n], abs=1.2 * voxel)
+    assert away.min() == pytest.approx(depths[n], abs=1.2 * voxel)
     np.testing.assert_allclose(lumen.share(pose[:3, 3] + away[:, None] * rays), movie.HALF, atol=0.3)
     inwards = lumen.normals(pose[:3, 3] + away[:, None] * rays)
     assert ((inwards * rays).sum(axis=1) < -0.5).all()

@@ -145,7 +145,12 @@ def test_a_hole_without_a_part_is_refused() -> None:
 def test_the_data_decode_to_the_points_of_the_plans(data: dict[str, Any], plans: tuple[Plan, ...]) -> None:
     assert [each["digest"] for each in data["plans"]] == [each.digest for each in plans]
     for stored, plan in zip(data["plans"], plans, strict=True):
-        np.testing.assert_allclose(pack.unpack(stored["scope"]["points"]), plan.scope.points_lps, atol=1e-4)
+        scope, tip = stored["scope"], plan.scope.lps_from_scope_tip
+        for key, end in (("points", tip[:3, 3]), ("forward", tip[:3, 2]), ("up", tip[:3, 0])):
+            np.testing.assert_allclose(pack.unpack(scope[key])[-1], end, atol=1e-3)
+        body = np.concatenate([pack.unpack(scope["shaft"]), pack.unpack(scope["sections"])[-1]])
+        away = np.linalg.norm(plan.curves().scope.points_lps[:, None] - body, axis=2).min(axis=1)
+        assert away.max() < 1.0
         tubes, needle = pack.unpack(stored["tubes"]["points"]), pack.unpack(stored["needle"]["points"])
         np.testing.assert_allclose(
             tubes[:, 0], np.tile(plan.scope.lps_from_scope_tip[:3, 3], (len(tubes), 1)), atol=1e-4
@@ -201,16 +206,17 @@ def test_the_profile_agrees_with_the_plan_and_with_exact_distances(
         assert bend[needle].max() <= profile["most_curvature_per_mm"] * (1 + 1e-6)
 
 
-def test_the_camera_starts_front_up_and_ends_as_the_tip_points(plans: tuple[Plan, ...]) -> None:
-    scope = plans[0].scope
-    forward, up = deployment.camera_axes(np.asarray(scope.points_lps), scope.lps_from_scope_tip)
-    np.testing.assert_allclose(np.linalg.norm(forward, axis=1), 1.0, atol=1e-9)
-    np.testing.assert_allclose((forward * up).sum(axis=1), 0.0, atol=1e-9)
-    np.testing.assert_allclose(forward[-1], scope.lps_from_scope_tip[:3, 2], atol=1e-9)
-    assert up[0] @ np.array([0.0, -1.0, 0.0]) > 0.9
-    turned = np.arccos(np.clip((up[1:] * up[:-1]).sum(axis=1), -1, 1))
-    bent = np.arccos(np.clip((forward[1:] * forward[:-1]).sum(axis=1), -1, 1))
-    assert (turned <= bent + 1e-6).all()
+def test_the_camera_follows_the_states_with_the_top_of_its_picture_where_a_bend_turns(
+    plans: tuple[Plan, ...],
+) -> None:
+    from lungaccess.report.html.movie import camera_poses
+
+    tip, poses = plans[0].scope.lps_from_scope_tip, camera_poses(plans[0], 40)
+    np.testing.assert_allclose(poses[-1][:3, 2], tip[:3, 2], atol=1e-9)
+    np.testing.assert_allclose(-poses[-1][:3, 1], tip[:3, 0], atol=1e-9)
+    np.testing.assert_allclose(poses[-1][:3, 3], tip[:3, 3], atol=1e-9)
+    rotations = np.array(poses)[:, :3, :3]
+    np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-9)
 
 
 def test_cost_over_time_is_read_as_it_was_written(tmp_path: Path) -> None:

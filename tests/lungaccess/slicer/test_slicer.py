@@ -251,7 +251,7 @@ def test_the_route_of_custusx_runs_from_target_to_trachea(folder: Path, plan: Pl
     rows = np.loadtxt(lines)
     assert lines[0].endswith(f"Number of positions: {len(rows)}")
     assert np.allclose(rows[0, :3], plan.needle.end_lps, atol=1e-4)
-    assert np.allclose(rows[-1, :3], plan.scope.points_lps[0], atol=1e-4)
+    assert np.allclose(rows[-1, :3], plan.scope.lps_from_entry[:3, 3], atol=1e-4)
     flags = rows[:, 3].astype(int).tolist()
     assert flags == sorted([f for f in flags if f == 2], reverse=True) + [f for f in flags if f != 2]
     branches = 1 + flags.count(1)

@@ -29,10 +29,11 @@ from tests.stages.tube.pairs import thin_pair
 TUBES, STRAIGHT = thin_pair(30.0), thin_pair(0.0)
 INNER, OUTER = TUBES.inner, TUBES.outer
 MARGINS = Margins(segmentation_margin_mm=0.3, registration_margin_mm=0.2)
-TIPS = np.array(
+POINTS = np.array(
     [[-3.0, 0.0, -15.0, 0.0, 0.0, 1.0], [-1.0, 2.0, -12.0, 0.1, 0.0, 1.0], [8.0, 0, 0, 0, 0, 1.0]]
 )
-TIPS[:, 3:] /= np.linalg.norm(TIPS[:, 3:], axis=1, keepdims=True)
+FRAMES = np.array([pose(tip[:3], tip[3:]) for tip in POINTS])
+TIPS = np.concatenate([FRAMES[:, :3, 3], FRAMES[:, :3, 2], FRAMES[:, :3, 0]], axis=1)
 
 
 def scene() -> Lung:
@@ -100,9 +101,8 @@ def test_each_is_what_the_judge_says(lung: Lung) -> None:
     found = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
     validator = DeploymentValidator(lung, TUBES, MARGINS, with_fissures=True)
     for n in np.random.default_rng(0).choice(found.count, 60, replace=False):
-        tip = TIPS[found.site[n]]
         one = validator.validate(
-            pose(tip[:3], tip[3:]), found.rotation_rad[n], found.outer_mm[n], found.inner_mm[n]
+            FRAMES[found.site[n]], found.rotation_rad[n], found.outer_mm[n], found.inner_mm[n]
         )
         assert isinstance(one, Deployment)
         assert np.allclose(one.lps_from_tip[:3, 3], found.positions[n], atol=1e-9)
@@ -145,7 +145,7 @@ def test_the_same_call_gives_the_same_arrays(lung: Lung) -> None:
 
 
 def test_no_sites_no_deployments(lung: Lung) -> None:
-    found = enumerate_deployments(lung, TUBES, MARGINS, np.zeros((0, 6)), with_fissures=False)
+    found = enumerate_deployments(lung, TUBES, MARGINS, np.zeros((0, 9)), with_fissures=False)
     assert found.count == 0 and found.candidates == 0 and found.refused == {}
     assert found.positions.shape == (0, 3)
 
@@ -167,11 +167,11 @@ def test_progress_is_told(lung: Lung) -> None:
 
 
 def test_straight_tubes_leave_along_the_axis_of_the_scope(lung: Lung) -> None:
-    tip = np.array([[-4.0, 0.0, -12.0, 0.6, 0.0, 0.8]])
+    tip = np.array([[-4.0, 0.0, -12.0, 0.6, 0.0, 0.8, 0.8, 0.0, -0.6]])
     found = enumerate_deployments(lung, STRAIGHT, MARGINS, tip, with_fissures=False, rotations=1)
     assert found.count > 0
-    along = (found.positions - tip[0, :3]) @ tip[0, 3:]
-    assert np.allclose(found.positions, tip[0, :3] + along[:, None] * tip[0, 3:], atol=1e-9)
+    along = (found.positions - tip[0, :3]) @ tip[0, 3:6]
+    assert np.allclose(found.positions, tip[0, :3] + along[:, None] * tip[0, 3:6], atol=1e-9)
     assert np.allclose(along, found.inner_mm)
 
 

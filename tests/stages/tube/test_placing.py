@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from anatomy.lung import Lung
-from anatomy.poses import pose
 from stages.tube import (
     PlacedShapes,
     ShapeGrid,
@@ -24,12 +23,10 @@ from stages.tube.environment import tube_constants, tube_environment
 from stages.tube.kernels.shapes import bend_towards, carried
 from stages.tube.kernels.wall_exit import ACCEPTED, IN_TISSUE, PHASE, march, reset
 from stages.tube.shapes import TubeShapes
-from tests.stages.tube.test_deployments import MARGINS, TIPS, TUBES, scene
+from tests.stages.tube.test_deployments import FRAMES, MARGINS, TIPS, TUBES, scene
 from tests.stages.tube.test_shapes import PAIR
 
 ROTATIONS = 24
-FRAMES = np.array([pose(tip[:3], tip[3:6]) for tip in TIPS])
-ROWS = np.concatenate([FRAMES[:, :3, 3], FRAMES[:, :3, 2], FRAMES[:, :3, 0]], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +56,7 @@ def test_todays_design_as_today(lung: Lung) -> None:
         ),
     )
     found = placed(lung, shapes, 0.1)
-    today = enumerate_deployments(lung, TUBES, MARGINS, ROWS, with_fissures=True, rotations=ROTATIONS)
+    today = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=ROTATIONS)
 
     def key(site: int, rotation: float, inner: float, outer: float) -> tuple[float, ...]:
         return site, round(rotation, 6), round(inner, 6), round(outer, 6)

@@ -1,0 +1,144 @@
+"""Which design of tubes reaches most of the periphery: 20 designs in one bronchoscope.
+
+    python -m experiments.tube_designs [--quick] [--results FOLDER] [--patients NAME ...]
+
+A target is reached if a single arc of the needle, proved clear, leads to it from a deployment of the atlas.
+What is finished is kept in a file beside the result, and a run that was stopped goes on from there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import lungaccess as la
+from anatomy.errors import SettingsError
+from anatomy.io.files import atomic_write
+from anatomy.lung import Lung
+from anatomy.settings import override
+from experiments.support.anatomies import anatomy, default_anatomies
+from experiments.support.results import Result, setting_of, study_parser, write_result
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.system import System, system_fingerprint
+from stages.needle import direct_arcs, needle_environment
+
+TARGETS_A_LUNG, QUICK_TARGETS_A_LUNG = 50, 3
+BASE = "ultrathin"
+PLAIN = {"outer.slotted_segments": (), "inner.slotted_segments": (), "max_channel_curvature_per_mm": None}
+"""Tubes without slots; the channel is as bent as their strain allows."""
+PAIRS: Mapping[str, Mapping[str, Any]] = {
+    "straight outer tube (the preset)": {},
+    "inner tube curved by 1/80 mm": {"inner.precurvature_per_mm": 0.0125},
+    "inner tube curved by 1/57 mm": {"inner.precurvature_per_mm": 0.0175},
+    "inner tube curved by 1/29 mm": {"inner.precurvature_per_mm": 0.035},
+    "inner tube curved by 1/22 mm": {"inner.precurvature_per_mm": 0.045},
+    "curve of 20 mm": {"inner.curved_length_mm": 20.0},
+    "curve of 30 mm": {"inner.curved_length_mm": 30.0},
+    "curve of 50 mm": {"inner.curved_length_mm": 50.0},
+    "curve of 60 mm": {"inner.curved_length_mm": 60.0},
+    "curve of 20 mm by 1/22 mm": {"inner.curved_length_mm": 20.0, "inner.precurvature_per_mm": 0.045},
+    "curve of 60 mm by 1/80 mm": {"inner.curved_length_mm": 60.0, "inner.precurvature_per_mm": 0.0125},
+    "without slots": PLAIN,
+    "without slots, strain of 4 %": {**PLAIN, "max_strain": 0.04},
+    "outer tube with a thicker wall": {"outer.inner_diameter_mm": 1.27},
+    "thinner inner tube": {"inner.outer_diameter_mm": 1.1, "inner.inner_diameter_mm": 0.92},
+}
+"""Designs of two tubes: what differs from the preset, by key.  All are assumptions, as its own sizes."""
+ALONE: Mapping[str, Mapping[str, Any]] = {
+    "one straight tube, 30 mm": {
+        "curved_length_mm": 0.0,
+        "precurvature_per_mm": 0.0,
+        "max_extension_mm": 30.0,
+    },
+    "one straight tube, 60 mm": {"curved_length_mm": 0.0, "precurvature_per_mm": 0.0},
+    "one tube curved by 1/80 mm": {"precurvature_per_mm": 0.0125},
+    "one tube curved by 1/40 mm": {},
+    "one tube curved by 1/22 mm": {"precurvature_per_mm": 0.045},
+}
+"""Designs in which the preset's inner tube is the only one, with what differs."""
+
+
+def designs() -> Iterator[tuple[str, System | None]]:
+    """Yield the name of each design and its system, None if it breaks its own limits."""
+    base = la.load_system(BASE, fissures_allowed=True)
+    alone = replace(base, tubes=replace(base.tubes, outer=None))
+    for name, changes in PAIRS.items():
+        yield name, _changed(base, {f"tubes.{key}": value for key, value in changes.items()})
+    for name, changes in ALONE.items():
+        where = {key: "tubes." if key == "max_extension_mm" else "tubes.inner." for key in changes}
+        yield name, _changed(alone, {where[key] + key: value for key, value in changes.items()})
+
+
+def _changed(system: System, changes: Mapping[str, Any]) -> System | None:
+    try:
+        return override(system, changes)
+    except SettingsError:
+        return None
+
+
+def reached_of(lung: Lung, system: System, per_lung: int, seed: int) -> int:
+    """Return how many of the peripheral targets a single arc reaches."""
+    atlas = la.build_atlas(lung, system)
+    environment = needle_environment(lung, system.needle, system.margins, with_fissures=atlas.with_fissures)
+    entries, reached = atlas.deployments, 0
+    for target in peripheral_targets(lung, per_lung, seed):
+        near, _ = atlas.index.holding(environment, target)
+        at = (entries.positions[near], entries.tangents[near], entries.branch[near])
+        blockers, _, _ = direct_arcs(environment, *at, target)
+        reached += bool((blockers == 0).any())
+    return reached
+
+
+class Finished:
+    """Counts that are kept in a file, one a lung, system, seed and number of targets."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._counts: dict[str, int] = json.loads(file.read_text()) if file.exists() else {}
+
+    def count(self, lung: Lung, system: System, per_lung: int, seed: int) -> int:
+        """Return the count, as kept or else made and kept."""
+        key = f"{lung.key} {system_fingerprint(system)} {per_lung} {seed}"
+        if key not in self._counts:
+            self._counts[key] = reached_of(lung, system, per_lung, seed)
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self._file) as temporary:
+                temporary.write_text(json.dumps(self._counts, indent=1))
+        return self._counts[key]
+
+
+def main() -> None:
+    """Run the study and store its result."""
+    parser = study_parser(__doc__)
+    parser.add_argument("--patients", nargs="+", default=default_anatomies())
+    options = parser.parse_args()
+    per_lung = QUICK_TARGETS_A_LUNG if options.quick else TARGETS_A_LUNG
+    patients = options.patients[:1] if options.quick else options.patients
+    setting = setting_of(options)
+    result = Result(
+        name="tube_designs", title="Peripheral targets within reach, by design of the tubes",
+        setting=setting, seeds=[options.seed],
+        conditions={
+            "system": f"{BASE}, with other tubes", "fissures": "may be crossed",
+            "targets": f"{2 * per_lung} random peripheral points a patient",
+            "reached": "by a single arc that is proved clear, from a deployment of the atlas",
+        },
+    )  # fmt: skip
+    finished = Finished(Path(options.results) / setting / "tube_designs_finished" / "counts.json")
+    for name in patients:
+        lung = anatomy(name)
+        for design, system in designs():
+            label = f"{lung.name}: {design}"
+            if system is None:
+                result.add(label, None, note="breaks its own limit of strain")
+                continue
+            count = finished.count(lung, system, per_lung, options.seed)
+            result.add(label, 100.0 * count / (2 * per_lung), unit="%")
+    write_result(result, options.results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Shapes between those of the grid: any joint values near a deployment, fast enough for local search."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.errors import SettingsError
+from anatomy.grid import read_only
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+from stages.tube.equilibrium import matrices
+from stages.tube.kernels import shapes as kernel
+from stages.tube.mechanics import TubeMechanics
+from stages.tube.sequences import BEND_RAD
+from stages.tube.shapes import TubeShapes
+
+ROOM = 4 * kernel.MOST_ARCS
+"""For arcs: more than designs of three tubes have pieces; it grows where that is too little."""
+
+
+@frozen_record
+class NearbyShape:
+    """A deployment of any joint values; see `TubeShapes` for its fields.
+
+    The least determinant is that of the way from the deployment nearby.
+    """
+
+    insertions_mm: Float
+    rotations_rad: Float
+    tip_angles_rad: Float
+    arcs: Float
+    scope_from_tip: Float
+    least_determinant: float
+    arc_error_mm: float
+
+
+class NearbyShapes:
+    """Finds shapes of joint values next to those of a grid.
+
+    Sideways sweep and strain of the whole way are not judged: what is chosen in the end has to be deployed by
+    itself, see `stages.tube.following.deploy`.
+    """
+
+    def __init__(self, shapes: TubeShapes) -> None:
+        self.shapes = shapes
+        self._mechanics = TubeMechanics(shapes.tubes)
+        self._radii = np.array([tube.radius_mm for tube in shapes.tubes])
+
+    def at(self, shape: int, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
+        """Return the shape of joint values, reached straight from a shape of the grid; None if tubes snap.
+
+        Parameters
+        ----------
+        shape : int
+            A deployment nearby.
+        insertions_mm, rotations_rad : (n,) float64
+
+        Raises
+        ------
+        SettingsError
+            If numbers are missing or not finite, or the tubes get out of order.
+        """
+        mechanics, near = self._mechanics, self.shapes
+        out, turned = (np.array(values, dtype=np.float64) for values in (insertions_mm, rotations_rad))
+        for name, values in (("insertions", out), ("rotations", turned)):
+            if values.shape != (mechanics.count,) or not np.isfinite(values).all():
+                raise SettingsError(
+                    f"The {name} are {values.tolist()}", expected=f"{mechanics.count} finite numbers"
+                )
+        end = out - mechanics.lengths_mm
+        mechanics.check_shifts(end[None])
+        result, tips = np.zeros(kernel.SHAPE_COLUMNS), near.tip_angles_rad[shape].copy()
+        base = near.rotations_rad[shape] + BEND_RAD
+        beta = near.insertions_mm[shape] - mechanics.lengths_mm
+        room = ROOM
+        while True:
+            arcs = np.zeros((room, kernel.ARC_COLUMNS))
+            count = kernel.arcs_near(
+                mechanics.design, self._radii, base, beta, turned - near.rotations_rad[shape], end,
+                mechanics.step_rad, tips, result, arcs,
+            )  # fmt: skip
+            if count >= 0:
+                break
+            room, tips = 2 * room, near.tip_angles_rad[shape].copy()
+        if count == 0:
+            return None
+        return NearbyShape(
+            insertions_mm=read_only(out),
+            rotations_rad=read_only(turned),
+            tip_angles_rad=read_only(tips),
+            arcs=read_only(arcs[:count].copy()),
+            scope_from_tip=read_only(matrices(result[None, kernel.TIP :])[0]),
+            least_determinant=float(result[kernel.LEAST]),
+            arc_error_mm=float(result[kernel.ERROR]),
+        )

@@ -80,8 +80,11 @@ class Motion:
         )
 
     def body_pieces(self) -> tuple[Int, Float]:
-        """Return the arcs of the body in the last state: their states `(P,)` and lengths `(P,)` in mm."""
-        moved = np.flatnonzero(self.moves)
+        """Return the arcs of the body in the last state: their states `(P,)` and lengths `(P,)` in mm.
+
+        What draws back, which a motion must not, lays none.
+        """
+        moved = np.flatnonzero(self.advances > TINY_MM)
         last = len(self.states) - 1
         return np.append(moved, last), np.append(self.advances[moved], self.section_mm)
 

@@ -27,7 +27,7 @@ def limit_lower(case: Case, rng: Rng) -> Mutant | None:
 def slots_stripped(case: Case, rng: Rng) -> Mutant | None:
     """Tubes that use much of their limit of strain have lost the slots that keep them within it."""
     tubes = case.plan.system.tubes
-    if not tubes.outer.slotted_segments:
+    if tubes.outer is None or not tubes.outer.slotted_segments:
         return None
     measured = max(_value(case, "tube.strain.outer"), _value(case, "tube.strain.inner"))
     weakest = max(tube.slotted_segments[0].strain_factor for tube in (tubes.outer, tubes.inner))

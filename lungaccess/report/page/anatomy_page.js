@@ -89,7 +89,7 @@ export function openPage(page) {
     state: () => page.report(),
     set: (place) => {
       page.moveTo(place);
-      page.draw();
+      page.redraw.now();
     },
   };
 }

@@ -25,17 +25,18 @@ export function sceneBackground() {
   return [1, 3, 5].map((n) => parseInt(value.slice(n, n + 2), 16) / 255);
 }
 
-// Call a function at most once for each picture of the screen.
+// Call a function at most once for each picture of the screen; `now` calls it at once, and no call waits then.
 export function oncePerFrame(task) {
-  let waiting = false;
-  return () => {
-    if (waiting) return;
-    waiting = true;
-    requestAnimationFrame(() => {
-      waiting = false;
-      task();
-    });
+  let waiting = null;
+  const later = () => {
+    waiting ??= requestAnimationFrame(later.now);
   };
+  later.now = () => {
+    if (waiting !== null) cancelAnimationFrame(waiting);
+    waiting = null;
+    task();
+  };
+  return later;
 }
 
 // Connect the buttons of the views, the canvas and the letters at its edges with a camera.

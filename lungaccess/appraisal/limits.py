@@ -66,7 +66,7 @@ KINDS = (
         scale=100.0,
     ),
     _Kind(what="needle bend in scope (strain)", findings=("needle.strain",), unit="%", scale=100.0),
-    _radius("scope bend with tubes in it", "tube.channel"),
+    _radius("scope radius of curvature", "tube.channel"),
     _angle("bend set at the scope's handle", "scope.handle"),
     _distance("sideways sweep of tubes", "tube.sweep.limit", "tube.sweep.stated_limit"),
     _angle("tubes to wall at exit", "tube.exit.angle.limit", "tube.exit.angle.stated_limit"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -165,8 +166,13 @@ def test_limits_are_those_of_the_check_nearest_first(appraisal: Appraisal) -> No
             assert each.value is not None and (
                 device == "tube" or min(each.stated, 19.0) <= each.value + 0.05
             )
-    (bend,) = [each for each in appraisal.limits if each.what == "needle radius of curvature"]
-    assert bend.side == "at least" and bend.bound == pytest.approx(SYSTEM.needle.min_radius_of_curvature_mm)
+    bounds = {each.what: each.bound for each in appraisal.limits if "radius of curvature" in each.what}
+    assert all(each.side == "at least" for each in appraisal.limits if each.what in bounds)
+    assert SYSTEM.tubes.max_channel_curvature_per_mm is not None
+    assert bounds == {
+        "scope radius of curvature": pytest.approx(1.0 / SYSTEM.tubes.max_channel_curvature_per_mm),
+        "needle radius of curvature": pytest.approx(SYSTEM.needle.min_radius_of_curvature_mm),
+    }
 
 
 def test_every_distance_stands_once(appraisal: Appraisal) -> None:
@@ -221,7 +227,7 @@ def test_an_appraisal_joins_check_and_estimate(
 def test_a_notebook_shows_headline_and_limits(appraisal: Appraisal) -> None:
     shown = appraisal._repr_html_()
     assert appraisal.headline.text.replace("'", "&#x27;") in shown
-    assert all(each.what in shown for each in appraisal.limits[:10])
+    assert all(escape(each.what) in shown for each in appraisal.limits[:10])
     assert (Grade.GOOD.colour in shown) == (appraisal.headline.grade == Grade.GOOD)
 
 

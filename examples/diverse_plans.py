@@ -4,16 +4,14 @@
 The picture shows tubes and needles of the set from the front, over the airway tree.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 
 import lungaccess as la
 from lungaccess.coupled import alternatives
 
 lung = la.load_patient("phantom-3")
-system = la.load_system(Path(__file__).with_name("my_device.toml"))
-target = la.resolve_target(lung, nodule=2)
+system = la.load_system("ultrathin")
+target = la.resolve_target(lung, nodule=1)
 found = alternatives(lung, system, target, count=8, separation_mm=5.0)
 figure, ax = plt.subplots(figsize=(9, 5))
 x, _y, z = lung.tree.points_lps.T

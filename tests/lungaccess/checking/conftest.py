@@ -131,9 +131,16 @@ def is_airway_of(labels: np.ndarray, branch: int) -> np.ndarray:
     )
 
 
-def toy_plan(lung: Any, system: System, outer_mm: float, inner_mm: float, arcs: Any = ARCS) -> Plan:
+def toy_plan(
+    lung: Any,
+    system: System,
+    outer_mm: float,
+    inner_mm: float,
+    arcs: Any = ARCS,
+    straightened_rad: float = STRAIGHTENED_RAD,
+) -> Plan:
     """The plan, every stated value from closed forms and brute force."""
-    scope = toy_scope(lung, system)
+    scope = toy_scope(lung, system, straightened_rad)
     tube, tube_points, exit_at = toy_tube(lung, system, scope.lps_from_scope_tip, outer_mm, inner_mm)
     frames, at = follow(tube.lps_from_tip, list(arcs), 0.1)
     points, tangents = frames[:, :3, 3], frames[:, :3, 2]
@@ -193,14 +200,14 @@ def toy_plan(lung: Any, system: System, outer_mm: float, inner_mm: float, arcs: 
     )
 
 
-def toy_scope(lung: Any, system: System) -> ScopeInsertion:
+def toy_scope(lung: Any, system: System, straightened_rad: float) -> ScopeInsertion:
     """Down the trachea and some way into the lobar bronchus, by pursuit; at last the tip straightens."""
     tree: AirwayTree = lung.tree
     site = int(tree.branch_start[LOBAR]) + SITE_STEP
     length, section = float(tree.distance_from_root_mm[site]), system.scope.bending_length_mm
     led = pursued(tree.points_lps[tree.route(site)], length, section, np.array([1.0, 0.3, 0.0]))
     advance, twist, bend = led.states[-1]
-    bend -= STRAIGHTENED_RAD
+    bend -= straightened_rad
     motion = replace(led, states=np.append(led.states, [[advance, twist, bend]], axis=0))
     margin = float(brute_depth(lung, motion).min()) - system.scope.radius_mm
     points = motion.body(0.05)[:, :3, 3]

@@ -24,8 +24,13 @@ REFUSED_BY = {
 
 
 @pytest.fixture(scope="module")
-def case(plan: Plan, lung: Any) -> Case:
-    return Case(lung=lung, plan=plan, report=check(plan, lung), other=plan)
+def case(plan: Plan, lung: Any, system: Any, tools: Any) -> Case:
+    """The toy plan with a tip that stays bent, so that the tubes have something to straighten."""
+    inserted = plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
+    bent = tools.toy_plan(lung, system, *inserted, straightened_rad=0.02)
+    report = check(bent, lung)
+    assert not {each.name for each in report.refusals} & set.union(*REFUSED_BY.values())
+    return Case(lung=lung, plan=bent, report=report, other=plan)
 
 
 def test_strain_and_handle_agree_with_the_planner_s(case: Case) -> None:

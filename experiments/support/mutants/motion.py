@@ -53,9 +53,12 @@ def exit_edited(case: Case, rng: Rng) -> Mutant | None:
 
 
 def exit_at_a_corner(case: Case, rng: Rng) -> Mutant | None:
-    """The exit is stated where the axis cuts a corner of the wall, before it leaves for good."""
+    """The exit is stated where the axis cuts a corner of the wall, before it leaves for good.
+
+    Where there is no such corner, one voxel that the axis passes behind the exit becomes lumen.
+    """
     tube, lung = case.plan.tube, case.lung
-    arc = np.arange(0.0, tube.exit.arc_length_mm - 0.05, 0.005)
+    arc = np.arange(0.0, tube.inner_insertion_mm, 0.005)
     points = centreline(
         case.plan.system.tubes,
         case.plan.scope.lps_from_scope_tip,
@@ -66,9 +69,15 @@ def exit_at_a_corner(case: Case, rng: Rng) -> Mutant | None:
     )
     index = np.rint(lung.grid.ijk(points)).astype(np.int64)
     wet = (lung.labels[tuple(index.T)] & structures.LUMEN) != 0
-    leaves = np.flatnonzero(wet[:-1] & ~wet[1:])
+    leaves = np.flatnonzero(wet[:-1] & ~wet[1:] & (arc[1:] < tube.exit.arc_length_mm - 0.05))
     if not len(leaves):
-        return None
+        # The axis stays 0.05 mm in the voxel: shorter ways through lumen may be overlooked.
+        passed = (index[:-10] == index[10:]).all(axis=1) & (arc[5:-5] > tube.exit.arc_length_mm + 0.1)
+        if not passed.any():
+            return None
+        n = 5 + int(rng.choice(np.flatnonzero(passed)))
+        label = int(lung.labels[tuple(index[n])]) | structures.LUMEN
+        return Mutant(plan=case.plan, voxel=index[n], label=label)
     n = int(rng.choice(leaves))
     edits = {"tube__exit__arc_length_mm": float(arc[n]), "tube__exit__point_lps": points[n]}
     return Mutant(plan=changed(case.plan, **edits, exemption__exit_point_lps=points[n]))

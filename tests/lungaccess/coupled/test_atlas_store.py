@@ -20,15 +20,20 @@ SYSTEM = la.load_system("ultrathin")
 COARSE: dict[str, Any] = {"rotations": 4, "stop_spacing_mm": 10.0, "site_spacing_mm": 4.0}
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The systems for which an atlas was enumerated."""
-    names: list[str] = []
-    build = atlas_store.build_atlas
+@pytest.fixture(scope="module")
+def enumerated(small_lung: Lung) -> Atlas:
+    """An atlas as the store has it made: what is in it does not matter to the store."""
+    return atlas_store.build_atlas(small_lung, SYSTEM, **COARSE)
 
-    def counted(lung: Lung, system: Any, **options: Any) -> Atlas:
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch, enumerated: Atlas) -> list[str]:
+    """The systems for which an atlas was asked of `build_atlas`; it always has the same contents."""
+    names: list[str] = []
+
+    def counted(lung: Lung, system: Any, **_options: Any) -> Atlas:
         names.append(system.name)
-        return build(lung, system, **options)
+        return replace(enumerated, lung=lung, system=system)
 
     monkeypatch.setattr(atlas_store, "build_atlas", counted)
     return names

@@ -19,7 +19,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.task import Task
-from stages.scope import Bronchoscope, prover_of
+from stages.scope import Bronchoscope, ScopeMotion, prover_of
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 TIGHTEST_RADIUS_MM = 20.0
@@ -159,8 +159,9 @@ def scope_changes(
         room_mm = prover.prove(candidate.tip.motion)
         if isinstance(room_mm, str):
             continue
-        widest = thin_atlas.system.scope.outer_diameter_mm + 2.0 * room_mm
-        needed = round(math.floor(widest / SCOPE_STEP_MM + 1e-9) * SCOPE_STEP_MM, 6)
+        needed = _widest_mm(
+            task, candidate.tip.motion, thin_atlas.system.scope.outer_diameter_mm + 2.0 * room_mm
+        )
         system = _with_scope(task.system, needed)
         plan = _assembled(replace(task, system=system), thin_atlas, candidate)
         yield Counterfactual(
@@ -170,6 +171,20 @@ def scope_changes(
             plan=plan,
         )
         return
+
+
+def _widest_mm(task: Task, motion: ScopeMotion, known_mm: float) -> float:
+    """Return the largest diameter, in steps and below the present one, for which a motion is proved.
+
+    `known_mm` is known to do: the room that a proof met is a lower bound.
+    """
+    steps = math.floor(known_mm / SCOPE_STEP_MM + 1e-9)
+    while (wider := round((steps + 1) * SCOPE_STEP_MM, 6)) < task.system.scope.outer_diameter_mm:
+        scope = _with_scope(task.system, wider).scope
+        if isinstance(prover_of(task.lung, scope).prove(motion), str):
+            break
+        steps += 1
+    return round(steps * SCOPE_STEP_MM, 6)
 
 
 def _thinnest_mm(scope: Bronchoscope) -> float:

@@ -39,6 +39,7 @@ from lungaccess.problem.task import Task
 from stages.needle import OUR_PLANNERS, TERMS, Objective
 from stages.scope import MotionProver, in_tip_region
 from tests.lungaccess.cli.ahead import turned_candidates
+from tests.lungaccess.points import FAR_TARGET
 from tests.lungaccess.resample import needle_walk, problems
 
 SYSTEM = la.load_system("ultrathin")
@@ -48,8 +49,6 @@ KEYS = [term.key for term in TERMS]
 
 KUNTZ_TARGET = "lps:-56.3,53.9,-48.5"
 """One that random placement finds within a few thousand draws."""
-FAR_TARGET = "lps:-48.4,-38.6,-7.8"
-"""One that lies in no workspace of the atlas."""
 TARGET = "lps:-45.6,47.0,-65.1"
 """One to which many direct arcs are clear."""
 

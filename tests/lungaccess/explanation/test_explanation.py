@@ -19,10 +19,12 @@ from lungaccess.coupled import Attempt, DirectArcs
 from lungaccess.explanation import FAILS, explain, explain_no_plan, explanation_record, sections
 from lungaccess.explanation.blocking import MOST_ARCS
 from lungaccess.explanation.explanation import Explanation
+from lungaccess.explanation.kernels import STEP_MM
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle import direct_arcs
+from tests.lungaccess.points import FAR_TARGET
 from tests.stages.scenes import lung_of
 
 SYSTEM = la.load_system("ultrathin")
@@ -52,8 +54,8 @@ def no_plan(lung: Lung, system: System, target: Target, atlas: la.Atlas) -> la.N
 
 @pytest.fixture(scope="module")
 def far(small_lung: Lung, atlas_of: AtlasOf) -> Explanation:
-    """Of a nodule outside the workspace of every deployment, without a limit of time."""
-    target, atlas = la.resolve_target(small_lung, nodule=3), atlas_of(SYSTEM, lambda _share: None)
+    """Of a target outside the workspace of every deployment, without a limit of time."""
+    target, atlas = la.resolve_target(small_lung, FAR_TARGET), atlas_of(SYSTEM, lambda _share: None)
     failure = no_plan(small_lung, SYSTEM, target, atlas)
     return explain_no_plan(small_lung, SYSTEM, target, failure, atlas=atlas, time_s=None, atlas_of=atlas_of)
 
@@ -100,14 +102,17 @@ class TestBlocked:
     def test_the_least_violation_is_what_the_exact_distances_say(
         self, blocked: tuple[Explanation, la.Atlas], walled: tuple[Lung, Target]
     ) -> None:
-        """Along the arc, which ends at the target, exact clearance is lacking by the stated amount."""
+        """Along the arc, which ends at the target, exact clearance is lacking by the stated amount.
+
+        It is stated of points STEP_MM apart, and changes by no more than the distance between two points.
+        """
         arc, (lung, target) = blocked[0].blocked_arc, walled
         assert arc is not None
         np.testing.assert_allclose(arc.points_lps[-1], target.lps_mm, atol=1e-6)
         past_exit = arc.points_lps[int(SYSTEM.needle.exit_exemption_mm) + 2 :]
         clearance = lung.exact_clearance_mm(past_exit, OBSTACLES, cap_mm=3.0)
         assert arc.required_mm == pytest.approx(0.9)
-        assert (arc.required_mm - clearance).max() <= arc.shortfall_mm + 1e-9
+        assert (arc.required_mm - clearance).max() <= arc.shortfall_mm + 0.5 * STEP_MM
         # The shell is 1.5 mm thick, and the clearance lacks on both sides of it.
         assert 1.5 < arc.blocked_mm < 12.0
         spot = arc.structure.lps_mm
@@ -143,12 +148,12 @@ class TestBlocked:
 
     def test_what_was_not_tried_is_no_no(self, blocked: tuple[Explanation, la.Atlas]) -> None:
         explanation, _atlas = blocked
-        untried = {"lung-default", "flexure-needle", "therapeutic-scope"}
+        untried = {"stylet-needle", "lung-default", "flexure-needle", "therapeutic-scope"}
         assert set(explanation.untried) == untried and not explanation.attempts
         assert {part.name for part in explanation.not_tried} == {f"preset {name}" for name in untried}
         assert "no other preset" not in explanation.headline and "not tried" in explanation.headline
         tried = [each["tried"] for each in explanation_record(explanation)["presets"]]
-        assert tried == [False] * 3
+        assert tried == [False] * 4
 
 
 class TestFar:
@@ -157,7 +162,7 @@ class TestFar:
     def test_every_part_was_done(self, far: Explanation) -> None:
         assert not far.not_tried and not far.untried
         names = [attempt.system.name for attempt in far.attempts]
-        assert names == ["lung-default", "flexure-needle", "therapeutic-scope"]
+        assert names == ["stylet-needle", "lung-default", "flexure-needle", "therapeutic-scope"]
 
     def test_the_arc_beyond_the_limits_ends_at_the_target_and_exceeds_one(self, far: Explanation) -> None:
         arc = far.arc_beyond_limits

@@ -17,6 +17,7 @@ from lungaccess.explanation import FAILS, Explanation, explain_no_plan
 from lungaccess.report import no_plan_png
 from lungaccess.report.html import no_plan_page
 from tests.lungaccess.loading import load_with
+from tests.lungaccess.points import FAR_TARGET
 from tests.lungaccess.report import browser
 
 SYSTEM = la.load_system("ultrathin")
@@ -25,8 +26,8 @@ NO_TIME_S = 1e-9
 
 @pytest.fixture(scope="module")
 def explanation(small_lung: Lung) -> Explanation:
-    """Of a nodule out of reach: what blocks, the starts and the nearest point."""
-    target = la.resolve_target(small_lung, nodule=3)
+    """Of a target out of reach: what blocks, the starts and the nearest point."""
+    target = la.resolve_target(small_lung, FAR_TARGET)
     atlas = la.build_atlas(small_lung, SYSTEM, rotations=12, stop_spacing_mm=4.0, site_spacing_mm=2.0)
     with pytest.raises(la.NoPlan) as caught:
         list(la.plan(small_lung, SYSTEM, target, atlas=atlas, iterations=5, counterfactuals=False))
@@ -115,14 +116,14 @@ def test_the_command_leaves_what_it_learned_and_exits_1(
     monkeypatch.setattr("lungaccess.coupled.open_atlas", lambda *_, **__: atlas)
     (tmp_path / "plan.json").write_text("{}")
     words = [
-        "plan", "toy", "--nodule", "3", "--system", "ultrathin", "--iterations", "3", "--no-pictures",
+        "plan", "toy", "--target", FAR_TARGET, "--system", "ultrathin", "--iterations", "3", "--no-pictures",
         "--explain-time", str(NO_TIME_S), "--out", str(tmp_path), *(["--json"] if as_json else []),
     ]  # fmt: skip
     assert cli.main(words) == ExitCode.NEGATIVE
     said = capsys.readouterr().out
     stored = json.loads((tmp_path / "no_plan.json").read_text())
     assert all(part["outcome"] == "not tried" for part in stored["parts"]) and stored["parts"]
-    assert [each["tried"] for each in stored["presets"]] == [False] * 3
+    assert [each["tried"] for each in stored["presets"]] == [False] * 4
     if as_json:
         record = json.loads(said)
         assert record["headline"] == stored["headline"] and record["files"] == ["no_plan.json"]

@@ -147,7 +147,7 @@ def test_exits_of_a_tour_with_required_plans_have_a_coupled_plan(small_lung: Lun
     candidates = places(small_lung, 40)
     for lesion in candidates:
         accepts = coupled_plan_test(atlas, lesion)
-        good = [p for p in np.unique(atlas.sites.tree_point).tolist() if accepts(0, p)]
+        good = [p for p in np.unique(atlas.motions.tree_point).tolist() if accepts(0, p)]
         if good:
             break
     else:

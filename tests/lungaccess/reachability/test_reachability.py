@@ -242,7 +242,13 @@ def test_neighbours_come_before() -> None:
 
 def test_devices_are_compared(small_lung: Lung) -> None:
     stiff = replace(SYSTEM, name="stiff", needle=replace(SYSTEM.needle, max_curvature_per_mm=0.002))
-    thick = replace(SYSTEM, name="thick", scope=replace(SYSTEM.scope, outer_diameter_mm=15.0))
+    thick = replace(
+        SYSTEM,
+        name="thick",
+        scope=replace(
+            SYSTEM.scope, outer_diameter_mm=15.0, min_bending_radius_mm=8.0, min_shaft_radius_mm=8.0
+        ),
+    )
     told: list[str] = []
     maps = compare_reach(
         small_lung, (SYSTEM, stiff, thick), spacing_mm=25.0, progress=lambda name, _share: told.append(name)

@@ -13,14 +13,8 @@ from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.coupled import tip_clearances_mm, tube_stability
 from stages.tube import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, insertion_stops, kernels
 from stages.tube.shape import centreline
+from tests.lungaccess.coupled.planning import SYSTEM
 from tests.stages.scenes import brute_clearance
-
-SYSTEM = la.load_system("ultrathin")
-
-
-@pytest.fixture(scope="module")
-def atlas(small_lung: Lung) -> la.Atlas:
-    return la.build_atlas(small_lung, SYSTEM)
 
 
 def test_counts_add_up(atlas: la.Atlas) -> None:

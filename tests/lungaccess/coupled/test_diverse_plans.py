@@ -20,14 +20,8 @@ from lungaccess.coupled import Alternative, alternatives, with_front
 from lungaccess.coupled.kernels.separation import choose_separated
 from lungaccess.coupled.search.separated_arcs import _branches_first, _lines, _samples
 from stages.needle.path import direct_path
+from tests.lungaccess.coupled.planning import SYSTEM
 from tests.lungaccess.resample import needle_walk
-
-SYSTEM = la.load_system("ultrathin")
-
-
-@pytest.fixture(scope="module")
-def atlas(small_lung: Lung) -> la.Atlas:
-    return la.build_atlas(small_lung, SYSTEM)
 
 
 @pytest.fixture(scope="module")

@@ -31,18 +31,13 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle.device import Needle
 from stages.tube import Deployment, DeploymentValidator, tracking_length_mm
+from tests.lungaccess.coupled.planning import SYSTEM
 from tests.lungaccess.resample import problems
 
-SYSTEM = la.load_system("ultrathin")
 EASY_TARGET = "lps:-56.3,53.9,-48.5"
 """One that the first two thousand random placements reach several times."""
 ITERATIONS = 2000
 SPACING_MM = np.array([0.55, 0.6, 0.7])
-
-
-@pytest.fixture(scope="module")
-def atlas(small_lung: Lung) -> la.Atlas:
-    return la.build_atlas(small_lung, SYSTEM)
 
 
 @pytest.fixture(scope="module")

@@ -16,16 +16,15 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
 from stages.needle import SHORTEST
+from tests.lungaccess.coupled.planning import SYSTEM
 
-SYSTEM = la.load_system("ultrathin")
 COUNT = 12
 AHEAD_MM = 25.0
 
 
 @pytest.fixture(scope="module")
-def plans(small_lung: Lung) -> list[Plan]:
+def plans(small_lung: Lung, atlas: la.Atlas) -> list[Plan]:
     """Plans from turned tips all over the lung, to points straight ahead of the tube."""
-    atlas = la.build_atlas(small_lung, SYSTEM)
     entries, found = atlas.deployments, []
     turned = np.flatnonzero(atlas.motions.turned[entries.site])
     for entry in np.random.default_rng(0).permutation(turned):

@@ -1,0 +1,230 @@
+"""Lungs on disk: damage is repaired, nothing half-made is used."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from anatomy import store
+from anatomy.errors import AnatomyError, FileError
+from anatomy.lung import Lung
+from anatomy.patient import PatientImages
+from anatomy.store import META, open_lung
+from tests.anatomy import toys
+from tests.anatomy.stored_toy import KEY, SOURCES, no_reading, require_same
+from tests.anatomy.toys import toy
+
+
+def _truncate(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def _other_shape(file: Path) -> None:
+    np.save(file, np.zeros((3, 4, 5), dtype=np.load(file).dtype, order="F"))
+
+
+def _set_meta(**values: Any) -> Callable[[Path], None]:
+    def change(file: Path) -> None:
+        file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        (META, Path.unlink),
+        (META, _truncate),
+        (META, lambda file: file.write_text("")),
+        (META, lambda file: file.write_text("[1, 2]")),
+        (META, lambda file: file.write_text('{"format": 0}')),
+        (META, lambda file: file.write_bytes(b"\xff\xfe\x00")),
+        (META, _set_meta(format=-1)),
+        (META, _set_meta(shape=[1, 2])),
+        (META, _set_meta(shape=[1, 2, 3])),
+        (META, _set_meta(lps_from_ijk=[[0.0]])),
+        (META, _set_meta(fields=3)),
+        (META, _set_meta(tree_report=None)),
+        (META, _set_meta(tree_report={"gaps_bridged": [1]})),
+        ("labels.npy", Path.unlink),
+        ("labels.npy", _truncate),
+        ("labels.npy", lambda file: file.write_bytes(b"")),
+        ("labels.npy", _other_shape),
+        ("obstacle.npy", Path.unlink),
+        ("obstacle.npy", _truncate),
+        ("obstacle.npy", _other_shape),
+        ("nodules.npy", _other_shape),
+        ("lumen_depth.npy", Path.unlink),
+        ("tree.npz", Path.unlink),
+        ("tree.npz", _truncate),
+        ("tree.npz", lambda file: file.write_bytes(b"")),
+        ("tree.npz", lambda file: np.savez(file, points_lps=np.zeros((2, 3)))),
+    ],
+)
+def test_damage_is_repaired(
+    cache: Path, name: str, damage: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damage(cache / KEY / name)
+    calls: list[int] = []
+
+    def read() -> PatientImages:
+        calls.append(1)
+        return toy()
+
+    lung = open_lung(SOURCES, read, cache=cache)
+    assert calls == [1]
+    require_same(lung, open_lung(SOURCES, no_reading, cache=cache))
+    assert [path.name for path in cache.iterdir()] == [KEY]
+
+
+@pytest.mark.parametrize(
+    ("raised", "expected"),
+    [
+        (KeyboardInterrupt(), KeyboardInterrupt),
+        (MemoryError(), MemoryError),
+        (OSError(errno.ENOSPC, "No space left on device"), FileError),
+    ],
+)
+@pytest.mark.parametrize("after", [0, 2, 6])
+def test_a_build_that_fails_leaves_nothing(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    after: int,
+    raised: BaseException,
+    expected: type[BaseException],
+) -> None:
+    save, calls = np.save, []
+
+    def failing(*args: Any, **kwargs: Any) -> None:
+        calls.append(1)
+        if len(calls) > after:
+            raise raised
+        save(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store.np, "save", failing)
+        with pytest.raises(expected):
+            open_lung(SOURCES, toy, cache=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    assert open_lung(SOURCES, toy, cache=tmp_path).name == "Toy"
+
+
+def test_what_a_patient_may_not_be_is_not_stored(tmp_path: Path) -> None:
+    with pytest.raises(AnatomyError):
+        open_lung(SOURCES, lambda: toy(lung=np.zeros(toys.grid().shape, dtype=bool)), cache=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from anatomy import store
+from tests.anatomy.toys import toy
+
+def die(*_args):
+    os.kill(os.getpid(), 9)
+
+store._save_rest = die
+store.open_lung({sources!r}, toy, cache=Path(sys.argv[1]))
+"""
+
+
+def test_a_killed_build_is_not_taken_for_a_lung(tmp_path: Path) -> None:
+    """Nobody can tidy up after SIGKILL; what remains must have another name."""
+    code = KILLED.format(sources=SOURCES)
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], cwd=root, env={**os.environ, "PYTHONPATH": str(root)}
+    )
+    assert done.returncode == -9
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".building-")
+    assert (left / "labels.npy").is_file()
+    calls: list[int] = []
+
+    def read() -> PatientImages:
+        calls.append(1)
+        return toy()
+
+    open_lung(SOURCES, read, cache=tmp_path)
+    assert calls == [1]
+
+
+def test_two_builds_at_once_end_with_one_lung(tmp_path: Path) -> None:
+    """While one process builds, another finishes the same lung."""
+    inner: list[Lung] = []
+
+    def read() -> PatientImages:
+        inner.append(open_lung(SOURCES, toy, cache=tmp_path))
+        return toy()
+
+    outer = open_lung(SOURCES, read, cache=tmp_path)
+    require_same(outer, inner[0])
+    assert [path.name for path in tmp_path.iterdir()] == [KEY]
+
+
+def test_the_other_process_may_win_at_the_last_moment(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between looking and renaming, the folder appears: rename fails, and the other lung is as good."""
+    late = tmp_path / "late"
+    rename = os.replace
+
+    def slow(source: Path, target: Path) -> None:
+        shutil.copytree(cache / KEY, late / KEY)
+        rename(source, target)
+
+    monkeypatch.setattr(store.os, "replace", slow)
+    lung = open_lung(SOURCES, toy, cache=late)
+    require_same(lung, open_lung(SOURCES, no_reading, cache=cache))
+    assert [path.name for path in late.iterdir()] == [KEY]
+
+
+def test_a_mapped_lung_outlives_its_folder(cache: Path) -> None:
+    lung = open_lung(SOURCES, no_reading, cache=cache)
+    before = lung.labels.copy()
+    shutil.rmtree(cache)
+    assert (lung.labels == before).all()
+
+
+def test_a_cache_that_cannot_be_written_is_an_error_with_a_remedy(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileError, match=r"cannot be written.*--cache or LUNGACCESS_CACHE"):
+        open_lung(SOURCES, toy, cache=tmp_path / "file")
+    with pytest.raises(FileError, match="cannot be written"):
+        open_lung(SOURCES, toy, cache=tmp_path / "file" / "below")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_stored_lung_is_read_from_a_cache_that_cannot_be_written(cache: Path) -> None:
+    cache.chmod(0o500)
+    try:
+        assert open_lung(SOURCES, no_reading, cache=cache).name == "Toy"
+        with pytest.raises(FileError, match="cannot be written"):
+            open_lung({"other": "d" * 64}, toy, cache=cache)
+    finally:
+        cache.chmod(0o700)
+
+
+def test_what_a_killed_build_left_is_removed_a_day_later(tmp_path: Path) -> None:
+    images = toy()
+    old, new = tmp_path / ".building-old", tmp_path / ".building-new"
+    for folder in (old, new):
+        folder.mkdir()
+        (folder / "labels.npy").write_bytes(b"half")
+    long_ago = time.time() - 2 * 24 * 3600
+    os.utime(old, (long_ago, long_ago))
+    open_lung(dict(images.sources), lambda: images, cache=tmp_path)
+    assert not old.exists()
+    assert new.exists()

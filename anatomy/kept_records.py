@@ -1,0 +1,98 @@
+"""Records that are slow to make, kept in the cache: one file of arrays for all that a record depends on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from anatomy.cache import cache_limit_bytes, default_cache
+from anatomy.cache_entries import make_room, note_use
+from anatomy.errors import FileError
+from anatomy.grid import read_only
+from anatomy.io.files import atomic_write
+
+T = TypeVar("T")
+DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
+"""What reading a damaged or foreign file raises; the record is then made anew."""
+
+
+def kept_record(
+    kind: str,
+    version: int,
+    depends_on: Mapping[str, Any],
+    *,
+    make: Callable[[], T],
+    parts: Callable[[T], Mapping[str, Any]],
+    rebuilt: Callable[[dict[str, Any]], T],
+    cache: Path | None = None,
+    name: str = "",
+    in_use: tuple[Path, ...] = (),
+) -> T:
+    """Return the record from the cache, or make and keep it; what was used least recently makes room for it.
+
+    Parameters
+    ----------
+    kind : str
+        What it is, one of `anatomy.cache_entries`; the file is named after it.
+    version : int
+        To be raised when `make` returns something else for the same `depends_on`.
+    depends_on : mapping
+        Plain values.
+    parts, rebuilt : callable
+        Returns the arrays and the plain values of a record by name, and the record from them.
+    cache : Path, optional
+        Folder of the cache; `anatomy.cache.default_cache()` if None.
+    name : str
+        Whose it is; empty if it belongs to no patient.
+    in_use : tuple of Path
+        What has to stay in the cache as well.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    SettingsError
+        If the limit of the cache is no size.
+    """
+    text = json.dumps({"format": version, **depends_on}, sort_keys=True, default=list)
+    path = (cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
+    stored = _stored(path, rebuilt)
+    if stored is not None:
+        note_use(path)
+        return stored
+    most_bytes = cache_limit_bytes()
+    made = make()
+    _save(kind, {"format": version, "name": name, **parts(made)}, path)
+    make_room(path.parent, most_bytes, {kind: version}, keep=(path, *in_use))
+    return made
+
+
+def _stored(path: Path, rebuilt: Callable[[dict[str, Any]], T]) -> T | None:
+    """Return the record in a file; None if there is none or it is damaged."""
+    try:
+        with np.load(path) as stored:
+            arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
+            return rebuilt(arrays | json.loads(str(stored["rest"])))
+    except DAMAGE:
+        return None
+
+
+def _save(kind: str, values: Mapping[str, Any], path: Path) -> None:
+    arrays: dict[str, Any] = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    rest = {name: value for name, value in values.items() if name not in arrays}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as temporary, open(temporary, "wb") as stream:
+            np.savez(stream, rest=np.array(json.dumps(rest)), **arrays)
+    except OSError as error:
+        raise FileError(
+            f"The {kind} cannot be stored in {path.parent}: {error}",
+            remedy="Choose another folder with --cache or LUNGACCESS_CACHE",
+            expected="a folder that may be written to, with room on the disk",
+        ) from error

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
 from anatomy.structures import AIRWAY, LUMEN
-from anatomy.typed import Float, Labels
+from anatomy.typed import Bool, Float, Labels
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, branch_of, chord_mm, labels_at
 from lungaccess.problem.system import System
 from stages.needle import ArcPath, arc_transform
@@ -51,16 +52,13 @@ class TubeValidator:
             return REASONS[kernels.PROTRUDES]
         points, at_mm = shape.sample(LABEL_STEP_MM)
         labels = labels_at(self._obstacles.lung, points)
-        outside = (labels & LUMEN) == 0
-        # One sample alone, between others in the lumen, is the corner of a voxel.
-        left = np.flatnonzero(outside & np.append(outside[1:], True))
-        if outside[0] or not len(left):
+        first = self._first_outside(points, at_mm, (labels & LUMEN) != 0)
+        if first == 0:
             return REASONS[kernels.NO_EXIT]
-        first = int(left[0])
         branch = int(branch_of(labels[first - 1 : first])[0])
         if self._mediastinal[branch]:
             return REASONS[kernels.LEAVES_MEDIASTINAL]
-        exit_mm = self._leaving_mm(points[first - 1 : first + 1], at_mm[first - 1 : first + 1])
+        exit_mm = self._border_mm(points, at_mm, first)
         refused = self._contained(labels[first:], at_mm[first:] - exit_mm, branch)
         if refused:
             return refused
@@ -86,12 +84,26 @@ class TubeValidator:
             lateral_sweep_mm=0.0,
         )
 
-    def _leaving_mm(self, ends: Float, at_mm: Float) -> float:
-        """Return the arc length at which the axis leaves the lumen, between two samples."""
+    def _first_outside(self, points: Float, at_mm: Float, inside: Bool) -> int:
+        """Return the first sample beyond the lumen for good, behind the corners of voxels; 0 if there is none."""
+        crossings = np.flatnonzero(inside[1:] != inside[:-1]) + 1
+        if not inside[0] or not len(crossings):
+            return 0
+        for left, back in itertools.zip_longest(crossings[::2], crossings[1::2]):
+            if back is None:
+                return int(left)
+            out_mm = self._border_mm(points, at_mm, back) - self._border_mm(points, at_mm, left)
+            if out_mm > kernels.CORNER_MM:
+                return int(left)
+        return 0
+
+    def _border_mm(self, points: Float, at_mm: Float, sample: int) -> float:
+        """Return the arc length at which the axis crosses the border of the lumen before a sample."""
         share = np.linspace(0.0, 1.0, EXIT_SAMPLES)
-        labels = labels_at(self._obstacles.lung, ends[0] + share[:, None] * (ends[1] - ends[0]))
-        last = int(np.argmin((labels & LUMEN) != 0)) - 1
-        return float(at_mm[0] + share[last] * (at_mm[1] - at_mm[0]))
+        begin, end = points[sample - 1 : sample + 1]
+        inside = (labels_at(self._obstacles.lung, begin + share[:, None] * (end - begin)) & LUMEN) != 0
+        last = int(np.argmax(inside != inside[0])) - 1
+        return float(at_mm[sample - 1] + share[last] * (at_mm[sample] - at_mm[sample - 1]))
 
     def _wall_angle_rad(self, shape: ArcPath, exit_mm: float) -> float:
         lung, frame = self._obstacles.lung, frame_at(shape, exit_mm)

@@ -168,8 +168,8 @@ class TestTubes:
                 assert ours.wall_angle_rad == pytest.approx(theirs.wall_angle_rad, abs=0.05)
             only_meshes += isinstance(ours, Deployment) and isinstance(theirs, str)
             only_proof += isinstance(ours, str) and isinstance(theirs, Deployment)
-        # The proof knows no corners of voxels that the samples step over; chords are padded by 0.01 mm.
-        assert both >= 20 and only_proof <= 2 and only_meshes <= 0.25 * both
+        # Chords are padded by 0.01 mm.
+        assert both >= 20 and only_proof <= 1 and only_meshes <= 0.25 * both
 
     def test_lines_follow_their_curves(self, obstacles: Obstacles) -> None:
         frame = poses.pose([1.0, 2.0, 3.0], [0.2, 0.4, 1.0])

@@ -72,6 +72,21 @@ def require_same(atlas: Atlas, lung: Lung, system: System) -> None:
         )
 
 
+def motions_of(lung: Lung, system: System, spacing_mm: float = TIP_SPACING_MM) -> ScopeMotions:
+    """Return the motions of the scope to tips at which the tubes of a system can leave the airway.
+
+    `spacing_mm` is that of the tips along the airway.
+    """
+    return find_motions(
+        lung,
+        system.scope,
+        reach_mm=tracking_length_mm(system.tubes),
+        max_curvature_per_mm=system.tubes.channel_curvature_per_mm,
+        tip_bends_rad=bends_with_tubes_rad(system),
+        spacing_mm=spacing_mm,
+    )
+
+
 def build_atlas(
     lung: Lung,
     system: System,
@@ -94,15 +109,7 @@ def build_atlas(
     """
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)
-    reach = tracking_length_mm(system.tubes)
-    motions = find_motions(
-        lung,
-        system.scope,
-        reach_mm=reach,
-        max_curvature_per_mm=system.tubes.channel_curvature_per_mm,
-        tip_bends_rad=bends_with_tubes_rad(system),
-        spacing_mm=site_spacing_mm,
-    )
+    motions = motions_of(lung, system, site_spacing_mm)
     straight = int((~motions.turned).sum())
     share = straight / max(motions.count, 1)
     tell = progress or (lambda _share: None)

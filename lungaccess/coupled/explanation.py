@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 
-from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.atlas import Atlas, motions_of
 from lungaccess.coupled.counterfactuals import Counterfactual, find_counterfactuals
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.no_plan import NoPlan
@@ -97,7 +98,7 @@ def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...])
     """
     atlas = arcs.atlas
     if atlas.motions.count == 0:
-        return _thinner_scope(atlas.motions.passages.widest_scope_mm)
+        return _thinner_scope(arcs.task, atlas.motions.passages.widest_scope_mm)
     if atlas.deployments.count == 0:
         return ""
     if direct:
@@ -116,10 +117,28 @@ def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...])
     return ". ".join(said)
 
 
-def _thinner_scope(widest_mm: float) -> str:
-    """Say how thin the scope must be to pass a place with an exit ahead, rounded down to a tenth."""
-    tenths = math.floor(10.0 * widest_mm)
-    return f"A bronchoscope of {tenths / 10:.1f} mm or less fits somewhere" if tenths else ""
+def _thinner_scope(task: Task, in_the_middle_mm: float) -> str:
+    """Say how thin the scope must be for a motion to an exit, in tenths of a millimetre.
+
+    `in_the_middle_mm` is the largest diameter that fits on the medial axis; beside it there may be more room.
+    """
+    scope = task.system.scope
+    fits, fits_not = math.floor(10.0 * in_the_middle_mm), math.ceil(10.0 * scope.outer_diameter_mm)
+    if fits == 0 or not _moves(task, fits):
+        return ""
+    while fits_not - fits > 1:
+        middle = (fits + fits_not) // 2
+        if _moves(task, middle):
+            fits = middle
+        else:
+            fits_not = middle
+    return f"A bronchoscope of {fits / 10:.1f} mm or less fits somewhere"
+
+
+def _moves(task: Task, tenths: int) -> bool:
+    """Tell whether a scope so thick, in tenths of a millimetre, gets anywhere."""
+    scope = replace(task.system.scope, outer_diameter_mm=tenths / 10.0)
+    return motions_of(task.lung, replace(task.system, scope=scope)).count > 0
 
 
 def _reached(arcs: DirectArcs, *, with_fissures: bool = True) -> bool:

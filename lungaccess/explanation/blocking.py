@@ -22,8 +22,6 @@ NEAR_MM = 5.0
 """Points that are so near to each other belong to one place of a structure."""
 SAME_SHORTFALL_MM = 0.05
 """Shortfalls that differ by less count as equal, and the shorter blocked length decides."""
-SHOWN_STEP_MM = 1.0
-"""Distance of the points of a path that is only shown."""
 
 
 @frozen_record
@@ -80,7 +78,7 @@ class BlockedArc:
     Parameters
     ----------
     points_lps : (N, 3) float64, LPS mm
-        From the tip of the tubes to the target.
+        From the tip of the tubes to the target; where the clearance was looked up.
     length_mm, blocked_mm : float
         Length of the arc, and of those parts of it that are too near to something.
     required_mm, shortfall_mm : float
@@ -271,4 +269,4 @@ def _points(arcs: DirectArcs, entry: int) -> Float:
 
     entries = arcs.atlas.deployments
     frame = poses.pose(entries.positions[entry], entries.tangents[entry])
-    return direct_path(frame, arcs.task.target.lps_mm).sample(SHOWN_STEP_MM)[0]
+    return direct_path(frame, arcs.task.target.lps_mm).sample(kernels.STEP_MM)[0]

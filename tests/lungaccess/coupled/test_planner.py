@@ -124,6 +124,7 @@ class TestKuntz2015:
 
     def test_it_finds_better_and_better_plans(self, kuntz_plans: list[Plan]) -> None:
         assert len(kuntz_plans) >= 2 and all(plan.method == "kuntz2015" for plan in kuntz_plans)
+        assert max(len(plan.needle.arcs) for plan in kuntz_plans) >= 2
         costs = [plan.costs["inverse_clearance"] for plan in kuntz_plans]
         assert costs == sorted(costs, reverse=True)
 

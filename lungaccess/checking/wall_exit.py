@@ -25,7 +25,7 @@ BISECTIONS = 20
 """The spacing of the samples, halved so often, is less than a nanometre."""
 SAMPLES = 25
 """Samples in a step of the curve, 0.002 mm apart: voxel corners thinner than the step are found."""
-CORNER_MM = 0.1
+CORNER_MM = 0.05
 """An axis that is out of the lumen for no more than this cuts the corner of a voxel: not an exit."""
 CORNER_TOLERANCE_MM = 0.005
 """Both ends of such a stretch are known to a sample."""

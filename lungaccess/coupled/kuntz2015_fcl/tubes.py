@@ -85,7 +85,7 @@ class TubeValidator:
         )
 
     def _first_outside(self, points: Float, at_mm: Float, inside: Bool) -> int:
-        """Return the first sample beyond the lumen for good, behind the corners of voxels; 0 if there is none."""
+        """Return the first sample beyond the lumen, behind corners of voxels; 0 if there is none."""
         crossings = np.flatnonzero(inside[1:] != inside[:-1]) + 1
         if not inside[0] or not len(crossings):
             return 0

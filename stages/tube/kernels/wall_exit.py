@@ -30,7 +30,7 @@ FREE = -1
 """Stands for the label of an obstacle where a bound says that there is none."""
 FINE_STEP_MM = 0.05
 """Least step in the lumen, where the axis may cut corners of voxels: a tenth of a voxel."""
-CORNER_MM = 0.1
+CORNER_MM = 0.05
 """An axis that is back in a lumen after no more than this has cut the corner of a voxel and not left: it is
 never farther than half of this from the lumen."""
 LOOK_MM = 0.02

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TypeVar, dataclass_transform
 
 T = TypeVar("T")
+LEFT_OUT_IF_EMPTY = "left out if empty"
+"""Metadata of a field that a file lacks where it is empty, as do files from before the field was there."""
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False)

@@ -15,6 +15,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from anatomy.errors import SettingsError
+from anatomy.records import LEFT_OUT_IF_EMPTY
 
 T = TypeVar("T")
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -142,9 +143,16 @@ def parse(cls: type[T], mapping: Mapping[str, object], where: str, remedy: str =
 
 
 def to_mapping(values: object) -> dict[str, Any]:
-    """Return settings as plain JSON types, from which `parse` restores them without loss."""
-    fields = dataclasses.fields(cast(Any, values))
-    return {field.name: _plain(getattr(values, field.name)) for field in fields}
+    """Return settings as plain JSON types, from which `parse` restores them without loss.
+
+    Fields with LEFT_OUT_IF_EMPTY in their metadata are left out where they are empty.
+    """
+    held = {field: getattr(values, field.name) for field in dataclasses.fields(cast(Any, values))}
+    return {
+        field.name: _plain(value)
+        for field, value in held.items()
+        if value or not field.metadata.get(LEFT_OUT_IF_EMPTY)
+    }
 
 
 def override(values: T, changes: Mapping[str, object], where: str = "overrides") -> T:

@@ -27,15 +27,15 @@ def check_channel(plan: Plan, found: Findings) -> None:
     if limit is not None:
         detail = "curvature of the channel that the tubes pass"
         found.at_most("tube.channel", tightest, limit, "1/mm", detail, 1e-9)
-    inserted = (plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm)
-    for name, tube, length in zip(("outer", "inner"), (tubes.outer, tubes.inner), inserted, strict=True):
-        if tube is None:
-            continue
+    inserted = plan.tube.insertions_mm(tubes)
+    for (name, tube), length in zip(tubes.named, inserted, strict=True):
         strain = max(_strains(tube, behind_mm, bent, length))
         detail = f"largest strain of the {name} tube on its way through the channel"
         found.at_most(f"tube.strain.{name}", strain, tubes.max_strain, "", detail, 1e-9)
     needle = plan.system.needle
-    strain = 0.5 * needle.diameter_mm * needle.strain_factor * max(tightest, _bend_at_rest(tubes.inner, 0.0))
+    # Tubes that share a bend are bent by no more than the most bent of them is at rest.
+    at_rest = max(curvature for tube in tubes.nested for _begin, _end, curvature in bent_at_rest(tube))
+    strain = 0.5 * needle.diameter_mm * needle.strain_factor * max(tightest, at_rest)
     detail = "largest strain of the needle on its way through channel and tubes"
     found.at_most("needle.strain", strain, needle.max_strain, "", detail, 1e-9)
     _check_handle(plan, inserted, found)
@@ -53,8 +53,20 @@ def _strains(tube: Tube, behind_mm: Float, bent: Float, inserted_mm: float) -> I
 
 
 def _bend_at_rest(tube: Tube, from_tip_mm: float) -> float:
-    """Return the precurvature at a place of a tube of one arc, 1/mm."""
-    return tube.precurvature_per_mm if from_tip_mm <= tube.curved_length_mm else 0.0
+    """Return the precurvature at a place of a tube, 1/mm."""
+    return max(k for begin, end, k in bent_at_rest(tube) if begin <= from_tip_mm <= end)
+
+
+def bent_at_rest(tube: Tube) -> list[tuple[float, float, float]]:
+    """Return the parts of a tube: begin and end in mm from its tip, and precurvature in 1/mm."""
+    parts, begin = [], 0.0
+    for piece in reversed(tube.bent_pieces):
+        parts.append((begin, begin + piece.length_mm, piece.precurvature_per_mm))
+        begin += piece.length_mm
+    if tube.curved_length_mm > 0.0:
+        parts.append((0.0, tube.curved_length_mm, tube.precurvature_per_mm))
+        begin = tube.curved_length_mm
+    return [*parts, (begin, np.inf, 0.0)]
 
 
 def _slots(tube: Tube, from_tip_mm: float) -> tuple[float, float]:
@@ -65,13 +77,11 @@ def _slots(tube: Tube, from_tip_mm: float) -> tuple[float, float]:
     return 1.0, 1.0
 
 
-def _check_handle(plan: Plan, inserted_mm: tuple[float, float], found: Findings) -> None:
+def _check_handle(plan: Plan, inserted_mm: tuple[float, ...], found: Findings) -> None:
     """Section and tubes share the bending moment that the handle sets: it must be set to bend both."""
     device, tubes = plan.system.scope, plan.system.tubes
     stiffness = device.bending_stiffness_n_mm2
-    for tube, inserted in zip((tubes.outer, tubes.inner), inserted_mm, strict=True):
-        if tube is None:
-            continue
+    for tube, inserted in zip(reversed(tubes.nested), inserted_mm, strict=True):
         plain = 1e3 * tube.youngs_modulus_gpa * np.pi / 64.0
         plain *= tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4
         inside = np.append(np.arange(inserted, inserted + device.bending_length_mm, STEP_MM), inserted)

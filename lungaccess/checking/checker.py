@@ -40,8 +40,8 @@ class Checker:
         target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
         if check_record(plan, self._environment.lung, found, system, target):
             check_scope(plan.scope, plan.system, self._environment, found)
-            curve = check_deployment(plan, self._environment, found)
-            check_needle(plan, self._environment, None if curve is None else curve.end, found)
+            tube_tip = check_deployment(plan, self._environment, found)
+            check_needle(plan, self._environment, tube_tip, found)
         return found.report()
 
 

@@ -17,6 +17,7 @@ from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import check_rigid, check_same_pose
 from lungaccess.checking.shapes import Curve
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
+from lungaccess.checking.twisted import SWEEP_TOLERANCE_MM, check_twisted
 from lungaccess.checking.wall_exit import Exit, check_exit, check_wall_run
 from lungaccess.plans.plan import Plan
 
@@ -34,47 +35,79 @@ SWEEP_STEP_MM = 1.0
 """Insertion between two replayed steps; the sweep changes slowly with it."""
 SWEEP_POINT_MM = 0.5
 """Spacing of the points of the body that are compared with the final shape."""
-SWEEP_TOLERANCE_MM = 0.02
-"""So much less may a replay at steps find than a formula that takes the largest sweep."""
+ROUNDING_MM = 1e-12
+"""Of an arc length: behind the end of a tube the next one begins."""
+_PROTRUSION = {"middle": "tube.protrusion.middle", "inner": "tube.protrusion"}
 
 
-def check_deployment(plan: Plan, environment: Environment, found: Findings) -> Curve | None:
-    """Record everything about the tubes; return their re-integrated centreline if it can be followed."""
+def check_deployment(plan: Plan, environment: Environment, found: Findings) -> Float | None:
+    """Record everything about the tubes; return their re-integrated tip `(4, 4)` if they can be followed."""
     tube, tubes, lung = plan.tube, plan.system.tubes, environment.lung
     if not (check_rigid("tube.tip", tube.lps_from_tip, found) and _is_pose(plan.scope.lps_from_scope_tip)):
         return None
-    bend = shapes.bend_of(tubes, tube.outer_insertion_mm, tube.inner_insertion_mm)
-    curve = shapes.tube_curve(plan.scope.lps_from_scope_tip, tube.rotation_rad, bend)
-    check_same_pose("tube.tip", tube.lps_from_tip, curve.end, found)
-    _check_limits(plan, bend, found)
+    if not found.true(
+        "tube.shape", (tube.shape is None) == tubes.planar, "arcs of tubes that are not planar"
+    ):
+        return None
+    pieces = shapes.tube_pieces(plan)
+    curve = shapes.integrate(plan.scope.lps_from_scope_tip, pieces)
+    tip = shapes.tube_tip(plan, curve)
+    check_same_pose("tube.tip", tube.lps_from_tip, tip, found)
+    _check_lengths(plan, found)
     check_channel(plan, found)
-    sweep_mm = _check_sweep(plan, found)
+    if tube.shape is None:
+        _check_strain(plan, found)
+        beside_mm = _check_sweep(plan, found)
+    else:
+        derived = check_twisted(plan, curve, found)
+        if derived is None:
+            return None
+        beside_mm = derived
     way_out = check_exit(plan, lung, curve, found)
     if way_out is not None:
-        curve = shapes.tube_curve(plan.scope.lps_from_scope_tip, tube.rotation_rad, bend, way_out.arc_mm)
+        curve = shapes.integrate(plan.scope.lps_from_scope_tip, shapes.cut_at(pieces, way_out.arc_mm))
         way_out = replace(way_out, frame=int(np.abs(curve.arc_mm - way_out.arc_mm).argmin()))
         labels = labels_at(lung, curve.points)
         _check_containment(plan, curve, labels, way_out, found)
         _check_out_of_lumen(environment, curve, way_out, found)
-        _check_clearance(plan, environment, curve, way_out, sweep_mm, found)
+        _check_clearance(plan, environment, curve, way_out, beside_mm, found)
         check_wall_run(plan, environment, curve, way_out, found)
-    return curve
+    return tip
 
 
 def _is_pose(pose: Float) -> bool:
     return bool(np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < 1e-3)
 
 
-def _check_limits(plan: Plan, bend: shapes.Bend, found: Findings) -> None:
-    """Insertions and strains are within what the tubes allow."""
+def _check_lengths(plan: Plan, found: Findings) -> None:
+    """Insertions are within what the tubes allow; that of a tube which is not there is 0."""
+    tube, tubes = plan.tube, plan.system.tubes
+    found.at_most(
+        "tube.extension", tube.inner_insertion_mm, tubes.max_extension_mm, "mm", "tip beyond the scope tip"
+    )
+    stated = {
+        "outer": (tube.outer_insertion_mm, tubes.outer),
+        "middle": (tube.middle_insertion_mm, tubes.middle),
+        "inner": (tube.inner_insertion_mm, tubes.inner),
+    }
+    around = 0.0, 0.0
+    for name, (inserted, device) in stated.items():
+        if device is None and name == "middle" and inserted == 0.0:
+            continue
+        length = 0.0 if device is None else device.length_mm
+        found.at_most(f"tube.{name}_length", inserted, length, "mm")
+        if name != "outer":
+            ahead = length - around[1]
+            detail = f"{name} beyond the tube around it"
+            found.at_most(_PROTRUSION[name], inserted - around[0], ahead, "mm", detail)
+        around = inserted, length
+
+
+def _check_strain(plan: Plan, found: Findings) -> None:
+    """Strains of planar tubes beyond the scope are within what the tubes allow."""
     tube, tubes = plan.tube, plan.system.tubes
     outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
-    found.at_most("tube.extension", inner, tubes.max_extension_mm, "mm", "tip beyond the scope tip")
-    outer_length = tubes.outer.length_mm if tubes.outer is not None else 0.0
-    found.at_most("tube.outer_length", outer, outer_length, "mm")
-    found.at_most("tube.inner_length", inner, tubes.inner.length_mm, "mm")
-    ahead = tubes.inner.length_mm - outer_length
-    found.at_most("tube.protrusion", inner - outer, ahead, "mm", "inner beyond outer tube")
+    bend = shapes.bend_of(tubes, outer, inner)
     # Straightened in the scope the inner tube is bent by its whole precurvature; the outer one bends with it.
     factors = [
         deployed_strain_factor(tube, length)
@@ -136,12 +169,8 @@ def _check_out_of_lumen(environment: Environment, curve: Curve, way_out: Exit, f
 def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:
     """Return the frame from which on, up to the exit, the tube's rim is never wholly in the lumen."""
     phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
-    device, frames = plan.system.tubes, curve.frames[: way_out.frame + 1, None, :3]
-    radius = 0.5 * np.where(
-        curve.arc_mm[: way_out.frame + 1] <= plan.tube.outer_insertion_mm,
-        device.outermost.outer_diameter_mm,
-        device.inner.outer_diameter_mm,
-    )
+    frames = curve.frames[: way_out.frame + 1, None, :3]
+    radius = shapes.radius_at(plan, curve.arc_mm[: way_out.frame + 1])
     across = np.cos(phi)[:, None] * frames[..., 0] + np.sin(phi)[:, None] * frames[..., 1]
     rim = frames[..., 3] + radius[:, None, None] * across
     wet = ((labels_at(lung, rim) & structures.LUMEN) != 0).reshape(len(radius), RIM_POINTS).all(axis=1)
@@ -149,18 +178,15 @@ def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:
 
 
 def _check_clearance(
-    plan: Plan, environment: Environment, curve: Curve, way_out: Exit, sweep_mm: float, found: Findings
+    plan: Plan, environment: Environment, curve: Curve, way_out: Exit, beside_mm: float, found: Findings
 ) -> None:
-    """From its first contact with the wall on, each tube keeps radius, margins and sweep from obstacles."""
+    """From its first contact with the wall on, each tube keeps radius, margins and more from obstacles.
+
+    More are the sweep and, of tubes that are not planar, how far the derived shape is from the curve.
+    """
     contact = _first_contact(environment.lung, curve, way_out, plan)
-    margin = plan.system.margins.total_mm + sweep_mm
-    tubes = plan.system.tubes
-    radius = np.where(
-        curve.arc_mm[:-1] < plan.tube.outer_insertion_mm,
-        0.5 * tubes.outermost.outer_diameter_mm,
-        0.5 * tubes.inner.outer_diameter_mm,
-    )
-    needed = radius + margin + curve.sagitta_mm
+    margin = plan.system.margins.total_mm + beside_mm
+    needed = shapes.radius_at(plan, curve.arc_mm[:-1] + ROUNDING_MM) + margin + curve.sagitta_mm
     for name, select, first in obstacles_of(way_out.branch, contact, way_out.frame):
         boxes = environment.boxes(select, REACH_MM)
         points = curve.points[first:]

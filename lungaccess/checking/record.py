@@ -15,7 +15,7 @@ from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.plans.file import SCHEMA
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import System, load_system, preset_names, system_fingerprint
+from lungaccess.problem.system import System, load_system, shipped_names, system_fingerprint
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -98,7 +98,7 @@ def _check_system(plan: Plan, found: Findings, system: System | None) -> None:
     found.true(
         "system.fingerprint", plan.system_fingerprint == system_fingerprint(plan.system), plan.system.name
     )
-    if plan.system.name in preset_names():
+    if plan.system.name in shipped_names():
         preset = to_mapping(load_system(plan.system.name))
         found.true("system.preset", stated == preset, "settings of the preset of that name")
     if system is not None:
@@ -110,7 +110,7 @@ def _check_required(plan: Plan, found: Findings) -> None:
     extra = margin.segmentation_margin_mm + margin.registration_margin_mm
     wanted = {
         "outer_tube": 0.5 * tubes.outermost.outer_diameter_mm + extra,
-        "inner_tube": 0.5 * tubes.inner.outer_diameter_mm + extra,
+        **{f"{name}_tube": 0.5 * tube.outer_diameter_mm + extra for name, tube in tubes.named},
         "needle": 0.5 * plan.system.needle.diameter_mm + extra,
     }
     names = {name for stage in plan.clearance_mm.values() for name in stage}
@@ -129,6 +129,12 @@ def _check_lengths(plan: Plan, found: Findings) -> bool:
     lengths = [tube.inner_insertion_mm, *(arc.length_mm for arc in arcs)]
     usable = bool(arcs) and min(lengths) > 0.0 and sum(lengths) <= MAX_TOTAL_MM
     usable &= 0.0 <= tube.outer_insertion_mm <= tube.inner_insertion_mm
+    if plan.system.tubes.middle is not None:
+        usable &= tube.outer_insertion_mm <= tube.middle_insertion_mm <= tube.inner_insertion_mm
+    if tube.shape is not None:
+        bent = np.abs(tube.shape.arcs[:, 2]).max(initial=0.0)
+        usable &= len(tube.shape.arcs) > 0 and float(bent) <= MAX_CURVATURE_PER_MM
+        usable &= bool((tube.shape.arcs[:, 0] >= 0.0).all()) and tube.shape.arcs[:, 0].sum() <= MAX_TOTAL_MM
     states = plan.scope.states
     usable &= 0 < len(states) <= MAX_STATES and float(np.abs(states[:, 1:]).max()) <= MAX_ANGLE_RAD
     usable &= float(np.abs(states[:, 0]).max()) <= MAX_TOTAL_MM

@@ -9,6 +9,7 @@ import numpy as np
 
 from anatomy.records import frozen_record
 from anatomy.typed import Float
+from lungaccess.plans.plan import Plan
 from stages.tube.device import ConcentricTubes
 
 TINY_MM = 1e-9
@@ -158,15 +159,45 @@ def bend_of(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> Bend:
     return Bend(edges_mm=tuple(edges), per_mm=tuple(values))
 
 
-def tube_curve(lps_from_scope_tip: Float, rotation_rad: float, bend: Bend, frame_at_mm: float = 0.0) -> Curve:
-    """Re-integrate the tubes from the tip of the scope, with a frame exactly at `frame_at_mm`."""
+def tube_pieces(plan: Plan) -> list[Piece]:
+    """Return the tubes of a plan as pieces: planar ones from their insertions, others as their arcs say."""
+    tube = plan.tube
+    if tube.shape is None:
+        bend = bend_of(plan.system.tubes, tube.outer_insertion_mm, tube.inner_insertion_mm)
+        return planar_pieces(tube.rotation_rad, bend)
+    pieces, turned = [], -tube.rotation_rad
+    for length, direction, curvature, _radius in tube.shape.arcs.tolist():
+        if length > TINY_MM:
+            pieces.append(Piece(length_mm=length, roll_rad=direction - turned, curvature_per_mm=curvature))
+            turned = direction
+    return pieces
+
+
+def planar_pieces(rotation_rad: float, bend: Bend) -> list[Piece]:
+    """Return planar tubes, turned by an angle, as pieces."""
     rolls = [rotation_rad] + [0.0] * len(bend.per_mm)
     lengths = np.diff(bend.edges_mm)
-    pieces = [
+    return [
         Piece(length_mm=float(length), roll_rad=roll, curvature_per_mm=curvature)
         for length, roll, curvature in zip(lengths, rolls, bend.per_mm, strict=False)
     ]
-    return integrate(lps_from_scope_tip, cut_at(pieces, frame_at_mm))
+
+
+def tube_tip(plan: Plan, curve: Curve) -> Float:
+    """Return the frame that a plan has to state where its tubes end, from the end of their curve."""
+    arcs = () if plan.tube.shape is None else plan.tube.shape.arcs
+    directions = [float(arc[1]) for arc in arcs if arc[0] > TINY_MM]
+    return np.asarray(curve.end @ turn(-directions[-1])) if directions else curve.end
+
+
+def radius_at(plan: Plan, arc_mm: Float) -> Float:
+    """Return the radius of the outermost tube at places `(n,)` beyond the scope tip, its own end included."""
+    radius = np.zeros(len(arc_mm))
+    inserted = plan.tube.insertions_mm(plan.system.tubes)
+    for (_name, tube), end_mm in reversed(list(zip(plan.system.tubes.named, inserted, strict=True))):
+        here = (arc_mm <= end_mm) | (radius == 0.0)
+        radius = np.where(here, 0.5 * tube.outer_diameter_mm, radius)
+    return radius
 
 
 def planar_shape(bend: Bend, step_mm: float) -> Float:

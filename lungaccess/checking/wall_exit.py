@@ -12,7 +12,7 @@ from anatomy.typed import Bool, Float, Int
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import POSITION_TOLERANCE_MM
-from lungaccess.checking.shapes import Curve
+from lungaccess.checking.shapes import Curve, radius_at
 from lungaccess.checking.space import branch_of, has, labels_at, region_around
 from lungaccess.plans.plan import Plan
 
@@ -167,8 +167,7 @@ def check_wall_run(
     """
     tubes, stated = plan.system.tubes, plan.tube.exit.wall_run_mm
     behind = np.flatnonzero(curve.arc_mm[1:] > way_out.arc_mm + 1e-9)
-    in_outer = curve.arc_mm[behind + 1] <= plan.tube.outer_insertion_mm + 1e-9
-    radius = 0.5 * np.where(in_outer, tubes.outermost.outer_diameter_mm, tubes.inner.outer_diameter_mm)
+    radius = radius_at(plan, curve.arc_mm[behind + 1] - 1e-9)
     walls = environment.boxes(has(structures.AIRWAY), float(radius.max()) + 1.0)
     ends = np.append(behind[:1], behind + 1)
     distance = walls.distance_mm(curve.points[ends])

@@ -85,7 +85,7 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
         ),
         (
             "tubes",
-            f"turn to {np.degrees(tube.rotation_rad):.1f}°, {plan.insertions} beyond the scope; "
+            f"{plan.rotations}, {plan.insertions} beyond the scope; "
             f"through the wall of branch {tube.exit.branch}",
         ),
         (

@@ -6,7 +6,7 @@ import numpy as np
 
 from anatomy.typed import Float
 from lungaccess.coupled.atlas import Atlas
-from stages.tube import TubeMechanics
+from stages.tube import TubeMechanics, shapes_of
 
 
 def tip_clearances_mm(atlas: Atlas) -> Float:
@@ -29,6 +29,8 @@ def tube_stability(atlas: Atlas) -> Float:
     1 is that of tubes which do not wind each other up; see `stages.tube.mechanics.Equilibrium`.
     """
     entries, tubes = atlas.deployments, atlas.system.tubes
+    if not tubes.planar:
+        return np.asarray(shapes_of(tubes).least_determinant[entries.shape])
     insertions, which = np.unique(
         np.stack([entries.inner_mm, entries.outer_mm], axis=1), axis=0, return_inverse=True
     )

@@ -15,9 +15,9 @@ from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
 from stages.scope import ScopeMotions, prover_of
-from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments
+from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, shapes_digest
 
-FORMAT = 7
+FORMAT = 8
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 
 
@@ -52,6 +52,7 @@ def open_atlas(
         "scope": to_mapping(system.scope),
         "tubes": to_mapping(system.tubes),
         "margins": to_mapping(system.margins),
+        "shapes": shapes_digest(system.tubes),
         "with_fissures": fissures_are_obstacles(lung, system),
         "rotations": rotations,
         "stop_mm": stop_spacing_mm,

@@ -242,8 +242,9 @@ class Explainer:
 
     def _proof(self) -> None:
         task = self._task
-        if len(self._arcs.in_workspace):
-            # What a deployment of the atlas has in its workspace cannot be proved to be in none.
+        if len(self._arcs.in_workspace) or not task.system.tubes.planar:
+            # What a deployment of the atlas has in its workspace cannot be proved to be in none; the proof
+            # knows planar tubes only.
             self._found["verdict"] = ReachVerdict(proved=False, boxes=0)
             return
         proof = UnreachableProof(

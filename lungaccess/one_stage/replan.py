@@ -16,7 +16,7 @@ from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
-from lungaccess.coupled.search.local_search import path_through
+from lungaccess.coupled.search.local_search import path_through, tube_arguments
 from lungaccess.one_stage.needle import needle_question
 from lungaccess.one_stage.obstruction import reason_in_words
 from lungaccess.plans.assemble import needle_clearance_mm, needle_part, tube_clearance_mm, tube_part
@@ -244,9 +244,10 @@ class _FromScope:
         vias[: len(points)] = points
         choice = np.array([0.0, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
         task, (x, y, z) = self._task, self._target.tolist()
-        tube = (
+        tube = tube_arguments(
             tube_environment(task.lung, with_fissures=task.with_fissures),
             tube_constants(task.system.tubes, task.system.margins),
+            deployment.shape,
         )
         state = np.array([task.seed], dtype=np.uint64)
         count, cost = improve(
@@ -256,7 +257,11 @@ class _FromScope:
         if not math.isfinite(cost):
             return deployment, path
         rotation, outer, inner = choice[1:].tolist()
-        found = self._evaluator.tubes.validate(self._frame, rotation % (2.0 * math.pi), outer, inner)
+        tubes, turned = self._evaluator.tubes, rotation % (2.0 * math.pi)
+        if deployment.shape is None:
+            found = tubes.validate(self._frame, turned, outer, inner)
+        else:
+            found = tubes.validate_shape(self._frame, turned, deployment.shape)
         if isinstance(found, str):
             return deployment, path
         better = path_through(found, vias[:count], self._target)
@@ -264,9 +269,7 @@ class _FromScope:
         return (found, better) if cheaper and self._evaluator.proves(found, better) else (deployment, path)
 
     def _deployment(self, entry: int) -> Deployment:
-        entries = self.entries
-        numbers = (entries.rotation_rad[entry], entries.outer_mm[entry], entries.inner_mm[entry])
-        found = self._evaluator.tubes.validate(self._frame, *(float(each) for each in numbers))
+        found = self._evaluator.tubes.choose(self._frame, *self.entries.choice(entry))
         if isinstance(found, str):
             raise NoPlan(f"The tubes are refused on a second look: {found}", reasons={f"tube: {found}": 1})
         return found

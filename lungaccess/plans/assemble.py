@@ -15,13 +15,21 @@ from anatomy.typed import Float
 from lungaccess.plans import costs
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.insertion import scope_insertion
-from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
+from lungaccess.plans.parts import (
+    Exemption,
+    NeedleArc,
+    NeedlePath,
+    ScopeInsertion,
+    TubeDeployment,
+    TwistedShape,
+    WallExit,
+)
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath
 from stages.scope import ScopeTip, prove_motion
-from stages.tube import Deployment, centreline
+from stages.tube import ConcentricTubes, Deployment, TubeShape
 
 CLEARANCE_CAP_MM = 5.0
 """Clearances below this are stated exactly: larger ones never limit a plan."""
@@ -62,7 +70,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         ),
         required_clearance_mm={
             "outer_tube": system.tubes.outermost.radius_mm + margin,
-            "inner_tube": system.tubes.inner.radius_mm + margin,
+            **{f"{name}_tube": tube.radius_mm + margin for name, tube in system.tubes.named},
             "needle": system.needle.radius_mm + margin,
         },
         clearance_mm={
@@ -99,9 +107,11 @@ def _scope(task: Task, tip: ScopeTip) -> ScopeInsertion:
 
 def tube_part(task: Task, lps_from_scope_tip: Float, deployment: Deployment) -> TubeDeployment:
     """Return the part of a plan that a deployment from a scope tip makes."""
+    tubes, shape = task.system.tubes, deployment.shape
     return TubeDeployment(
         rotation_rad=deployment.rotation_rad,
-        outer_insertion_mm=0.0 if task.system.tubes.outer is None else deployment.outer_mm,
+        outer_insertion_mm=0.0 if tubes.outer is None else deployment.outer_mm,
+        middle_insertion_mm=0.0 if shape is None or tubes.middle is None else float(shape.insertions_mm[1]),
         inner_insertion_mm=deployment.inner_mm,
         lps_from_tip=deployment.lps_from_tip,
         exit=WallExit(
@@ -112,7 +122,20 @@ def tube_part(task: Task, lps_from_scope_tip: Float, deployment: Deployment) -> 
             wall_run_mm=deployment.wall_run_mm,
         ),
         lateral_sweep_mm=deployment.lateral_sweep_mm,
-        follow_the_leader_error_mm=deployment.lateral_sweep_mm,
+        follow_the_leader_error_mm=(
+            deployment.lateral_sweep_mm if shape is None else shape.follow_the_leader_error_mm
+        ),
+        shape=None if shape is None else _twisted_shape(tubes, shape),
+    )
+
+
+def _twisted_shape(tubes: ConcentricTubes, shape: TubeShape) -> TwistedShape:
+    turned = zip(tubes.named, shape.rotations_rad[::-1].tolist(), strict=True)
+    return TwistedShape(
+        relative_rotations_rad={name: angle for (name, _tube), angle in turned},
+        arcs=shape.arcs,
+        arc_error_mm=shape.arc_error_mm,
+        least_determinant=shape.least_determinant,
     )
 
 
@@ -121,8 +144,7 @@ def _exit_point(task: Task, frame: Float, deployment: Deployment) -> Float:
 
 
 def _tube_points(task: Task, frame: Float, deployment: Deployment, arc_lengths: Float) -> Float:
-    rotation, outer, inner = deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm
-    return centreline(task.system.tubes, frame, rotation, outer, inner, arc_lengths)
+    return deployment.points(task.system.tubes, frame, arc_lengths)
 
 
 def needle_part(path: ArcPath) -> NeedlePath:

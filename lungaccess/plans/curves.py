@@ -17,6 +17,7 @@ from lungaccess.plans.parts import NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.problem.system import System
 from stages.scope.device import laid_pieces
 from stages.tube.device import ConcentricTubes
+from stages.tube.shape import SHORTEST_ARC_MM, pieces_of_arcs
 
 STEP_MM = 0.25
 """Largest distance between the poses of tubes and needle: the chord of a 40 mm arc is off by 0.2 um."""
@@ -26,9 +27,6 @@ SCOPE_STEP_MM = 1.0
 
 SHORTEST_MM = 1e-6
 """Lengths that differ by less are one."""
-
-SHORTEST_ARC_MM = 1e-9
-"""A piece of tube that is shorter than this is only the rounding of its neighbours' lengths."""
 
 
 @frozen_record
@@ -76,7 +74,6 @@ def device_curves(
     scope_poses, scope_mm = poses_on_pieces(scope.lps_from_entry, laid, SCOPE_STEP_MM)
     tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube, tubes), step_mm)
     needle_poses, needle_mm = poses_on_pieces(needle.lps_from_start, needle_pieces(needle), step_mm)
-    in_outer = tube_mm <= tube.outer_insertion_mm + SHORTEST_MM
     return DeviceCurves(
         scope=DeviceCurve(
             name="scope",
@@ -88,7 +85,7 @@ def device_curves(
         tubes=DeviceCurve(
             name="tubes",
             lps_from_device=tube_poses,
-            radius_mm=np.where(in_outer, tubes.outermost.radius_mm, tubes.inner.radius_mm),
+            radius_mm=tube_radii(tube, tubes, tube_mm),
             arc_length_mm=tube_mm,
             colour=(1.0, 0.5, 0.05),
         ),
@@ -104,11 +101,20 @@ def device_curves(
 
 def tube_pieces(tube: TubeDeployment, tubes: ConcentricTubes) -> Float:
     """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of each arc of the tubes."""
+    if tube.shape is not None:
+        return pieces_of_arcs(np.asarray(tube.shape.arcs), tube.rotation_rad)
     arcs = tubes.arcs(tube.outer_insertion_mm, tube.inner_insertion_mm)
     pieces = np.stack([arcs.length_mm[0], np.zeros(4), arcs.curvature_per_mm], axis=1)
     pieces = pieces[pieces[:, 0] > SHORTEST_ARC_MM]
     pieces[:1, 1] = tube.rotation_rad
     return pieces
+
+
+def tube_radii(tube: TubeDeployment, tubes: ConcentricTubes, arc_mm: Float) -> Float:
+    """Return the radius in mm `(N,)` of the outermost tube at arc lengths `(N,)` from the scope tip."""
+    ends = np.array(tube.insertions_mm(tubes)) + SHORTEST_MM
+    radii = np.array([each.radius_mm for _name, each in tubes.named])
+    return np.asarray(radii[np.minimum(np.searchsorted(ends, arc_mm), len(radii) - 1)])
 
 
 def needle_pieces(needle: NeedlePath) -> Float:

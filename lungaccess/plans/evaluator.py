@@ -101,10 +101,16 @@ class CandidateEvaluator:
         return math.isfinite(map_integral(self.task.lung.cost, path))
 
     def direct(
-        self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float
+        self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float, shape: int = -1
     ) -> Candidate | None:
-        """Return a deployment with a direct arc to the target, None if the deployment is refused."""
-        deployment = self.tubes.validate(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
+        """Return a deployment with a direct arc to the target, None if the deployment is refused.
+
+        Parameters
+        ----------
+        rotation_rad, outer_mm, inner_mm, shape
+            As those of `DeploymentValidator.choose`.
+        """
+        deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm, shape)
         if isinstance(deployment, str):
             return None
         path = direct_path(deployment.lps_from_tip, self.task.target.lps_mm)

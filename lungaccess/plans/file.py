@@ -17,8 +17,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from anatomy.errors import PlanFileError, SettingsError
+from anatomy.records import LEFT_OUT_IF_EMPTY
 from anatomy.settings import parse, to_mapping
-from lungaccess.plans.record import LEFT_OUT_IF_EMPTY, Record
+from lungaccess.plans.record import Record
 from lungaccess.problem.system import System
 
 SCHEMA = "lungaccess-plan-2"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import field
 
 import numpy as np
 
-from anatomy.records import frozen_record
+from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.typed import Float, Int
 from lungaccess.plans.record import Record, shaped
+from stages.tube.device import ConcentricTubes
 
 
 @frozen_record
@@ -74,17 +76,47 @@ class WallExit(Record):
 
 
 @frozen_record
+class TwistedShape(Record):
+    """The shape of tubes that are not planar, as the mechanics give it.
+
+    Parameters
+    ----------
+    relative_rotations_rad : mapping of str to float
+        By "outer", "middle" and "inner": how much farther than `TubeDeployment.rotation_rad` the rear end of
+        that tube is turned.
+    arcs : (A, 4) float64
+        Length in mm; direction of the bend in rad about the tangent, from +x of a frame that is carried from
+        the scope tip, turned by `TubeDeployment.rotation_rad`, without turning; curvature in 1/mm; radius of
+        the outermost tube in mm.
+    arc_error_mm : float
+        Largest distance between the arcs and the tubes.
+    least_determinant : float
+        Least on the way of the derivative of rear by front rotations: the tubes snap at 0.
+    """
+
+    relative_rotations_rad: Mapping[str, float]
+    arcs: Float = field(metadata=shaped(None, 4))
+    arc_error_mm: float
+    least_determinant: float
+
+
+@frozen_record
 class TubeDeployment(Record):
     """How the concentric tubes are turned and inserted, and what that does.
 
     Parameters
     ----------
     rotation_rad : float
-        Both tubes are turned by this; the inner one bends towards local (cos, sin) of the scope tip.
+        All tubes are turned by this; planar ones bend towards local (cos, sin) of the scope tip.
     outer_insertion_mm, inner_insertion_mm : float
         Lengths of outer and inner tube beyond the tip of the scope.
+    middle_insertion_mm : float
+        That of the middle tube, 0 where there is none.
     lps_from_tip : (4, 4) float64
-        Pose of the tip of the inner tube; +z is forward.
+        Pose of the tip of the inner tube; +z is forward; +x is carried from the scope tip without turning, or
+        points towards the bend of planar tubes.
+    shape : TwistedShape or None
+        None for planar tubes, whose shape follows in closed form.
     lateral_sweep_mm : float
         Largest sideways motion of the tubes while they are deployed.
     follow_the_leader_error_mm : float
@@ -98,6 +130,27 @@ class TubeDeployment(Record):
     exit: WallExit
     lateral_sweep_mm: float
     follow_the_leader_error_mm: float
+    middle_insertion_mm: float = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
+    shape: TwistedShape | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
+
+    def insertions_mm(self, tubes: ConcentricTubes) -> tuple[float, ...]:
+        """Return the insertions of the tubes that there are, the outermost first."""
+        of = {
+            "outer": self.outer_insertion_mm,
+            "middle": self.middle_insertion_mm,
+            "inner": self.inner_insertion_mm,
+        }
+        return tuple(of[name] for name, _tube in tubes.named)
+
+    def rotations_rad(self, tubes: ConcentricTubes) -> tuple[float, ...]:
+        """Return the rotations of the rear ends of the tubes that there are, the outermost first."""
+        relative = {} if self.shape is None else self.shape.relative_rotations_rad
+        return tuple(self.rotation_rad + relative.get(name, 0.0) for name, _tube in tubes.named)
+
+    @property
+    def clearance_loss_mm(self) -> float:
+        """What has to be free around the tubes beside their radius and the margins."""
+        return self.lateral_sweep_mm + (0.0 if self.shape is None else self.shape.arc_error_mm)
 
 
 @frozen_record

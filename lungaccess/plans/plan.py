@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from anatomy.errors import PlanFileError
-from anatomy.records import frozen_record
+from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.typed import Float
 from anatomy.words import plural
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
 from lungaccess.plans.parts import Exemption, NeedlePath, ScopeInsertion, TubeDeployment
-from lungaccess.plans.record import LEFT_OUT_IF_EMPTY, Record, shaped
+from lungaccess.plans.record import Record, shaped
 from lungaccess.problem.system import System
 
 if TYPE_CHECKING:
@@ -100,11 +100,24 @@ class Plan(Record):
     @property
     def insertions(self) -> str:
         """How far each tube goes beyond the tip of the scope, in words."""
-        tube = self.tube
-        inner = f"{tube.inner_insertion_mm:.1f} mm"
-        if self.system.tubes.outer is None:
-            return f"tube {inner}"
-        return f"outer tube {tube.outer_insertion_mm:.1f} mm, inner tube {inner}"
+        inserted = self.tube.insertions_mm(self.system.tubes)
+        if len(inserted) == 1:
+            return f"tube {inserted[0]:.1f} mm"
+        return ", ".join(
+            f"{name} tube {length:.1f} mm"
+            for (name, _tube), length in zip(self.system.tubes.named, inserted, strict=True)
+        )
+
+    @property
+    def rotations(self) -> str:
+        """How far the tubes are turned about the tip of the scope, in words."""
+        turned = [np.degrees(angle) for angle in self.tube.rotations_rad(self.system.tubes)]
+        if self.tube.shape is None:
+            return f"turn to {turned[-1]:.1f}°"
+        named = zip(self.system.tubes.named, turned, strict=True)
+        return "turn " + ", ".join(
+            f"the {name} tube to {angle % 360.0:.1f}°" for (name, tube), angle in named if tube.bends
+        )
 
     def figures(self) -> list[tuple[str, str]]:
         """Return what the plan says of devices, distances and costs, as names and values with units."""
@@ -117,7 +130,7 @@ class Plan(Record):
                 f"{self.scope.length_from_carina_mm:.1f} mm beyond the carina, to generation "
                 f"{self.scope.generation}",
             ),
-            ("tubes", f"turn to {np.degrees(tube.rotation_rad):.1f}°, {self.insertions}"),
+            ("tubes", f"{self.rotations}, {self.insertions}"),
             (
                 "exit",
                 f"branch {tube.exit.branch}, at {np.degrees(tube.exit.wall_angle_rad):.0f}° to the wall",

@@ -13,9 +13,6 @@ from anatomy.errors import PlanFileError
 from anatomy.grid import read_only
 from anatomy.typed import Array
 
-LEFT_OUT_IF_EMPTY = "left out if empty"
-"""Metadata of a field that a file lacks where it is empty, as do files from before the field was there."""
-
 
 def shaped(*shape: int | None, dtype: type = np.float64) -> dict[str, Any]:
     """Return the metadata that make a field of a `Record` an array; None stands for any length."""

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
         load_system,
         needle_preset_names,
         preset_names,
+        shipped_names,
         system_fingerprint,
+        tube_preset_names,
     )
     from lungaccess.problem.target import (
         StatedTarget,

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from lungaccess.problem.system import System
 from stages.tube import straightening
 
 
-def bend_factor(system: System, outer_mm: float, inner_mm: float) -> float:
+def bend_factor(system: System, *insertions_mm: float) -> float:
     """Return by how much more the handle must bend the section while the tubes are in it, 1 or more.
 
-    The tubes are inserted by so much beyond the tip; see `stages.tube.straightening`.
+    The tubes are inserted by so much beyond the tip, the outermost first; see `stages.tube.straightening`.
     """
-    scope = system.scope
-    inserted = outer_mm, inner_mm
-    return 1.0 + straightening(system.tubes, inserted, scope.bending_length_mm, scope.bending_stiffness_n_mm2)
+    scope, stiffness = system.scope, system.scope.bending_stiffness_n_mm2
+    return 1.0 + straightening(system.tubes, insertions_mm, scope.bending_length_mm, stiffness)
 
 
 def bends_with_tubes_rad(system: System) -> tuple[float, float]:
@@ -26,7 +27,7 @@ def bends_with_tubes_rad(system: System) -> tuple[float, float]:
     """
     tubes, scope = system.tubes, system.scope
     reach_mm = scope.bending_length_mm + tubes.max_extension_mm
-    factor = 1.0 + straightening(tubes, (0.0, 0.0), reach_mm, scope.bending_stiffness_n_mm2)
+    factor = 1.0 + straightening(tubes, np.zeros(len(tubes.nested)), reach_mm, scope.bending_stiffness_n_mm2)
     down, up = scope.bends_rad
     return (
         max(down, -math.radians(scope.bend_down_deg) / factor),

@@ -23,6 +23,7 @@ from stages.tube.device import ConcentricTubes
 
 _PRESETS = "presets"
 _NEEDLES = "presets/needles"
+_TUBES = "presets/tubes"
 _REMEDY = "`lungaccess presets --show lung-default` prints a complete file to start from"
 
 
@@ -62,7 +63,7 @@ class System:
 
     def __post_init__(self) -> None:
         outer, channel = self.tubes.outermost.outer_diameter_mm, self.scope.channel_diameter_mm
-        name = "inner" if self.tubes.outer is None else "outer"
+        name = self.tubes.named[0][0]
         if outer >= channel:
             raise impossible(
                 f"tubes.{name}.outer_diameter_mm", outer, f"less than scope.channel_diameter_mm = {channel:g}"
@@ -74,7 +75,9 @@ class System:
                 self.needle.diameter_mm,
                 f"less than tubes.inner.inner_diameter_mm = {bore:g}",
             )
-        bent = max(self.tubes.channel_curvature_per_mm, self.tubes.inner.max_precurvature_per_mm)
+        # Tubes that share a bend are bent by no more than the most bent of them is at rest.
+        at_rest = [tube.max_precurvature_per_mm for tube in self.tubes.nested]
+        bent = max(self.tubes.channel_curvature_per_mm, *at_rest)
         most = self.needle.most_bent_per_mm
         if bent > most:
             raise impossible(
@@ -100,6 +103,19 @@ def needle_preset_names() -> tuple[str, ...]:
     return _names_in(_NEEDLES)
 
 
+def tube_preset_names() -> tuple[str, ...]:
+    """Return the names of the systems that ship with tubes turned one against the other, sorted.
+
+    They are not tried where the system is chosen among the presets: their atlas takes minutes.
+    """
+    return _names_in(_TUBES)
+
+
+def shipped_names() -> tuple[str, ...]:
+    """Return the names of all systems that ship with the package."""
+    return (*preset_names(), *tube_preset_names(), *needle_preset_names())
+
+
 def _names_in(folder: str) -> tuple[str, ...]:
     entries = (resources.files("lungaccess") / folder).iterdir()
     return tuple(sorted(entry.name[:-5] for entry in entries if entry.name.endswith(".toml")))
@@ -113,14 +129,14 @@ def preset_text(name: str) -> str:
     SettingsError
         If there is no such preset.
     """
-    for folder in (_PRESETS, _NEEDLES):
+    for folder in (_PRESETS, _TUBES, _NEEDLES):
         if name in _names_in(folder):
             return (resources.files("lungaccess") / folder / f"{name}.toml").read_text(encoding="utf-8")
     raise _unknown(name)
 
 
 def _unknown(given: str) -> SettingsError:
-    known = (*preset_names(), *needle_preset_names())
+    known = shipped_names()
     return SettingsError(
         f"There is no system called {given!r}",
         expected=f"a preset ({', '.join(known)}) or the path of a .toml file",
@@ -155,7 +171,7 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     1.0
     """
     given = os.fspath(name_or_path)
-    if given in (*preset_names(), *needle_preset_names()):
+    if given in shipped_names():
         content = preset_text(given).encode("utf-8")
     elif isinstance(name_or_path, str) and not given.endswith(".toml"):
         raise _unknown(given)

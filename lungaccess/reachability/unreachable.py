@@ -69,11 +69,17 @@ class UnreachableProof:
     ----------
     between : callable, optional
         Called between the steps of the preparation, which takes some ten seconds; it may raise to end it.
+
+    Raises
+    ------
+    SettingsError
+        If the tubes are not planar.
     """
 
     def __init__(
         self, lung: Lung, system: System, *, with_fissures: bool, between: Callable[[], None] | None = None
     ) -> None:
+        system.tubes.require_planar("A proof that no deployment reaches a target")
         pause = between or (lambda: None)
         self._lung = lung
         self._tubes = tube_constants(system.tubes, system.margins)

@@ -35,9 +35,12 @@ def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) ->
     Returns
     -------
     Candidate or None
-        Cheaper than the one given by BETTER or more, or None; always None for an objective that the program
-        cannot express, see `lungaccess.refinement.problem.program_weights`.
+        Cheaper than the one given by BETTER or more, or None; always None for tubes that are not planar, and
+        for an objective that the program cannot express: see
+        `lungaccess.refinement.problem.program_weights`.
     """
+    if candidate.deployment.shape is not None:
+        return None
     weights = program_weights(task)
     if len(candidate.path.arcs) > ARC_COUNTS[-1] or weights is None:
         return None

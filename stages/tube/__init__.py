@@ -10,15 +10,20 @@ if TYPE_CHECKING:
     from stages.tube.casadi_model import CasadiTubes
     from stages.tube.casadi_shape import DerivedShape, derive_shape
     from stages.tube.deployments import (
-        DEFAULT_ROTATIONS,
         DEFAULT_STOP_MM,
         Deployments,
         enumerate_deployments,
         insertion_stops,
         join_deployments,
     )
+    from stages.tube.design_shapes import shape_tree_of, shapes_digest, shapes_of
     from stages.tube.device import BentPiece, ConcentricTubes, Tube
-    from stages.tube.environment import tracking_length_mm, tube_constants, tube_environment
+    from stages.tube.environment import (
+        DEFAULT_ROTATIONS,
+        tracking_length_mm,
+        tube_constants,
+        tube_environment,
+    )
     from stages.tube.equilibrium import Equilibrium
     from stages.tube.errors import ConvergenceError
     from stages.tube.following import DeployedSequence, SnapError, deploy
@@ -38,7 +43,7 @@ if TYPE_CHECKING:
         propose_designs,
     )
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
-    from stages.tube.shape import centreline
+    from stages.tube.shape import TubeShape, centreline, pieces_of_arcs, points_on_arcs
     from stages.tube.shape_store import SHAPES_FORMAT, open_shapes
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes

@@ -190,16 +190,21 @@ class OrderedTubes:
 
     @cached_property
     def body(self) -> Any:
-        """Function: tip angles (n,) rad, beta (n,) mm -> (4, N) arc lengths and points, from the tip, mm."""
+        """Function: tip angles (n,) rad, beta (n,) mm -> (3 + n, N) from the tip on.
+
+        Arc lengths and points, mm, and the angles of the tubes but the innermost, relative to it, rad.
+        """
         tip, beta = self._symbols("tip_angles_rad")
         passed: list[Any] = []
         _, position, rotation = self._integrate(tip, beta, passed)
         from_tip = casadi.horzcat(casadi.MX.zeros(3), *(states[POSITION, :] for states in passed))
+        others = slice(FIRST_ANGLE + 1, FIRST_ANGLE + len(self._tubes))
+        relative = casadi.horzcat(tip[1:] - tip[0], *(states[others, :] for states in passed))
         gaps = [(far - near) / self._steps for far, near in itertools.pairwise(self._places(beta))]
         spacing = casadi.vertcat(0, *(casadi.repmat(gap, self._steps) for gap in gaps))
         s = self._places(beta)[0] - casadi.cumsum(spacing)
         points = casadi.repmat(position, 1, from_tip.shape[1]) + rotation @ from_tip
-        return casadi.Function("body", [tip, beta], [casadi.vertcat(s.T, points)])
+        return casadi.Function("body", [tip, beta], [casadi.vertcat(s.T, points, relative)])
 
     def _integrate(self, tip: Any, beta: Any, states: list[Any] | None = None) -> tuple[Any, Any, Any]:
         """Return the base angles, and position and rotation of the tip; list all states of each piece."""
@@ -328,8 +333,9 @@ class CasadiTubes:
         )
 
     def body(self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike) -> Float:
-        """Return arc lengths and points `(N, 4)` mm of the centreline, from the front plate to the tip.
+        """Return arc lengths, points and relative angles `(N, 3 + n)` in mm and rad, from front plate to tip.
 
+        The angles are those of all tubes but the innermost, relative to it, where they are.
         Parameters and errors are those of `given_tip_angles`; something has to be ahead of the plate.
         """
         tip, beta = self._vector(tip_angles_rad, "tip angles"), self._vector(beta_mm, "beta")

@@ -22,6 +22,8 @@ STEP_MM = 1.0
 """Largest motion between two steps."""
 LARGEST_TURN_RAD = 0.2
 """Largest turn of a tip in a step that is no jump: where the tubes are about to snap they turn faster."""
+LEAST_SHARE = 1.0 / 64.0
+"""Of a step, by which tips that still turn as far are said to jump."""
 
 
 @frozen_record
@@ -34,16 +36,22 @@ class DerivedShape:
         From the scope tip, rising from 0.
     points_mm : (N, 3) float64
         Of the centreline, in the frame of the scope tip.
+    relative_rad : (N, n - 1) float64
+        Angles of the tubes around the innermost, relative to it, where they are.
     base_from_tip : (4, 4) float64
         Material frame of the innermost tube at its end.
+    way : tuple of (K, 4) float64
+        Arc lengths and points, mm, of every step of the way, the last of which is the deployment.
     least_determinant : float
         Least on the way of the derivative of base angles by tip angles: above 0 the tubes nowhere snap.
     """
 
     arc_lengths_mm: Float
     points_mm: Float
+    relative_rad: Float
     base_from_tip: Float
     least_determinant: float
+    way: tuple[Float, ...]
 
     def at(self, arc_lengths_mm: ArrayLike) -> Float:
         """Return points `(M, 3)` mm at arc lengths `(M,)`, straight between those that were derived."""
@@ -72,24 +80,44 @@ def derive_shape(tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm:
     sequence = together(tubes, turned, insertions_mm)
     angles, betas, moves = joint_steps(sequence, tubes, step_mm=STEP_MM, step_rad=np.pi)
     model = CasadiTubes(tubes)
-    tips, least = turned, 1.0
+    tips, least, before = turned, 1.0, betas[moves == 0][-1]
+    way = []
     for base, beta in zip(angles[moves > 0], betas[moves > 0], strict=True):
-        found = model.solve(base, beta, tips)
-        least = min(least, found.determinant)
-        jumped = float(np.abs(found.tip_angles_rad - tips).max())
-        if least <= 0.0 or jumped > LARGEST_TURN_RAD:
-            out = ", ".join(f"{length:.2f}" for length in beta + [tube.length_mm for tube in tubes])
-            raise ConvergenceError(
-                f"At insertions of {out} mm the tips turn by {jumped:.3g} rad and the determinant is "
-                f"{found.determinant:.3g}",
-                expected=f"at most {LARGEST_TURN_RAD:g} rad in {STEP_MM:g} mm, and a determinant above 0",
-                remedy="Turn the tubes less against each other, or insert them less far",
-            )
-        tips = found.tip_angles_rad
-    body = model.body(tips, betas[-1])
+        tips, determinant = _stepped(model, base, before, beta, tips)
+        least, before = min(least, determinant), beta
+        way.append(model.body(tips, beta))
+    body = way[-1]
     return DerivedShape(
         arc_lengths_mm=read_only(body[:, 0].copy()),
-        points_mm=read_only(body[:, 1:].copy()),
+        points_mm=read_only(body[:, 1:4].copy()),
+        relative_rad=read_only(body[:, 4:].copy()),
         base_from_tip=model.given_tip_angles(tips, betas[-1]).base_from_tip,
         least_determinant=least,
+        way=tuple(read_only(each[:, :4].copy()) for each in way),
     )
+
+
+def _stepped(model: CasadiTubes, base: Float, begin: Float, end: Float, tips: Float) -> tuple[Float, float]:
+    """Follow the rear ends from `begin` to `end`, in parts of the step where the tips turn fast.
+
+    Returns the tip angles there, and the least determinant.
+    """
+    done, share, least = 0.0, 1.0, 1.0
+    while done < 1.0:
+        to = min(done + share, 1.0)
+        beta = begin + to * (end - begin) if to < 1.0 else end
+        found = model.solve(base, beta, tips)
+        jumped = float(np.abs(found.tip_angles_rad - tips).max())
+        if found.determinant > 0.0 and jumped <= LARGEST_TURN_RAD:
+            done, tips, least = to, found.tip_angles_rad, min(least, found.determinant)
+            continue
+        share *= 0.5
+        if share < LEAST_SHARE:
+            raise ConvergenceError(
+                f"With rear ends at {np.round(beta, 2).tolist()} mm the tips turn by {jumped:.3g} rad and "
+                f"the determinant is {found.determinant:.3g}",
+                expected=f"at most {LARGEST_TURN_RAD:g} rad in {LEAST_SHARE * STEP_MM:g} mm, and a "
+                "determinant above 0",
+                remedy="Turn the tubes less against each other, or insert them less far",
+            )
+    return tips, least

@@ -18,16 +18,20 @@ from anatomy.margins import Margins
 from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.tube import kernels
+from stages.tube.design_shapes import shape_tree_of, shapes_of
 from stages.tube.device import ConcentricTubes
-from stages.tube.environment import tracking_length_mm, tube_constants, tube_environment
+from stages.tube.environment import (
+    DEFAULT_ROTATIONS,
+    THREADS,
+    tracking_length_mm,
+    tube_constants,
+    tube_environment,
+)
+from stages.tube.placing import place_shapes
 from stages.tube.validation import REASONS
 
-DEFAULT_ROTATIONS = 24
-"""Rotations 15 degrees apart: at 30 mm of curve, tips are about 3 mm apart, as far as the stops."""
 DEFAULT_STOP_MM = 2.0
 """Spacing of insertions: small against the reach of needles, which start at the tips."""
-THREADS = 2
-"""The kernels run without the interpreter's lock; more threads would wait for memory."""
 
 
 @frozen_record
@@ -39,7 +43,9 @@ class Deployments:
     site : (E,) int64
         Index of the scope pose.
     rotation_rad, outer_mm, inner_mm : (E,) float64
-        Rotation of both tubes; insertions beyond the scope tip.
+        Rotation of all tubes together; insertions of the outermost and the innermost beyond the scope tip.
+    shape : (E,) int64
+        Index in `shapes_of(tubes)`; -1 for planar tubes.
     branch : (E,) int64
         Pierced branch.
     exit_mm, wall_angle_rad : (E,) float64
@@ -58,6 +64,7 @@ class Deployments:
     rotation_rad: Float
     outer_mm: Float
     inner_mm: Float
+    shape: Int
     branch: Int
     exit_mm: Float
     wall_angle_rad: Float
@@ -71,6 +78,11 @@ class Deployments:
     def count(self) -> int:
         """Number of accepted deployments, E."""
         return len(self.site)
+
+    def choice(self, entry: int) -> tuple[float, float, float, int]:
+        """Return rotation, insertions and shape of one, as `DeploymentValidator.choose` takes them."""
+        turned, outer, inner = self.rotation_rad[entry], self.outer_mm[entry], self.inner_mm[entry]
+        return float(turned), float(outer), float(inner), int(self.shape[entry])
 
 
 def insertion_stops(tubes: ConcentricTubes, spacing_mm: float = DEFAULT_STOP_MM) -> Float:
@@ -92,8 +104,9 @@ def enumerate_deployments(
 ) -> Deployments:
     """Enumerate what the tubes can do from many scope tips.
 
-    Only deployments without sideways sweep are enumerated: those whose tip stays within
-    `tracking_length_mm` of the scope tip.
+    Of planar tubes only deployments without sideways sweep are enumerated: those whose tip stays within
+    `tracking_length_mm` of the scope tip.  Of any others, all shapes of the design are, whatever the spacing
+    of stops that is asked for.
 
     Parameters
     ----------
@@ -110,6 +123,8 @@ def enumerate_deployments(
         Told the share of sites done.
     """
     tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 9)
+    if not tubes.planar:
+        return _enumerate_shapes(lung, tubes, margins, tips, with_fissures, rotations, progress)
     rotations = rotations if tubes.inner.bends else 1
     coarse: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
     angles = np.concatenate([coarse, coarse + math.pi / rotations])
@@ -159,6 +174,46 @@ def enumerate_deployments(
     return _as_deployments(rows, angles, refused, sum(candidates for _, _, candidates in parts))
 
 
+def _enumerate_shapes(
+    lung: Lung,
+    tubes: ConcentricTubes,
+    margins: Margins,
+    tips: Float,
+    with_fissures: bool,
+    rotations: int,
+    progress: Callable[[float], None] | None,
+) -> Deployments:
+    """Place all shapes of a design at scope tips."""
+    shapes = shapes_of(tubes)
+    placed = place_shapes(
+        lung,
+        shapes,
+        margins,
+        [frames.pose(tip[:3], tip[3:6], tip[6:]) for tip in tips],
+        min_wall_angle_rad=math.radians(tubes.min_wall_angle_deg),
+        max_wall_run_mm=tubes.max_wall_run_mm,
+        with_fissures=with_fissures,
+        rotations=rotations if any(tube.bends for tube in tubes.nested) else 1,
+        tree=shape_tree_of(tubes),
+        progress=progress,
+    )
+    return Deployments(
+        site=placed.site,
+        rotation_rad=placed.rotation_rad,
+        outer_mm=read_only(shapes.insertions_mm[placed.shape, -1]),
+        inner_mm=read_only(shapes.insertions_mm[placed.shape, 0]),
+        shape=placed.shape,
+        branch=placed.branch,
+        exit_mm=placed.exit_mm,
+        wall_angle_rad=placed.wall_angle_rad,
+        wall_run_mm=placed.wall_run_mm,
+        positions=placed.positions,
+        tangents=placed.tangents,
+        candidates=placed.candidates,
+        refused=placed.refused,
+    )
+
+
 def _between_unlike(rows: Float, rotations: int, stops: Float) -> Int:
     """Return the rotations between which and the next ones other insertions are accepted: a limit is near."""
     accepted = np.zeros((rotations, len(stops), len(stops)), dtype=bool)
@@ -189,6 +244,7 @@ def _as_deployments(rows: Float, angles: Float, refused: Int, candidates: int) -
         rotation_rad=read_only(angles[rows[:, 1].astype(np.int64)]),
         outer_mm=read_only(rows[:, 2].copy()),
         inner_mm=read_only(rows[:, 3].copy()),
+        shape=read_only(np.full(len(rows), -1)),
         branch=read_only(rows[:, 4].astype(np.int64)),
         exit_mm=read_only(rows[:, 5].copy()),
         wall_angle_rad=read_only(rows[:, 6].copy()),

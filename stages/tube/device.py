@@ -1,14 +1,18 @@
-"""What the planner has to know of a pair of concentric tubes."""
+"""What the planner has to know of concentric tubes."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import field
+from itertools import pairwise
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from anatomy.errors import SettingsError
+from anatomy.records import LEFT_OUT_IF_EMPTY
 from anatomy.settings import impossible, quantity, settings
 from anatomy.typed import Float
 from stages.tube.parts import Bend, SlottedSegment, TubeParts, tube_parts
@@ -157,6 +161,11 @@ class Tube:
         return tuple(found)
 
     @property
+    def bent_length_mm(self) -> float:
+        """Length from the tip to the rear end of the rearmost bend, 0 of a straight tube."""
+        return self.length_mm - min((bend.from_mm for bend in self.bends), default=self.length_mm)
+
+    @property
     def max_precurvature_per_mm(self) -> float:
         """Largest curvature at rest, 1/mm."""
         return max((bend.curvature_per_mm for bend in self.bends), default=0.0)
@@ -187,9 +196,11 @@ class TubeArcs(NamedTuple):
 
 @settings
 class ConcentricTubes:
-    """A straight outer tube and a precurved inner tube, or one tube, and the limits of their deployment.
+    """One, two or three nested tubes, and the limits of their deployment.
 
-    Without an outer tube the inner one is alone, for instance as a straight stylet through the wall.
+    Without an outer tube the inner one is alone, for instance as a straight stylet through the wall.  Where
+    only the inner tube is bent, by one arc, the tubes bend in one plane and their shape has a closed form;
+    any other design is turned tube by tube, and its shapes follow from the mechanics.
     The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
     perpendicular; the extension counts along the tubes.  In the worst case the working channel bends the tube
     that it holds against its precurvature.  Where no largest curvature of the channel is stated, it is what
@@ -198,11 +209,12 @@ class ConcentricTubes:
     Raises
     ------
     SettingsError
-        If a value is not finite or absurd, the tubes do not nest, an outer tube is curved, or a tube held
-        straight exceeds `max_strain`.
+        If a value is not finite or absurd, the tubes do not nest, a tube held straight exceeds `max_strain`,
+        or slots would make the tubes bend otherwise than plain ones.
     """
 
     outer: Tube | None = None
+    middle: Tube | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     inner: Tube
     max_lateral_sweep_mm: Annotated[
         float, quantity("largest sideways motion of the tubes in tissue", at_least=0.0, at_most=20.0)
@@ -228,21 +240,11 @@ class ConcentricTubes:
 
     def __post_init__(self) -> None:
         self._check_nesting()
-        if self.outer is not None and self.outer.bends:
-            raise impossible(
-                "outer.precurvature_per_mm",
-                self.outer.max_precurvature_per_mm,
-                "0; plans need a straight outer tube",
-            )
-        if self.inner.bent_pieces:
-            raise impossible(
-                "inner.bent_pieces", len(self.inner.bent_pieces), "none; plans need an inner tube of one arc"
-            )
         self._check_strain()
         self._check_slots()
 
     def _check_strain(self) -> None:
-        for name, tube in self._named:
+        for name, tube in self.named:
             if tube.rest_strain > self.max_strain:
                 most = self.max_strain / tube.radius_mm
                 raise impossible(
@@ -251,7 +253,7 @@ class ConcentricTubes:
                     f"at most 2 max_strain / outer_diameter_mm = {most:.6g} without slots: held straight its "
                     f"strain is {tube.rest_strain:.4g}, max_strain is {self.max_strain:g}",
                 )
-        for name, tube in self._named:
+        for name, tube in self.named:
             most = tube.most_bent_per_mm(self.max_strain, self.passing_mm)
             if (self.max_channel_curvature_per_mm or 0.0) > most * (1.0 + ROUNDING) + ROUNDING:
                 raise impossible(
@@ -262,20 +264,46 @@ class ConcentricTubes:
                 )
 
     def _check_slots(self) -> None:
-        """Where tubes are deployed their stiffness changes nowhere, and slots change that of both alike."""
+        """Where tubes are deployed or bent their stiffness changes nowhere, and slots change all alike."""
         other = float(self.inner.parts.stiffness_n_mm2[0] / self.inner.bending_stiffness_n_mm2)
-        for name, tube in self._named:
+        twisted = sum(bool(tube.bends) for tube in self.nested) > 1
+        for name, tube in self.named:
             parts = tube.parts
-            deployed = parts.stiffness_n_mm2[parts.begin_mm < self.max_extension_mm]
+            bent_mm = 0.0 if self.planar else tube.bent_length_mm
+            deployed = parts.stiffness_n_mm2[parts.begin_mm < max(self.max_extension_mm, bent_mm)]
             share = deployed / tube.bending_stiffness_n_mm2
+            if twisted and tube.slotted_segments:
+                raise impossible(
+                    f"{name}.slotted_segments",
+                    len(tube.slotted_segments),
+                    "none where more than one tube is bent: how slots soften a tube that is twisted is not "
+                    "modelled",
+                )
             if np.ptp(share) > 0.0 or abs(share[0] - other) > ROUNDING:
                 raise impossible(
                     f"{name}.slotted_segments",
                     len(tube.slotted_segments),
-                    "the same stiffness_factor for both tubes over the whole max_extension_mm = "
-                    f"{self.max_extension_mm:g} from their tips: plans assume that they share their bend as "
-                    "plain tubes do",
+                    f"the same stiffness_factor for {'both' if self.middle is None else 'all'} tubes over "
+                    f"the whole max_extension_mm = {self.max_extension_mm:g} from their tips: plans assume "
+                    "that they share their bend as plain tubes do",
                 )
+
+    @property
+    def planar(self) -> bool:
+        """Whether at most the inner of two tubes is bent, by one arc: the shape has a closed form."""
+        bent = any(tube.bends for tube in self.nested[1:])
+        return self.middle is None and not bent and not self.inner.bent_pieces
+
+    def require_planar(self, what: str) -> None:
+        """Raise SettingsError unless the tubes are planar, which `what` needs."""
+        if not self.planar:
+            raise SettingsError(
+                f"{what} is asked for with {len(self.nested)} tubes, of which "
+                f"{sum(bool(tube.bends) for tube in self.nested)} are bent",
+                expected="one tube of one arc, or a straight outer and an inner tube of one arc: only these "
+                "have a closed form",
+                remedy="Leave that out, or choose a system with such tubes, for instance lung-default",
+            )
 
     @property
     def passing_mm(self) -> float:
@@ -296,33 +324,32 @@ class ConcentricTubes:
                 self.max_extension_mm,
                 f"at most inner.length_mm = {self.inner.length_mm:g}",
             )
-        if self.outer is None:
-            return
-        clearance = self.outer.inner_diameter_mm - self.inner.outer_diameter_mm
-        if clearance <= 0.0 or clearance < self.min_clearance_mm - 1e-9:
-            raise impossible(
-                "inner.outer_diameter_mm",
-                self.inner.outer_diameter_mm,
-                f"less than outer.inner_diameter_mm = {self.outer.inner_diameter_mm:g}, by at least "
-                f"min_clearance_mm = {self.min_clearance_mm:g}",
-            )
-        if self.inner.length_mm < self.outer.length_mm:
-            raise impossible(
-                "inner.length_mm",
-                self.inner.length_mm,
-                f"at least outer.length_mm = {self.outer.length_mm:g}",
-            )
+        if self.middle is not None and self.outer is None:
+            raise impossible("middle", "there", "left out where there is no tubes.outer")
+        for (name, around), (within, tube) in pairwise(self.named):
+            clearance = around.inner_diameter_mm - tube.outer_diameter_mm
+            if clearance <= 0.0 or clearance < self.min_clearance_mm - 1e-9:
+                raise impossible(
+                    f"{within}.outer_diameter_mm",
+                    tube.outer_diameter_mm,
+                    f"less than {name}.inner_diameter_mm = {around.inner_diameter_mm:g}, by at least "
+                    f"min_clearance_mm = {self.min_clearance_mm:g}",
+                )
+            if tube.length_mm < around.length_mm:
+                raise impossible(
+                    f"{within}.length_mm", tube.length_mm, f"at least {name}.length_mm = {around.length_mm:g}"
+                )
 
     @property
     def nested(self) -> tuple[Tube, ...]:
         """The tubes, the innermost first."""
-        return (self.inner,) if self.outer is None else (self.inner, self.outer)
+        return tuple(tube for _name, tube in reversed(self.named))
 
     @property
-    def _named(self) -> tuple[tuple[str, Tube], ...]:
+    def named(self) -> tuple[tuple[str, Tube], ...]:
         """The tubes with their names in a device file, the outermost first."""
-        inner = ("inner", self.inner)
-        return (inner,) if self.outer is None else (("outer", self.outer), inner)
+        all_three = (("outer", self.outer), ("middle", self.middle), ("inner", self.inner))
+        return tuple((name, tube) for name, tube in all_three if tube is not None)
 
     @property
     def outermost(self) -> Tube:
@@ -331,12 +358,12 @@ class ConcentricTubes:
 
     @property
     def max_inner_protrusion_mm(self) -> float:
-        """Length of inner tube that can be ahead of the outer one, mm, the rear ends being in order."""
+        """Length of inner tube that can be ahead of the outer one, mm, their rear ends being in order."""
         return self.inner.length_mm - (0.0 if self.outer is None else self.outer.length_mm)
 
     @property
     def overlap_curvature_per_mm(self) -> float:
-        """Curvature of the inner tube's bent part inside the straight outer tube, 1/mm.
+        """Curvature of the inner tube's bent part inside the straight outer tube of planar tubes, 1/mm.
 
         The two share the precurvature in proportion to their bending stiffness [Rucker2010].
         """
@@ -345,7 +372,10 @@ class ConcentricTubes:
         return self.inner.precurvature_per_mm * (inner / (inner + stiffness))
 
     def arcs(self, outer_mm: ArrayLike, inner_mm: ArrayLike) -> TubeArcs:
-        """Return the arcs for insertions `(N,)` in mm, 0 <= outer <= inner [Kuntz2015, sec. IV-B]."""
+        """Return the arcs of planar tubes for insertions `(N,)` in mm, 0 <= outer <= inner.
+
+        [Kuntz2015, sec. IV-B].
+        """
         outer, inner = (np.array(insertion, dtype=np.float64, ndmin=1) for insertion in (outer_mm, inner_mm))
         straight = np.maximum(inner - self.inner.curved_length_mm, 0.0)
         ends = np.stack([np.minimum(straight, outer), outer, np.maximum(straight, outer), inner], axis=1)

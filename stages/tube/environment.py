@@ -14,6 +14,11 @@ from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
 from stages.tube.kernels import TubeEnvironment
 
+DEFAULT_ROTATIONS = 24
+"""Rotations 15 degrees apart: at 30 mm of curve, tips are about 3 mm apart, as far as the stops."""
+THREADS = 2
+"""The kernels run without the interpreter's lock; more threads would wait for memory."""
+
 
 def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
     """Return what the tubes collide with in a lung.
@@ -38,12 +43,16 @@ def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
 
 
 def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
-    """Return the `(N_TUBES,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad."""
+    """Return the `(N_TUBES,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad.
+
+    Curvatures and the length of the curve are 0 where the tubes are not planar.
+    """
     constants = np.zeros(kernels.N_TUBES)
     inner, outer = tubes.inner, tubes.outermost
-    constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
-    constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
-    constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
+    if tubes.planar:
+        constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
+        constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
+        constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
     constants[kernels.OUTER_RADIUS] = outer.radius_mm
     constants[kernels.INNER_RADIUS] = inner.radius_mm
     constants[kernels.MARGIN] = margins.total_mm
@@ -56,10 +65,11 @@ def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
 
 
 def tracking_length_mm(tubes: ConcentricTubes) -> float:
-    """Return the greatest insertion in which the tubes follow their own track exactly.
+    """Return the greatest insertion that is enumerated.
 
-    Curved tubes do so as long as the straight part of the inner one stays in the scope.
+    Planar tubes follow their own track exactly up to it: curved ones do so as long as the straight part of
+    the inner one stays in the scope.
     """
-    if tubes.inner.precurvature_per_mm == 0.0:
+    if not tubes.planar or tubes.inner.precurvature_per_mm == 0.0:
         return tubes.max_extension_mm
     return min(tubes.inner.curved_length_mm, tubes.max_extension_mm)

@@ -15,8 +15,7 @@ from anatomy.margins import Margins
 from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.tube import kernels
-from stages.tube.deployments import DEFAULT_ROTATIONS, THREADS
-from stages.tube.environment import tube_environment
+from stages.tube.environment import DEFAULT_ROTATIONS, THREADS, tube_environment
 from stages.tube.kernels import placing
 from stages.tube.shape_tree import ShapeTree, tree_of_shapes
 from stages.tube.shapes import TubeShapes

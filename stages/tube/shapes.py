@@ -25,6 +25,7 @@ from stages.tube.kernels import shapes as kernel
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.nesting import SAME_MM
 from stages.tube.sequences import BEND_RAD
+from stages.tube.shape import TubeShape
 
 THREADS = 2
 """The kernel runs without the interpreter's lock."""
@@ -134,6 +135,22 @@ class TubeShapes:
     def arcs_of(self, shape: int) -> Float:
         """Return the arcs `(a, 4)` of one deployment."""
         return self.arcs[self.first_arc[shape] : self.first_arc[shape + 1]]
+
+    def member(self, shape: int) -> TubeShape:
+        """Return one deployment by itself."""
+        return TubeShape(
+            insertions_mm=self.insertions_mm[shape],
+            rotations_rad=self.rotations_rad[shape],
+            arcs=self.arcs_of(shape),
+            lateral_sweep_mm=float(self.lateral_sweep_mm[shape]),
+            follow_the_leader_error_mm=float(self.follow_the_leader_error_mm[shape]),
+            arc_error_mm=float(self.arc_error_mm[shape]),
+            least_determinant=float(self.least_determinant[shape]),
+        )
+
+    def beside_mm(self) -> Float:
+        """Return what has to be free around each shape beside its radius and the margins `(S,)`, mm."""
+        return np.asarray(self.lateral_sweep_mm + self.arc_error_mm)
 
 
 def tube_shapes(

@@ -18,7 +18,7 @@ from stages.tube.device import ConcentricTubes
 def channel_curvature_limit(tubes: ConcentricTubes, behind_tip_mm: ArrayLike) -> Float:
     """Return how bent the channel may be for the tubes to pass, (N,) float64 in 1/mm.
 
-    Both tubes may be inserted as far as the device allows.  Below 0, a tube cannot even be held straight.
+    All tubes may be inserted as far as the device allows.  Below 0, a tube cannot even be held straight.
 
     Parameters
     ----------
@@ -37,32 +37,31 @@ def channel_curvature_limit(tubes: ConcentricTubes, behind_tip_mm: ArrayLike) ->
 
 
 def transit_strain(tubes: ConcentricTubes, channel_pieces: ArrayLike, insertions_mm: ArrayLike) -> Float:
-    """Return the largest strain of outer and inner tube on their way to their place, (2,) float64.
+    """Return the largest strain of each tube on its way to its place, (n,) float64, the outermost first.
 
-    That of a tube which the device lacks is 0.
-    It counts the channel, the straight part of it and of the outer tube, and where both are bent beyond it.
+    That of a tube which the device lacks is 0.  It counts the channel, the straight part of it and of a
+    straight outer tube, and where planar tubes are bent beyond it; `TubeShapes` has the strain of other tubes
+    there.
 
     Parameters
     ----------
     channel_pieces : (P, 3) float64
         Length in mm, roll in rad and curvature in 1/mm of each arc of the channel, that at the scope's tip
         last; as `stages.scope.ScopeMotion.pieces`.
-    insertions_mm : (2,) float64
-        Outer and inner tube beyond the scope's tip.
+    insertions_mm : (n,) float64
+        Of the tubes beyond the scope's tip, the outermost first; the last are those of the tubes there are.
     """
     pieces = np.asarray(channel_pieces, dtype=np.float64).reshape(-1, 3)
     far = np.append(np.cumsum(pieces[::-1, 0])[::-1], 0.0)
-    bent = np.append(np.abs(pieces[:, 2]), tubes.overlap_curvature_per_mm)
-    out = np.zeros(2)
-    for n, tube in enumerate((tubes.outer, tubes.inner)):
-        if tube is None:
-            continue
+    bent = np.append(np.abs(pieces[:, 2]), tubes.overlap_curvature_per_mm if tubes.planar else 0.0)
+    inserted = np.asarray(insertions_mm, dtype=np.float64)
+    out = np.zeros(len(inserted))
+    for n, (_name, tube) in enumerate(tubes.named, start=len(inserted) - len(tubes.named)):
         parts = tube.parts
-        inserted = float(np.asarray(insertions_mm, dtype=np.float64)[n])
-        passes = parts.begin_mm <= inserted + far[:, None]
+        passes = parts.begin_mm <= float(inserted[n]) + far[:, None]
         # Beyond the scope the inner tube bends towards its precurvature, and the outer one with it.
         curvature = np.where(passes, bent[:, None], 0.0)
-        if n == 1:
+        if tube is tubes.inner:
             curvature[-1] = 0.0
         out[n] = ((curvature + parts.curvature_per_mm) * parts.strained_radius_mm).max()
     return out
@@ -79,16 +78,13 @@ def straightening(
 
     Parameters
     ----------
-    insertions_mm : (2,) float64
-        Outer and inner tube beyond the scope's tip.
+    insertions_mm : (n,) float64
+        As those of `transit_strain`.
     """
     total = 0.0
-    for tube, inserted in zip(
-        (tubes.outer, tubes.inner), np.asarray(insertions_mm, dtype=np.float64), strict=True
-    ):
-        if tube is None:
-            continue
+    inserted = np.asarray(insertions_mm, dtype=np.float64)[-len(tubes.nested) :]
+    for (_name, tube), out_mm in zip(tubes.named, inserted, strict=True):
         parts = tube.parts
-        inside = (parts.end_mm > inserted) & (parts.begin_mm < inserted + bending_length_mm)
+        inside = (parts.end_mm > out_mm) & (parts.begin_mm < out_mm + bending_length_mm)
         total += float(parts.stiffness_n_mm2[inside].max(initial=0.0))
     return total / section_stiffness_n_mm2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
 from anatomy.errors import SettingsError
@@ -11,8 +12,10 @@ from anatomy.margins import Margins
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.tube import kernels
+from stages.tube.design_shapes import shapes_of
 from stages.tube.device import ConcentricTubes
 from stages.tube.environment import tube_constants, tube_environment
+from stages.tube.shape import TubeShape, centreline, points_on_arcs
 
 REASONS: dict[int, str] = {
     kernels.NO_EXIT: "the tube does not leave the airway",
@@ -37,8 +40,14 @@ class Deployment:
 
     Parameters
     ----------
+    rotation_rad : float
+        Rotation of all tubes together about +z of the scope tip.
+    outer_mm, inner_mm : float
+        Insertions of the outermost and the innermost tube.
     lps_from_tip : (4, 4) float64
-        +z forward, +x towards the bend.
+        +z forward; +x towards the bend of planar tubes, else carried from the scope tip without turning.
+    shape : TubeShape or None
+        None for planar tubes, whose shape follows from their insertions.
     """
 
     rotation_rad: float
@@ -50,6 +59,14 @@ class Deployment:
     wall_angle_rad: float
     wall_run_mm: float
     lateral_sweep_mm: float
+    shape: TubeShape | None = None
+
+    def points(self, tubes: ConcentricTubes, lps_from_scope_tip: Float, arc_lengths_mm: ArrayLike) -> Float:
+        """Return points `(N, 3)` LPS mm of the centreline at arc lengths `(N,)` from the scope tip."""
+        if self.shape is not None:
+            return points_on_arcs(self.shape.arcs, lps_from_scope_tip, self.rotation_rad, arc_lengths_mm)
+        insertions = self.outer_mm, self.inner_mm
+        return centreline(tubes, lps_from_scope_tip, self.rotation_rad, *insertions, arc_lengths_mm)
 
     @property
     def length_in_tissue_mm(self) -> float:
@@ -58,7 +75,7 @@ class Deployment:
 
 
 class DeploymentValidator:
-    """Accepts or refuses single deployments of one pair of tubes in one lung.
+    """Accepts or refuses single deployments of tubes in one lung.
 
     Parameters
     ----------
@@ -68,14 +85,22 @@ class DeploymentValidator:
 
     def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
         self._environment = tube_environment(lung, with_fissures=with_fissures)
-        self._constants = tube_constants(tubes, margins)
+        self._tubes, self._constants = tubes, tube_constants(tubes, margins)
         self._trace = np.zeros(kernels.N_TRACE)
         self._tip = np.zeros(9)
+
+    def choose(
+        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float, shape: int
+    ) -> Deployment | str:
+        """Return an enumerated deployment, or the reason why it is refused; see `Deployments`."""
+        if shape < 0:
+            return self.validate(lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
+        return self.validate_shape(lps_from_scope_tip, rotation_rad, shapes_of(self._tubes).member(shape))
 
     def validate(
         self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
     ) -> Deployment | str:
-        """Return the deployment, or the reason why it is refused.
+        """Return the deployment of planar tubes, or the reason why it is refused.
 
         Parameters
         ----------
@@ -88,29 +113,67 @@ class DeploymentValidator:
         Raises
         ------
         SettingsError
-            If the outer tube would be ahead of the inner one.
+            If the outer tube would be ahead of the inner one, or the tubes are not planar.
         """
         if not 0.0 <= outer_mm <= inner_mm:
             raise SettingsError(
                 f"The insertions of outer and inner tube are {outer_mm:g} and {inner_mm:g} mm",
                 expected="0 <= outer <= inner",
             )
-        base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
-        normal = frames.bending_directions(lps_from_scope_tip, rotation_rad)[0]
-        trace, tip = self._trace, self._tip
+        self._tubes.require_planar("A deployment by two insertions and one rotation")
+        base, normal = _start(lps_from_scope_tip, rotation_rad)
         reason = kernels.validate_deployment(
-            self._environment, self._constants, base, normal, float(outer_mm), float(inner_mm), trace, tip
-        )
+            self._environment, self._constants, base, normal, float(outer_mm), float(inner_mm), self._trace,
+            self._tip,
+        )  # fmt: skip
         if reason != kernels.ACCEPTED:
             return REASONS[reason]
+        sweep = kernels.lateral_sweep(self._constants, float(outer_mm), float(inner_mm))
+        return self._accepted(rotation_rad, (outer_mm, inner_mm), float(sweep), None)
+
+    def validate_shape(
+        self, lps_from_scope_tip: Float, rotation_rad: float, shape: TubeShape
+    ) -> Deployment | str:
+        """Return the deployment of a shape of the design, or the reason why it is refused.
+
+        Parameters
+        ----------
+        lps_from_scope_tip : (4, 4) float64
+        rotation_rad : float
+            Of all tubes together about +z of the scope tip, counted from its +x.
+        shape : TubeShape
+            Its own limits (extension, sweep, strain, snaps) are kept by all members of `TubeShapes`.
+        """
+        base, normal = _start(lps_from_scope_tip, rotation_rad)
+        reason = kernels.validate_arcs(
+            self._environment, self._constants, base, normal, shape.arcs, shape.required_beside_mm,
+            self._trace, self._tip,
+        )  # fmt: skip
+        if reason != kernels.ACCEPTED:
+            return REASONS[reason]
+        ends = float(shape.insertions_mm[-1]), float(shape.insertions_mm[0])
+        return self._accepted(rotation_rad, ends, shape.lateral_sweep_mm, shape)
+
+    def _accepted(
+        self, rotation_rad: float, ends_mm: tuple[float, float], sweep_mm: float, shape: TubeShape | None
+    ) -> Deployment:
+        """Return the deployment that the kernel has just followed and accepted."""
+        trace, tip = self._trace, self._tip
         return Deployment(
             rotation_rad=float(rotation_rad),
-            outer_mm=float(outer_mm),
-            inner_mm=float(inner_mm),
+            outer_mm=float(ends_mm[0]),
+            inner_mm=float(ends_mm[1]),
             lps_from_tip=frames.pose(tip[:3], tip[3:6], tip[6:9]),
             branch=int(trace[kernels.BRANCH]),
             exit_mm=float(trace[kernels.LEFT_AT]),
             wall_angle_rad=float(trace[kernels.WALL_ANGLE]),
             wall_run_mm=float(trace[kernels.WALL_RUN]),
-            lateral_sweep_mm=float(kernels.lateral_sweep(self._constants, float(outer_mm), float(inner_mm))),
+            lateral_sweep_mm=sweep_mm,
+            shape=shape,
         )
+
+
+def _start(lps_from_scope_tip: Float, rotation_rad: float) -> tuple[Float, Float]:
+    """Return the pose `(6,)` of the scope tip, and the direction `(3,)` to which the tubes are turned."""
+    base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
+    return base, np.asarray(frames.bending_directions(lps_from_scope_tip, rotation_rad)[0])

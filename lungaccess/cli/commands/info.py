@@ -63,13 +63,13 @@ def presets(
     """
     from anatomy.settings import to_mapping
     from lungaccess.problem.preset_order import presets_by_invasiveness
-    from lungaccess.problem.system import load_system, needle_preset_names, preset_text
+    from lungaccess.problem.system import load_system, needle_preset_names, preset_text, tube_preset_names
 
     if show is not None and not output.json:
         terminal.console.file.write(preset_text(show))
         return ExitCode.OK
     ordered = [system.name for system in presets_by_invasiveness()]
-    names = (*ordered, *needle_preset_names()) if show is None else (show,)
+    names = (*ordered, *tube_preset_names(), *needle_preset_names()) if show is None else (show,)
     systems = {name: load_system(name) for name in names}
     if output.json:
         terminal.show_json({name: to_mapping(system) for name, system in systems.items()})

@@ -1,10 +1,12 @@
 """Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
-`tube` is the tuple (environment, constants) of `stages.tube.kernels`, `needle` a
-`lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x` holds a row of `scope_poses`, the
-rotation in rad, and the insertions of outer and inner tube in mm.  `vias` are points (LPS mm) through which
-single arcs lead from the tube to the target.  A row of `scope_poses` (9,) is a scope tip: point, unit
-tangent, and the unit vector across the tangent from which the rotation counts.
+`tube` is the tuple (environment, constants, arcs, beside): the first two are those of `stages.tube.kernels`,
+`arcs` (a, 4) and `beside` (mm) the shape of tubes that are not planar, as `validate_arcs` takes it; planar
+tubes have no arcs.  `needle` is a `lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x`
+holds a row of `scope_poses`, the rotation in rad, and the insertions of outer and inner tube in mm, which
+count for planar tubes only.  `vias` are points (LPS mm) through which single arcs lead from the tube to the
+target.  A row of `scope_poses` (9,) is a scope tip: point, unit tangent, and the unit vector across the
+tangent from which the rotation counts.
 """
 
 from __future__ import annotations
@@ -16,7 +18,16 @@ import numpy as np
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels import blocker_on_arc, cost_of_arc, least_cosine, map_costs_on_arc
-from stages.tube.kernels import ACCEPTED, BRANCH, MAX_EXTENSION, MAX_PROTRUSION, tip_pose, validate_deployment
+from stages.tube.kernels import (
+    ACCEPTED,
+    BRANCH,
+    MAX_EXTENSION,
+    MAX_PROTRUSION,
+    tip_of_arcs,
+    tip_pose,
+    validate_arcs,
+    validate_deployment,
+)
 
 SCOPE_POSE = 0
 ROTATION = 1
@@ -92,14 +103,15 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
 
     The fast tests come first: limits and cost of the needle, the deployment, the needle's clearance.
     """
-    environment, constants = tube
+    environment, constants, arcs, beside = tube
+    planar = arcs.shape[0] == 0
     row = int(x[SCOPE_POSE])
     outer, inner = x[OUTER], x[INNER]
     if row < 0 or row >= scope_poses.shape[0] or not allowed[row]:
         return math.inf
-    if outer < 0.0 or outer > inner or inner > constants[MAX_EXTENSION]:
+    if planar and (outer < 0.0 or outer > inner or inner > constants[MAX_EXTENSION]):
         return math.inf
-    if inner - outer > constants[MAX_PROTRUSION]:
+    if planar and inner - outer > constants[MAX_PROTRUSION]:
         return math.inf
     base = scope_poses[row]
     c, s = math.cos(x[ROTATION]), math.sin(x[ROTATION])
@@ -108,12 +120,19 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
         c * base[7] + s * (base[5] * base[6] - base[3] * base[8]),
         c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
     )
-    pose = tip_pose(constants, base, normal, outer, inner)
+    if planar:
+        pose = tip_pose(constants, base, normal, outer, inner)
+    else:
+        pose = tip_of_arcs(base, normal, arcs)
     cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
     if cost == math.inf:
         return math.inf
     towards = np.array(normal)
-    if validate_deployment(environment, constants, base[:6], towards, outer, inner, trace, tip) != ACCEPTED:
+    if planar:
+        reason = validate_deployment(environment, constants, base[:6], towards, outer, inner, trace, tip)
+    else:
+        reason = validate_arcs(environment, constants, base[:6], towards, arcs, beside, trace, tip)
+    if reason != ACCEPTED:
         return math.inf
     branch = int(trace[BRANCH])
     if not _needle_clear(needle, pose, vias, count, target, branch):

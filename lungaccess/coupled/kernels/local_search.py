@@ -156,6 +156,9 @@ def sample_deployments(
     rotations,
     outers,
     inners,
+    arcs,
+    first_arc,
+    beside,
     spreads,
     target,
     tries,
@@ -173,6 +176,9 @@ def sample_deployments(
         The row of `scope_poses` of each deployment.
     rotations, outers, inners : (N,) float64
         The deployments: rad, mm, mm.
+    arcs, first_arc, beside : (A, 4) float64, (N + 1,) int64, (N,) float64
+        The shapes of deployments that are not planar, which are kept, and where the arcs of each begin;
+        instead of those in `tube`.
     spreads : (2,) float64
         The largest change of rotation in rad and of insertions in mm.
     target : tuple of 3 floats
@@ -186,11 +192,15 @@ def sample_deployments(
 
     Returns
     -------
-    float
+    cost : float
         Its estimated cost, or `cost_limit` if there is none.
+    near : int
+        The deployment near which it is, -1 if there is none.
     """
+    environment, constants, _arcs, _beside = tube
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
+    near = -1
     x = np.zeros(N_CHOICE)
     vias = np.zeros((MAX_VIAS, 3))
     allowed = np.ones(scope_poses.shape[0], dtype=np.bool_)
@@ -201,11 +211,12 @@ def sample_deployments(
         x[ROTATION] = rotations[n] + spreads[0] * (2.0 * uniform(state) - 1.0)
         x[OUTER] = max(outers[n] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
         x[INNER] = max(inners[n] + spreads[1] * (2.0 * uniform(state) - 1.0), x[OUTER])
+        shaped = (environment, constants, arcs[first_arc[n] : first_arc[n + 1]], beside[n])
         cost = validated_cost(
-            tube, needle, scope_poses, allowed, x, vias, none, target, cost_limit, trace, tip
+            shaped, needle, scope_poses, allowed, x, vias, none, target, cost_limit, trace, tip
         )
         if cost < cost_limit:
-            cost_limit = cost
+            cost_limit, near = cost, n
             for m in range(N_CHOICE):
                 best[m] = x[m]
-    return cost_limit
+    return cost_limit, near

@@ -67,12 +67,8 @@ class DirectArcs:
     def candidate(self, entry: int) -> Candidate | None:
         """Return a deployment of the atlas in full with its arc, None if the tubes are refused."""
         entries = self.atlas.deployments
-        return self.evaluator.direct(
-            self.atlas.motions.tip(int(entries.site[entry])),
-            float(entries.rotation_rad[entry]),
-            float(entries.outer_mm[entry]),
-            float(entries.inner_mm[entry]),
-        )
+        tip = self.atlas.motions.tip(int(entries.site[entry]))
+        return self.evaluator.direct(tip, *entries.choice(entry))
 
     def proved(self, entry: int) -> Candidate | None:
         """Return a deployment of the atlas with its arc, None if the proof fails."""

@@ -35,6 +35,7 @@ class KuntzSearch:
     phase = "Algorithm 1"
 
     def __init__(self, task: Task, atlas: Atlas, *, rejects: bool = True) -> None:
+        task.system.tubes.require_planar("Algorithm 1 of [Kuntz2015]")
         self._task, self._atlas, self._rejects = task, atlas, rejects
         self._evaluator = CandidateEvaluator(task)
         self._needle_planner = NamedNeedlePlanner(self._evaluator, PLANNER)

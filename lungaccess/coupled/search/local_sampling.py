@@ -15,6 +15,8 @@ from lungaccess.coupled.search.entries import different
 from lungaccess.coupled.search.local_search import LocalSearch
 from lungaccess.plans.candidate import Candidate
 from stages.needle import Needle
+from stages.tube import ConcentricTubes, shapes_of
+from stages.tube.kernels import ARC_COLUMNS
 
 MOST = 1000
 """Deployments of the atlas around which samples are drawn: about as many as one iteration has samples for."""
@@ -46,14 +48,20 @@ class LocalSampling:
         numbers, self._pose_of = np.unique(entries.site[chosen], return_inverse=True)
         self._motions, self._numbers = motions, numbers
         self._poses = np.ascontiguousarray(motions.tips[numbers])
-        self._deployed = (entries.rotation_rad[chosen], entries.outer_mm[chosen], entries.inner_mm[chosen])
+        self._shapes = entries.shape[chosen]
+        self._deployed = (
+            entries.rotation_rad[chosen],
+            entries.outer_mm[chosen],
+            entries.inner_mm[chosen],
+            *_arcs_of(arcs.task.system.tubes, self._shapes),
+        )
 
     def sample(self, cost_limit: float) -> Candidate | None:
         """Return the cheapest of TRIES samples if its estimated cost is below a limit."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
         best = np.zeros(N_CHOICE)
-        cost = sample_deployments(
-            self._kernel_arguments.tube,
+        cost, near = sample_deployments(
+            self._kernel_arguments.tube(),
             self._kernel_arguments.needle,
             self._poses,
             self._pose_of,
@@ -69,7 +77,20 @@ class LocalSampling:
             return None
         rotation, outer, inner = best[1:].tolist()
         tip = self._motions.tip(int(self._numbers[int(best[SCOPE_POSE])]))
-        return self._evaluator.direct(tip, rotation % (2.0 * math.pi), outer, inner)
+        return self._evaluator.direct(tip, rotation % (2.0 * math.pi), outer, inner, int(self._shapes[near]))
+
+
+def _arcs_of(tubes: ConcentricTubes, chosen: Int) -> tuple[Float, Int, Float]:
+    """Return the arcs of shapes, where those of each begin, and what must be free beside them.
+
+    Planar tubes have none.
+    """
+    if tubes.planar:
+        return np.zeros((0, ARC_COLUMNS)), np.zeros(len(chosen) + 1, dtype=np.int64), np.zeros(len(chosen))
+    shapes = shapes_of(tubes)
+    arcs = [shapes.arcs_of(shape) for shape in chosen.tolist()]
+    first = np.append(0, np.cumsum([len(each) for each in arcs])).astype(np.int64)
+    return np.concatenate([np.zeros((0, ARC_COLUMNS)), *arcs]), first, shapes.beside_mm()[chosen]
 
 
 def sampling_near_target(

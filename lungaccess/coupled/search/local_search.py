@@ -14,7 +14,11 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from stages.needle import ArcPath, direct_path
 from stages.scope import TipRow, evenly
-from stages.tube import Deployment, tube_constants, tube_environment
+from stages.tube import Deployment, TubeEnvironment, TubeShape, tube_constants, tube_environment
+from stages.tube.kernels import ARC_COLUMNS
+
+TubeArguments = tuple[TubeEnvironment, Float, Float, float]
+"""Tubes for the kernels; see `lungaccess.coupled.kernels.candidate`."""
 
 SHIFTS_MM = evenly(0.25, 4.0)
 """How much farther the scope may stop: a fraction of the 1 mm between the tips of an atlas, and several times
@@ -41,6 +45,8 @@ class LocalSearchRun:
         Estimated cost of that choice; infinite before the search has begun.
     evaluated_cost : float
         The estimated cost at which the choice was last evaluated in full.
+    shape : TubeShape or None
+        That of tubes which are not planar; it is kept.
     """
 
     poses: TipRow
@@ -49,6 +55,7 @@ class LocalSearchRun:
     count: int
     cost: float = math.inf
     evaluated_cost: float = math.inf
+    shape: TubeShape | None = None
 
 
 class LocalSearch:
@@ -59,8 +66,8 @@ class LocalSearch:
 
     Attributes
     ----------
-    tube, needle : tuple
-        Arguments of the kernels; see `lungaccess.coupled.kernels.candidate`.
+    needle : tuple
+        Argument of the kernels; see `lungaccess.coupled.kernels.candidate`.
     target : tuple of 3 floats
     """
 
@@ -68,10 +75,14 @@ class LocalSearch:
         task = evaluator.task
         self._evaluator, self._rng = evaluator, rng
         environment = tube_environment(task.lung, with_fissures=task.with_fissures)
-        self.tube = (environment, tube_constants(task.system.tubes, task.system.margins))
+        self._tube = (environment, tube_constants(task.system.tubes, task.system.margins))
         self.needle = evaluator.needle_arrays
         x, y, z = task.target.lps_mm.tolist()
         self.target = (x, y, z)
+
+    def tube(self, shape: TubeShape | None = None) -> TubeArguments:
+        """Return the tubes for the kernels, with their shape if they are not planar."""
+        return tube_arguments(*self._tube, shape)
 
     def begin(self, candidate: Candidate | None) -> LocalSearchRun | None:
         """Return a run from a candidate; None without one, or if its needle has too many arcs."""
@@ -86,13 +97,13 @@ class LocalSearch:
         vias[: len(points)] = points
         home = float(len(SHIFTS_MM) // 2)
         x = np.array([home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
-        return LocalSearchRun(poses=poses, x=x, vias=vias, count=len(points))
+        return LocalSearchRun(poses=poses, x=x, vias=vias, count=len(points), shape=deployment.shape)
 
     def advance(self, run: LocalSearchRun, tries: int) -> None:
         """Evaluate so many variations of a run's choice, and keep the best."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
         run.count, run.cost = improve(
-            self.tube,
+            self.tube(run.shape),
             self.needle,
             run.poses.tips,
             run.poses.proved,
@@ -120,11 +131,22 @@ class LocalSearch:
         index = int(run.x[SCOPE_POSE])
         tip, (rotation, outer, inner) = self._evaluator.tip_rows.tip(run.poses, index), run.x[1:].tolist()
         rotation %= 2.0 * math.pi
-        deployment = self._evaluator.tubes.validate(tip.lps_from_scope_tip, rotation, outer, inner)
+        tubes, frame = self._evaluator.tubes, tip.lps_from_scope_tip
+        if run.shape is None:
+            deployment = tubes.validate(frame, rotation, outer, inner)
+        else:
+            deployment = tubes.validate_shape(frame, rotation, run.shape)
         if isinstance(deployment, str):
             return None
         path = path_through(deployment, run.vias[: run.count], self._evaluator.task.target.lps_mm)
         return Candidate(tip=tip, deployment=deployment, path=path)
+
+
+def tube_arguments(environment: TubeEnvironment, constants: Float, shape: TubeShape | None) -> TubeArguments:
+    """Return tubes as the kernels take them; see `lungaccess.coupled.kernels.candidate`."""
+    if shape is None:
+        return environment, constants, np.zeros((0, ARC_COLUMNS)), 0.0
+    return environment, constants, np.array(shape.arcs), shape.required_beside_mm
 
 
 def path_through(deployment: Deployment, vias: Float, target: Float) -> ArcPath:

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from stages.tube.kernels.deployment import ENTRY_COLUMNS, ENTRY_TIP, enumerate_site, validate_deployment
+    from stages.tube.kernels.deployment import (
+        ENTRY_COLUMNS,
+        ENTRY_TIP,
+        enumerate_site,
+        tip_of_arcs,
+        validate_arcs,
+        validate_deployment,
+    )
     from stages.tube.kernels.planar import (
         CURVED_LENGTH,
         INNER_CURVATURE,
@@ -26,6 +33,7 @@ if TYPE_CHECKING:
         planar_points,
         tip_pose,
     )
+    from stages.tube.kernels.shapes import ARC_COLUMNS
     from stages.tube.kernels.wall_exit import (
         ACCEPTED,
         BRANCH,

@@ -1,4 +1,4 @@
-"""Validation of one deployment, and the enumeration of all deployments from one scope tip.
+"""Validation of one deployment, and the enumeration of all planar deployments from one scope tip.
 
 `environment` and `trace` are those of `wall_exit`, `tubes` is the array of `planar`.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numba
 
 from stages.tube.kernels import planar
+from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
 from stages.tube.kernels.wall_exit import (
     ACCEPTED,
     BRANCH,
@@ -21,6 +22,7 @@ from stages.tube.kernels.wall_exit import (
     WALL_ANGLE,
     WALL_RUN,
     advance,
+    march,
     reset,
 )
 
@@ -32,7 +34,7 @@ ENTRY_COLUMNS = 14
 
 @numba.njit(cache=True, nogil=True)
 def validate_deployment(environment, tubes, base, normal, outer, inner, trace, tip):
-    """Validate one deployment from the scope tip pose `base`, bending towards `normal`.
+    """Validate one planar deployment from the scope tip pose `base`, bending towards `normal`.
 
     Fills `trace` and `tip` (9,): tip pose and the normal there.  Returns a reason.
     """
@@ -60,6 +62,44 @@ def validate_deployment(environment, tubes, base, normal, outer, inner, trace, t
     for m in range(3):
         tip[6 + m] = towards[m]
     return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
+
+
+@numba.njit(cache=True, nogil=True)
+def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
+    """Validate a shape of any tubes from the scope tip pose `base`.
+
+    Directions of `arcs` (a, ARC_COLUMNS) count from `normal`; `beside` mm beside radius and margins have to
+    be free.  Fills `trace` and `tip` as `validate_deployment` does, with the normal carried along without
+    turning.  Returns a reason.
+    """
+    reset(trace)
+    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
+    across = (normal[0], normal[1], normal[2])
+    clearance, at = tubes[planar.MARGIN] + beside, 0.0
+    for a in range(arcs.shape[0]):
+        length, direction = arcs[a, LENGTH], arcs[a, DIRECTION]
+        bend = bend_towards(pose, across, direction, arcs[a, CURVATURE])
+        reason = march(environment, tubes, trace, pose, bend, at, length, arcs[a, RADIUS], clearance)
+        if reason != ACCEPTED:
+            return reason
+        pose, across = carried(pose, across, bend, direction, length)
+        at += length
+    for m in range(6):
+        tip[m] = pose[m]
+    for m in range(3):
+        tip[6 + m] = across[m]
+    return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
+
+
+@numba.njit(cache=True)
+def tip_of_arcs(base, normal, arcs):
+    """Return the pose at the end of a shape's arcs; see `validate_arcs`."""
+    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
+    across = (normal[0], normal[1], normal[2])
+    for a in range(arcs.shape[0]):
+        bend = bend_towards(pose, across, arcs[a, DIRECTION], arcs[a, CURVATURE])
+        pose, across = carried(pose, across, bend, arcs[a, DIRECTION], arcs[a, LENGTH])
+    return pose
 
 
 @numba.njit(cache=True)

@@ -61,7 +61,7 @@ def test_bend_of_the_tubes(system: Any) -> None:
 def test_planar_quadrature_is_the_curve_in_space(system: Any) -> None:
     bend = shapes.bend_of(system.tubes, 22.0, 47.0)
     flat = shapes.planar_shape(bend, 0.25)
-    curve = shapes.tube_curve(np.eye(4), 0.0, bend)
+    curve = shapes.integrate(np.eye(4), shapes.planar_pieces(0.0, bend))
     np.testing.assert_allclose(curve.end[[0, 2], 3], flat[-1], atol=1e-5)
     assert shapes.distance_to_polyline(curve.points[::7, [0, 2]], flat).max() < 1e-3
 

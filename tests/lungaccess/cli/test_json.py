@@ -20,7 +20,7 @@ from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import OutputOptions
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import needle_preset_names, preset_names
+from lungaccess.problem.system import shipped_names
 from tests.lungaccess.appraisals import appraise_as_told, make_risk
 from tests.lungaccess.cli.every_command import commands
 from tests.lungaccess.loading import load_with
@@ -44,7 +44,7 @@ def test_every_command_has_one_style_of_json() -> None:
 def test_presets_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["presets", "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
-    assert set(found) == {*preset_names(), *needle_preset_names()}
+    assert set(found) == set(shipped_names())
     assert found["lung-default"]["needle"]["diameter_mm"] == 1.0
 
 
@@ -60,7 +60,7 @@ def test_quiet_prints_json_and_errors_alone(
     code, said = run("presets")
     assert (code, said.out, said.err) == (ExitCode.OK, "", "")
     code, said = run("presets", "--json")
-    assert code == ExitCode.OK and set(json.loads(said.out)) == {*preset_names(), *needle_preset_names()}
+    assert code == ExitCode.OK and set(json.loads(said.out)) == set(shipped_names())
     code, said = run("plan", "toy", "--nodule", "--system", "no-such-system")
     assert code == ExitCode.BAD_INPUT and said.out == "" and "no-such-system" in said.err
     assert cli.main(["presets"]) == ExitCode.OK

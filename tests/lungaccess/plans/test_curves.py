@@ -54,7 +54,8 @@ def test_any_tubes_are_the_ones_that_the_check_integrates(outer: float, more: fl
     tube = replace(toy_plan.tube, outer_insertion_mm=outer, inner_insertion_mm=outer + more)
     curve = replace(toy_plan, tube=tube).curves().tubes
     bend = shapes.bend_of(toy_plan.system.tubes, outer, outer + more)
-    integrated = shapes.tube_curve(toy_plan.scope.lps_from_scope_tip, tube.rotation_rad, bend)
+    pieces = shapes.planar_pieces(tube.rotation_rad, bend)
+    integrated = shapes.integrate(toy_plan.scope.lps_from_scope_tip, pieces)
     np.testing.assert_allclose(curve.lps_from_device[-1], integrated.end, atol=1e-6)
     nearest = shapes.distance_to_polyline(curve.points_lps, integrated.points)
     assert nearest.max() < 1e-4

@@ -15,7 +15,9 @@ from lungaccess.problem.system import (
     load_system,
     needle_preset_names,
     preset_names,
+    shipped_names,
     system_fingerprint,
+    tube_preset_names,
 )
 
 PRESETS = Path(__file__).resolve().parents[3] / "lungaccess" / "presets"
@@ -37,9 +39,10 @@ def test_presets_ship_with_the_package() -> None:
         "ultrathin",
     )
     assert needle_preset_names() == ("med-rad-needle",)
+    assert tube_preset_names() == ("curved-outer",)
 
 
-@pytest.mark.parametrize("name", [*preset_names(), *needle_preset_names()])
+@pytest.mark.parametrize("name", shipped_names())
 def test_preset_is_valid_sourced_and_survives_a_round_trip(name: str) -> None:
     system = load_system(name)
     assert system.name == name
@@ -48,7 +51,7 @@ def test_preset_is_valid_sourced_and_survives_a_round_trip(name: str) -> None:
     assert parse(System, to_mapping(system), name) == system
 
 
-@pytest.mark.parametrize("name", [*preset_names(), *needle_preset_names()])
+@pytest.mark.parametrize("name", shipped_names())
 def test_sources_of_presets_are_in_the_bibliography(name: str) -> None:
     bibliography = (PRESETS.parents[1] / "docs" / "reference" / "bibliography.md").read_text(encoding="utf-8")
     keys = {part.split("]")[0] for source in load_system(name).sources for part in source.split("[")[1:]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +13,10 @@ from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, angle_between
 from lungaccess.checking.shapes import Curve, distance_to_polyline, radius_at
 from lungaccess.plans.plan import Plan
-from stages.tube import DerivedShape, derive_shape
 from stages.tube.device import Tube
+
+if TYPE_CHECKING:
+    from stages.tube.casadi_shape import DerivedShape
 
 SWEEP_TOLERANCE_MM = 0.02
 """So much less may a replay at steps find than a planner that takes the largest sweep."""
@@ -39,6 +42,8 @@ def check_twisted(plan: Plan, curve: Curve, found: Findings) -> float | None:
         What has to be free beside radius and margins: the sweep, and how far the arcs are from the tubes, mm.
     """
     tube, tubes, shape = plan.tube, plan.system.tubes, plan.tube.shape
+    from stages.tube.casadi_shape import derive_shape
+
     names = {name for name, _tube in tubes.named}
     if shape is None or not found.true(
         "tube.rotations", set(shape.relative_rotations_rad) == names, f"of {', '.join(sorted(names))}"

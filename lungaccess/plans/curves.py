@@ -16,8 +16,8 @@ from anatomy.typed import Float
 from lungaccess.plans.parts import NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.problem.system import System
 from stages.scope.device import laid_pieces
+from stages.tube.arcs import SHORTEST_ARC_MM, pieces_of_arcs
 from stages.tube.device import ConcentricTubes
-from stages.tube.shape import SHORTEST_ARC_MM, pieces_of_arcs
 
 STEP_MM = 0.25
 """Largest distance between the poses of tubes and needle: the chord of a 40 mm arc is off by 0.2 um."""

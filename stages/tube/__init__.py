@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from stages.tube.arcs import TubeShape, pieces_of_arcs, points_on_arcs
     from stages.tube.casadi_model import CasadiTubes
     from stages.tube.casadi_shape import DerivedShape, derive_shape
     from stages.tube.deployments import (
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
         propose_designs,
     )
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
-    from stages.tube.shape import TubeShape, centreline, pieces_of_arcs, points_on_arcs
+    from stages.tube.shape import centreline
     from stages.tube.shape_store import SHAPES_FORMAT, open_shapes
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes

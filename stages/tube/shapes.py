@@ -19,13 +19,13 @@ from anatomy.grid import read_only
 from anatomy.records import frozen_record
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float, Int
+from stages.tube.arcs import TubeShape
 from stages.tube.device import Tube
 from stages.tube.equilibrium import matrices
 from stages.tube.kernels import shapes as kernel
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.nesting import SAME_MM
 from stages.tube.sequences import BEND_RAD
-from stages.tube.shape import TubeShape
 
 THREADS = 2
 """The kernel runs without the interpreter's lock."""

@@ -12,10 +12,11 @@ from anatomy.margins import Margins
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.tube import kernels
+from stages.tube.arcs import TubeShape, points_on_arcs
 from stages.tube.design_shapes import shapes_of
 from stages.tube.device import ConcentricTubes
 from stages.tube.environment import tube_constants, tube_environment
-from stages.tube.shape import TubeShape, centreline, points_on_arcs
+from stages.tube.shape import centreline
 
 REASONS: dict[int, str] = {
     kernels.NO_EXIT: "the tube does not leave the airway",

@@ -50,7 +50,7 @@ class Case:
 def case(small_lung: Lung) -> Case:
     """Direct arcs to a point that many of them reach."""
     system, lung = SYSTEM, small_lung
-    target = la.resolve_target(lung, "lps:-45.6,47.0,-65.1")
+    target = la.resolve_target(lung, "lps:-58.2,55.4,-47.4")
     task = Task(lung=lung, system=system, target=target)
     places = find_motions(lung, system.scope, reach_mm=tracking_length_mm(system.tubes))
     fissures = {"with_fissures": task.with_fissures}
@@ -168,9 +168,9 @@ class TestProgram:
             assert np.abs(values[problem.layout.constraints["end"]]).max() < 1e-6
             length_mm = values[problem.layout.constraints["length"]][0]
             assert length_mm == pytest.approx(candidate.path.length_mm)
-        # The first two graze an obstacle, where the smooth clearance of the program has no peak.
-        np.testing.assert_allclose(shares[2:], 1.0, rtol=0.05)
-        assert max(shares[:2]) < 1.0
+        # The first grazes an obstacle, where the smooth clearance of the program has no peak.
+        np.testing.assert_allclose(shares[1:], 1.0, rtol=0.1)
+        assert shares[0] < 1.0
 
     def test_its_gradients_are_those_of_differences(self, case: Case) -> None:
         problem, solver = set_up(case)
@@ -208,7 +208,7 @@ class TestProgram:
             np.testing.assert_allclose(jacobian[:, n], slope, atol=tolerance)
 
     def test_the_symbolic_tip_follows_the_site(self, case: Case) -> None:
-        which = 3  # Its tubes are proved along the way of the tip, too.
+        which = 5  # Its tubes are proved along the way of the tip, too.
         problem, _solver = set_up(case, which)
         x, p = (
             casadi.SX.sym(n, size)

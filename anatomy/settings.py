@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import types
+import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, cast, dataclass_transform
 
@@ -268,8 +270,14 @@ def _class_at(cls: type, keys: Sequence[int | str]) -> type | None:
     owner: Any = cls
     for key in keys:
         field = _fields(owner).get(str(key))
-        owner = field.annotation if field is not None else None
+        owner = None if field is None else _without_none(field.annotation)
     return cast(type | None, owner)
+
+
+def _without_none(annotation: object) -> object:
+    """Return the class of a field that may be left out, any other annotation as it is."""
+    kinds = [kind for kind in typing.get_args(annotation) if kind is not type(None)]
+    return kinds[0] if len(kinds) == 1 and isinstance(annotation, types.UnionType) else annotation
 
 
 def _fields(cls: type | None) -> Mapping[str, FieldInfo]:

@@ -140,15 +140,17 @@ class Headline:
         if self.risk is None:
             return ()
         model, label = self.risk.model, self.risk.model.label
+        sizes = model.words(with_needle=self.risk.with_needle)
+        last = "needle ends" if self.risk.with_needle else "tubes end"
         source = (
-            f"All sizes of '{label}' are assumptions: {model.words}."
+            f"All sizes of '{label}' are assumptions: {sizes}."
             if model.is_default
-            else f"Errors of '{label}': {model.words}. A size that it does not state is an assumption."
+            else f"Errors of '{label}': {sizes}. A size that it does not state is an assumption."
         )
         return (
             f"{plural(self.risk.samples, 'draw')}, seed {self.risk.seed}; the devices are not corrected on "
             "their way.",
-            f"Success: the needle ends within {self.risk.radius_mm:.1f} mm of the target "
+            f"Success: the {last} within {self.risk.radius_mm:.1f} mm of the target "
             f"({self.risk.radius_origin}) and nothing forbidden is touched.",
             source,
         )

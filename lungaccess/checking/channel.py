@@ -33,11 +33,12 @@ def check_channel(plan: Plan, found: Findings) -> None:
         detail = f"largest strain of the {name} tube on its way through the channel"
         found.at_most(f"tube.strain.{name}", strain, tubes.max_strain, "", detail, 1e-9)
     needle = plan.system.needle
-    # Tubes that share a bend are bent by no more than the most bent of them is at rest.
-    at_rest = max(curvature for tube in tubes.nested for _begin, _end, curvature in bent_at_rest(tube))
-    strain = 0.5 * needle.diameter_mm * needle.strain_factor * max(tightest, at_rest)
-    detail = "largest strain of the needle on its way through channel and tubes"
-    found.at_most("needle.strain", strain, needle.max_strain, "", detail, 1e-9)
+    if needle is not None:
+        # Tubes that share a bend are bent by no more than the most bent of them is at rest.
+        at_rest = max(curvature for tube in tubes.nested for _begin, _end, curvature in bent_at_rest(tube))
+        strain = 0.5 * needle.diameter_mm * needle.strain_factor * max(tightest, at_rest)
+        detail = "largest strain of the needle on its way through channel and tubes"
+        found.at_most("needle.strain", strain, needle.max_strain, "", detail, 1e-9)
     _check_handle(plan, inserted, found)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from lungaccess.checking.deployment import check_deployment
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import CheckReport, Findings
+from lungaccess.checking.outcome import check_tubes_at_target
 from lungaccess.checking.record import check_record
 from lungaccess.checking.scope import check_scope
 from lungaccess.checking.steering import check_needle
@@ -41,7 +42,11 @@ class Checker:
         if check_record(plan, self._environment.lung, found, system, target):
             check_scope(plan.scope, plan.system, self._environment, found)
             tube_tip = check_deployment(plan, self._environment, found)
-            check_needle(plan, self._environment, tube_tip, found)
+            needle, device = plan.needle, plan.system.needle
+            if needle is None or device is None:
+                check_tubes_at_target(plan, self._environment, tube_tip, found)
+            else:
+                check_needle(plan, needle, device, self._environment, tube_tip, found)
         return found.report()
 
 

@@ -51,14 +51,15 @@ def check_needle_alone(
         Whether the needle begins at the wall and pierces it itself.
     """
     found = Findings()
+    needle = system.require_needle("The check of a needle alone")
     if check_rigid("needle.start", lps_from_start, found):
         pieces = [
             Piece(length_mm=float(length), roll_rad=float(roll), curvature_per_mm=float(curvature))
             for length, roll, curvature in np.asarray(arcs, dtype=np.float64).reshape(-1, 3)
         ]
-        exempt_mm = system.needle.exit_exemption_mm if branches else 0.0
+        exempt_mm = needle.exit_exemption_mm if branches else 0.0
         curve = integrate(lps_from_start, cut_at(cut_at(pieces, exempt_mm), WALL_ZONE_MM))
-        if check_limits(pieces, system.needle, curve, found):
+        if check_limits(pieces, needle, curve, found):
             miss = float(np.linalg.norm(curve.end[:3, 3] - target_lps))
             found.at_most(
                 "target.reached", miss, POSITION_TOLERANCE_MM, "mm", "end of the needle to the target"
@@ -74,7 +75,7 @@ def _check_clear(
 ) -> None:
     """Everything but the airway along all of the needle, and the airway beyond the exempt length."""
     everywhere = np.ones(len(curve.points), dtype=bool)
-    required = system.needle.radius_mm + system.margins.total_mm
+    required = system.track_radius_mm + system.margins.total_mm
     cases = [
         ("vessel", structures.VESSEL, everywhere),
         ("outside", structures.OUTSIDE, everywhere),
@@ -115,11 +116,11 @@ def _check_exit(
     region = region_around(lung, points, REACH_MM)
     airway = (region.labels & structures.AIRWAY) != 0
     others = airway & ~np.isin(branch_of(region.labels), list(branches))
-    required = system.needle.radius_mm + system.margins.total_mm
+    required = system.track_radius_mm + system.margins.total_mm
     gap = float(_box_distance(points, region.grid.lps(np.argwhere(others)), lung).min())
     tolerance = CLEARANCE_TOLERANCE_MM
     found.at_least("needle.clearance.other_airway", gap, required, "mm", "to branches not pierced", tolerance)
-    kept = np.full(len(points), system.needle.radius_mm)
+    kept = np.full(len(points), system.track_radius_mm)
     if at_wall:
         kept = np.clip(np.sin(np.radians(LEAVING_DEG)) * (arc - WALL_ZONE_MM), 0.0, kept)
         points, kept = points[arc >= WALL_ZONE_MM - TINY_MM], kept[arc >= WALL_ZONE_MM - TINY_MM]

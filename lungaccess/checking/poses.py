@@ -11,6 +11,8 @@ POSITION_TOLERANCE_MM = 1e-3
 """Closed form and integration agree far better; a device cannot be placed to a micrometre."""
 ANGLE_TOLERANCE_RAD = 1e-4
 """Over 100 mm of needle an angle of this size moves the tip by 0.01 mm."""
+LENGTH_TOLERANCE_MM = 1e-6
+"""Lengths are sums of a few numbers and agree up to rounding."""
 ROTATION_TOLERANCE = 1e-6
 """Rounding of a matrix that is the product of a hundred rotations is less by far."""
 

@@ -111,10 +111,11 @@ def _check_required(plan: Plan, found: Findings) -> None:
     wanted = {
         "outer_tube": 0.5 * tubes.outermost.outer_diameter_mm + extra,
         **{f"{name}_tube": 0.5 * tube.outer_diameter_mm + extra for name, tube in tubes.named},
-        "needle": 0.5 * plan.system.needle.diameter_mm + extra,
     }
+    if plan.system.needle is not None:
+        wanted["needle"] = 0.5 * plan.system.needle.diameter_mm + extra
     names = {name for stage in plan.clearance_mm.values() for name in stage}
-    known = set(plan.clearance_mm) == {"tube", "needle"} and names <= STRUCTURES
+    known = set(plan.clearance_mm) == in_tissue(plan.system) and names <= STRUCTURES
     found.true("clearance.names", known, ", ".join(sorted(names)))
     stated = plan.required_clearance_mm
     if found.true("clearance.required.names", set(stated) == set(wanted), ", ".join(stated)):
@@ -122,12 +123,22 @@ def _check_required(plan: Plan, found: Findings) -> None:
             found.agrees(f"clearance.required.{name}", stated[name], value, NUMBER_TOLERANCE, "mm")
 
 
+def in_tissue(system: System) -> set[str]:
+    """Return the names of the devices that leave the airway."""
+    return {"tube"} if system.needle is None else {"tube", "needle"}
+
+
 def _check_lengths(plan: Plan, found: Findings) -> bool:
     """Tell whether every length is positive and of a size that can be re-integrated."""
-    tube, arcs = plan.tube, plan.needle.arcs
-    found.true("needle.arcs", len(arcs) > 0, f"{len(arcs)} arcs")
+    tube, arcs = plan.tube, () if plan.needle is None else plan.needle.arcs
+    planned, owned = plan.needle is not None, plan.system.needle is not None
+    usable = found.true(
+        "needle.present", planned == owned, f"the plan has one: {planned}; the system has one: {owned}"
+    )
+    if owned:
+        usable &= found.true("needle.arcs", len(arcs) > 0, f"{len(arcs)} arcs")
     lengths = [tube.inner_insertion_mm, *(arc.length_mm for arc in arcs)]
-    usable = bool(arcs) and min(lengths) > 0.0 and sum(lengths) <= MAX_TOTAL_MM
+    usable &= min(lengths) > 0.0 and sum(lengths) <= MAX_TOTAL_MM
     usable &= 0.0 <= tube.outer_insertion_mm <= tube.inner_insertion_mm
     if plan.system.tubes.middle is not None:
         usable &= tube.outer_insertion_mm <= tube.middle_insertion_mm <= tube.inner_insertion_mm

@@ -126,6 +126,17 @@ def cut_at(pieces: Sequence[Piece], at_mm: float) -> list[Piece]:
     return cut
 
 
+def beyond(curve: Curve, begin_mm: float) -> Curve:
+    """Return what lies beyond an arc length of a curve; at least its end."""
+    begin_mm = min(begin_mm, float(curve.arc_mm[-1]))
+    first = int(np.searchsorted(curve.arc_mm, begin_mm, side="right")) - 1
+    frames = curve.frames[first:].copy()
+    frames[0, :3, 3] = [np.interp(begin_mm, curve.arc_mm, curve.points[:, axis]) for axis in range(3)]
+    arc_mm = curve.arc_mm[first:] - begin_mm
+    arc_mm[0] = 0.0
+    return Curve(frames=frames, arc_mm=arc_mm, sagitta_mm=curve.sagitta_mm[first:])
+
+
 @frozen_record
 class Bend:
     """Curvature of the deployed tubes along their length from the scope tip: `per_mm` between `edges_mm`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +12,10 @@ from anatomy.typed import Float
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
+from lungaccess.checking.outcome import check_costs, check_target, forbidden_bits
 from lungaccess.checking.poses import (
     ANGLE_TOLERANCE_RAD,
+    LENGTH_TOLERANCE_MM,
     POSITION_TOLERANCE_MM,
     angle_between,
     check_rigid,
@@ -21,6 +23,7 @@ from lungaccess.checking.poses import (
 )
 from lungaccess.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
+from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.needle.device import Needle
 
@@ -29,30 +32,20 @@ if TYPE_CHECKING:
 
 TURN_TOLERANCE_RAD = 1e-3
 """The turn is summed over thousands of small steps, whose rounding adds up to less than this."""
-LENGTH_TOLERANCE_MM = 1e-6
-"""Lengths are sums of a few numbers and agree up to rounding."""
 LIMIT_TOLERANCE = 1e-9
 """A planner may use all of a limit, so that rounding alone may exceed it, by this share."""
-COST_TOLERANCE = 0.02
-"""Share by which a planner's sampled integral may differ from the finer one of the check."""
-COST_STEP_MM = 0.1
-"""Step of the integral: small against the distances over which a clearance changes."""
-COST_REACH_MM = 100.0
-"""No point of a lung is farther than this from the pleura, so that every clearance is found."""
-CLEARANCE_FLOOR_MM = 0.1
-"""1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1]."""
-GREATEST_VOXEL_COST = 1.0
-"""Of one voxel: so much may two sums differ because one grazes a voxel that the other does not."""
-GRAZED_MM = 1e-9
-"""A voxel that is crossed for less than this is met at an edge only, by rounding."""
-COSTS = ("inverse_clearance", "cost_map", "voxel_sum", "length_mm")
-ROUNDING = 1e-12
-"""Sums of four numbers agree to this share of them, whatever the order."""
 
 
-def check_needle(plan: Plan, environment: Environment, tube_end: Float | None, found: Findings) -> None:
+def check_needle(
+    plan: Plan,
+    needle: NeedlePath,
+    device: Needle,
+    environment: Environment,
+    tube_end: Float | None,
+    found: Findings,
+) -> None:
     """Record everything about the needle, the target and the costs."""
-    needle, lung = plan.needle, environment.lung
+    lung = environment.lung
     if not check_rigid("needle.start", needle.lps_from_start, found):
         return
     check_same_pose("needle.start", needle.lps_from_start, plan.tube.lps_from_tip, found)
@@ -63,24 +56,26 @@ def check_needle(plan: Plan, environment: Environment, tube_end: Float | None, f
         for arc in needle.arcs
     ]
     curve = integrate(needle.lps_from_start, cut_at(pieces, plan.exemption.needle_length_mm))
-    if not _check_motion(plan, pieces, curve, found):
+    if not _check_motion(needle, device, pieces, curve, found):
         return
-    _check_target(plan, lung, curve, found)
-    _check_exemption(plan, found)
+    found.agrees("needle.end", needle.end_lps, curve.points[-1], POSITION_TOLERANCE_MM, "mm")
+    check_target(plan, lung, curve.points[-1], found)
+    _check_exemption(plan, device, found)
     _check_containment(plan, lung, curve, found)
-    _check_clearance(plan, environment, curve, found)
-    _check_costs(plan, environment, curve, found)
+    _check_clearance(plan, device, environment, curve, found)
+    check_costs(plan, environment, curve, found)
 
 
-def _check_motion(plan: Plan, pieces: Sequence[Piece], curve: Curve, found: Findings) -> bool:
+def _check_motion(
+    needle: NeedlePath, device: Needle, pieces: Sequence[Piece], curve: Curve, found: Findings
+) -> bool:
     """Curvature, length and both turning limits; tell whether the needle is as short as the device's."""
-    needle = plan.needle
     length = float(sum(arc.length_mm for arc in needle.arcs))
     found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
     turned, angle = _turning(curve)
     found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
     found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
-    return check_limits(pieces, plan.system.needle, curve, found)
+    return check_limits(pieces, device, curve, found)
 
 
 def _turning(curve: Curve) -> tuple[float, float]:
@@ -109,40 +104,10 @@ def check_limits(pieces: Sequence[Piece], device: Needle, curve: Curve, found: F
     )
 
 
-def _check_target(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> None:
-    """The needle ends at the target, which lies in the lung and in no obstacle."""
-    end = curve.points[-1]
-    found.agrees("needle.end", plan.needle.end_lps, end, POSITION_TOLERANCE_MM, "mm")
-    miss = float(np.linalg.norm(end - plan.target_lps))
-    if plan.target_origin.startswith("nodule"):
-        ends = np.stack([end, plan.target_lps])
-        found.true("target.in_nodule", _in_nodule(lung, ends), "needle end and target are nodule")
-    else:
-        found.at_most("target.reached", miss, POSITION_TOLERANCE_MM, "mm", "end of the needle to the target")
-    label = int(labels_at(lung, plan.target_lps)[0])
-    found.true("target.in_lung", not label & structures.OUTSIDE, "the target is lung")
-    forbidden = forbidden_bits(plan)
-    found.true("target.free", not label & forbidden, "the target lies in no obstacle")
-
-
-def _in_nodule(lung: Lung, points: Float) -> bool:
-    if lung.nodules is None:
-        return False
-    index = np.rint(lung.nodules.grid.ijk(points)).astype(np.int64)
-    if ((index < 0) | (index >= np.asarray(lung.nodules.grid.shape))).any():
-        return False
-    return bool(lung.nodules.array[tuple(index.T)].all())
-
-
-def forbidden_bits(plan: Plan) -> int:
-    """Return the structures that the needle must stay clear of."""
-    return structures.obstacle_bits(plan.fissures_are_obstacles)
-
-
-def _check_exemption(plan: Plan, found: Findings) -> None:
+def _check_exemption(plan: Plan, device: Needle, found: Findings) -> None:
     """The exemption is not longer than the device's; the exit of the tubes settles its branch and point."""
     exempt = plan.exemption.needle_length_mm
-    limit, detail = plan.system.needle.exit_exemption_mm, "needle that may be near the pierced wall"
+    limit, detail = device.exit_exemption_mm, "needle that may be near the pierced wall"
     found.at_most("exemption.length", exempt, limit, "mm", detail, LENGTH_TOLERANCE_MM)
     found.at_least("exemption.length.sign", exempt, 0.0, "mm")
 
@@ -161,9 +126,11 @@ def _check_containment(plan: Plan, lung: Lung, curve: Curve, found: Findings) ->
     found.true("needle.containment", not hit.any(), f"{int(hit.sum())} samples in an obstacle")
 
 
-def _check_clearance(plan: Plan, environment: Environment, curve: Curve, found: Findings) -> None:
+def _check_clearance(
+    plan: Plan, device: Needle, environment: Environment, curve: Curve, found: Findings
+) -> None:
     """The needle, as capsules padded by the sagitta, keeps radius and margins from every structure."""
-    radius = 0.5 * plan.system.needle.diameter_mm
+    radius = 0.5 * device.diameter_mm
     required = radius + plan.system.margins.total_mm
     everywhere = np.ones(len(curve.points), dtype=bool)
     exempt = curve.arc_mm < plan.exemption.needle_length_mm - TINY_MM
@@ -202,91 +169,3 @@ def run_of_frames(where: np.ndarray) -> tuple[int, int]:
     if not len(frames):
         return 0, 0
     return int(frames[0]), min(int(frames[-1]) + 1, len(where) - 1)
-
-
-def _check_costs(plan: Plan, environment: Environment, curve: Curve, found: Findings) -> None:
-    """The stated costs are those of the re-integrated needle."""
-    stated: Mapping[str, float] = plan.costs
-    required = set(COSTS) - {"voxel_sum"}
-    named = required <= set(stated) <= {*COSTS, plan.objective}
-    if not found.true("costs.names", named, ", ".join(stated)):
-        return
-    weights = objective_weights(plan.objective)
-    known = plan.objective in stated and weights is not None and set(weights) <= set(stated)
-    is_sum = plan.objective not in COSTS
-    if found.true("costs.objective", known, plan.objective) and is_sum and weights is not None:
-        total = sum(weight * stated[name] for name, weight in weights.items())
-        tolerance = ROUNDING * abs(total)
-        found.agrees("costs.objective.sum", stated[plan.objective], total, tolerance, "")
-    found.agrees("costs.length_mm", stated["length_mm"], curve.arc_mm[-1], LENGTH_TOLERANCE_MM, "mm")
-    recomputed = inverse_clearance(plan, environment, curve)
-    tolerance = COST_TOLERANCE * recomputed
-    found.agrees("costs.inverse_clearance", stated["inverse_clearance"], recomputed, tolerance, "")
-    mapped, summed = cost_map_integral_and_sum(environment.lung, curve)
-    found.agrees("costs.cost_map", stated["cost_map"], mapped, COST_TOLERANCE * mapped + 1e-6, "mm")
-    if "voxel_sum" in stated:
-        tolerance = COST_TOLERANCE * summed + GREATEST_VOXEL_COST
-        found.agrees("costs.voxel_sum", stated["voxel_sum"], summed, tolerance, "")
-
-
-def objective_weights(objective: str) -> dict[str, float] | None:
-    """Return the weights of an objective by the names of costs; None if its text is not one.
-
-    The text is the name of a cost, or a sum such as "cost_map=0.5,length_mm=1".
-    """
-    weights: dict[str, float] = {}
-    for part in objective.split(","):
-        name, equals, weight = part.partition("=")
-        try:
-            weights[name] = float(weight) if equals else 1.0
-        except ValueError:
-            return None
-    in_range = all(0.0 < weight < np.inf for weight in weights.values())
-    return weights if in_range and set(weights) <= set(COSTS) else None
-
-
-def inverse_clearance(plan: Plan, environment: Environment, curve: Curve) -> float:
-    """Return the integral of 1 / clearance over the needle's length [Kuntz2015], by the trapezoid rule.
-
-    The clearance to the nearest obstacle, voxels as solid boxes, is not taken below 0.1 mm nor above
-    `COST_REACH_MM`, which is farther than any point of a lung lies from its pleura.
-    """
-    length = float(curve.arc_mm[-1])
-    arc = np.linspace(0.0, length, max(int(np.ceil(length / COST_STEP_MM)), 1) + 1)
-    points = np.stack([np.interp(arc, curve.arc_mm, curve.points[:, axis]) for axis in range(3)], axis=1)
-    obstacles = has(forbidden_bits(plan))
-    clearance = environment.boxes(obstacles, REACH_MM).distance_mm(points)
-    far = clearance >= REACH_MM
-    if far.any():
-        clearance[far] = environment.boxes(obstacles, COST_REACH_MM).distance_mm(points[far])
-    return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
-
-
-def cost_map_integral_and_sum(lung: Lung, curve: Curve) -> tuple[float, float]:
-    """Return the line integral of the cost map in mm, and its sum over the set of voxels crossed.
-
-    The chords of the curve, shorter than a voxel, are cut at the faces of voxels.  Without a map both are
-    0; both are infinite off the grid and in voxels of infinite cost.
-    """
-    if lung.cost is None:
-        return 0.0, 0.0
-    place = lung.cost.grid.ijk(curve.points) + 0.5
-    cell = np.floor(place)
-    cuts = [curve.arc_mm]
-    for axis in range(3):
-        step = np.flatnonzero(cell[1:, axis] != cell[:-1, axis])
-        begin, end = place[step, axis], place[step + 1, axis]
-        share = (np.maximum(cell[step, axis], cell[step + 1, axis]) - begin) / (end - begin)
-        cuts.append(curve.arc_mm[step] + share * np.diff(curve.arc_mm)[step])
-    arc = np.sort(np.concatenate(cuts))
-    length = np.diff(arc)
-    middle = 0.5 * (arc[1:] + arc[:-1])[length > GRAZED_MM]
-    index = np.stack([np.floor(np.interp(middle, curve.arc_mm, place[:, n])) for n in range(3)], axis=1)
-    inside = ((index >= 0) & (index < np.asarray(lung.cost.grid.shape))).all(axis=1)
-    if not inside.all():
-        return float("inf"), float("inf")
-    voxels, which = np.unique(index.astype(np.int64), axis=0, return_inverse=True)
-    values = lung.cost.array[tuple(voxels.T)].astype(np.float64)
-    if not np.isfinite(values).all():
-        return float("inf"), float("inf")
-    return float((values[which.ravel()] * length[length > GRAZED_MM]).sum()), float(values.sum())

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.panel import Panel
 from rich.table import Table
 
-from anatomy.words import plural
 from lungaccess.appraisal.grade import Grade
 from lungaccess.cli import terminal
 from stages.needle import Objective
@@ -65,10 +63,11 @@ def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
     """Return the stages of a plan and its costs."""
     from lungaccess.plans.costs import costs_in_words, known_costs
 
+    what = "the tubes beyond the lumen" if plan.needle is None else "the needle"
     return [
-        terminal.table("The three stages", ("stage", "what to do"), _stage_rows(plan)),
+        terminal.table("The stages", ("stage", "what to do"), _stage_rows(plan)),
         terminal.table(
-            f"Costs of the needle (made small: {Objective.of(plan.objective).words})",
+            f"Costs of {what} (made small: {Objective.of(plan.objective).words})",
             ("cost", "value"),
             costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None)),
         ),
@@ -76,7 +75,7 @@ def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
 
 
 def _stage_rows(plan: Plan) -> list[terminal.Row]:
-    scope, tube, needle = plan.scope, plan.tube, plan.needle
+    scope, tube = plan.scope, plan.tube
     return [
         (
             "scope",
@@ -88,11 +87,7 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
             f"{plan.rotations}, {plan.insertions} beyond the scope; "
             f"through the wall of branch {tube.exit.branch}",
         ),
-        (
-            "needle",
-            f"steer {needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}, at most "
-            f"{np.degrees(needle.max_angle_from_start_rad):.1f}° from its start",
-        ),
+        ("needle", plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""The coupled planner: it searches for plans of all three stages, diverse plan sets, and counterfactuals."""
+"""The coupled planner: it searches for plans of all stages, diverse plan sets, and counterfactuals."""
 
 from __future__ import annotations
 
@@ -27,9 +27,16 @@ if TYPE_CHECKING:
         none_reaches,
         plan_with_presets,
     )
+    from lungaccess.coupled.search.aimed_tubes import AimedTubes
     from lungaccess.coupled.search.atlas_search import AtlasSearch
     from lungaccess.coupled.search.base import Incumbent, ParallelSearch, PlanSearch, Step, evaluated_step
     from lungaccess.coupled.search.direct_arcs import DirectArcs
+    from lungaccess.coupled.search.direct_candidates import (
+        DirectCandidates,
+        Scan,
+        direct_candidates,
+        reach_scan,
+    )
     from lungaccess.coupled.search.kuntz2015 import KuntzSearch
     from lungaccess.coupled.search.settings import SearchSettings
 

@@ -13,6 +13,7 @@ import numpy as np
 from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.coupled.search.direct_arcs import DirectArcs
+from lungaccess.coupled.search.direct_candidates import direct_candidates
 from lungaccess.coupled.search.separated_arcs import separated_candidates
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
@@ -69,14 +70,15 @@ class Counterfactual:
 
 
 def find_counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]:
-    """Return the changes of one parameter with which a single arc reaches the target, the smallest first.
+    """Return the changes of one parameter that reach the target by its simplest way, the smallest first.
 
     The parameters are the needle's curvature and diameter, with the deployments of the atlas, and the
     diameter of the scope, with what a thinner one could reach beyond them.  Each is changed alone, and no
-    more than a single arc of the needle demands.  Whether such a device exists, and what else it would need,
-    is not asked.
+    more than a single arc of the needle, or without one the tubes aimed at the target, demand.  Whether such
+    a device exists, and what else it would need, is not asked.
     """
-    found = [*needle_changes(task, atlas), *scope_changes(task, atlas)]
+    of_needle = [] if task.system.needle is None else needle_changes(task, atlas)
+    found = [*of_needle, *scope_changes(task, atlas)]
     return tuple(sorted(found, key=lambda change: change.relative_change))
 
 
@@ -87,7 +89,7 @@ def needle_changes(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
 
 
 def _curvature(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
-    needle = task.system.needle
+    needle = task.system.require_needle("A change of the needle")
     present = needle.min_radius_of_curvature_mm
 
     def made(radius_mm: float) -> System:
@@ -99,7 +101,7 @@ def _curvature(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
 
 
 def _needle_diameter(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
-    needle = task.system.needle
+    needle = task.system.require_needle("A change of the needle")
 
     def made(diameter_mm: float) -> System:
         return _changed(task.system, needle=replace(needle, diameter_mm=diameter_mm))
@@ -148,9 +150,8 @@ def scope_changes(
     thin_atlas = _with_the_thinnest_scope(atlas, progress)
     if thin_atlas is None:
         return
-    thin = DirectArcs(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), thin_atlas)
-    near, site = thin.in_workspace, thin_atlas.deployments.site
-    clear = near[thin.blockers(near)[0] == 0]
+    thin = direct_candidates(replace(task, system=_with_scope(task.system, _thinnest_mm(scope))), thin_atlas)
+    clear, site = thin.clear(), thin_atlas.deployments.site
     prover = prover_of(task.lung, thin_atlas.system.scope)
     for entry in clear[np.argsort(-thin_atlas.motions.room_mm[site[clear]], kind="stable")]:
         candidate = thin.proved(int(entry))

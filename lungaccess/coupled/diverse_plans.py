@@ -11,7 +11,7 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.explanation import explain
-from lungaccess.coupled.search.direct_arcs import DirectArcs
+from lungaccess.coupled.search.direct_candidates import direct_candidates
 from lungaccess.coupled.search.separated_arcs import separated_candidates
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
@@ -37,7 +37,7 @@ class Alternative:
     ----------
     criteria : dict of str to float
         "clearance_mm" and "pleura_mm", least distance of tube and needle from any obstacle and from the
-        pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" of the needle.
+        pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" as the plan states them.
     on_front : bool
         Whether no other plan of the set is at least as good in all criteria and better in one.
     """
@@ -61,8 +61,9 @@ def alternatives(
     """Return a diverse plan set: the needles of every two of its plans are separated by `separation_mm`.
 
     Two needles are separated if some point of either is at least so far from all points of the other.  The
-    plans are direct arcs from the atlas.  The cheapest through each airway branch comes first, then the
-    others by their cost.  Each plan is proved and complete as any other.
+    plans are direct arcs from the atlas.  Without a needle they are tubes aimed at the target, whose parts
+    beyond the lumen are separated.  The cheapest through each airway branch comes first, then the others by
+    their cost.  Each plan is proved and complete as any other.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ def alternatives(
     Raises
     ------
     NoPlan
-        If no direct arc reaches the target.
+        If no direct arc, or no tubes aimed at it, reach the target.
     SettingsError
         If a number is not above 0, the objective is unknown, or the atlas belongs to another lung or system.
     TargetError
@@ -96,10 +97,10 @@ def alternatives(
         require_same(atlas, lung, system)
     atlas = atlas or build_atlas(lung, system)
     began = time.perf_counter()
-    arcs = DirectArcs(task, atlas)
-    chosen = list(separated_candidates(arcs, count, separation_mm))
+    direct = direct_candidates(task, atlas)
+    chosen = list(separated_candidates(direct, count, separation_mm))
     if not chosen:
-        raise explain(task, atlas, arcs.evaluator.blocked, 0, counterfactuals=counterfactuals)
+        raise explain(task, atlas, direct.evaluator.blocked, 0, counterfactuals=counterfactuals)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
     plans = [assemble(task, each, iteration=0, timing=timing) for each in chosen]
     return with_front(plans)
@@ -107,14 +108,12 @@ def alternatives(
 
 def criteria(plan: Plan) -> dict[str, float]:
     """Return what plans are compared by; see `Alternative`."""
-    clearances = [plan.clearance_mm[stage] for stage in ("tube", "needle")]
+    clearances = list(plan.clearance_mm.values())
     obstacles = [name for name in clearances[0] if name != "fissure" or plan.fissures_are_obstacles]
     return {
         "clearance_mm": min(values[name] for values in clearances for name in obstacles),
         "pleura_mm": min(values["outside"] for values in clearances),
-        "length_in_tissue_mm": plan.needle.length_mm
-        + plan.tube.inner_insertion_mm
-        - plan.tube.exit.arc_length_mm,
+        "length_in_tissue_mm": plan.tissue_mm,
         "inverse_clearance": plan.costs["inverse_clearance"],
         "cost_map": plan.costs["cost_map"],
     }

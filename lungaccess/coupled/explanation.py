@@ -8,10 +8,13 @@ from dataclasses import replace
 
 from lungaccess.coupled.atlas import Atlas, motions_of
 from lungaccess.coupled.counterfactuals import Counterfactual, find_counterfactuals
+from lungaccess.coupled.search.aimed_tubes import NO_SOLUTION, REACH_MM, AimedTubes
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.task import Task
 from stages.needle import needle_environment
+
+WITH_A_NEEDLE = "A system with a needle goes on from where the tubes end; `--system auto` tries every preset"
 
 
 def explain(
@@ -28,8 +31,10 @@ def explain(
     counterfactuals : bool
         Whether changes of the device are looked for; without them the advice is empty.
     """
+    if task.system.needle is None:
+        return _explain_tubes(AimedTubes(task, atlas), blocked, iterations, counterfactuals)
     arcs = DirectArcs(task, atlas)
-    main_reason = _main_reason(arcs, blocked)
+    main_reason = _before_the_needle(task, atlas) or _main_reason(arcs, blocked)
     found = f"No plan to the target after {iterations} iterations: {main_reason}"
     reasons = _reasons(arcs, blocked)
     if not counterfactuals:
@@ -45,10 +50,43 @@ def explain(
     )
 
 
-def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
-    atlas = arcs.atlas
+def _explain_tubes(
+    aimed: AimedTubes, blocked: Counter[str], iterations: int, counterfactuals: bool
+) -> NoPlan:
+    """Return the `NoPlan` of a search without a needle."""
+    atlas, near = aimed.atlas, len(aimed.promising)
+    main_reason = _before_the_needle(aimed.task, atlas)
+    if not main_reason:
+        main_reason = f"the tip of the tubes was found to come within {aimed.nearest_mm:.1f} mm of the target"
+        stopped = {why: n for why, n in blocked.items() if why != NO_SOLUTION}
+        if stopped:
+            main_reason += f"; nearer it is refused, mostly because {max(stopped, key=stopped.__getitem__)}"
+    reasons = {
+        **_scope_reasons(atlas),
+        **{f"tube: {why}": count for why, count in atlas.deployments.refused.items()},
+        f"tube: scope tips with a deployment that ends within {REACH_MM:g} mm of the target": near,
+        **{f"tube, aimed at the target: {why}": count for why, count in sorted(blocked.items())},
+    }
+    advice = ""
     if atlas.motions.count == 0:
-        scope = f"the scope ({arcs.task.system.scope.outer_diameter_mm:g} mm) fits nowhere"
+        advice = _thinner_scope(aimed.task, atlas.motions.passages.widest_scope_mm)
+    changes = find_counterfactuals(aimed.task, atlas) if counterfactuals and atlas.deployments.count else ()
+    if changes:
+        advice = " or ".join(str(change) for change in changes)
+        advice = f"{advice[0].upper()}{advice[1:]} would reach it"
+    return NoPlan(
+        f"No plan to the target after {iterations} iterations: {main_reason}",
+        reasons=reasons,
+        main_reason=main_reason,
+        advice=advice or WITH_A_NEEDLE,
+        counterfactuals={str(change): change.plan for change in changes},
+    )
+
+
+def _before_the_needle(task: Task, atlas: Atlas) -> str:
+    """Say what keeps scope or tubes from every deployment; nothing if there are some."""
+    if atlas.motions.count == 0:
+        scope = f"the scope ({task.system.scope.outer_diameter_mm:g} mm) fits nowhere"
         passages = atlas.motions.passages
         if (passages.passable & passages.exits_ahead).any():
             return (
@@ -62,6 +100,10 @@ def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
         return f"{scope}; the airway is {narrow}"
     if atlas.deployments.count == 0:
         return "the tubes cannot leave the airway safely from any scope tip"
+    return ""
+
+
+def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
     if not len(arcs.in_workspace):
         return "the target lies outside the needle's workspace for every deployment"
     obstacles = blocked.copy()
@@ -73,6 +115,18 @@ def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
 def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
     """Count, stage by stage, what was ruled out and why."""
     atlas = arcs.atlas
+    reasons = _scope_reasons(atlas)
+    reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
+    outside = atlas.deployments.count - len(arcs.in_workspace)
+    reasons["needle: deployments whose workspace does not hold the target"] = outside
+    for name, count in sorted(blocked.items()):
+        if name != "nothing":
+            reasons[f"needle: arcs stopped by {name}"] = count
+    return reasons
+
+
+def _scope_reasons(atlas: Atlas) -> dict[str, int]:
+    """Count scope tips, airways that are too narrow, and the deployments looked at."""
     reasons = {"scope: tips with a proved motion": atlas.motions.count}
     generation, excess = atlas.motions.passages.narrowest
     closed = int((~atlas.motions.passages.passable).sum())
@@ -81,14 +135,7 @@ def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
             f"scope: tree points beyond airways too narrow (mostly at generation {generation}, "
             f"typically by {2 * excess:.1f} mm)"
         ] = closed
-    reasons["tube: deployments looked at"] = atlas.deployments.candidates
-    reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
-    outside = atlas.deployments.count - len(arcs.in_workspace)
-    reasons["needle: deployments whose workspace does not hold the target"] = outside
-    for name, count in sorted(blocked.items()):
-        if name != "nothing":
-            reasons[f"needle: arcs stopped by {name}"] = count
-    return reasons
+    return reasons | {"tube: deployments looked at": atlas.deployments.candidates}
 
 
 def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...]) -> str:
@@ -146,6 +193,6 @@ def _reached(arcs: DirectArcs, *, with_fissures: bool = True) -> bool:
     task = arcs.task
     environment = arcs.evaluator.environment
     if not with_fissures:
-        system = task.system
-        environment = needle_environment(task.lung, system.needle, system.margins, with_fissures=False)
+        needle, margins = task.system.require_needle("A direct arc"), task.system.margins
+        environment = needle_environment(task.lung, needle, margins, with_fissures=False)
     return bool((arcs.blockers(arcs.in_workspace, environment)[0] == 0).any())

@@ -15,6 +15,7 @@ from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
 from lungaccess.coupled.search.atlas_search import AtlasSearch
 from lungaccess.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
 from lungaccess.coupled.search.kuntz2015 import KuntzSearch
+from lungaccess.coupled.search.tube_search import TubeSearch
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
@@ -22,14 +23,22 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle import Objective, require_planner
 
+
+def _over_the_atlas(task: Task, atlas: Atlas) -> PlanSearch:
+    """Return the search over the atlas: for paths of the needle, or without one for the tubes alone."""
+    return TubeSearch(task, atlas) if task.system.needle is None else AtlasSearch(task, atlas)
+
+
 METHODS: dict[str, SearchFactory] = {
-    "atlas": AtlasSearch,
+    "atlas": _over_the_atlas,
     "kuntz2015": KuntzSearch,
     "kuntz2015-without-rejection": partial(KuntzSearch, rejects=False),
     "reference": ReferenceSearch,
     "reference-without-rejection": partial(ReferenceSearch, rejects=False),
 }
 """The searches by their names.  A search of your own becomes a method of `plan` when you add it here."""
+NEED_A_NEEDLE = tuple(name for name in METHODS if name != "atlas")
+"""The methods that draw paths of a needle from placements of the tubes."""
 PROGRESS_EVERY_S = 0.1
 """Time between two progress reports: a display looks smooth, and the reports cost no time worth mention."""
 
@@ -72,7 +81,7 @@ def plan(
     counterfactuals: bool = True,
     on_progress: Callable[[ProgressEvent], None] | None = None,
 ) -> Iterator[Plan]:
-    """Plan all three stages; yield each plan that is better than the one before.
+    """Plan all stages of a system; yield each plan that is better than the one before.
 
     Parameters
     ----------
@@ -83,7 +92,8 @@ def plan(
         One of METHODS, to which you can add a search of your own; see
         `lungaccess.coupled.search.base.PlanSearch`.  "atlas": direct arcs from every deployment of the atlas,
         then local search from the best of them, local sampling of deployments between, the needle's own
-        search from others, and joint refinement.  "kuntz2015": Algorithm 1 of that paper;
+        search from others, and joint refinement; without a needle, the tubes aimed at the target from all
+        scope tips of the atlas, then from tips between.  "kuntz2015": Algorithm 1 of that paper;
         "kuntz2015-without-rejection": the same without its workspace test.  "reference" and
         "reference-without-rejection": the same as printed, with FCL on meshes, slow; see
         `lungaccess.coupled.kuntz2015_fcl`.
@@ -116,9 +126,9 @@ def plan(
     NoPlan
         If the search ends without a plan; counts the reasons.
     SettingsError
-        If objective, method or needle planner is unknown, the method takes no needle planner, the atlas
-        belongs to another lung or system, there cannot be so many processes, or OMPL was used before in this
-        process.
+        If objective, method or needle planner is unknown, the method takes no needle planner or needs a
+        needle that the system does not have, the atlas belongs to another lung or system, there cannot be so
+        many processes, or OMPL was used before in this process.
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
@@ -131,6 +141,9 @@ def plan(
         )
     if needle_planner:
         require_planner(needle_planner)
+        system.require_needle(f"The needle planner {needle_planner}")
+    if method in NEED_A_NEEDLE:
+        system.require_needle(f"The method {method}")
     tell = on_progress or (lambda _event: None)
     task = Task(
         lung=lung,
@@ -176,8 +189,8 @@ def _parallel(search: PlanSearch, method: str, processes: int) -> Iterator[Step]
     if not isinstance(search, ParallelSearch):
         raise SettingsError(
             f"{processes} processes are asked for with {method}",
-            expected="one process, or method atlas",
-            remedy="Leave out --processes, or choose --method atlas",
+            expected="one process, or method atlas with a system that has a needle",
+            remedy="Leave out --processes, or choose --method atlas and such a system",
         )
     return parallel_steps(search, processes)
 

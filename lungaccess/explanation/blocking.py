@@ -189,7 +189,7 @@ def arc_beyond_limits(arcs: DirectArcs) -> ArcBeyondLimits | None:
 
     By how much a limit is exceeded is measured as a share of it, and these shares are added.
     """
-    entries, needle = arcs.atlas.deployments, arcs.task.system.needle
+    entries, needle = arcs.atlas.deployments, arcs.evaluator.environment.needle
     if not entries.count:
         return None
     offset = arcs.task.target.lps_mm - entries.positions

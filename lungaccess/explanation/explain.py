@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from anatomy.lung import Lung
 from lungaccess.appraisal import DRAWS, SEED
@@ -17,6 +17,7 @@ from lungaccess.coupled import (
     Counterfactual,
     DirectArcs,
     build_atlas,
+    direct_candidates,
     first_attempt,
     needle_changes,
     plan,
@@ -43,6 +44,7 @@ ITERATIONS = 20
 PROOF_BOXES = 300_000
 """Boxes a piece of airway: a tenth of what `certify` looks at, which can take minutes."""
 TIME_IS_UP = "the time was up"
+NO_NEEDLE = "the system has no needle"
 
 AtlasOf = Callable[[System, Callable[[float], None]], Atlas]
 
@@ -113,7 +115,7 @@ class Explainer:
     ) -> None:
         self._task, self._atlas, self._time_s = task, atlas, time_s
         self._atlas_of, self._on_part = atlas_of, on_part
-        self._arcs = DirectArcs(task, atlas)
+        self._direct = direct_candidates(task, atlas)
         self._checker = Checker(task.lung)
         self._began = time.perf_counter()
         self._parts: list[Part] = []
@@ -124,20 +126,20 @@ class Explainer:
         others = presets_by_invasiveness(fissures_allowed=self._fissures_allowed())
         untried = [each for each in others if each.name != self._task.system.name]
         tried: list[Attempt] = []
-        self._part("what blocks the direct arcs", self._what_blocks)
-        self._part("map of the starts", self._starts)
+        self._part_of_needle("what blocks the direct arcs", self._what_blocks)
+        self._part_of_needle("map of the starts", self._starts)
         if self._task.with_fissures:
-            self._part("crossing a fissure", self._through_fissures)
+            self._part_of_needle("crossing a fissure", self._through_fissures)
         self._part("nearest point that is reached", self._neighbour)
         for shares_atlas in (True, False):
             for system in untried:
                 if self._shares_atlas(system) == shares_atlas:
                     self._part(f"preset {system.name}", partial(self._attempt, system, tried))
             if shares_atlas:
-                self._part("change of the needle", self._needle_changes)
+                self._part_of_needle("change of the needle", self._needle_changes)
                 self._part("share of the surroundings that is reached", self._shares)
         self._part("change of the bronchoscope", self._scope_changes)
-        self._part("proof that the target is unreachable", self._proof)
+        self._part_of_needle("proof that the target is unreachable", self._proof)
         done = {attempt.system.name for attempt in tried}
         order = {each.name: n for n, each in enumerate(least_invasive_first([a.system for a in tried]))}
         changes = self._found.pop("changes", [])
@@ -174,6 +176,20 @@ class Explainer:
         else:
             self._parts.append(Part(name=name, outcome=DONE))
 
+    def _part_of_needle(self, name: str, do: Callable[[], None]) -> None:
+        """Do a part that looks at paths of the needle, unless the system has none."""
+        if self._task.system.needle is None:
+            self._parts.append(Part(name=name, outcome=NOT_TRIED, why=NO_NEEDLE))
+        else:
+            self._part(name, do)
+
+    @property
+    def _arcs(self) -> DirectArcs:
+        """The direct arcs of the needle."""
+        if not isinstance(self._direct, DirectArcs):
+            self._task.system.require_needle("A direct arc")
+        return cast(DirectArcs, self._direct)
+
     def _alive(self) -> None:
         if self._time_s is not None and time.perf_counter() - self._began > self._time_s:
             raise OutOfTime
@@ -192,20 +208,21 @@ class Explainer:
 
     def _through_fissures(self) -> None:
         """Try the direct arcs from the same deployments with fissures that are no obstacles."""
-        lung, system = self._task.lung, self._task.system
-        environment = needle_environment(lung, system.needle, system.margins, with_fissures=False)
+        lung, margins = self._task.lung, self._task.system.margins
+        needle = self._task.system.require_needle("A direct arc")
+        environment = needle_environment(lung, needle, margins, with_fissures=False)
         blockers = self._arcs.blockers(self._arcs.in_workspace, environment)[0]
         self._found["through_fissures"] = bool((blockers == 0).any())
 
     def _neighbour(self) -> None:
         if self._atlas.deployments.count:
-            found = Surroundings(self._arcs).nearest(self._alive)
+            found = Surroundings(self._direct).nearest(self._alive)
             if found is not None and self._checker.check(found.plan, self._task.system).accepted:
                 self._found["neighbour"] = found
 
     def _shares(self) -> None:
         if self._atlas.deployments.count:
-            self._found["shares"] = tuple(Surroundings(self._arcs).shares(self._alive))
+            self._found["shares"] = tuple(Surroundings(self._direct).shares(self._alive))
 
     def _shares_atlas(self, system: System) -> bool:
         own = self._task.system

@@ -10,13 +10,13 @@ import numpy as np
 from anatomy.records import frozen_record
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
-from lungaccess.coupled import DirectArcs, plan
+from lungaccess.coupled import DirectCandidates, plan, reach_scan
 from lungaccess.explanation.blocking import region_of
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from lungaccess.risk import Share
-from stages.needle import DIRECT, ReachScan
+from stages.needle import DIRECT
 
 RADII_MM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 22.0, 30.0, 40.0)
 """Radii of the spheres on which points are tried; beyond the last, a point is no neighbour."""
@@ -65,17 +65,14 @@ class ReachedShare:
 
 
 class Surroundings:
-    """The points around a target, asked one after the other whether a single arc reaches them."""
+    """The points around a target, asked one after the other whether a simple way reaches them."""
 
-    def __init__(self, arcs: DirectArcs) -> None:
-        entries = arcs.atlas.deployments
-        self._task, self._atlas = arcs.task, arcs.atlas
-        self._scan = ReachScan(
-            arcs.evaluator.environment, entries.positions, entries.tangents, entries.branch, arcs=1
-        )
+    def __init__(self, direct: DirectCandidates) -> None:
+        self._task, self._atlas = direct.task, direct.atlas
+        self._scan = reach_scan(direct.atlas, arcs=1)
 
     def reached(self, point: Float) -> bool:
-        """Tell whether a single arc from some deployment of the atlas is proved clear to a point (3,)."""
+        """Tell whether the simplest way from some entry of the atlas is proved clear to a point (3,)."""
         found = self._scan.reach(point[None], np.zeros(1, dtype=np.uint64))
         return int(found.kinds[0]) == DIRECT
 

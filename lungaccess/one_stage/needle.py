@@ -201,12 +201,11 @@ def needle_question(lung: Organ, system: System, lps_from_start: Float, target_l
     """
     if not isinstance(lung, Lung):
         lung = _opened(lung, system, lps_from_start[:3, 3])
-    environment = needle_environment(
-        lung, system.needle, system.margins, with_fissures=not system.fissures_allowed
-    )
+    needle = system.require_needle("A path of the needle")
+    environment = needle_environment(lung, needle, system.margins, with_fissures=not system.fissures_allowed)
     point = lps_from_start[:3, 3]
     branches = pierced_branches(lung, point, environment.required_clearance_mm)
-    at_wall = begins_at_wall(lung, point, system.needle.radius_mm)
+    at_wall = begins_at_wall(lung, point, needle.radius_mm)
     if at_wall:
         environment = begun_at_wall(environment, point, branches)
     query = Query(lps_from_start=lps_from_start, target=target_lps, branch=[*branches, -1][0])
@@ -217,7 +216,8 @@ def _opened(organ: Organ, system: System, point: Float) -> Organ:
     """Return an organ whose surface is pierced at a start, if it lies within `WALL_MM` of it."""
     if organ.exact_clearance_mm(point, OUTSIDE, cap_mm=WALL_MM)[0] >= WALL_MM:
         return organ
-    reach_mm = system.needle.exit_exemption_mm + system.needle.radius_mm + system.margins.total_mm
+    needle = system.require_needle("A path of the needle")
+    reach_mm = needle.exit_exemption_mm + needle.radius_mm + system.margins.total_mm
     return with_entry(organ, point, reach_mm)
 
 

@@ -16,11 +16,17 @@ from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
+from lungaccess.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.coupled.search.local_search import path_through, tube_arguments
 from lungaccess.one_stage.needle import needle_question
 from lungaccess.one_stage.obstruction import reason_in_words
-from lungaccess.plans.assemble import needle_clearance_mm, needle_part, tube_clearance_mm, tube_part
-from lungaccess.plans.costs import path_costs
+from lungaccess.plans.assemble import (
+    needle_clearance_mm,
+    needle_part,
+    stated_costs,
+    tube_clearance_mm,
+    tube_part,
+)
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.parts import NeedlePath, TubeDeployment
@@ -60,11 +66,12 @@ class RestOfPlan:
     lps_from_measured : (4, 4) float64
         The pose as it was taken: that of the scope's tip, or of the tube's tip where `tube` is None.
     tube : TubeDeployment or None
-    needle : NeedlePath
+    needle : NeedlePath or None
+        None where the system has none, and the tip of the tubes is at the target.
     branch : int
         Branch whose wall is exempt at the exit; -1 for none.
     clearance_mm : mapping
-        As that of a plan, for "tube" and "needle".
+        As that of a plan.
     costs : mapping of str to float
         As those of a plan.
     objective : str
@@ -72,7 +79,7 @@ class RestOfPlan:
 
     lps_from_measured: Float
     tube: TubeDeployment | None
-    needle: NeedlePath
+    needle: NeedlePath | None
     branch: int
     clearance_mm: Mapping[str, Mapping[str, float]]
     costs: Mapping[str, float]
@@ -91,7 +98,7 @@ class RestOfPlan:
             "found": True,
             "lps_from_measured": self.lps_from_measured.tolist(),
             "tube": None if self.tube is None else plain(self.tube),
-            "needle": plain(self.needle),
+            "needle": None if self.needle is None else plain(self.needle),
             "pierced_branch": self.branch,
             "clearance_mm": {name: dict(each) for name, each in self.clearance_mm.items()},
             "objective": self.objective,
@@ -111,8 +118,8 @@ def replan_from_scope(
     """Plan tubes and needle from where the tip of the scope really is.
 
     The deployments from this one pose are enumerated as in an atlas; the cheapest clear direct arc is the
-    first answer, or what the needle's own search finds, and a local search improves it.  The same input and
-    seed give the same answer.
+    first answer, or what the needle's own search finds, and a local search improves it.  Without a needle the
+    tubes are aimed at the target.  The same input and seed give the same answer.
 
     Parameters
     ----------
@@ -132,7 +139,8 @@ def replan_from_scope(
     task = Task(
         lung=lung, system=system, target=target, objective=Objective.of(objective), method="replan", seed=seed
     )
-    search = _FromScope(CandidateEvaluator(task), frame)
+    evaluator = CandidateEvaluator(task)
+    search = _FromScope(evaluator, frame) if system.needle else AimedFromPose(evaluator, frame)
     found = search.best()
     if found is None:
         raise NoPlan(f"No plan from the scope's tip as measured: {search.why}", reasons=search.reasons)
@@ -150,6 +158,8 @@ def replan_from_tube(
     seed: int = 0,
 ) -> RestOfPlan:
     """Plan the needle from where the tip of the tubes really is; see `replan_from_scope`.
+
+    SettingsError is raised if the system has no needle: then nothing is left to plan.
 
     A tip near an airway is taken to have pierced its wall, as `plan_needle` does.
 
@@ -318,17 +328,18 @@ def _rigid(lung: Lung, pose: ArrayLike, what: str) -> Float:
 
 
 def _rest(task: Task, frame: Float, path: ArcPath, branch: int, deployment: Deployment | None) -> RestOfPlan:
-    clearance = {"needle": needle_clearance_mm(task, path, branch)}
-    tube = None
+    clearance, tube, needle = {}, None, None
+    if task.system.needle is not None:
+        clearance["needle"], needle = needle_clearance_mm(task, path, branch), needle_part(path)
     if deployment is not None:
         tube = tube_part(task, frame, deployment)
         clearance["tube"] = tube_clearance_mm(task, frame, deployment)
     return RestOfPlan(
         lps_from_measured=frame,
         tube=tube,
-        needle=needle_part(path),
+        needle=needle,
         branch=branch,
         clearance_mm=clearance,
-        costs=task.objective.stated(path_costs(task.lung, path, with_fissures=task.with_fissures)),
+        costs=stated_costs(task, deployment, path),
         objective=str(task.objective),
     )

@@ -200,17 +200,17 @@ def plan_tour(
 def _rule_of(atlas: Atlas | None) -> ExitRule:
     if atlas is None:
         return ExitRule()
-    system = atlas.system
-    reach = system.tubes.max_extension_mm + system.needle.max_length_mm
+    system, needle = atlas.system, atlas.system.needle
+    reach = system.tubes.max_extension_mm + (0.0 if needle is None else needle.max_length_mm)
     return ExitRule(reach_mm=min(reach, FARTHEST_MM))
 
 
 def coupled_plan_test(atlas: Atlas, lesion_lps: Float) -> ExitTest:
     """Return the test whether a coupled plan leads from a tree point to a lesion, `(3,)` LPS mm.
 
-    All deployments of the atlas whose workspace holds the lesion are tried with the direct arc; a site counts
-    if one of its best deployments is proved in full.  Searches around obstacles are not tried, so that a
-    refused exit may still be possible.
+    All deployments of the atlas whose workspace holds the lesion are tried with the direct arc, or without a
+    needle those that end nearby, aimed at it; a site counts if one of its best deployments is proved in full.
+    Searches around obstacles are not tried, so that a refused exit may still be possible.
 
     Raises
     ------
@@ -223,28 +223,23 @@ def coupled_plan_test(atlas: Atlas, lesion_lps: Float) -> ExitTest:
 
 def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
     """Return the tree points from where a lesion can be reached."""
-    from lungaccess.coupled import DirectArcs
+    from lungaccess.coupled import direct_candidates
     from lungaccess.problem.target import point_target
     from lungaccess.problem.task import Task
     from stages.needle import SHORTEST
 
     target = point_target(atlas.lung, lesion)
     task = Task(lung=atlas.lung, system=atlas.system, target=target, objective=SHORTEST)
-    arcs = DirectArcs(task, atlas)
-    entries, held = atlas.deployments, arcs.in_workspace
-    if not len(held):
-        return frozenset()
-    blockers, lengths, _costs = arcs.blockers(held)
-    clear = np.flatnonzero(blockers == 0)
-    clear = held[clear[np.argsort(lengths[clear], kind="stable")]]
-    points = atlas.motions.tree_point[entries.site[clear]]
+    direct = direct_candidates(task, atlas)
+    clear = direct.clear()
+    points = atlas.motions.tree_point[atlas.deployments.site[clear]]
     good: set[int] = set()
     tried: dict[int, int] = {}
     for entry, point in zip(clear.tolist(), points.tolist(), strict=True):
         if point in good or tried.get(point, 0) >= PROOFS_PER_SITE:
             continue
         tried[point] = tried.get(point, 0) + 1
-        if arcs.proved(entry) is not None:
+        if direct.proved(entry) is not None:
             good.add(int(point))
     return frozenset(good)
 

@@ -12,8 +12,8 @@ from anatomy.errors import AnatomyError
 from anatomy.lung import Lung
 from anatomy.structures import BITS
 from anatomy.typed import Float
-from lungaccess.plans import costs
-from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.candidate import Candidate, wall_in_path_mm
+from lungaccess.plans.costs import path_costs
 from lungaccess.plans.insertion import scope_insertion
 from lungaccess.plans.parts import (
     Exemption,
@@ -25,7 +25,7 @@ from lungaccess.plans.parts import (
     WallExit,
 )
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import system_fingerprint
+from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath
 from stages.scope import ScopeTip, prove_motion
@@ -46,8 +46,10 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         If the motion of the scope is not proved, which no candidate of a search may be.
     """
     system, lung = task.system, task.lung
-    margin = system.margins.total_mm
-    frame, deployment = candidate.tip.lps_from_scope_tip, candidate.deployment
+    frame, deployment, needle = candidate.tip.lps_from_scope_tip, candidate.deployment, system.needle
+    of_needle = {}
+    if needle is not None:
+        of_needle = {"needle": needle_clearance_mm(task, candidate.path, deployment.branch)}
     return Plan(
         software_version=software_version(),
         patient_name=lung.name,
@@ -62,28 +64,40 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         objective=str(task.objective),
         scope=_scope(task, candidate.tip),
         tube=tube_part(task, frame, deployment),
-        needle=needle_part(candidate.path),
+        needle=None if needle is None else needle_part(candidate.path),
         exemption=Exemption(
             branch=deployment.branch,
             exit_point_lps=_exit_point(task, frame, deployment),
-            needle_length_mm=system.needle.exit_exemption_mm,
+            needle_length_mm=0.0 if needle is None else needle.exit_exemption_mm,
         ),
-        required_clearance_mm={
-            "outer_tube": system.tubes.outermost.radius_mm + margin,
-            **{f"{name}_tube": tube.radius_mm + margin for name, tube in system.tubes.named},
-            "needle": system.needle.radius_mm + margin,
-        },
-        clearance_mm={
-            "tube": tube_clearance_mm(task, frame, deployment),
-            "needle": needle_clearance_mm(task, candidate.path, deployment.branch),
-        },
-        costs=task.objective.stated(costs.path_costs(lung, candidate.path, with_fissures=task.with_fissures)),
+        required_clearance_mm=required_clearance_mm(system),
+        clearance_mm={"tube": tube_clearance_mm(task, frame, deployment)} | of_needle,
+        costs=stated_costs(task, deployment, candidate.path),
         method=task.method,
         needle_planner=task.needle_planner,
         seed=task.seed,
         iterations=iteration,
         timing=timing,
     )
+
+
+def required_clearance_mm(system: System) -> dict[str, float]:
+    """Return the radius and margins of each device in tissue by its name in a plan."""
+    margin, tubes = system.margins.total_mm, system.tubes
+    required = {
+        "outer_tube": tubes.outermost.radius_mm + margin,
+        **{f"{name}_tube": tube.radius_mm + margin for name, tube in tubes.named},
+    }
+    if system.needle is not None:
+        required["needle"] = system.needle.radius_mm + margin
+    return required
+
+
+def stated_costs(task: Task, deployment: Deployment | None, path: ArcPath) -> dict[str, float]:
+    """Return the costs of a path beyond a deployment, or of its tubes, as a plan states them."""
+    wall_mm = 0.0 if deployment is None else wall_in_path_mm(task.system, deployment)
+    found = path_costs(task.lung, path, with_fissures=task.with_fissures, wall_mm=wall_mm)
+    return task.objective.stated(found)
 
 
 @cache
@@ -176,7 +190,8 @@ def needle_clearance_mm(task: Task, path: ArcPath, branch: int) -> dict[str, flo
     From the airway beyond the exempt length; where the needle ends before that, only other branches count.
     """
     points, lengths = path.sample(SAMPLE_MM)
-    beyond = lengths >= task.system.needle.exit_exemption_mm - 0.5 * SAMPLE_MM
+    needle = task.system.require_needle("The clearance of a needle")
+    beyond = lengths >= needle.exit_exemption_mm - 0.5 * SAMPLE_MM
     out = {}
     for name in _structures(task):
         if name == "airway":

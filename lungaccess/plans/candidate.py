@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from anatomy.records import frozen_record
+from anatomy.typed import Float
+from lungaccess.plans.curves import deployed_pieces, pieces_beyond
+from lungaccess.problem.system import System
 from stages.needle import ArcPath
 from stages.scope import ScopeTip
 from stages.tube import Deployment
@@ -19,9 +22,23 @@ class Candidate:
     deployment : Deployment
         The tubes from there.
     path : ArcPath
-        The needle from the tip of the tubes to the target.
+        What the costs are of: the needle from the tip of the tubes to the target; without a needle, the tubes
+        from where they leave the lumen to their tip, which is at the target.
     """
 
     tip: ScopeTip
     deployment: Deployment
     path: ArcPath
+
+
+def tubes_in_tissue(system: System, lps_from_scope_tip: Float, deployment: Deployment) -> ArcPath:
+    """Return the tubes of a deployment, from where they leave the lumen to their tip, as a path."""
+    outer_mm, inner_mm = deployment.outer_mm, deployment.inner_mm
+    pieces = deployed_pieces(system.tubes, deployment.rotation_rad, outer_mm, inner_mm)
+    start, arcs = pieces_beyond(lps_from_scope_tip, pieces, deployment.exit_mm)
+    return ArcPath(lps_from_start=start, arcs=arcs)
+
+
+def wall_in_path_mm(system: System, deployment: Deployment) -> float:
+    """Return how much of a candidate's path lies in the wall that is pierced: a needle begins beyond it."""
+    return deployment.wall_run_mm if system.needle is None else 0.0

@@ -1,18 +1,24 @@
-"""What a needle path costs in a lung."""
+"""What a path of the needle costs in a lung; without a needle, that of the tubes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float
+from lungaccess.plans.curves import pieces_beyond
 from stages import needle
-from stages.needle import TERMS, ArcPath, Objective, Obstacles
+from stages.needle import TERMS, ArcPath, Objective, Obstacles, Term
+
+LEAST_MM = 1e-6
+"""So much of a path is left where all of it lies in the wall: the voxel of its end still counts."""
 
 
-def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fissures: bool) -> float:
-    """Return the cost of a needle path under an objective.
+def path_cost(
+    lung: Lung, path: ArcPath, objective: str | Objective, *, with_fissures: bool, wall_mm: float = 0.0
+) -> float:
+    """Return the cost of a path under an objective.
 
     Parameters
     ----------
@@ -22,15 +28,36 @@ def path_cost(lung: Lung, path: ArcPath, objective: str | Objective, *, with_fis
         See `stages.needle.objective.Objective.of`.
     with_fissures : bool
         Whether fissures are obstacles.
+    wall_mm : float
+        Length at the beginning of the path that lies in the wall which the tubes pierce.  The costs of the
+        map, which forbids walls, count beyond it.
     """
     weighed = Objective.of(objective)
     terms = [term for term, _weight in weighed.weighed]
-    return weighed.total(needle.path_costs(_obstacles(lung, with_fissures), lung.cost, path, terms))
+    return weighed.total(_costs(lung, path, terms, with_fissures, wall_mm))
 
 
-def path_costs(lung: Lung, path: ArcPath, *, with_fissures: bool) -> dict[str, float]:
-    """Return every cost of a needle path by its key; see `path_cost`."""
-    return needle.path_costs(_obstacles(lung, with_fissures), lung.cost, path)
+def path_costs(lung: Lung, path: ArcPath, *, with_fissures: bool, wall_mm: float = 0.0) -> dict[str, float]:
+    """Return every cost of a path by its key; see `path_cost`."""
+    return _costs(lung, path, TERMS, with_fissures, wall_mm)
+
+
+def _costs(
+    lung: Lung, path: ArcPath, terms: Sequence[Term], with_fissures: bool, wall_mm: float
+) -> dict[str, float]:
+    obstacles, beyond = _obstacles(lung, with_fissures), path_beyond(path, wall_mm)
+    return {
+        term.key: needle.path_costs(obstacles, lung.cost, beyond if term.of_map else path, [term])[term.key]
+        for term in terms
+    }
+
+
+def path_beyond(path: ArcPath, begin_mm: float) -> ArcPath:
+    """Return what lies beyond a length of a path: nearly nothing of it where that is its end or farther."""
+    if begin_mm <= 0.0:
+        return path
+    start, arcs = pieces_beyond(path.lps_from_start, path.arcs, min(begin_mm, path.length_mm - LEAST_MM))
+    return ArcPath(lps_from_start=start, arcs=arcs)
 
 
 def known_costs(stated: Mapping[str, float], *, has_map: bool) -> dict[str, float | None]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.grid import freeze_arrays
-from anatomy.poses import poses_on_pieces
+from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.parts import NeedlePath, ScopeInsertion, TubeDeployment
@@ -54,15 +54,27 @@ class DeviceCurve:
 
 
 class DeviceCurves(NamedTuple):
-    """Scope, tubes and needle of a plan."""
+    """Scope, tubes and needle of a plan.
+
+    Where there is no needle, its curve has the one pose of the tip of the tubes, and no length.
+    """
 
     scope: DeviceCurve
     tubes: DeviceCurve
     needle: DeviceCurve
 
+    @property
+    def present(self) -> tuple[DeviceCurve, ...]:
+        """The curves of the devices that there are."""
+        return tuple(curve for curve in self if len(curve.arc_length_mm) > 1)
+
 
 def device_curves(
-    scope: ScopeInsertion, tube: TubeDeployment, needle: NeedlePath, system: System, step_mm: float = STEP_MM
+    scope: ScopeInsertion,
+    tube: TubeDeployment,
+    needle: NeedlePath | None,
+    system: System,
+    step_mm: float = STEP_MM,
 ) -> DeviceCurves:
     """Return the curves of the three devices, poses of tubes and needle at most `step_mm` apart.
 
@@ -73,7 +85,9 @@ def device_curves(
     laid = laid_pieces(scope.states, system.scope.bending_length_mm)
     scope_poses, scope_mm = poses_on_pieces(scope.lps_from_entry, laid, SCOPE_STEP_MM)
     tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube, tubes), step_mm)
-    needle_poses, needle_mm = poses_on_pieces(needle.lps_from_start, needle_pieces(needle), step_mm)
+    start = tube.lps_from_tip if needle is None else needle.lps_from_start
+    needle_poses, needle_mm = poses_on_pieces(start, needle_pieces(needle), step_mm)
+    needle_radius_mm = 0.0 if system.needle is None else system.needle.radius_mm
     return DeviceCurves(
         scope=DeviceCurve(
             name="scope",
@@ -92,7 +106,7 @@ def device_curves(
         needle=DeviceCurve(
             name="needle",
             lps_from_device=needle_poses,
-            radius_mm=np.full(len(needle_mm), system.needle.radius_mm),
+            radius_mm=np.full(len(needle_mm), needle_radius_mm),
             arc_length_mm=needle_mm,
             colour=(0.1, 0.1, 0.1),
         ),
@@ -103,10 +117,15 @@ def tube_pieces(tube: TubeDeployment, tubes: ConcentricTubes) -> Float:
     """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of each arc of the tubes."""
     if tube.shape is not None:
         return pieces_of_arcs(np.asarray(tube.shape.arcs), tube.rotation_rad)
-    arcs = tubes.arcs(tube.outer_insertion_mm, tube.inner_insertion_mm)
+    return deployed_pieces(tubes, tube.rotation_rad, tube.outer_insertion_mm, tube.inner_insertion_mm)
+
+
+def deployed_pieces(tubes: ConcentricTubes, rotation_rad: float, outer_mm: float, inner_mm: float) -> Float:
+    """Return the same of planar tubes, from rotation and insertions."""
+    arcs = tubes.arcs(outer_mm, inner_mm)
     pieces = np.stack([arcs.length_mm[0], np.zeros(4), arcs.curvature_per_mm], axis=1)
     pieces = pieces[pieces[:, 0] > SHORTEST_ARC_MM]
-    pieces[:1, 1] = tube.rotation_rad
+    pieces[:1, 1] = rotation_rad
     return pieces
 
 
@@ -117,8 +136,38 @@ def tube_radii(tube: TubeDeployment, tubes: ConcentricTubes, arc_mm: Float) -> F
     return np.asarray(radii[np.minimum(np.searchsorted(ends, arc_mm), len(radii) - 1)])
 
 
-def needle_pieces(needle: NeedlePath) -> Float:
+def pieces_beyond(lps_from_start: Float, pieces: Float, begin_mm: float) -> tuple[Float, Float]:
+    """Return pose and arcs of what lies beyond an arc length of a row of arcs.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+        Where the first arc starts.
+    pieces : (P, 3) float64
+        Length in mm, roll before it in rad, which is kept for the next, and curvature in 1/mm of each arc.
+    begin_mm : float
+        From 0 to less than the length of all arcs.
+
+    Returns
+    -------
+    (4, 4) float64, (R, 3) float64
+    """
+    pose, left_mm = np.asarray(lps_from_start), begin_mm
+    for number, (length, roll, curvature) in enumerate(pieces):
+        if left_mm < length - SHORTEST_ARC_MM:
+            rest = pieces[number:].copy()
+            if left_mm > 0.0:
+                pose = poses_on_arc(pose, roll, curvature, np.array([left_mm]))[0]
+                rest[0, :2] = length - left_mm, 0.0
+            return pose, rest
+        pose, left_mm = poses_on_arc(pose, roll, curvature, np.array([length]))[0], left_mm - length
+    return pose, np.zeros((0, 3))
+
+
+def needle_pieces(needle: NeedlePath | None) -> Float:
     """Return length in mm, roll before it in rad and curvature in 1/mm `(A, 3)` of each arc of the needle."""
+    if needle is None:
+        return np.zeros((0, 3))
     arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in needle.arcs]
     return np.array(arcs, dtype=np.float64).reshape(-1, 3)
 

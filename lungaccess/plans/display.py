@@ -32,7 +32,7 @@ def plan_html(
 
 def _drawing(view: str, curves: DeviceCurves, exit_lps: Float, target_lps: Float) -> str:
     drawing = Drawing(view)
-    for curve in curves:
+    for curve in curves.present:
         red, green, blue = (round(255 * c) for c in curve.colour)
         width_mm = max(2.0 * float(curve.radius_mm.max()), LEAST_WIDTH_MM)
         drawing.line(curve.points_lps, f"#{red:02x}{green:02x}{blue:02x}", width_mm)

@@ -11,8 +11,8 @@ import numpy as np
 
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Float, Float32, Int
-from lungaccess.plans.candidate import Candidate
-from lungaccess.plans.costs import path_cost
+from lungaccess.plans.candidate import Candidate, tubes_in_tissue, wall_in_path_mm
+from lungaccess.plans.costs import path_beyond, path_cost
 from lungaccess.plans.tip_rows import TipRows
 from lungaccess.problem.task import Task
 from stages.needle import (
@@ -56,14 +56,15 @@ class NeedleArrays(NamedTuple):
 BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"), (AIRWAY, "an airway"))
 """Names of obstacles; the first one of a voxel counts."""
 
+TIP_OFF_MM = 1e-6
+"""So far from the target may the tip of the tubes be by rounding where there is no needle."""
+
 
 class CandidateEvaluator:
     """Proves and costs the candidates of one task, from the numbers that a plan will state.
 
     Attributes
     ----------
-    environment : NeedleEnvironment
-        What the needle collides with, and its limits.
     tubes : DeploymentValidator
         Validates deployments of the tubes.
     blocked : Counter of str
@@ -73,32 +74,51 @@ class CandidateEvaluator:
     def __init__(self, task: Task) -> None:
         self.task = task
         system, fissures = task.system, task.with_fissures
-        self.environment: NeedleEnvironment = needle_environment(
-            task.lung, system.needle, system.margins, with_fissures=fissures
-        )
         self.tubes = DeploymentValidator(task.lung, system.tubes, system.margins, with_fissures=fissures)
         self.blocked: Counter[str] = Counter()
 
-    def cost(self, path: ArcPath) -> float:
-        """Return the cost of a path under the task's objective."""
+    @cached_property
+    def environment(self) -> NeedleEnvironment:
+        """What the needle collides with, and its limits; SettingsError if the system has no needle."""
         task = self.task
-        return path_cost(task.lung, path, task.objective, with_fissures=task.with_fissures)
+        needle = task.system.require_needle("A search for paths of the needle")
+        return needle_environment(task.lung, needle, task.system.margins, with_fissures=task.with_fissures)
+
+    def cost(self, path: ArcPath, wall_mm: float = 0.0) -> float:
+        """Return the cost of a path, which begins with so much wall, under the task's objective."""
+        task = self.task
+        return path_cost(task.lung, path, task.objective, with_fissures=task.with_fissures, wall_mm=wall_mm)
 
     def evaluate(self, candidate: Candidate) -> float:
         """Return the cost of a candidate, infinite if its proof fails."""
-        proved = self.proves(candidate.deployment, candidate.path)
-        return self.cost(candidate.path) if proved else math.inf
+        if not self.proves(candidate.deployment, candidate.path):
+            return math.inf
+        return self.cost(candidate.path, wall_in_path_mm(self.task.system, candidate.deployment))
 
     def proves(self, deployment: Deployment, path: ArcPath) -> bool:
-        """Tell whether a needle path keeps all limits, is clear, and enters no voxel of infinite cost.
+        """Tell whether a path ends at the target, keeps all limits, is clear, and enters no infinite cost.
 
-        Such a voxel may not be entered, whatever the objective is.
+        Without a needle the deployment is proved clear by its own validation.  A voxel of infinite cost may
+        not be entered, whatever the objective is, but in the wall that the tubes pierce.
         """
-        if path.arcs[:, CURVATURE].max() > self.task.system.needle.max_curvature_per_mm:
+        needle, target = self.task.system.needle, self.task.target.lps_mm
+        if needle is None:
+            kept = np.abs(deployment.lps_from_tip[:3, 3] - target).max() <= TIP_OFF_MM
+        else:
+            kept = path.arcs[:, CURVATURE].max() <= needle.max_curvature_per_mm
+            kept = kept and not violation(self.environment, self.query(deployment), path)
+        if not kept:
             return False
-        if violation(self.environment, self.query(deployment), path):
-            return False
-        return math.isfinite(map_integral(self.task.lung.cost, path))
+        beyond = path_beyond(path, wall_in_path_mm(self.task.system, deployment))
+        return math.isfinite(map_integral(self.task.lung.cost, beyond))
+
+    def aimed(self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float) -> Candidate | None:
+        """Return a deployment that is to end at the target itself, None if it is refused."""
+        deployment = self.tubes.validate(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
+        if isinstance(deployment, str):
+            return None
+        path = tubes_in_tissue(self.task.system, tip.lps_from_scope_tip, deployment)
+        return Candidate(tip=tip, deployment=deployment, path=path)
 
     def direct(
         self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float, shape: int = -1

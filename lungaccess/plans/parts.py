@@ -192,7 +192,7 @@ class NeedlePath(Record):
 class Exemption(Record):
     """The one obstacle that may be touched: the wall of the pierced branch.
 
-    It holds for the tube and for the first `needle_length_mm` of the needle.
+    It holds for the tube and for the first `needle_length_mm` of the needle, 0 where there is none.
     """
 
     branch: int

@@ -11,11 +11,19 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from anatomy.errors import PlanFileError
+from anatomy.poses import poses_on_pieces
 from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.typed import Float
 from anatomy.words import plural
 from lungaccess.plans import file as plan_file
-from lungaccess.plans.curves import STEP_MM, DeviceCurves, device_curves
+from lungaccess.plans.curves import (
+    STEP_MM,
+    DeviceCurves,
+    device_curves,
+    needle_pieces,
+    pieces_beyond,
+    tube_pieces,
+)
 from lungaccess.plans.parts import Exemption, NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.plans.record import Record, shaped
 from lungaccess.problem.system import System
@@ -46,15 +54,17 @@ class Plan(Record):
     objective : str
         What was minimised: a key of `costs`; see `stages.needle.objective.Objective`.
     scope, tube, needle
-        The three stages.
+        The stages; `needle` is None where the system has none, and the tip of the tubes is at the target.
     required_clearance_mm : mapping of str to float
-        Radius plus margins of "outer_tube", "inner_tube" and "needle".
+        Radius plus margins of "outer_tube", "inner_tube" and, where there is one, "needle".
     clearance_mm : mapping of str to mapping of str to float
-        For "tube" and "needle": smallest distance of the axis from each structure ("airway", "vessel",
-        "outside", "fissure"; voxels as solid boxes) where it must be kept.  A structure may be left out.
+        For "tube" and, where there is one, "needle": smallest distance of the axis from each structure
+        ("airway", "vessel", "outside", "fissure"; voxels as solid boxes) where it must be kept.  A structure
+        may be left out.
     costs : mapping of str to float
-        "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, and the cost under the
-        objective where that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
+        "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, or without one of the
+        tubes beyond the lumen (costs of the map: beyond the wall), and the cost under the objective where
+        that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
     needle_planner : str
         The planner of the needle that the search was told to use; "" for the method's own.
     system_choice : tuple of str
@@ -78,7 +88,7 @@ class Plan(Record):
     objective: str
     scope: ScopeInsertion
     tube: TubeDeployment
-    needle: NeedlePath
+    needle: NeedlePath | None
     exemption: Exemption
     required_clearance_mm: Mapping[str, float]
     clearance_mm: Mapping[str, Mapping[str, float]]
@@ -119,9 +129,37 @@ class Plan(Record):
             f"the {name} tube to {angle % 360.0:.1f}°" for (name, tube), angle in named if tube.bends
         )
 
+    @property
+    def way_to_target(self) -> str:
+        """What goes to the target and how, in words."""
+        needle = self.needle
+        if needle is None:
+            return f"none: the tip of the tubes is at the target, {self.tissue_mm:.1f} mm beyond the lumen"
+        return (
+            f"{needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}, at most "
+            f"{np.degrees(needle.max_angle_from_start_rad):.1f}° from its start"
+        )
+
+    @property
+    def tissue_mm(self) -> float:
+        """Length of tubes and needle beyond the lumen that the tubes leave."""
+        needle_mm = 0.0 if self.needle is None else self.needle.length_mm
+        return needle_mm + self.tube.inner_insertion_mm - self.tube.exit.arc_length_mm
+
+    def costed_poses(self, step_mm: float = STEP_MM) -> tuple[Float, Float]:
+        """Return poses `(N, 4, 4)` along what the costs are of, and the lengths `(N,)` up to them, mm.
+
+        That is the needle; without one it is the tubes beyond the lumen.
+        """
+        if self.needle is not None:
+            return poses_on_pieces(self.needle.lps_from_start, needle_pieces(self.needle), step_mm)
+        pieces = tube_pieces(self.tube, self.system.tubes)
+        start = pieces_beyond(self.scope.lps_from_scope_tip, pieces, self.tube.exit.arc_length_mm)
+        return poses_on_pieces(*start, step_mm)
+
     def figures(self) -> list[tuple[str, str]]:
         """Return what the plan says of devices, distances and costs, as names and values with units."""
-        tube, needle = self.tube, self.needle
+        tube = self.tube
         x, y, z = self.target_lps
         rows = [
             ("target, LPS mm", f"{x:.1f}, {y:.1f}, {z:.1f} ({self.target_origin})"),
@@ -135,11 +173,7 @@ class Plan(Record):
                 "exit",
                 f"branch {tube.exit.branch}, at {np.degrees(tube.exit.wall_angle_rad):.0f}° to the wall",
             ),
-            (
-                "needle",
-                f"{needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}, at most "
-                f"{np.degrees(needle.max_angle_from_start_rad):.1f}° from its start",
-            ),
+            ("needle", self.way_to_target),
         ]
         for device, distances in self.clearance_mm.items():
             words = ", ".join(f"{name} {value:.2f}" for name, value in distances.items())

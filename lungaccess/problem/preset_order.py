@@ -10,8 +10,9 @@ from lungaccess.problem.system import System, load_system, preset_names
 
 WHY_THIS_ORDER = (
     "A system is less invasive if it may cross no fissure; then if its outer tube, which pierces the airway "
-    "wall, is thinner; then if its needle is thinner; then if its bronchoscope, which stays in the airways, "
-    "is thinner; then if its needle bends less tightly, since a bent needle presses on the tissue beside it"
+    "wall, is thinner; then if its needle, or without one its inner tube, is thinner; then if its "
+    "bronchoscope, which stays in the airways, is thinner; then if its needle, or without one its inner "
+    "tube, bends less tightly, since a bent device presses on the tissue beside it"
 )
 
 
@@ -26,19 +27,19 @@ class Invasiveness(NamedTuple):
         Whether a fissure may be crossed, which pierces the pleura twice.
     hole_mm2 : float
         Cross-section of the outer tube: the hole in the airway wall.
-    needle_mm2 : float
-        Cross-section of the needle: its track through the lung.
+    track_mm2 : float
+        Cross-section of what goes to the target, the needle or the inner tube: its track through the lung.
     scope_diameter_mm : float
         Outer diameter of the bronchoscope, which stays in the airways and injures least.
-    needle_curvature_per_mm : float
-        Greatest curvature of the needle.
+    track_curvature_per_mm : float
+        Greatest curvature of what goes to the target.
     """
 
     fissures_allowed: bool
     hole_mm2: float
-    needle_mm2: float
+    track_mm2: float
     scope_diameter_mm: float
-    needle_curvature_per_mm: float
+    track_curvature_per_mm: float
 
 
 def invasiveness(system: System) -> Invasiveness:
@@ -49,12 +50,14 @@ def invasiveness(system: System) -> Invasiveness:
     >>> invasiveness(load_system("ultrathin")) < invasiveness(load_system("therapeutic-scope"))
     True
     """
+    needle, inner = system.needle, system.tubes.inner
+    bent_per_mm = inner.max_precurvature_per_mm if needle is None else needle.max_curvature_per_mm
     return Invasiveness(
         fissures_allowed=system.fissures_allowed,
         hole_mm2=_area_mm2(system.tubes.outermost.outer_diameter_mm),
-        needle_mm2=_area_mm2(system.needle.diameter_mm),
+        track_mm2=_area_mm2(2.0 * system.track_radius_mm),
         scope_diameter_mm=float(system.scope.outer_diameter_mm),
-        needle_curvature_per_mm=float(system.needle.max_curvature_per_mm),
+        track_curvature_per_mm=float(bent_per_mm),
     )
 
 

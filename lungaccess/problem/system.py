@@ -39,8 +39,8 @@ class System:
         Where the numbers come from; what has no source says "assumption".
     tubes : ConcentricTubes
         The outer tube, or the only one, runs in the channel of the scope.
-    needle : Needle
-        Runs inside the inner tube.
+    needle : Needle, optional
+        Runs inside the inner tube.  Without one the tip of the inner tube goes to the target itself.
     margins : Margins, optional
         Kept around every device.
     fissures_allowed : bool, optional
@@ -57,7 +57,7 @@ class System:
     sources: Annotated[tuple[str, ...], Field(description="where the numbers come from")] = ()
     scope: Bronchoscope
     tubes: ConcentricTubes
-    needle: Needle
+    needle: Needle | None = None
     margins: Margins = Margins()
     fissures_allowed: Annotated[bool, switch("whether a fissure may be crossed")] = False
 
@@ -68,26 +68,81 @@ class System:
             raise impossible(
                 f"tubes.{name}.outer_diameter_mm", outer, f"less than scope.channel_diameter_mm = {channel:g}"
             )
+        if self.needle is None:
+            self._check_aim()
+        else:
+            self._check_needle(self.needle)
+
+    def _check_aim(self) -> None:
+        """Without a needle the tip of the tubes must come to points in space, not on a line only."""
+        if not self.tubes.planar or self.tubes.outer is None or not self.tubes.inner.bends:
+            raise impossible(
+                "needle",
+                None,
+                "the table [needle], or else a straight outer tube and an inner tube of one arc: the tip of one "
+                "tube or of straight ones comes only to a line or surface from each place of the scope, and of "
+                "others only some shapes are known",
+            )
+
+    def _check_needle(self, needle: Needle) -> None:
         bore = self.tubes.inner.inner_diameter_mm
-        if self.needle.diameter_mm >= bore:
+        if needle.diameter_mm >= bore:
             raise impossible(
                 "needle.diameter_mm",
-                self.needle.diameter_mm,
+                needle.diameter_mm,
                 f"less than tubes.inner.inner_diameter_mm = {bore:g}",
             )
         # Tubes that share a bend are bent by no more than the most bent of them is at rest.
         at_rest = [tube.max_precurvature_per_mm for tube in self.tubes.nested]
         bent = max(self.tubes.channel_curvature_per_mm, *at_rest)
-        most = self.needle.most_bent_per_mm
+        most = needle.most_bent_per_mm
         if bent > most:
             raise impossible(
                 "needle.diameter_mm",
-                self.needle.diameter_mm,
-                f"at most {self.needle.diameter_mm * most / bent:.3g}: channel and tubes bend the needle by "
+                needle.diameter_mm,
+                f"at most {needle.diameter_mm * most / bent:.3g}: channel and tubes bend the needle by "
                 f"{bent:.4g} / mm, so that its strain exceeds needle.max_strain = "
-                f"{self.needle.max_strain:g}. A smaller needle.strain_factor (slots) or "
+                f"{needle.max_strain:g}. A smaller needle.strain_factor (slots) or "
                 "tubes.max_channel_curvature_per_mm allows more",
             )
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The devices that go one through the other, the first to move first."""
+        return ("scope", "tube") if self.needle is None else ("scope", "tube", "needle")
+
+    @property
+    def track_radius_mm(self) -> float:
+        """Radius of what goes to the target: of the needle, or of the inner tube where there is none."""
+        return self.tubes.inner.radius_mm if self.needle is None else self.needle.radius_mm
+
+    @property
+    def needle_sizes(self) -> tuple[str, str]:
+        """Diameter and least radius of curvature of the needle, mm, as tables say them."""
+        if self.needle is None:
+            return "none", "none"
+        return f"{self.needle.diameter_mm:g}", f"{self.needle.min_radius_of_curvature_mm:.0f}"
+
+    def require_needle(self, use: str) -> Needle:
+        """Return the needle.
+
+        Parameters
+        ----------
+        use : str
+            What needs it, in words that begin a sentence.
+
+        Raises
+        ------
+        SettingsError
+            If the system has none.
+        """
+        if self.needle is None:
+            raise SettingsError(
+                f"{use} needs a needle, and the system {self.name!r} has none",
+                expected="a system with the table [needle]",
+                remedy="Name a preset with a needle, such as lung-default, or add [needle] to the file",
+            )
+        return self.needle
 
 
 def preset_names() -> tuple[str, ...]:

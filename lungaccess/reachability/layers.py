@@ -15,7 +15,8 @@ from anatomy.io.files import atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float, Float32, Int, Mask, UInt64
-from stages.needle import Reached, ReachScan
+from lungaccess.coupled import Scan
+from stages.needle import Reached
 
 THREADS = 2
 """The kernels hold no lock, and two cores are the least that a machine of today has."""
@@ -42,11 +43,7 @@ def _layer_points(grid: Grid, k: int) -> Float:
 
 
 def scan_layers(
-    scan: ReachScan,
-    grid: Grid,
-    counted: Mask,
-    store: LayerStore | None,
-    progress: Callable[[float], None] | None,
+    scan: Scan, grid: Grid, counted: Mask, store: LayerStore | None, progress: Callable[[float], None] | None
 ) -> tuple[Float32, int]:
     """Try the points of all layers.
 

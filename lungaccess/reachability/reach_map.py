@@ -17,19 +17,12 @@ from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Bool
+from lungaccess.coupled import reach_scan
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.reachability.layers import LayerStore, counted_voxels, scan_layers
 from lungaccess.reachability.regions import Regions, lung_regions
-from stages.needle import (
-    DEFAULT_ARCS,
-    DIRECT,
-    NO_CLEARANCE,
-    SEARCHED,
-    UNREACHED,
-    ReachScan,
-    needle_environment,
-)
+from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED
 
 DEFAULT_SPACING_MM = 3.0
 """Half the diameter of a small nodule, so that none falls between the points."""
@@ -204,7 +197,8 @@ def map_reach(
     """Return what a system reaches of a lung.
 
     Every free point is tried from all deployments of the atlas: first single arcs and, with `trees`, also
-    paths of several arcs.  The same inputs give the same map, resumed or not.
+    paths of several arcs.  Without a needle the tubes are aimed at it.  The same inputs give the same map,
+    resumed or not.
 
     Parameters
     ----------
@@ -223,7 +217,8 @@ def map_reach(
     Raises
     ------
     SettingsError
-        If spacing, arcs or trees are out of range, or the atlas belongs to another lung or system.
+        If spacing, arcs or trees are out of range, trees are asked for without a needle, or the atlas belongs
+        to another lung or system.
     FileError
         If the folder cannot be written to.
     """
@@ -235,9 +230,9 @@ def map_reach(
         )
     made = atlas or build_atlas(lung, system)
     began = time.perf_counter()
-    environment = needle_environment(lung, system.needle, system.margins, with_fissures=made.with_fissures)
-    entries = made.deployments
-    scan = ReachScan(environment, entries.positions, entries.tangents, entries.branch, arcs=arcs, trees=trees)
+    if trees:
+        system.require_needle("A search with random trees")
+    scan = reach_scan(made, arcs=arcs, trees=trees)
     counted = counted_voxels(lung, grid, made.with_fissures)
     store = None if work is None else LayerStore(Path(work), _key(made, spacing_mm, arcs, trees))
     found, resumed = scan_layers(scan, grid, counted, store, progress)
@@ -249,7 +244,7 @@ def map_reach(
         cost=Volume(grid=grid, array=found[1]),
         clearance_mm=Volume(grid=grid, array=found[2]),
         regions=lung_regions(lung, grid, counted),
-        entries=entries.count,
+        entries=made.deployments.count,
         resumed_layers=resumed,
         scan_s=time.perf_counter() - began,
         atlas_s=made.build_s,

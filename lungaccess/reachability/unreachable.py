@@ -83,9 +83,8 @@ class UnreachableProof:
         pause = between or (lambda: None)
         self._lung = lung
         self._tubes = tube_constants(system.tubes, system.margins)
-        self._limits = needle_environment(
-            lung, system.needle, system.margins, with_fissures=with_fissures
-        ).limits
+        needle = system.require_needle("The proof that no needle reaches a target")
+        self._limits = needle_environment(lung, needle, system.margins, with_fissures=with_fissures).limits
         longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
         greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)

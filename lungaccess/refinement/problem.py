@@ -86,7 +86,8 @@ class Problem:
     ) -> None:
         self.task = evaluator.task
         self._candidate, self._weights = candidate, weights
-        needle, deployment = self.task.system.needle, candidate.deployment
+        self._needle = needle = self.task.system.require_needle("The joint refinement")
+        deployment = candidate.deployment
         rows = rows_of(candidate.path)
         arcs = next(count for count in ARC_COUNTS if count >= len(rows))
         self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
@@ -195,7 +196,7 @@ class Problem:
             "axis_tangents": tangents,
             "sideways": self.sideways,
             "target": self.task.target.lps_mm,
-            "max_curvature_per_mm": self.task.system.needle.max_curvature_per_mm,
+            "max_curvature_per_mm": self._needle.max_curvature_per_mm,
             "shared_curvature_per_mm": constants[index.OVERLAP_CURVATURE],
             "inner_curvature_per_mm": constants[index.INNER_CURVATURE],
             "curved_length_mm": constants[index.CURVED_LENGTH],
@@ -224,7 +225,7 @@ class Problem:
             "outer": (0.0, self.longest_mm),
             "inner": (system.tubes.inner.curved_length_mm if self._straight_out else 0.0, self.longest_mm),
             "exit": (0.0, self.longest_mm),
-            "lengths": (SHORTEST_ARC_MM, system.needle.max_length_mm),
+            "lengths": (SHORTEST_ARC_MM, self._needle.max_length_mm),
         }
         for name, (low, high) in bounds.items():
             lower[at[name]], upper[at[name]] = low, high
@@ -233,7 +234,7 @@ class Problem:
 
     def _constraint_bounds(self) -> tuple[Float, Float]:
         system, deployment = self.task.system, self._candidate.deployment
-        needle, tubes, margin = system.needle, system.tubes, system.margins.total_mm
+        needle, tubes, margin = self._needle, system.tubes, system.margins.total_mm
         level, slope = self._lumen_at_exit()
         thick = tubes.inner.radius_mm + deployment.lateral_sweep_mm + TUBE_SLACK_MM
         clear = needle.radius_mm + margin + NEEDLE_SLACK_MM

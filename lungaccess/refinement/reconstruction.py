@@ -73,7 +73,8 @@ class Reconstruction:
 
     def candidate(self, placement: Placement, x: Float) -> Candidate | None:
         """Return the candidate with the needle of `x`, aimed anew, None if its proof fails."""
-        at, kappa = self._problem.layout.variables, self._evaluator.task.system.needle.max_curvature_per_mm
+        needle = self._evaluator.task.system.require_needle("The joint refinement")
+        at, kappa = self._problem.layout.variables, needle.max_curvature_per_mm
         start = placement.deployment.lps_from_tip
         rows = np.stack([x[at["lengths"]], kappa * x[at["bend_x"]], kappa * x[at["bend_y"]]], axis=1)
         aim = aimed(start, rows, self._evaluator.task.target.lps_mm, kappa)

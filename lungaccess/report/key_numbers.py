@@ -51,7 +51,7 @@ def _fissures(plan: Plan) -> str:
 
 
 def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
-    scope, tube, needle = plan.scope, plan.tube, plan.needle
+    scope, tube = plan.scope, plan.tube
     names, insertions = "outer / inner", f"{tube.outer_insertion_mm:.1f} / {tube.inner_insertion_mm:.1f} mm"
     if plan.system.tubes.outer is None:
         names, insertions = "length", f"{tube.inner_insertion_mm:.1f} mm"
@@ -64,12 +64,19 @@ def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
         (f"{names} beyond scope", insertions),
         ("pierced branch", f"{tube.exit.branch}"),
     ]
-    needle_rows = [
+    return [("Scope", scope_rows), ("Tube", tube_rows), *_needle_rows(plan)]
+
+
+def _needle_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
+    needle = plan.needle
+    if needle is None:
+        return [("No needle", [("tubes, from lumen to target", f"{plan.tissue_mm:.1f} mm")])]
+    rows = [
         ("length", f"{needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}"),
         ("greatest angle from start", f"{np.degrees(needle.max_angle_from_start_rad):.1f}°"),
         ("accumulated turn", f"{np.degrees(needle.accumulated_turn_rad):.1f}°"),
     ]
-    return [("Scope", scope_rows), ("Tube", tube_rows), ("Needle", needle_rows)]
+    return [("Needle", rows)]
 
 
 def _limit_rows(appraisal: Appraisal) -> tuple[str, list[Row]]:
@@ -80,8 +87,8 @@ def _limit_rows(appraisal: Appraisal) -> tuple[str, list[Row]]:
 def _clearance_rows(plan: Plan) -> tuple[str, list[Row]]:
     return "Least distance stated by the plan / required", [
         (f"{device} to {STRUCTURES.get(name, name)}", f"{value:.2f} / {_least(plan, device, name)}")
-        for device in ("tube", "needle")
-        for name, value in plan.clearance_mm[device].items()
+        for device, distances in plan.clearance_mm.items()
+        for name, value in distances.items()
     ]
 
 

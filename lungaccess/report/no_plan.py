@@ -116,15 +116,15 @@ def _miss(explanation: Explanation) -> Float | None:
 
 
 def _nearest(explanation: Explanation) -> Float | None:
-    """Return the points of the needle to the nearest point that is reached."""
+    """Return the points of the needle, or of the tubes, to the nearest point that is reached."""
     neighbour = explanation.neighbour
-    return None if neighbour is None else neighbour.plan.curves().needle.points_lps
+    return None if neighbour is None else neighbour.plan.costed_poses()[0][:, :3, 3]
 
 
 def _other(explanation: Explanation) -> Float | None:
-    """Return the points of the needle of the least invasive preset that reaches the target."""
+    """Return the points of the needle, or of the tubes, of the least invasive preset that does."""
     plans = [attempt.plan for attempt in explanation.attempts if attempt.succeeded]
-    return None if not plans or plans[0] is None else plans[0].curves().needle.points_lps
+    return None if not plans or plans[0] is None else plans[0].costed_poses()[0][:, :3, 3]
 
 
 def _legend(explanation: Explanation) -> list[Line2D]:

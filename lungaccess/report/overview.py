@@ -59,7 +59,7 @@ def overview_png(
     panels.clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
     panels.text_panel(style.panel(figure, TEXT_IN), plan, lung, appraisal)
     _heading(figure, plan, appraisal)
-    _legend(figure, layers)
+    _legend(figure, layers, with_needle=plan.needle is not None)
     return style.save_png(figure, path)
 
 
@@ -83,10 +83,11 @@ def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
 
 
 def _stages(axes: Axes, plan: Plan, view: View, scope: Float) -> None:
-    _scope, tubes, needle = plan.curves()
+    _scope, *others = plan.curves().present
     drawing.curve(axes, scope, style.SCOPE, 3.4, 6)
-    drawing.curve(axes, view.project(tubes.points_lps), style.TUBE, 3.0, 7)
-    drawing.curve(axes, view.project(needle.points_lps), style.NEEDLE, 2.2, 8)
+    looks = ((style.TUBE, 3.0), (style.NEEDLE, 2.2))
+    for order, (curve, (colour, width)) in enumerate(zip(others, looks, strict=False), start=7):
+        drawing.curve(axes, view.project(curve.points_lps), colour, width, order)
 
 
 def _nodule(axes: Axes, layers: Layers, view: View) -> None:
@@ -97,7 +98,8 @@ def _nodule(axes: Axes, layers: Layers, view: View) -> None:
 
 def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
     """Write the title, and the headline below it in the colour of its grade."""
-    style.heading(figure, f"Three-stage plan for {plan.patient_name}", size=15)
+    stages = "Three-stage plan" if plan.needle is not None else "Plan of scope and tubes"
+    style.heading(figure, f"{stages} for {plan.patient_name}", size=15)
     headline = Headline.of(None, None) if appraisal is None else appraisal.headline
     words = f"{headline.grade.mark} {headline.verdict}: {headline.text}"
     figure.text(
@@ -110,18 +112,19 @@ def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
     )
 
 
-def _legend(figure: Figure, layers: Layers) -> None:
+def _legend(figure: Figure, layers: Layers, *, with_needle: bool) -> None:
     figure.legend(
-        handles=_legend_entries(layers), loc="lower left", bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN),
-        ncols=12, fontsize=9, frameon=False, handlelength=1.8, columnspacing=1.3,
+        handles=_legend_entries(layers, with_needle), loc="lower left",
+        bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN), ncols=12, fontsize=9, frameon=False,
+        handlelength=1.8, columnspacing=1.3,
     )  # fmt: skip
 
 
-def _legend_entries(layers: Layers) -> list[Line2D | Patch]:
+def _legend_entries(layers: Layers, with_needle: bool) -> list[Line2D | Patch]:
     entries: list[Line2D | Patch] = [
         Line2D([], [], color=style.SCOPE, lw=4, label="bronchoscope"),
         Line2D([], [], color=style.TUBE, lw=4, label="tubes"),
-        Line2D([], [], color=style.NEEDLE, lw=3, label="needle"),
+        *([Line2D([], [], color=style.NEEDLE, lw=3, label="needle")] if with_needle else []),
         Line2D([], [], color=style.INK, lw=0.9, ls=(0, (3, 2)), label="required clearance"),
         Line2D([], [], ls="none", marker="D", mfc="white", mec=style.INK, label="exit"),
         Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2, label="target"),

@@ -53,8 +53,10 @@ def _required_line(axes: Axes, plan: Plan, tube_arc: Float, along: Float) -> Non
     """Draw the least distance of the axis (radius, margins and sweep), which steps at each tube end."""
     required, sweep_mm = plan.required_clearance_mm, plan.tube.lateral_sweep_mm
     outer_end = plan.tube.outer_insertion_mm - tube_arc[-1]
-    places = [along[0], max(outer_end, along[0]), 0.0, along[-1]]
-    levels = [required["outer_tube"] + sweep_mm, required["inner_tube"] + sweep_mm, required["needle"]]
+    places = [along[0], max(outer_end, along[0]), 0.0]
+    levels = [required["outer_tube"] + sweep_mm, required["inner_tube"] + sweep_mm]
+    if plan.needle is not None:
+        places, levels = [*places, along[-1]], [*levels, required["needle"]]
     for start, stop, level in zip(places[:-1], places[1:], levels, strict=True):
         axes.fill_between([start, stop], 0.0, level, color=style.FORBIDDEN, lw=0, zorder=1)
     axes.stairs(levels, places, baseline=None, color=style.INK, lw=1.4, label="required", zorder=5)

@@ -178,10 +178,11 @@ def _text(figure: Figure, reach: ReachMap) -> None:
         f"{row.name}: {row.volume_ml:.0f} mL, {100.0 * row.reached:.1f} % reached"
         for row in reach.by_region()
     ]
+    diameter, radius = system.needle_sizes
+    of_needle = f"needle {diameter} mm,\nradius of curvature {radius} mm" if system.needle else "no needle"
     lines += [
         "",
-        f"scope {system.scope.outer_diameter_mm:g} mm, needle {system.needle.diameter_mm:g} mm,",
-        f"radius of curvature {system.needle.min_radius_of_curvature_mm:.0f} mm",
+        f"scope {system.scope.outer_diameter_mm:g} mm, " + of_needle,
         f"fissures {'are obstacles' if reach.with_fissures else 'may be crossed or have no mask'}",
         f"{reach.entries} deployments, voxels of {reach.kinds.grid.spacing_mm[0]:g} mm",
         "not counted: outside the lung, in an obstacle",

@@ -45,13 +45,17 @@ def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
 
 
 def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
-    """Draw the path of the needle, in the direction that shows it best, on a cut that follows it."""
-    needle = plan.curves().needle.points_lps
+    """Draw the needle, or the tubes beyond the lumen where there is none, on a cut that follows them.
+
+    It is seen in the direction that shows it best.
+    """
+    path = plan.costed_poses()[0][:, :3, 3]
     target = np.asarray(plan.target_lps)
-    view = plane_view(needle, "")
-    shown = np.concatenate([needle, target[None]])
-    _cut_panel(axes, plan, layers, view, needle, shown, margin_mm=6.0)
-    drawing.title(axes, "Needle (cut that follows it)")
+    view = plane_view(path, "")
+    shown = np.concatenate([path, target[None]])
+    _cut_panel(axes, plan, layers, view, path, shown, margin_mm=6.0)
+    what = "Tubes to the target (cut that follows them)"
+    drawing.title(axes, what if plan.needle is None else "Needle (cut that follows it)")
 
 
 def _bending_plane(plan: Plan, tube: Float) -> Float:
@@ -86,11 +90,12 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     drawing.ribbon(axes, scope, system.scope.radius_mm, style.SCOPE, fill=0.35, order=6)
     drawing.ribbon(axes, outer, system.tubes.outermost.radius_mm, style.TUBE, fill=0.45, order=7)
     drawing.ribbon(axes, tube_uv, system.tubes.inner.radius_mm, style.TUBE, fill=0.9, order=8)
-    drawing.ribbon(axes, needle_uv, system.needle.radius_mm, style.NEEDLE, fill=0.9, order=9)
     required = plan.required_clearance_mm
     drawing.dashed_band(axes, outer, required["outer_tube"], 5)
     drawing.dashed_band(axes, tube_uv[len(outer) - 1 :], required["inner_tube"], 5)
-    drawing.dashed_band(axes, needle_uv, required["needle"], 5)
+    if system.needle is not None:
+        drawing.ribbon(axes, needle_uv, system.needle.radius_mm, style.NEEDLE, fill=0.9, order=9)
+        drawing.dashed_band(axes, needle_uv, required["needle"], 5)
     axes.set_xlim(limits[0])
     axes.set_ylim(limits[1])
 

@@ -13,7 +13,7 @@ from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.deviations import Draws
-from lungaccess.risk.errors import CURVATURE, UNITS, ErrorModel
+from lungaccess.risk.errors import CURVATURE, ErrorModel
 from lungaccess.risk.statistics import Share, share_of
 
 DEFAULT_SAMPLES = 10_000
@@ -23,7 +23,7 @@ MISS_QUANTILES = (0.5, 0.9, 0.95)
 
 
 MISSES = "misses the goal"
-"""A draw whose needle ends farther from the target than the radius of the goal."""
+"""A draw whose needle, or without one whose tubes, end outside the goal: farther than its radius."""
 
 
 @frozen_value
@@ -44,6 +44,8 @@ class RiskReport:
         The names of `touches` that a success must not have.
     miss_mm : mapping of float to float
         Distance of the tip from the target that a share of the samples does not exceed, by the share.
+    with_needle : bool
+        Whether the plan has a needle; its tubes end at the target where it has none.
     alone : mapping of str to Share
         Successes if there were errors of one kind only, by kind; empty if that was not asked for.
     """
@@ -59,6 +61,7 @@ class RiskReport:
     forbidden: tuple[str, ...]
     miss_mm: Mapping[float, float]
     alone: Mapping[str, Share]
+    with_needle: bool = True
 
     @property
     def failures(self) -> tuple[tuple[str, Share], ...]:
@@ -111,7 +114,7 @@ def assess(
     draws = Draws(samples, assessor.n_arcs, seed)
     outcomes = assessor.outcomes(draws.scaled(stated.sizes, stated.curvature_factors))
     touched = {name: share_of((outcomes.touched & flag) != 0) for name, flag in assessor.structures.items()}
-    kinds = UNITS if each_kind else ()
+    kinds = assessor.kinds if each_kind else ()
     alone = {name: assessor.success(draws, *_one_kind(stated, name)) for name in kinds}
     return RiskReport(
         model=stated,
@@ -125,6 +128,7 @@ def assess(
         forbidden=assessor.forbidden,
         miss_mm=MappingProxyType({q: float(np.quantile(outcomes.miss_mm, q)) for q in MISS_QUANTILES}),
         alone=MappingProxyType(alone),
+        with_needle=plan.needle is not None,
     )
 
 

@@ -16,6 +16,7 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.deviations import TUBE_PIECES, Deviations, Draws, deviated_pieces, deviated_starts
+from lungaccess.risk.errors import OF_NEEDLE, UNITS
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.statistics import Share, share_of
 from stages.needle import Obstacles
@@ -39,7 +40,7 @@ THREADS = 2
 class Outcomes:
     """What became of N deviated plans, `(N,)` each.
 
-    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the needle's tip is from the deviated target.
+    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the last tip is from the deviated target.
     """
 
     touched: Int
@@ -48,6 +49,11 @@ class Outcomes:
 
 class RiskAssessor:
     """A plan in its lung, ready to be deviated from.
+
+    Attributes
+    ----------
+    kinds : tuple of str
+        The kinds of error that the devices of the plan can have.
 
     Parameters
     ----------
@@ -60,7 +66,7 @@ class RiskAssessor:
     PlanFileError
         If the plan was made for another lung.
     SettingsError
-        If the radius is not above 0 and finite, or the plan has no needle.
+        If the radius is not above 0 and finite, or the needle of the plan has no arc.
     """
 
     def __init__(self, plan: Plan, lung: Lung, *, radius_mm: float | None = None) -> None:
@@ -71,10 +77,11 @@ class RiskAssessor:
                 expected="a finite length above 0",
                 remedy="Choose a radius in mm, such as 5",
             )
-        if not plan.needle.arcs:
+        if plan.needle is not None and not plan.needle.arcs:
             raise SettingsError("The needle of the plan has no arc", expected="at least one arc")
         self.plan = plan
-        self.n_arcs = len(plan.needle.arcs)
+        self.n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
+        self.kinds = tuple(name for name in UNITS if plan.needle is not None or name not in OF_NEEDLE)
         self.radius_mm, self.radius_origin = (
             goal_radius(lung, plan) if radius_mm is None else (float(radius_mm), "given")
         )

@@ -19,7 +19,7 @@ TUBE_PIECES = 4
 
 @frozen_record
 class Deviations:
-    """N sets of errors of a plan whose needle has A arcs.
+    """N sets of errors of a plan whose needle has A arcs, 0 where there is none.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     The radius of the tubes includes the sideways sweep of the plan.  Neither tube goes back behind the
     scope tip, nor the inner behind the outer, nor the needle behind the end of an arc.
     """
-    arcs = plan.needle.arcs
+    arcs = () if plan.needle is None else plan.needle.arcs
     pieces = np.zeros((deviations.count, TUBE_PIECES + len(arcs), kernel.N_PIECE))
     outer = np.maximum(plan.tube.outer_insertion_mm + deviations.insertion_mm[:, 0], 0.0)
     inner = np.maximum(plan.tube.inner_insertion_mm + deviations.insertion_mm[:, 1], outer)
@@ -155,7 +155,7 @@ def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     pieces[:, 0, kernel.ROLL] = plan.tube.rotation_rad + deviations.rotation_rad
     pieces[:, :TUBE_PIECES, kernel.CURVATURE] = tubes.curvature_per_mm
     pieces[:, :TUBE_PIECES, kernel.RADIUS] = tubes.radius_mm + plan.tube.lateral_sweep_mm
-    pieces[:, TUBE_PIECES:, kernel.RADIUS] = plan.system.needle.radius_mm
+    pieces[:, TUBE_PIECES:, kernel.RADIUS] = plan.system.track_radius_mm
     ends = np.cumsum([arc.length_mm for arc in arcs]) + deviations.stop_mm
     ends = np.maximum.accumulate(np.maximum(ends, 0.0), axis=1)
     pieces[:, TUBE_PIECES:, kernel.LENGTH] = np.diff(ends, axis=1, prepend=0.0)

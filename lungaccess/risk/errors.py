@@ -26,6 +26,8 @@ UNITS: dict[str, str] = {
     "target_position": "mm",
 }
 """Kinds of error and the unit in which their size is stated."""
+OF_NEEDLE = (CURVATURE, "needle_roll", "needle_insertion")
+"""The kinds that only a needle has."""
 
 
 @settings
@@ -114,15 +116,17 @@ class ErrorModel:
         """What the model is called: its name, "default" if all sizes are the default ones, else "stated"."""
         return self.name or ("default" if self.is_default else "stated")
 
-    @property
-    def words(self) -> str:
-        """The sizes of all errors in one clause, standard deviations but for the factors of the curvature."""
+    def words(self, *, with_needle: bool) -> str:
+        """Return all sizes in one clause, standard deviations but for the factors of the curvature."""
         low, high = self.curvature_factors
+        of_needle = (
+            f"needle {self.needle_insertion_mm:g} mm and {self.needle_roll_deg:g}°, "
+            f"its curvature {low:g} to {high:g} times the planned one, "
+        )
         return (
             f"scope tip {self.scope_position_mm:g} mm and {self.scope_direction_deg:g}°, "
             f"tubes {self.tube_insertion_mm:g} mm and {self.tube_rotation_deg:g}°, "
-            f"needle {self.needle_insertion_mm:g} mm and {self.needle_roll_deg:g}°, "
-            f"its curvature {low:g} to {high:g} times the planned one, target {self.target_position_mm:g} mm"
+            f"{of_needle if with_needle else ''}target {self.target_position_mm:g} mm"
         )
 
     @property

@@ -103,7 +103,7 @@ def find_tolerances(
     stated = model or ErrorModel()
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
     draws = Draws(samples, assessor.n_arcs, seed)
-    return tuple(_tolerance(assessor, draws, stated, name, probability) for name in UNITS)
+    return tuple(_tolerance(assessor, draws, stated, name, probability) for name in assessor.kinds)
 
 
 def _tolerance(

@@ -104,7 +104,7 @@ def _write_devices(plan: Plan, devices: DeviceCurves, folder: Path, *, refused: 
     """Write curves, tubes and points; a refused plan is named so wherever its devices show."""
     prefix = "REFUSED by the check: " if refused else ""
     items = []
-    for curve in devices:
+    for curve in devices.present:
         curve_file, model_file = f"{curve.name}.mrk.json", f"{curve.name}.ply"
         _write_json(folder / curve_file, _named(curve_markup(curve), prefix))
         write_ply(folder / model_file, device_surface(curve))

@@ -175,7 +175,7 @@ def _planners(text: str) -> tuple[str, ...]:
 
 def _radii(text: str | None, rules: Rules, device: System) -> tuple[float, ...]:
     if text is None and rules == "ours":
-        return (device.needle.min_radius_of_curvature_mm,)
+        return (device.require_needle("The benchmark of needles").min_radius_of_curvature_mm,)
     try:
         radii = tuple(float(part) for part in (UNC_RADII_MM if text is None else text).split(","))
     except ValueError:

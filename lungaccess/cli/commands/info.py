@@ -85,8 +85,7 @@ def _preset_table(systems: Mapping[str, System]) -> Table:
             name,
             f"{system.scope.outer_diameter_mm:g}",
             " / ".join(f"{tube.outer_diameter_mm:g}" for tube in reversed(system.tubes.nested)),
-            f"{system.needle.diameter_mm:g}",
-            f"{1.0 / system.needle.max_curvature_per_mm:.0f}",
+            *system.needle_sizes,
             system.description,
         )
         for name, system in systems.items()

@@ -93,13 +93,13 @@ def _stems(maps: tuple[ReachMap, ...]) -> list[str]:
 
 def record(reach: ReachMap) -> dict[str, object]:
     """Return the figures of a map as plain values."""
-    system = reach.system
+    system, needle = reach.system, reach.system.needle
     return {
         "patient": reach.patient_name,
         "system": system.name,
         "scope_diameter_mm": system.scope.outer_diameter_mm,
-        "needle_diameter_mm": system.needle.diameter_mm,
-        "needle_radius_of_curvature_mm": system.needle.min_radius_of_curvature_mm,
+        "needle_diameter_mm": None if needle is None else needle.diameter_mm,
+        "needle_radius_of_curvature_mm": None if needle is None else needle.min_radius_of_curvature_mm,
         "fissures_are_obstacles": reach.with_fissures,
         "spacing_mm": float(reach.kinds.grid.spacing_mm[0]),
         "deployments": reach.entries,
@@ -145,8 +145,7 @@ def _comparison_table(maps: tuple[ReachMap, ...]) -> Table:
         (
             each.system.name,
             f"{each.system.scope.outer_diameter_mm:g}",
-            f"{each.system.needle.diameter_mm:g}",
-            f"{each.system.needle.min_radius_of_curvature_mm:.0f}",
+            *each.system.needle_sizes,
             *(f"{100.0 * row.reached:.1f}" for row in each.by_region()),
             f"{gained:.0f}",
             f"{lost:.0f}",

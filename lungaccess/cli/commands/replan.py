@@ -108,7 +108,12 @@ def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
             ("inner tube", f"{tube.inner_insertion_mm:.1f} mm"),
             ("exit through branch", f"{tube.exit.branch}"),
         ]
-    rows += [("needle", f"{needle.length_mm:.1f} mm")]
+    rows += [
+        (
+            "needle",
+            "none: the tip of the tubes is at the target" if needle is None else f"{needle.length_mm:.1f} mm",
+        )
+    ]
     rows += [
         (f"least clearance of the {name}", f"{min(each.values()):.2f} mm")
         for name, each in found.clearance_mm.items()
@@ -121,9 +126,10 @@ def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
             f"{arc.length_mm:.2f}",
             f"{1.0 / arc.curvature_per_mm:.1f}" if arc.curvature_per_mm else "straight",
         )
-        for n, arc in enumerate(needle.arcs, start=1)
+        for n, arc in enumerate(() if needle is None else needle.arcs, start=1)
     ]
-    return [
-        terminal.table("the rest, proved", ("", ""), rows),
-        terminal.table("arcs of the needle", ("", "roll first, deg", "insert, mm", "radius, mm"), arcs),
-    ]
+    tables = [terminal.table("the rest, proved", ("", ""), rows)]
+    if arcs:
+        headings = ("", "roll first, deg", "insert, mm", "radius, mm")
+        tables.append(terminal.table("arcs of the needle", headings, arcs))
+    return tables

@@ -99,8 +99,9 @@ class ReferenceSearch:
         self.obstacles = obstacles or obstacles_for(task)
         self._budget = (rrt_iterations, None) if rrt_time_s is None else (None, rrt_time_s)
         self._tubes = TubeValidator(system, self.obstacles)
-        required_mm = system.needle.radius_mm + system.margins.total_mm
-        self._needle_rrt = NeedleRRT(system.needle, required_mm, self.obstacles)
+        needle = system.require_needle("Algorithm 1 of [Kuntz2015]")
+        required_mm = needle.radius_mm + system.margins.total_mm
+        self._needle_rrt = NeedleRRT(needle, required_mm, self.obstacles)
         self.counts: Counter[str] = Counter()
         self.spent_s: defaultdict[str, float] = defaultdict(float)
         self.refused_by_proof: list[Refusal] = []
@@ -177,9 +178,9 @@ class ReferenceSearch:
 
 def obstacles_for(task: Task) -> Obstacles:
     """Return the solids that a task's tubes and needle may touch."""
-    system = task.system
-    reach = system.tubes.max_extension_mm + system.needle.exit_exemption_mm
-    widest = max(system.tubes.outermost.radius_mm, system.needle.radius_mm)
+    system, needle = task.system, task.system.require_needle("Algorithm 1 of [Kuntz2015]")
+    reach = system.tubes.max_extension_mm + needle.exit_exemption_mm
+    widest = max(system.tubes.outermost.radius_mm, needle.radius_mm)
     return Obstacles(
         task.lung, with_fissures=task.with_fissures, reach_mm=reach + widest + system.margins.total_mm
     )

@@ -64,6 +64,36 @@ class DirectArcs:
             self.task.target.lps_mm,
         )
 
+    def clear(self) -> Int:
+        """Return the deployments (C,) with a clear arc, the shortest first."""
+        blockers, lengths, _costs = self.blockers(self.promising)
+        clear = np.flatnonzero(blockers == 0)
+        return self.promising[clear[np.argsort(lengths[clear], kind="stable")]]
+
+    def lines(self, chosen: Int, samples: int) -> Float:
+        """Return points (N, samples, 3) of the arcs from deployments."""
+        entries, target = self.atlas.deployments, self.task.target.lps_mm
+        start, tangent = entries.positions[chosen], entries.tangents[chosen]
+        offset = target - start
+        ahead = (offset * tangent).sum(axis=1, keepdims=True)
+        aside = offset - ahead * tangent
+        off = np.linalg.norm(aside, axis=1, keepdims=True)
+        normal = np.divide(aside, off, out=np.zeros_like(aside), where=off > 1e-9)
+        turn = 2.0 * np.arctan2(off, ahead)
+        share = np.linspace(0.0, 1.0, samples)
+        angle = turn[:, :, None] * share[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            radius = np.where(off > 1e-9, 0.5 * (off**2 + ahead**2) / off, 0.0)[:, :, None]
+        straight = (off <= 1e-9)[:, :, None] * ahead[:, :, None] * share[:, None]
+        along = radius * np.sin(angle) + straight
+        bent = radius * (1.0 - np.cos(angle))
+        return np.asarray(start[:, None] + along * tangent[:, None] + bent * normal[:, None])
+
+    @property
+    def promising(self) -> Int:
+        """The deployments from which the target may be reached: `in_workspace`."""
+        return self.in_workspace
+
     def candidate(self, entry: int) -> Candidate | None:
         """Return a deployment of the atlas in full with its arc, None if the tubes are refused."""
         entries = self.atlas.deployments

@@ -102,7 +102,8 @@ def sampling_near_target(
     """
     inside = different(arcs.atlas.deployments, arcs.by_bound[0])[: MOST // 2]
     target, most = arcs.task.target.lps_mm, MOST - len(inside)
-    outside = nearly_reaching(arcs.atlas, arcs.task.system.needle, target, most)
+    needle = arcs.evaluator.environment.needle
+    outside = nearly_reaching(arcs.atlas, needle, target, most)
     return LocalSampling(local_search, arcs, np.concatenate([inside, outside]), rng)
 
 

@@ -1,4 +1,4 @@
-"""Direct arcs from the atlas that are separated from each other: the candidates of a diverse plan set."""
+"""Ways to a target that are separated from each other: the candidates of a diverse plan set."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from anatomy.typed import Float, Int
+from anatomy.typed import Int
 from lungaccess.coupled.kernels.separation import choose_separated
-from lungaccess.coupled.search.direct_arcs import DirectArcs
+from lungaccess.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.plans.candidate import Candidate
 
 SAMPLES = 17
@@ -19,13 +19,13 @@ NEAREST, SAMPLED, LEAST_OF_BRANCH = 1000, 2000, 100
 many of every branch."""
 
 
-def separated_candidates(arcs: DirectArcs, count: int, separation_mm: float) -> Iterator[Candidate]:
-    """Yield proved direct arcs that are separated, the cheapest of each branch first, then the others.
+def separated_candidates(arcs: DirectCandidates, count: int, separation_mm: float) -> Iterator[Candidate]:
+    """Yield proved ways to the target that are separated, the cheapest of each branch first, then the others.
 
     The nearest deployments are evaluated with an even sample of the others, then further samples, but only
     as long as there are not enough plans.
     """
-    near, evaluator = arcs.in_workspace, arcs.evaluator
+    near, evaluator = arcs.promising, arcs.evaluator
     pool, pool_costs = np.zeros(0, dtype=np.int64), np.zeros(0)
     proved: dict[int, Candidate | None] = {}
     chosen: list[int] = []
@@ -62,10 +62,14 @@ def _samples(branch: Int) -> Iterator[Int]:
 
 
 def _chosen(
-    arcs: DirectArcs, ordered: Int, count: int, separation_mm: float, proved: dict[int, Candidate | None]
+    arcs: DirectCandidates,
+    ordered: Int,
+    count: int,
+    separation_mm: float,
+    proved: dict[int, Candidate | None],
 ) -> list[int]:
     """Choose separated deployments from clear ones by rising cost; `proved` keeps the proofs."""
-    lines = _lines(arcs, ordered)
+    lines = arcs.lines(ordered, SAMPLES)
     order = _branches_first(arcs.atlas.deployments.branch[ordered])
     while True:
         refused = [n for n, entry in enumerate(ordered.tolist()) if proved.get(entry, True) is None]
@@ -85,23 +89,3 @@ def _branches_first(branch: Int) -> Int:
     first = np.sort(first)
     rest = np.setdiff1d(np.arange(len(branch)), first)
     return np.concatenate([first, rest])
-
-
-def _lines(arcs: DirectArcs, chosen: Int) -> Float:
-    """Return points (E, SAMPLES, 3) of the direct arcs."""
-    entries, target = arcs.atlas.deployments, arcs.task.target.lps_mm
-    start, tangent = entries.positions[chosen], entries.tangents[chosen]
-    offset = target - start
-    ahead = (offset * tangent).sum(axis=1, keepdims=True)
-    aside = offset - ahead * tangent
-    off = np.linalg.norm(aside, axis=1, keepdims=True)
-    normal = np.divide(aside, off, out=np.zeros_like(aside), where=off > 1e-9)
-    turn = 2.0 * np.arctan2(off, ahead)
-    share = np.linspace(0.0, 1.0, SAMPLES)
-    angle = turn[:, :, None] * share[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        radius = np.where(off > 1e-9, 0.5 * (off**2 + ahead**2) / off, 0.0)[:, :, None]
-    straight = (off <= 1e-9)[:, :, None] * ahead[:, :, None] * share[:, None]
-    along = radius * np.sin(angle) + straight
-    bent = radius * (1.0 - np.cos(angle))
-    return np.asarray(start[:, None] + along * tangent[:, None] + bent * normal[:, None])

@@ -50,7 +50,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
             "scope": plan.system.scope.radius_mm,
             "outer": plan.system.tubes.outermost.radius_mm,
             "inner": plan.system.tubes.inner.radius_mm,
-            "needle": plan.system.needle.radius_mm,
+            "needle": plan.system.track_radius_mm,
         },
         "scope": _scope(plan),
         "tubes": _tubes(plan),
@@ -64,9 +64,9 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
 
 def device_points(plan: Plan) -> Float:
     """Return points `(N, 3)`, LPS mm, of the last part of the scope, the tubes and the needle."""
-    scope, tubes, needle = plan.curves()
+    scope, *others = plan.curves()
     near = scope.arc_length_mm >= scope.arc_length_mm[-1] - SCOPE_SHOWN_MM
-    return np.concatenate([scope.points_lps[near], tubes.points_lps, needle.points_lps])
+    return np.concatenate([scope.points_lps[near], *(curve.points_lps for curve in others)])
 
 
 def _scope(plan: Plan) -> Packed:
@@ -139,7 +139,7 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     `CAP_MM`; for "airway" the pierced branch is passed over as long as it is exempt, and up to the exit
     there is only `NOT_MEASURED`.  "margin_mm" is the least of them against "required_mm" on the needle.
     """
-    _scope, tube, needle = plan.curves()
+    (_scope, tube, needle), device = plan.curves(), plan.system.needle
     start = float(tube.arc_length_mm[-1])
     points = np.concatenate([tube.points_lps, needle.points_lps[1:]])
     along = np.concatenate([tube.arc_length_mm, start + needle.arc_length_mm[1:]])
@@ -148,7 +148,7 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     outer = plan.tube.outer_insertion_mm
     needed, sweep_mm = plan.required_clearance_mm, plan.tube.lateral_sweep_mm
     of_tube = np.where(along <= outer, needed["outer_tube"], needed["inner_tube"]) + sweep_mm
-    required = np.where(along <= start, of_tube, needed["needle"])
+    required = np.where(along <= start, of_tube, needed.get("needle", 0.0))
     limited = [v for k, v in clearances.items() if k != "fissure" or plan.fissures_are_obstacles]
     margin = np.min(limited, axis=0) - required
     return {
@@ -162,8 +162,8 @@ def profile(plan: Plan, lung: Lung) -> Packed:
         "required_mm": pack(required, "f4"),
         "margin_mm": pack(margin[-len(needle.arc_length_mm) :], "f4"),
         "curvature_per_mm": pack(_curvature(plan, along), "f4"),
-        "most_curvature_per_mm": 1.0 / plan.system.needle.min_radius_of_curvature_mm,
-        "cost": _cost_so_far(plan, lung),
+        "most_curvature_per_mm": 0.0 if device is None else device.max_curvature_per_mm,
+        **_cost_so_far(plan, lung),
     }
 
 
@@ -187,9 +187,12 @@ def _curvature(plan: Plan, along: Float) -> Float:
 
 
 def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
-    """Return the integral of 1 / clearance up to each point of the needle, and of the cost map if any."""
-    needle = plan.curves().needle
-    points = needle.points_lps
+    """Return the integral of 1 / clearance along what the costs are of, and of the cost map if any.
+
+    "cost_mm" are the distances from the scope's tip.
+    """
+    poses, lengths_mm = plan.costed_poses()
+    points = poses[:, :3, 3]
     clearance = obstacle_clearance_mm(lung, points, with_fissures=plan.fissures_are_obstacles)
     rates = {"inverse_clearance": 1.0 / np.maximum(clearance, FLOOR_MM)}
     if lung.cost is not None:
@@ -198,8 +201,12 @@ def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
         values = np.asarray(lung.cost.array, dtype=np.float64)[tuple(ijk.T)]
         if np.isfinite(values).all():
             rates["cost_map"] = values
-    steps = np.diff(needle.arc_length_mm)
-    return {
+    steps = np.diff(lengths_mm)
+    begin_mm = plan.tube.inner_insertion_mm
+    if plan.needle is None:
+        begin_mm = plan.tube.exit.arc_length_mm
+    so_far = {
         key: pack(np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * steps)]), "f4")
         for key, rate in rates.items()
     }
+    return {"cost_mm": pack(begin_mm + lengths_mm, "f4"), "cost": so_far}

@@ -105,7 +105,7 @@ def _starts(explanation: Explanation) -> list[Packed]:
 
 def _paths(explanation: Explanation) -> Iterator[tuple[Packed, Float]]:
     """Yield the paths that can be shown: the miss, the nearest plan, and plans of other systems."""
-    radius = explanation.system.needle.radius_mm
+    radius = explanation.system.track_radius_mm
     if explanation.miss is not None:
         points = explanation.miss.points_lps
         yield _path("path that violates least (not allowed)", MISS, radius, [points], True)
@@ -120,9 +120,8 @@ def _paths(explanation: Explanation) -> Iterator[tuple[Packed, Float]]:
 
 
 def _devices(name: str, colour: str, plan: Plan, shown: bool) -> tuple[Packed, Float]:
-    scope, tubes, needle = plan.curves()
-    curves = [scope.points_lps, tubes.points_lps, needle.points_lps]
-    return _path(name, colour, plan.system.needle.radius_mm, curves, shown)
+    curves = [curve.points_lps for curve in plan.curves().present]
+    return _path(name, colour, plan.system.track_radius_mm, curves, shown)
 
 
 def _path(name: str, colour: str, radius_mm: float, curves: list[Float], shown: bool) -> tuple[Packed, Float]:

@@ -145,10 +145,14 @@ def cost_history(path: Path | None) -> list[list[float]]:
 
 def _summary(plan: Plan) -> str:
     x, y, z = (float(c) for c in plan.target_lps)
+    needle = plan.needle
+    of_needle = "no needle: the tip of the tubes is at the target"
+    if needle is not None:
+        of_needle = f"needle {needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}"
     facts = (
         f"{plan.system.name}; scope to generation {plan.scope.generation}, "
         f"{plan.scope.length_from_carina_mm:.0f} mm beyond the carina; {plan.insertions}; "
-        f"needle {plan.needle.length_mm:.1f} mm in {plural(len(plan.needle.arcs), 'arc')}; target at LPS "
+        f"{of_needle}; target at LPS "
         f"{x:.1f}, {y:.1f}, {z:.1f} mm"
     )
     # Why this system, if it was chosen among several: the last sentence of its choice.

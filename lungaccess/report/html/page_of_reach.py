@@ -134,8 +134,7 @@ def systems_section(maps: Sequence[ReachMap]) -> str:
         gained, lost = each.gained_and_lost_ml(maps[0])
         figures: list[Any] = [
             f"{each.system.scope.outer_diameter_mm:g}",
-            f"{each.system.needle.diameter_mm:g}",
-            f"{each.system.needle.min_radius_of_curvature_mm:.0f}",
+            *each.system.needle_sizes,
             "are obstacles" if each.with_fissures else "may be crossed or have no mask",
             each.entries,
             f"{100.0 * each.total.reached:.1f}",

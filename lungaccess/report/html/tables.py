@@ -174,9 +174,10 @@ def risk_section(report: RiskReport | None) -> str:
         for share, miss in report.miss_mm.items()
     ]
     alone = [(name, _share(share)) for name, share in report.alone.items()]
+    sizes = report.model.words(with_needle=report.with_needle)
     note = (
         f"{report.samples} deviated plans, seed {report.seed}, open loop, errors of '{report.model.label}': "
-        f"{report.model.words}{', all of them assumed' if report.model.is_default else ''}. Radius of the "
+        f"{sizes}{', all of them assumed' if report.model.is_default else ''}. Radius of the "
         f"goal: {report.radius_origin}. The range is the 95 % interval."
     )
     return (

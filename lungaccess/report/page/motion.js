@@ -35,6 +35,10 @@ export class Motion {
     return motion;
   }
 
+  get hasNeedle() {
+    return this.ends.needle > 0;
+  }
+
   // Return everything at a place of the slider, 0 to 1.
   at(position) {
     const { starts, ends } = this;

@@ -60,7 +60,9 @@ class PlanPage extends AnatomyPage {
   }
 
   listSwitches() {
-    for (const device of DEVICES) {
+    const hasNeedle = this.motions.some((motion) => motion.hasNeedle);
+    for (const element of document.querySelectorAll("[data-needle]")) element.hidden = !hasNeedle;
+    for (const device of DEVICES.filter(({ key }) => key !== "needle" || hasNeedle)) {
       addSwitch(byId("devices"), device, (on) => {
         this.shown[device.key] = on;
         this.redraw();
@@ -189,7 +191,8 @@ class PlanPage extends AnatomyPage {
     const { profile, costs, objective } = this.motion.plan;
     const along = await unpack(profile.arc_length_mm);
     const x = { name: "mm beyond the tip of the scope" };
-    const marks = [{ at: profile.exit_mm, name: "exit" }, { at: profile.tube_mm, name: "needle" }];
+    const hasNeedle = this.motion.hasNeedle;
+    const marks = [{ at: profile.exit_mm, name: "exit" }, ...(hasNeedle ? [{ at: profile.tube_mm, name: "needle" }] : [])];
     const clearances = await Promise.all(Object.entries(profile.clearance_mm).map(async ([key, packed]) => {
       const allowed = key === "fissure" && !profile.fissures_are_obstacles ? " (may be crossed)" : "";
       return { name: CHART[key][0] + allowed, colour: CHART[key][1], dash: CHART[key][2], xs: along, ys: await unpack(packed) };
@@ -197,7 +200,7 @@ class PlanPage extends AnatomyPage {
     const required = { name: "required", colour: "currentColor", xs: along, ys: await unpack(profile.required_mm), stairs: true, width: 1.8 };
     const cost = await Promise.all(Object.entries(profile.cost).map(async ([key, packed], n) => ({
       name: key === "cost_map" ? "cost map" : "1/clearance", colour: COSTS[n][0], dash: COSTS[n][1],
-      xs: Array.from(await unpack(this.motion.plan.needle.arc_length_mm), (mm) => mm + profile.tube_mm), ys: await unpack(packed),
+      xs: await unpack(profile.cost_mm), ys: await unpack(packed),
     })));
     const bend = { name: "curvature", colour: "#0072B2", xs: along, ys: await unpack(profile.curvature_per_mm), stairs: true };
     const limit = { name: "limit of the needle", colour: "currentColor", dash: "6 4", width: 1.6,
@@ -207,7 +210,7 @@ class PlanPage extends AnatomyPage {
         x, y: { name: "mm" }, series: [...clearances, required], top: profile.cap_mm, marks,
         spans: [{ from: 0, to: Math.max(profile.exempt_to_mm, 0) }],
       }),
-      lineChart(byId("chart-curvature"), { x, y: { name: "1/mm" }, series: [bend, limit], marks }),
+      lineChart(byId("chart-curvature"), { x, y: { name: "1/mm" }, series: hasNeedle ? [bend, limit] : [bend], marks }),
       lineChart(byId("chart-cost"), { x, y: { name: "cost so far" }, series: cost }),
     ];
     byId("cost-total").textContent = `In all ${costs[objective].toPrecision(4)} (${this.motion.plan.objective_words}, as the plan states).`;

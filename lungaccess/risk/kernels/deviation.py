@@ -140,6 +140,8 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, eno
         nx, ny, nz = normal_on_arc(pose, bend, length)
         pose = pose_on_arc(pose, bend, length)
         done += length
+    if n_tube == pieces.shape[0] and pierced == IN_LUMEN:
+        touched |= STAYS_INSIDE
     return touched, pose[0], pose[1], pose[2]
 
 

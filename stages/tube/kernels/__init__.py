@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from stages.tube.kernels.aiming import CLOSE_MM, aim
     from stages.tube.kernels.deployment import (
         ENTRY_COLUMNS,
         ENTRY_TIP,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         planar_point,
         planar_points,
         tip_pose,
+        tube_pieces,
     )
     from stages.tube.kernels.shapes import ARC_COLUMNS
     from stages.tube.kernels.wall_exit import (

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lungaccess.checking.steering import inverse_clearance
+from lungaccess.checking.outcome import inverse_clearance
 
 
 @pytest.mark.parametrize("distance_mm", [5.0, 19.9, 20.0, 45.0])

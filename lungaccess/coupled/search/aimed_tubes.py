@@ -1,0 +1,243 @@
+"""Tubes aimed at a target from the scope tips of an atlas: what a system without a needle can do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.lung import Lung
+from anatomy.poses import poses_on_pieces
+from anatomy.structures import obstacle_bits
+from anatomy.typed import Bool, Float, Int
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.kernels.aimed_tubes import COST, INNER, MISSES, N_AIMED, OUTER, ROTATION, aim_tubes
+from lungaccess.plans.candidate import Candidate, tubes_in_tissue
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.system import System
+from lungaccess.problem.task import Task
+from stages.needle import ArcPath, Objective, Obstacles
+from stages.scope import ScopeTip
+from stages.tube import REASONS, Deployment, insertion_stops, tube_constants, tube_environment
+
+REACH_MM = 6.0
+"""From deployments whose tips are so near the tubes are aimed.  Where a scope tip has a deployment to the
+target, the atlas has one of that tip about so near: the tips of turned ones are up to 30 degrees, 5 mm at
+18 mm from the axis, and 4 mm of insertion apart."""
+STARTS_MM = 8.0
+"""Spacing of the insertions from which the tubes are aimed from one pose: Newton's method goes as far."""
+NO_SOLUTION = "no insertions bring the tip of the tubes to the target"
+
+
+class TubeAiming:
+    """Aims the tubes of a system at points in a lung.
+
+    Parameters
+    ----------
+    objective : Objective
+        By which deployments are cheap.
+    """
+
+    def __init__(self, lung: Lung, system: System, objective: Objective, *, with_fissures: bool) -> None:
+        self._tube = (
+            tube_environment(lung, with_fissures=with_fissures),
+            tube_constants(system.tubes, system.margins),
+        )
+        field, bits = lung.obstacle_field(with_fissures=with_fissures), obstacle_bits(with_fissures)
+        self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
+        weighed = objective.without_map if lung.cost is None else objective
+        arrays = weighed.arrays(None if lung.cost is None else lung.cost.array)
+        of_map = arrays._replace(inverse_clearance=0.0, length=0.0)
+        self._weights = arrays._replace(map_integral=0.0, voxel_sum=0.0), of_map
+
+    def aim(
+        self,
+        target: Float,
+        tips: Float,
+        allowed: Bool,
+        row_of: Int,
+        outer_mm: Float,
+        inner_mm: Float,
+        enough: int = 0,
+    ) -> tuple[Float, Int]:
+        """Aim the tubes at a point from scope tips.
+
+        Parameters
+        ----------
+        target : (3,) float64, LPS mm
+        tips : (K, 9) float64
+        allowed : (K,) bool
+            Which of them the scope can take.
+        row_of : (N,) int64
+            The tip of each attempt.
+        outer_mm, inner_mm : (N,) float64
+            Insertions from which each begins.
+        enough : int
+            So many deployments end the attempts; 0 to make all of them.
+
+        Returns
+        -------
+        found : (N, N_AIMED) float64
+            Rotation in rad, insertions in mm and estimated cost, which is infinite where there is nothing.
+        why : (N,) int64
+            0 for a deployment that ends at the point, MISSES, NOT_TRIED, or why the tubes refuse it.
+        """
+        found, why = np.zeros((len(row_of), N_AIMED)), np.zeros(len(row_of), dtype=np.int64)
+        x, y, z = target.tolist()
+        aim_tubes(
+            self._tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), outer_mm,
+            inner_mm, (x, y, z), enough or len(row_of), found, why,
+        )  # fmt: skip
+        return found, why
+
+
+def nearest_of_each_tip(atlas: Atlas, entries: Int, away_mm: Float) -> Int:
+    """Return of entries (N,) of an atlas the nearest of each scope tip, the nearest first."""
+    ordered = entries[np.argsort(away_mm, kind="stable")]
+    _sites, first = np.unique(atlas.deployments.site[ordered], return_index=True)
+    return ordered[np.sort(first)]
+
+
+def tips_of(atlas: Atlas, entries: Int) -> tuple[Float, Int]:
+    """Return the scope tips (K, 9) of entries (N,) of an atlas, and which of them each entry has."""
+    sites, row_of = np.unique(atlas.deployments.site[entries], return_inverse=True)
+    return np.ascontiguousarray(atlas.motions.tips[sites]), row_of.ravel()
+
+
+class AimedFromPose:
+    """The tubes aimed at the target of a task from one pose of the scope.
+
+    Attributes
+    ----------
+    reasons : dict of str to int
+        How many attempts each reason refused.
+    why : str
+        What prevents a plan, in words.
+    """
+
+    def __init__(self, evaluator: CandidateEvaluator, lps_from_scope_tip: Float) -> None:
+        self._evaluator, self._frame = evaluator, lps_from_scope_tip
+        self.reasons: dict[str, int] = {}
+        self.why = NO_SOLUTION
+
+    def best(self) -> tuple[Deployment, ArcPath] | None:
+        """Return the cheapest proved deployment to the target, and its tubes in tissue."""
+        task, frame = self._evaluator.task, self._frame
+        aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
+        stops = insertion_stops(task.system.tubes, STARTS_MM)
+        outer, inner = (each.ravel() for each in np.meshgrid(stops, stops))
+        outer, inner = outer[outer <= inner].copy(), inner[outer <= inner].copy()
+        row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
+        found, why = aiming.aim(
+            task.target.lps_mm, row, np.ones(1, dtype=np.bool_), np.zeros(len(outer), dtype=np.int64),
+            outer, inner,
+        )  # fmt: skip
+        self.reasons = {f"tube, aimed at the target: {name}": n for name, n in reasons_of(why).items()}
+        for n in np.argsort(found[:, COST], kind="stable").tolist():
+            if not np.isfinite(found[n, COST]):
+                break
+            rotation, outer_mm, inner_mm = found[n, [ROTATION, OUTER, INNER]].tolist()
+            made = self._evaluator.tubes.validate(frame, rotation, outer_mm, inner_mm)
+            if isinstance(made, str):
+                continue
+            path = tubes_in_tissue(task.system, frame, made)
+            if self._evaluator.proves(made, path):
+                return made, path
+        stopped = {name: n for name, n in reasons_of(why).items() if name != NO_SOLUTION}
+        if stopped:
+            self.why = max(stopped, key=stopped.__getitem__)
+        return None
+
+
+def reasons_of(why: Int) -> dict[str, int]:
+    """Return how many attempts (N,) each reason refused, in words."""
+    codes, counts = np.unique(why, return_counts=True)
+    names = {MISSES: NO_SOLUTION, **REASONS}
+    return {names[c]: n for c, n in zip(codes.tolist(), counts.tolist(), strict=True) if c in names}
+
+
+class AimedTubes:
+    """The deployments, from the scope tips of an atlas, that end at the target of a task.
+
+    Attributes
+    ----------
+    evaluator : CandidateEvaluator
+    promising : (N,) int64
+        Entries of the atlas from which the tubes are aimed, one for each scope tip, the nearest first.
+    nearest_mm : float
+        Distance of the target from the nearest tip of the tubes in the atlas; infinite if there is none.
+    """
+
+    def __init__(self, task: Task, atlas: Atlas) -> None:
+        self.task, self.atlas = task, atlas
+        self.evaluator = CandidateEvaluator(task)
+        entries = atlas.deployments
+        away = np.linalg.norm(entries.positions - task.target.lps_mm, axis=1)
+        self.nearest_mm = float(away.min(initial=math.inf))
+        near = np.flatnonzero(away <= REACH_MM)
+        self.promising: Int = nearest_of_each_tip(atlas, near, away[near])
+        self._aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
+
+    def aim(self, entries: Int) -> tuple[Float, Int]:
+        """Aim from entries of the atlas; see `aim_from`."""
+        made, (tips, row_of) = self.atlas.deployments, tips_of(self.atlas, entries)
+        allowed = np.ones(len(tips), dtype=np.bool_)
+        return self.aim_from(tips, allowed, row_of, made.outer_mm[entries], made.inner_mm[entries])
+
+    def aim_from(
+        self, tips: Float, allowed: Bool, row_of: Int, outer_mm: Float, inner_mm: Float
+    ) -> tuple[Float, Int]:
+        """Aim the tubes from scope tips, and count why they are refused; see `TubeAiming.aim`.
+
+        Returns
+        -------
+        found : (N, N_AIMED) float64
+        clear : (C,) int64
+            The attempts with a deployment, the cheapest first.
+        """
+        target = self.task.target.lps_mm
+        found, why = self._aiming.aim(target, tips, allowed, row_of, outer_mm, inner_mm)
+        self.evaluator.blocked.update(reasons_of(why))
+        clear = np.flatnonzero(np.isfinite(found[:, COST]))
+        return found, clear[np.argsort(found[clear, COST], kind="stable")]
+
+    def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
+        """Return for entries (E,) whether they are refused, 1 if so, their estimated costs, and the least."""
+        found, clear = self.aim(chosen)
+        refused = np.ones(len(chosen), dtype=np.int64)
+        refused[clear] = 0
+        return refused, found[:, COST], float(found[:, COST].min(initial=math.inf))
+
+    def clear(self) -> Int:
+        """Return the entries (C,) with a deployment to the target, the cheapest first."""
+        return self.promising[self.aim(self.promising)[1]]
+
+    def proved(self, entry: int) -> Candidate | None:
+        """Return the deployment from the scope tip of an entry, None if its proof fails."""
+        found, clear = self.aim(np.array([entry]))
+        if not len(clear):
+            return None
+        candidate = self.candidate(self.tip(entry), found[0])
+        proved = candidate is not None and self.evaluator.proves(candidate.deployment, candidate.path)
+        return candidate if proved else None
+
+    def lines(self, chosen: Int, samples: int) -> Float:
+        """Return points (E, samples, 3) of the tubes in tissue from the scope tips of entries."""
+        rows, _clear = self.aim(chosen)
+        lines = np.zeros((len(chosen), samples, 3))
+        for line, entry, row in zip(lines, chosen.tolist(), rows, strict=True):
+            candidate = self.candidate(self.tip(entry), row)
+            if candidate is not None:
+                path = candidate.path
+                poses, _mm = poses_on_pieces(path.lps_from_start, path.arcs, path.length_mm / samples)
+                line[:] = poses[np.linspace(0, len(poses) - 1, samples).round().astype(int), :3, 3]
+        return lines
+
+    def tip(self, entry: int) -> ScopeTip:
+        """Return the scope tip of an entry."""
+        return self.atlas.motions.tip(int(self.atlas.deployments.site[entry]))
+
+    def candidate(self, tip: ScopeTip, found: Float) -> Candidate | None:
+        """Return a row of what was found as a candidate, None if the tubes are refused."""
+        rotation, outer, inner = (float(found[column]) for column in (ROTATION, OUTER, INNER))
+        return self.evaluator.aimed(tip, rotation, outer, inner)

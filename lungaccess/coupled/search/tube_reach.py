@@ -1,0 +1,103 @@
+"""Which of many points the tip of the tubes reaches, for a system without a needle."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+from anatomy.typed import Float, Int, UInt64
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.kernels.aimed_tubes import COST, INNER, OUTER, ROTATION
+from lungaccess.coupled.search.aimed_tubes import REACH_MM, TubeAiming, nearest_of_each_tip, tips_of
+from lungaccess.plans.candidate import tubes_in_tissue
+from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, UNREACHED, Objective, Reached
+from stages.tube import DeploymentValidator
+
+STEP_MM = 0.25
+"""Spacing of the points at which the clearance of the tubes is looked up; half of it is taken off."""
+CLEARANCE_CAP_MM = 5.0
+"""Clearances below this are exact: larger ones never limit a plan."""
+FIELD_BITS = {"airway": AIRWAY, "vessel": VESSEL, "pleura": OUTSIDE, "fissure": FISSURE}
+"""The clearance fields, and the structure of each in the labels."""
+
+
+class TubeReachScan:
+    """The deployments of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
+
+    A point is reached directly if the tubes, aimed at it from the scope tip of some deployment that ends
+    nearby, are proved clear.  It may be used by several threads at once.
+
+    Parameters
+    ----------
+    deployments : int
+        Of so many deployments to a point the cheapest is told.
+    """
+
+    def __init__(self, atlas: Atlas, *, deployments: int = DEFAULT_ARCS) -> None:
+        from scipy.spatial import cKDTree
+
+        self._atlas, self._enough = atlas, deployments
+        self._aiming = TubeAiming(
+            atlas.lung, atlas.system, Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures
+        )
+        self._field = atlas.lung.obstacle_field(with_fissures=atlas.with_fissures)
+        self._required_mm = atlas.system.tubes.inner.radius_mm + atlas.system.margins.total_mm
+        self._tips = cKDTree(atlas.deployments.positions) if atlas.deployments.count else None
+
+    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
+        """Try all points, one after the other; neither seeds nor neighbours matter.
+
+        Parameters
+        ----------
+        points : (N, 3) float64, LPS mm
+        """
+        places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
+        kinds, entries = np.full(len(places), UNREACHED, dtype=np.uint8), np.full(len(places), -1)
+        cost, clearance = np.zeros(len(places)), np.zeros(len(places))
+        kinds[self._field.lower_bound_mm(places) < self._required_mm] = NO_CLEARANCE
+        for n, point in enumerate(places):
+            found = self._best(point)
+            if found is not None:
+                entries[n], cost[n], clearance[n] = found
+                kinds[n] = DIRECT
+        return Reached(kinds=kinds, cost=cost, clearance_mm=clearance, entries=entries)
+
+    def _best(self, point: Float) -> tuple[int, float, float] | None:
+        """Return entry, cost and clearance of the cheapest of some deployments to a point."""
+        atlas = self._atlas
+        if self._tips is None:
+            return None
+        close = np.array(self._tips.query_ball_point(point, REACH_MM, return_sorted=True), dtype=np.int64)
+        if not len(close):
+            return None
+        made = atlas.deployments
+        chosen = nearest_of_each_tip(atlas, close, np.linalg.norm(made.positions[close] - point, axis=1))
+        tips, row_of = tips_of(atlas, chosen)
+        found, _why = self._aiming.aim(
+            point, tips, np.ones(len(tips), dtype=np.bool_), row_of, made.outer_mm[chosen],
+            made.inner_mm[chosen], self._enough,
+        )  # fmt: skip
+        best = int(found[:, COST].argmin())
+        if not np.isfinite(found[best, COST]):
+            return None
+        return int(chosen[best]), float(found[best, COST]), self._clearance_mm(int(chosen[best]), found[best])
+
+    def _clearance_mm(self, entry: int, found: Float) -> float:
+        """Return a lower bound of the clearance of the tubes in tissue, the pierced branch passed over."""
+        atlas = self._atlas
+        frame = atlas.motions.tip(int(atlas.deployments.site[entry])).lps_from_scope_tip
+        system, fissures = atlas.system, atlas.with_fissures
+        tubes = DeploymentValidator(atlas.lung, system.tubes, system.margins, with_fissures=fissures)
+        made = tubes.validate(frame, *(float(found[column]) for column in (ROTATION, OUTER, INNER)))
+        if isinstance(made, str):
+            return 0.0
+        points, _mm = tubes_in_tissue(system, frame, made).sample(STEP_MM)
+        names = ("airway", "vessel", "pleura", *(("fissure",) if fissures else ()))
+        least = min(
+            atlas.lung.least_clearance_mm(
+                points, name, FIELD_BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=made.branch
+            )
+            for name in names
+        )
+        return max(least - 0.5 * STEP_MM, 0.0)

@@ -79,9 +79,9 @@ class System:
             raise impossible(
                 "needle",
                 None,
-                "the table [needle], or else a straight outer tube and an inner tube of one arc: the tip of one "
-                "tube or of straight ones comes only to a line or surface from each place of the scope, and of "
-                "others only some shapes are known",
+                "the table [needle], or else a straight outer tube and an inner tube of one arc: the tip of "
+                "one tube or of straight ones comes only to a line or surface from each place of the scope, "
+                "and of others only some shapes are known",
             )
 
     def _check_needle(self, needle: Needle) -> None:

@@ -48,6 +48,8 @@ def check_tubes_at_target(
     if tube_tip is None:
         return
     check_target(plan, environment.lung, tube_tip[:3, 3], found)
+    miss, detail = float(np.linalg.norm(tube_tip[:3, 3] - plan.target_lps)), "tip of the tubes to the target"
+    found.at_most("tube.at_target", miss, POSITION_TOLERANCE_MM, "mm", detail)
     curve = integrate(plan.scope.lps_from_scope_tip, tube_pieces(plan))
     way_out = plan.tube.exit
     in_tissue = beyond(curve, way_out.arc_length_mm)

@@ -10,7 +10,8 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng, direction, far, signed
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle
+from lungaccess.plans.parts import NeedleArc, NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath
 from stages.tube.shape import centreline
@@ -92,6 +93,7 @@ def wall_run_edited(case: Case, rng: Rng) -> Mutant | None:
     return Mutant(plan=changed(case.plan, tube__exit__wall_run_mm=run))
 
 
+@of_needle
 def exemption_longer(case: Case, rng: Rng) -> Mutant | None:
     """More needle is exempt than the device allows, or less than none."""
     limit = case.plan.system.needle.exit_exemption_mm
@@ -99,6 +101,7 @@ def exemption_longer(case: Case, rng: Rng) -> Mutant | None:
     return Mutant(plan=changed(case.plan, exemption__needle_length_mm=length))
 
 
+@of_needle
 def arcs_edited(case: Case, rng: Rng) -> Mutant | None:
     """Length, roll or curvature of arcs, or arcs lost or swapped: the needle ends elsewhere."""
     arcs = list(case.plan.needle.arcs)
@@ -136,6 +139,7 @@ def end_of(plan: Plan, arcs: Any) -> Float:
     return np.asarray(ArcPath(lps_from_start=plan.needle.lps_from_start, arcs=rows).frames()[-1][:3, 3])
 
 
+@of_needle
 def needle_statement_edited(case: Case, rng: Rng) -> Mutant | None:
     """A number about the needle that is not so."""
     needle = case.plan.needle
@@ -150,7 +154,28 @@ def needle_statement_edited(case: Case, rng: Rng) -> Mutant | None:
     return Mutant(plan=changed(case.plan, **{key: edits[key]}))
 
 
+def needle_added_or_removed(case: Case, rng: Rng) -> Mutant | None:
+    """A plan without the needle that its system has, or with one that its system does not have."""
+    plan, tip = case.plan, case.plan.tube.lps_from_tip
+    if plan.needle is not None:
+        clearance = {"tube": plan.clearance_mm["tube"]}
+        return Mutant(plan=changed(plan, needle=None, clearance_mm=clearance))
+    length = far(rng, 0.01, 30.0)
+    needle = NeedlePath(
+        lps_from_start=tip,
+        arcs=(NeedleArc(length_mm=length, roll_rad=0.0, curvature_per_mm=0.0),),
+        end_lps=tip[:3, 3] + length * tip[:3, 2],
+        length_mm=length,
+        max_angle_from_start_rad=0.0,
+        accumulated_turn_rad=0.0,
+    )
+    if rng.integers(2):
+        return Mutant(plan=changed(plan, needle=needle))
+    return Mutant(plan=changed(plan, needle=needle, target_lps=needle.end_lps, target_origin="point"))
+
+
 MUTATIONS: tuple[Mutation, ...] = (
+    needle_added_or_removed,
     tube_edited,
     exit_edited,
     exit_at_a_corner,

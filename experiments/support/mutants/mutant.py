@@ -7,6 +7,7 @@ docs/explanation/check.md says is refused; its digest fits.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -15,6 +16,7 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from experiments.support.mutants.draws import Rng
 from lungaccess.checking import CheckReport
+from lungaccess.plans.assemble import required_clearance_mm
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, system_fingerprint
 
@@ -49,6 +51,16 @@ class Mutant:
 Mutation = Callable[[Case, Rng], Mutant | None]
 
 
+def of_needle(mutation: Mutation) -> Mutation:
+    """Make a mutation of the needle apply only to plans that have one."""
+
+    @functools.wraps(mutation)
+    def applied(case: Case, rng: Rng) -> Mutant | None:
+        return None if case.plan.needle is None else mutation(case, rng)
+
+    return applied
+
+
 def changed(record: Any, **values: Any) -> Any:
     """Replace values in nested records, as `changed(plan, tube__exit__branch=2)`."""
     nested: dict[str, dict[str, Any]] = {}
@@ -65,14 +77,9 @@ def changed(record: Any, **values: Any) -> Any:
 
 def with_system(plan: Plan, system: System) -> Plan:
     """Return a plan whose system, fingerprint and required clearances agree."""
-    margin = system.margins.total_mm
     return changed(
         plan,
         system=system,
         system_fingerprint=system_fingerprint(system),
-        required_clearance_mm={
-            "outer_tube": system.tubes.outermost.radius_mm + margin,
-            "inner_tube": system.tubes.inner.radius_mm + margin,
-            "needle": system.needle.radius_mm + margin,
-        },
+        required_clearance_mm=required_clearance_mm(system),
     )

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng, direction, far, rotation, signed
 from experiments.support.mutants.motion import end_of
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 
@@ -29,7 +29,6 @@ def moved(plan: Plan, pieces: tuple[str, ...], matrix: Float, turn: float = 1.0)
         return np.asarray(matrix @ frame @ keep_handed)
 
     scope, tube, needle = plan.scope, plan.tube, plan.needle
-    arcs = tuple(replace(arc, roll_rad=turn * arc.roll_rad) for arc in needle.arcs)
     edits: dict[str, dict[str, Any]] = {
         "scope": {
             "scope__lps_from_entry": pose(scope.lps_from_entry),
@@ -44,19 +43,21 @@ def moved(plan: Plan, pieces: tuple[str, ...], matrix: Float, turn: float = 1.0)
             "tube__exit__point_lps": point(tube.exit.point_lps),
             "exemption__exit_point_lps": point(plan.exemption.exit_point_lps),
         },
-        "needle": {
-            "needle__lps_from_start": pose(needle.lps_from_start),
-            "needle__end_lps": point(needle.end_lps),
-            "needle__arcs": arcs,
-        },
         "target": {"target_lps": point(plan.target_lps)},
     }
-    return changed(plan, **{key: value for piece in pieces for key, value in edits[piece].items()})
+    if needle is not None:
+        edits["needle"] = {
+            "needle__lps_from_start": pose(needle.lps_from_start),
+            "needle__end_lps": point(needle.end_lps),
+            "needle__arcs": tuple(replace(arc, roll_rad=turn * arc.roll_rad) for arc in needle.arcs),
+        }
+    return changed(plan, **{key: value for piece in pieces for key, value in edits.get(piece, {}).items()})
 
 
-def some_pieces(rng: Rng) -> tuple[str, ...]:
+def some_pieces(plan: Plan, rng: Rng) -> tuple[str, ...]:
     """Return one stage, or all with or without the target."""
-    choices = [("scope",), ("tube",), ("tube", "exit"), ("needle",), ("needle", "target"), PIECES[:4], PIECES]
+    last = [("target",)] if plan.needle is None else [("needle",), ("needle", "target")]
+    choices = [("scope",), ("tube",), ("tube", "exit"), *last, PIECES[:4], PIECES]
     return choices[int(rng.integers(len(choices)))]
 
 
@@ -65,7 +66,7 @@ def shifted_by_a_voxel(case: Case, rng: Rng) -> Mutant | None:
     matrix = np.eye(4)
     axis = int(rng.integers(3))
     matrix[:3, 3] = float(rng.choice([-1.0, 1.0])) * case.lung.grid.lps_from_ijk[:3, axis]
-    return Mutant(plan=moved(case.plan, some_pieces(rng), matrix))
+    return Mutant(plan=moved(case.plan, some_pieces(case.plan, rng), matrix))
 
 
 def mirrored(case: Case, rng: Rng) -> Mutant | None:
@@ -76,7 +77,7 @@ def mirrored(case: Case, rng: Rng) -> Mutant | None:
     about = rng.choice(["origin", "carina"])
     if about == "carina":
         matrix[axis, 3] = 2.0 * case.lung.tree.carina_lps[axis]
-    return Mutant(plan=moved(case.plan, some_pieces(rng), matrix, turn=-1.0))
+    return Mutant(plan=moved(case.plan, some_pieces(case.plan, rng), matrix, turn=-1.0))
 
 
 def rotated(case: Case, rng: Rng) -> Mutant | None:
@@ -85,9 +86,10 @@ def rotated(case: Case, rng: Rng) -> Mutant | None:
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     matrix[:3, 3] = case.lung.tree.carina_lps - turn @ case.lung.tree.carina_lps
-    return Mutant(plan=moved(case.plan, some_pieces(rng), matrix))
+    return Mutant(plan=moved(case.plan, some_pieces(case.plan, rng), matrix))
 
 
+@of_needle
 def other_units(case: Case, rng: Rng) -> Mutant | None:
     """Lengths in cm, angles in degrees, curvatures per cm or per m, or x and y with the signs of RAS."""
     plan, tube, needle = case.plan, case.plan.tube, case.plan.needle
@@ -124,7 +126,7 @@ def other_units(case: Case, rng: Rng) -> Mutant | None:
 
 def pose_edited(case: Case, rng: Rng) -> Mutant | None:
     """A pose turned by a few degrees, rolled, moved, inverted, mirrored or scaled."""
-    name = str(rng.choice(POSES))
+    name = str(rng.choice(POSES if case.plan.needle is not None else POSES[:3]))
     stage, field = name.split("__")
     pose = getattr(getattr(case.plan, stage), field).copy()
     kind = int(rng.integers(6))
@@ -150,7 +152,8 @@ def pose_edited(case: Case, rng: Rng) -> Mutant | None:
 
 def stage_of_another_plan(case: Case, rng: Rng) -> Mutant | None:
     """Scope, tubes, needle or exemption of another plan of the same lung."""
-    name = str(rng.choice(["scope", "tube", "needle"]))
+    both = case.plan.needle is not None and case.other.needle is not None
+    name = str(rng.choice(["scope", "tube", "needle"] if both else ["scope", "tube"]))
     pose = {"scope": "lps_from_scope_tip", "tube": "lps_from_tip", "needle": "lps_from_start"}[name]
     mine, theirs = getattr(case.plan, name), getattr(case.other, name)
     if np.abs(getattr(mine, pose) - getattr(theirs, pose)).max() < 0.01:

@@ -37,7 +37,7 @@ JOINT_ITERATIONS = 402
 def random_system(rng: Rng) -> System:
     """Return a preset, or one with other sizes, limits and margins."""
     preset = la.load_system(str(rng.choice(la.preset_names())))
-    if rng.random() < 0.2:
+    if rng.random() < 0.2 or preset.needle is None:
         return preset
     while True:
         scope, needle = preset.scope.outer_diameter_mm, preset.needle.diameter_mm
@@ -113,7 +113,7 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
         int(rng.integers(2**31)),
         rng.random(),
     )
-    if kind > 0.75:
+    if kind > 0.75 and system.needle is not None:
         yield from bent_plans(
             Task(lung=lung, system=system, target=target, objective=objective, method="bent", seed=seed),
             atlas,
@@ -127,7 +127,7 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
             )
             yield from (each.plan for each in found)
             return
-        method = "kuntz2015" if kind > 0.7 else "atlas"
+        method = "kuntz2015" if kind > 0.7 and system.needle is not None else "atlas"
         iterations = 200 if method == "kuntz2015" else int(rng.choice([1, 40, 150, JOINT_ITERATIONS]))
         found = la.plan(
             lung, system, target, objective=objective, method=method, seed=seed, iterations=iterations,
@@ -140,7 +140,7 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
 
 def bent_plans(task: Task, atlas: Atlas, rng: Rng) -> Iterator[Plan]:
     """Yield plans of several arcs at random, from deployments near the target, to where they end."""
-    device = task.system.needle
+    device = task.system.require_needle("A path of several arcs")
     arcs_to_target = DirectArcs(task, atlas)
     made = 0
     for entry in rng.permutation(arcs_to_target.in_workspace)[:TRIED]:

@@ -122,7 +122,7 @@ def target_moved(case: Case, rng: Rng) -> Mutant | None:
 
 def clearance_overstated(case: Case, rng: Rng) -> Mutant | None:
     """More clearance is stated than there is."""
-    stage = str(rng.choice(["tube", "needle"]))
+    stage = str(rng.choice(list(case.plan.clearance_mm)))
     stated = {key: dict(value) for key, value in case.plan.clearance_mm.items()}
     name = str(rng.choice(list(stated[stage])))
     most = case.limit(f"{stage}.clearance.{name}.stated")
@@ -134,7 +134,7 @@ def clearance_overstated(case: Case, rng: Rng) -> Mutant | None:
 
 def clearance_understated(case: Case, rng: Rng) -> Mutant | None:
     """Much less clearance is stated than there is: not this plan's."""
-    stage = str(rng.choice(["tube", "needle"]))
+    stage = str(rng.choice(list(case.plan.clearance_mm)))
     stated = {key: dict(value) for key, value in case.plan.clearance_mm.items()}
     name = str(rng.choice(list(stated[stage])))
     least = case.limit(f"{stage}.clearance.{name}.stated.least")

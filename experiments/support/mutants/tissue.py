@@ -10,7 +10,7 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng, direction
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
@@ -26,6 +26,7 @@ def needle_samples(plan: Plan) -> tuple[Float, Float]:
     return ArcPath(lps_from_start=plan.needle.lps_from_start, arcs=rows).sample(SAMPLE_MM)
 
 
+@of_needle
 def needle_elsewhere(case: Case, rng: Rng) -> Mutant | None:
     """An honest plan from the same tube to another target, through a vessel, an airway or the pleura.
 
@@ -104,6 +105,7 @@ def foreign_airway(case: Case, rng: Rng) -> Callable[[int], int]:
     return lambda label: (label & below) | structures.AIRWAY | name
 
 
+@of_needle
 def voxel_at_the_needle(case: Case, rng: Rng) -> Mutant | None:
     """A voxel of vessel, pleura, fissure or another airway within the needle's clearance."""
     points, _ = needle_samples(case.plan)

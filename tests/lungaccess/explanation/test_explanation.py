@@ -146,12 +146,12 @@ class TestBlocked:
 
     def test_what_was_not_tried_is_no_no(self, blocked: tuple[Explanation, la.Atlas]) -> None:
         explanation, _atlas = blocked
-        untried = {"stylet-needle", "lung-default", "flexure-needle", "therapeutic-scope"}
+        untried = {"stylet-needle", "tubes-only", "lung-default", "flexure-needle", "therapeutic-scope"}
         assert set(explanation.untried) == untried and not explanation.attempts
         assert {part.name for part in explanation.not_tried} == {f"preset {name}" for name in untried}
         assert "no other preset" not in explanation.headline and "not tried" in explanation.headline
         tried = [each["tried"] for each in explanation_record(explanation)["presets"]]
-        assert tried == [False] * 4
+        assert tried == [False] * 5
 
 
 class TestFar:
@@ -160,7 +160,7 @@ class TestFar:
     def test_every_part_was_done(self, far: Explanation) -> None:
         assert not far.not_tried and not far.untried
         names = [attempt.system.name for attempt in far.attempts]
-        assert names == ["stylet-needle", "lung-default", "flexure-needle", "therapeutic-scope"]
+        assert names == ["stylet-needle", "tubes-only", "lung-default", "flexure-needle", "therapeutic-scope"]
 
     def test_the_arc_beyond_the_limits_ends_at_the_target_and_exceeds_one(self, far: Explanation) -> None:
         arc = far.arc_beyond_limits
@@ -241,7 +241,7 @@ def test_a_headline_names_the_least_invasive_preset_that_does(far: Explanation) 
     report: Any = type("Report", (), {"accepted": True})()
     done = tuple(
         replace(each, report=report, plan=far.neighbour and far.neighbour.plan, failure=None)
-        if each.system.name not in ("stylet-needle", "lung-default")
+        if each.system.name not in ("stylet-needle", "tubes-only", "lung-default")
         else Attempt(system=each.system, failure=la.NoPlan("No", reasons={}, main_reason="it is too thick"))
         for each in far.attempts
     )

@@ -36,6 +36,7 @@ def test_presets_ship_with_the_package() -> None:
         "lung-default",
         "stylet-needle",
         "therapeutic-scope",
+        "tubes-only",
         "ultrathin",
     )
     assert needle_preset_names() == ("med-rad-needle",)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,9 @@ from anatomy.grid import freeze_arrays, read_only
 from anatomy.records import frozen_record
 from anatomy.tree_report import TreeReport
 from anatomy.typed import Bool, Float, Int
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 LEAST_CONTINUED_RADIUS = 0.85
 MOST_SIDE_RADIUS = 0.6
@@ -202,6 +206,13 @@ class AirwayTree:
         radius = self.branch_mean_radius_mm / self.branch_mean_radius_mm[parent]
         others = radius[np.setdiff1d(self.children(parent), branch)]
         return bool(radius[branch] >= LEAST_CONTINUED_RADIUS and (others < MOST_SIDE_RADIUS).all())
+
+    @cached_property
+    def nearest_point_index(self) -> cKDTree:
+        """Search tree of the points: `query` finds the nearest tree points of any points."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points_lps)
 
     @cached_property
     def leaf_branches(self) -> Int:

@@ -175,7 +175,6 @@ def _septum(lung: Mask, airway: Mask, grid: Grid, warnings: list[str]) -> Mask:
 
 def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> None:
     """Set AIRWAY, LUMEN and, of the branches nearest by their centreline, the one nearest by its surface."""
-    from scipy.spatial import cKDTree
 
     if tree.n_branches > structures.MAX_BRANCHES:
         raise AnatomyError(
@@ -185,7 +184,7 @@ def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, g
         )
     voxels = np.argwhere(airway)
     neighbours = min(NEIGHBOURS, tree.n_points)
-    distance, index = cKDTree(tree.points_lps).query(grid.lps(voxels), k=neighbours)
+    distance, index = tree.nearest_point_index.query(grid.lps(voxels), k=neighbours)
     distance, index = distance.reshape(len(voxels), -1), index.reshape(len(voxels), -1)
     nearest = np.argmin(distance - tree.radius_mm[index], axis=1)
     branch = tree.branch_of_point[index[np.arange(len(voxels)), nearest]]

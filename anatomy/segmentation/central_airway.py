@@ -223,7 +223,6 @@ def grow(ct: CoarseCt, seed: Int, outside: Mask) -> Mask:
 def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
     """Return trachea and main bronchi: the parts nearest to the two first generations of the tree."""
     import edt
-    from scipy.spatial import cKDTree
 
     from anatomy.tree import tree_from_mask
 
@@ -244,7 +243,7 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
         main[box] = wide
         return main, (f"The main bronchi could not be told from the lobar ones: {error.found}",)
     voxels = np.argwhere(wide)
-    _, nearest = cKDTree(tree.points_lps).query(grid.lps(voxels))
+    _, nearest = tree.nearest_point_index.query(grid.lps(voxels))
     first = tree.generation[tree.branch_of_point[nearest]] <= 1
     chosen = voxels[first] + low
     main[tuple(chosen.T)] = True

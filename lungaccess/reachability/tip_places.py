@@ -93,7 +93,7 @@ def place_pieces(lung: Lung, centres: Float, leaving: Mask, reach_mm: float) -> 
     # An exit lies in a voxel whose centre may be half a diagonal away; a tip, in a part of a voxel.
     exit_mm, _ = cKDTree(lung.grid.lps(exits)).query(tree.points_lps)
     near = exit_mm <= reach_mm + voxel_mm + MAX_OFF_AXIS_MM
-    nearest_mm, _ = cKDTree(tree.points_lps).query(centres)
+    nearest_mm, _ = tree.nearest_point_index.query(centres)
     around = cKDTree(centres).query_ball_point(tree.points_lps, MAX_OFF_AXIS_MM + half_mm)
     around = [np.array(found, dtype=np.int64) for found in around]
     own = [

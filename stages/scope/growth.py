@@ -16,7 +16,7 @@ from stages.scope.kernels.growth import Device, Route
 STEP_MM = 1.0
 """Advance from layer to layer: about a voxel and a half, far shorter than a bending section."""
 BEAMS = (24, 96)
-"""States kept in a layer, and those kept where fewer did not get to the end of a branch."""
+"""States kept in a layer, and those kept where fewer did not get as far as the scope passes the axis."""
 RINGS_PER_MM = (0.003, 0.01, 0.03)
 """Curvatures beside that which leads to the route ahead: at a tip of 15 mm they move it by 0.3 to 3 mm."""
 SPOKES = 8
@@ -89,11 +89,13 @@ class Growth:
     ----------
     tried : (N,) bool
         Tree points that the scope might get to; routes end at the last of them.
+    passable : (N,) bool
+        Tree points to which a ball as thick as the scope gets along the axis.
     """
 
-    def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, device: Device) -> None:
+    def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, passable: Bool, device: Device) -> None:
         self._walls, self._tree, self._device = walls, tree, device
-        self._tried = tried
+        self._tried, self._passable = tried, passable
         self._offsets = rings(RINGS_PER_MM, SPOKES)
         self._rows: list[Float] = []
         self._parents: list[Int] = []
@@ -108,7 +110,7 @@ class Growth:
         for branch in range(self._tree.n_branches):
             points = self._tree.branch_points(branch)
             points = points[self._tried[points]]
-            if len(points):
+            if len(points) and not self._ends_before(branch):
                 self._grow_branch(branch, self._tree.route(int(points[-1])))
         return self._result()
 
@@ -121,8 +123,26 @@ class Growth:
             known = self._layers.get(branch, [])
             if not known or (layers and layers[-1][1] > known[-1][1]):
                 self._layers[branch] = layers
-            if layers and layers[-1][1] >= self._tree.distance_from_root_mm[points[-1]] - 2.0 * STEP_MM:
+            expected = points[self._passable[points]]
+            if not len(expected) or self._farthest(branch) >= (
+                self._tree.distance_from_root_mm[expected[-1]] - 2.0 * STEP_MM
+            ):
                 return
+
+    def _farthest(self, branch: int) -> float:
+        """Return how far from the root the states of a branch get, 0 if there are none."""
+        return self._layers[branch][-1][1] if self._layers.get(branch) else 0.0
+
+    def _ends_before(self, branch: int) -> bool:
+        """Tell whether the parent's states end before its fork, as those along this branch would then.
+
+        The routes of both are the same until TANGENT_MM before the fork, and so are the searches.
+        """
+        if branch == 0:
+            return False
+        fork = int(self._tree.parent_point[self._tree.branch_start[branch]])
+        parent = int(self._tree.branch_parent[branch])
+        return bool(self._farthest(parent) < self._tree.distance_from_root_mm[fork] - TANGENT_MM)
 
     def _follow(
         self, branch: int, points: Int, route: Route, beam: int, before_mm: float

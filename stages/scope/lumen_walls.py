@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 
 from anatomy.fields import corner_geometry
@@ -12,9 +14,18 @@ from stages.scope.device import Bronchoscope
 from stages.scope.kernels.body import Walls
 from stages.scope.kernels.growth import Device
 
+_WALLS: WeakKeyDictionary[Lung, Walls] = WeakKeyDictionary()
+"""The walls of each lung: to make them takes as long as to prove a hundred motions."""
+
 
 def walls_of(lung: Lung) -> Walls:
-    """Return the walls around the lumen of a lung."""
+    """Return the walls around the lumen of a lung, made once."""
+    if lung not in _WALLS:
+        _WALLS[lung] = _walls(lung)
+    return _WALLS[lung]
+
+
+def _walls(lung: Lung) -> Walls:
     inside = (lung.labels & LUMEN) != 0
     low, high = np.zeros(3, dtype=np.int64), np.array(lung.grid.shape)
     for axis in range(3):
@@ -23,7 +34,7 @@ def walls_of(lung: Lung) -> Walls:
         if len(filled):
             low[axis], high[axis] = max(filled[0] - 1, 0), min(filled[-1] + 2, high[axis])
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    solid = np.asfortranarray(np.where(inside[box], 0, OUTSIDE).astype(np.uint16))
+    solid = np.asfortranarray(np.where(inside[box], np.uint16(0), np.uint16(OUTSIDE)))
     return Walls(
         solid=read_only(solid),
         geometry=corner_geometry(lung.grid.crop(low, high)),

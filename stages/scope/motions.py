@@ -13,31 +13,17 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
 from stages.scope.device import Bronchoscope
-from stages.scope.growth import Growth, StateTree, rings
+from stages.scope.growth import Growth, StateTree
 from stages.scope.kernels import growth as kernel
 from stages.scope.kernels import turning
 from stages.scope.lumen_walls import kernel_device, walls_of
 from stages.scope.motion import ScopeMotion
 from stages.scope.motion_steps import State, slide, turn
 from stages.scope.passages import Passages, find_passages
-from stages.scope.tip_region import in_tip_region
+from stages.scope.tip_search import find_tips
 
-TURNED_SPACING_MM = 2.0
-"""Spacing of turned tips: each place has many directions, and nearer ones give about the same poses."""
-TURN_RINGS_PER_MM = (0.004, 0.008, 0.014, 0.022, 0.032, 0.045, 0.06)
-"""Curvatures beside that of a state: they turn the tip of a section of 15 mm by 3 to 50 degrees."""
-TURN_SPOKES = 12
-POLAR_RAD = math.radians(15.0)
-"""Turned tips are told apart by rings of so many degrees about the direction of the airway."""
-AZIMUTHS = 8
-SIDES = 3
-"""And by whether they lie on the axis, or beside it before or behind the direction they are turned to."""
 BESIDE_AXIS_MM = 0.5
 """The lumen may be wider by so much, half a voxel or more, beside the axis than on it."""
-TRIES = 12
-"""So many of a kind are tried before a kind is given up: most are refused for the same wall."""
-OFF_AXIS_MM = 1.0
-"""Nearer to the axis tips count as on it: about a voxel and a half."""
 
 
 @frozen_record
@@ -185,12 +171,40 @@ def find_motions(
     """
     passages = find_passages(lung, scope, reach_mm=reach_mm)
     walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)
-    states = Growth(walls, lung.tree, _worth_a_try(lung.tree, device.radius), device).grow()
-    found = _Tips(lung, passages, states, device, spacing_mm)
+    tried = _worth_a_try(lung.tree, device.radius)
+    states = Growth(walls, lung.tree, tried, passages.passable, device).grow()
     least, most = tip_bends_rad or scope.bends_rad
-    found.turn(device._replace(least_bend=least, most_bend=most), max_curvature_per_mm)
-    kept, rooms = found.prove(walls)
-    return found.motions(kept, rooms)
+    tips, tree_point, ahead = find_tips(
+        walls,
+        lung.tree,
+        passages.exits_ahead,
+        states,
+        device._replace(least_bend=least, most_bend=most),
+        max_curvature_per_mm=max_curvature_per_mm,
+        spacing_mm=spacing_mm,
+    )
+    kept, number = states.only(tips[:, turning.SOURCE].astype(np.int64))
+    return ScopeMotions(
+        tips=tips[:, :9],
+        tree_point=tree_point,
+        turned=np.arange(len(tips)) >= ahead,
+        room_mm=tips[:, turning.TIP_ROOM],
+        max_curvature_per_mm=tips[:, turning.TIP_CURVATURE],
+        state=number,
+        settings=tips[:, turning.TWIST_TO : turning.BY_STRAIGHT + 1],
+        lps_from_entry=_entry(states),
+        states=kept,
+        bending_length_mm=device.length,
+        passages=passages,
+    )
+
+
+def _entry(states: StateTree) -> Float:
+    """Return the base frame of the first state, the world's frame if there is none."""
+    entry = np.eye(4)
+    if len(states.states):
+        entry[:3] = states.states[0, : kernel.U].reshape(4, 3).T
+    return entry
 
 
 def _worth_a_try(tree: AirwayTree, radius_mm: float) -> Bool:
@@ -199,106 +213,3 @@ def _worth_a_try(tree: AirwayTree, radius_mm: float) -> Bool:
     for point in range(1, tree.n_points):
         wide[point] &= wide[tree.parent_point[point]]
     return wide
-
-
-class _Tips:
-    """Candidates for tips, sorted by kind: the first free one of each kind is taken."""
-
-    def __init__(
-        self, lung: Lung, passages: Passages, states: StateTree, device: kernel.Device, spacing_mm: float
-    ) -> None:
-        self._tree, self._passages, self._states, self._device = lung.tree, passages, states, device
-        self._spacing_mm = spacing_mm
-
-    def turn(self, device: kernel.Device, max_curvature_per_mm: float) -> None:
-        """Make the candidates."""
-        tree, rows = self._tree, self._states.states[self._states.turned_from]
-        offsets = rings(TURN_RINGS_PER_MM, TURN_SPOKES)[1:]
-        out = np.zeros((len(rows), len(offsets), 11))
-        turning.tips_beside(device, max_curvature_per_mm, rows, offsets, out)
-        candidates = out.reshape(-1, 11)
-        source = np.repeat(self._states.turned_from, len(offsets))
-        possible = np.flatnonzero(np.isfinite(candidates[:, 9]))
-        nearest, inside = in_tip_region(tree, candidates[possible])
-        inside &= self._passages.exits_ahead[nearest]
-        self._source, self._tips, self._near = (
-            source[possible[inside]], candidates[possible[inside]], nearest[inside],
-        )  # fmt: skip
-
-    def _kinds(self) -> tuple[Int, Float]:
-        """Return the kind of each candidate and what it costs within its kind."""
-        tree, near, tips = self._tree, self._near, self._tips
-        axis = tree.tangents[near]
-        cosine = np.clip(np.einsum("sk,sk->s", tips[:, 3:6], axis), -1.0, 1.0)
-        polar = np.arccos(cosine)
-        helper = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
-        first = np.cross(axis, helper)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        second = np.cross(axis, first)
-        turned_to = tips[:, 3:6] - cosine[:, None] * axis
-        azimuth = np.arctan2(
-            np.einsum("sk,sk->s", turned_to, second), np.einsum("sk,sk->s", turned_to, first)
-        )
-        away = tips[:, :3] - tree.points_lps[near]
-        across = away - np.einsum("sk,sk->s", away, axis)[:, None] * axis
-        off = np.linalg.norm(across, axis=1)
-        ring = np.floor(polar / POLAR_RAD + 0.5).astype(np.int64)
-        spoke = np.floor((azimuth / (2.0 * math.pi) + 0.5) * AZIMUTHS).astype(np.int64) % AZIMUTHS
-        towards = np.einsum("sk,sk->s", across, turned_to)
-        side = np.where(off <= OFF_AXIS_MM, 0, np.where(towards >= 0.0, 1, 2))
-        kind = (np.where(ring == 0, 0, ring * AZIMUTHS + spoke)) * SIDES + side
-        return kind, off**2 + (0.3 * np.abs(polar - ring * POLAR_RAD) / POLAR_RAD) ** 2
-
-    def prove(self, walls: object) -> tuple[Int, Float]:
-        """Return the candidates taken and their rooms."""
-        tree, near = self._tree, self._near
-        kind, cost = self._kinds()
-        from_root = tree.distance_from_root_mm[near]
-        branch = tree.branch_of_point[near]
-        chosen, rooms = [], []
-        for spacing, straight in (
-            (self._spacing_mm, True),
-            (max(self._spacing_mm, TURNED_SPACING_MM), False),
-        ):
-            slot = np.floor(from_root / spacing).astype(np.int64)
-            rows = np.flatnonzero((kind == 0) == straight)
-            order = rows[np.lexsort((rows, cost[rows], kind[rows], slot[rows], branch[rows]))]
-            keys = np.stack([branch[order], slot[order], kind[order]], axis=1)
-            new = np.ones(len(order), dtype=np.bool_)
-            new[1:] = (keys[1:] != keys[:-1]).any(axis=1)
-            groups = np.cumsum(new)
-            kept, room = np.zeros(len(order), dtype=np.bool_), np.zeros(len(order))
-            turning.first_free(
-                walls, self._device, self._states.states[self._source[order]], self._tips[order], groups,
-                TRIES, kept, room,
-            )  # fmt: skip
-            chosen.append(order[kept])
-            rooms.append(room[kept])
-        self._straight = len(chosen[0])
-        return np.concatenate(chosen), np.concatenate(rooms)
-
-    def motions(self, kept: Int, rooms: Float) -> ScopeMotions:
-        """Return the record."""
-        tips, source = self._tips[kept], self._source[kept]
-        states, number = self._states.only(source)
-        frames = turning.tip_frames(self._device.length, self._states.states[source], tips)
-        entry = np.eye(4)
-        if len(self._states.states):
-            row = self._states.states[0]
-            entry[:3] = row[: kernel.U].reshape(4, 3).T
-        curvature = np.maximum(
-            self._states.states[source, kernel.CURVATURE], np.hypot(tips[:, 6], tips[:, 7])
-        )
-        return ScopeMotions(
-            tips=frames,
-            tree_point=self._near[kept],
-            turned=np.arange(len(kept)) >= self._straight,
-            room_mm=rooms,
-            max_curvature_per_mm=curvature,
-            state=number,
-            settings=tips[:, 8:11],
-            lps_from_entry=entry,
-            states=states,
-            bending_length_mm=self._device.length,
-            passages=self._passages,
-        )

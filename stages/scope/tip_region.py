@@ -29,9 +29,7 @@ def in_tip_region(tree: AirwayTree, tips: Float) -> tuple[Int, Bool]:
     tips : (S, >= 6) float64
         Point and unit direction of each tip, LPS mm.
     """
-    from scipy.spatial import cKDTree
-
-    distance_mm, nearest = cKDTree(tree.points_lps).query(tips[:, :3])
+    distance_mm, nearest = tree.nearest_point_index.query(tips[:, :3])
     cosine = np.einsum("sk,sk->s", tips[:, 3:6], tree.tangents[nearest])
     inside = (distance_mm <= MAX_OFF_AXIS_MM) & (cosine >= math.cos(MAX_TURN_AT_TIP_RAD))
     return np.asarray(nearest, dtype=np.int64), np.asarray(inside)

@@ -122,44 +122,51 @@ def room_along(walls, radius, base, u, v, begin, end, growth, longest_step):
 
 
 @inner_kernel
+def along_setting(walls, radius, length, base, twist, bend, growth, longest_step):
+    """Return the room along a section of given twist and bend; see `room_along`."""
+    u = bend / length * math.cos(twist)
+    v = bend / length * math.sin(twist)
+    return room_along(walls, radius, base, u, v, 0.0, length, growth, longest_step)
+
+
+@inner_kernel
 def change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, finest, longest_step):
     """Return a room that is there all along a steady change of twist and bend, BLOCKED if none is proved.
 
-    A point `s` mm from the base moves by at most D s^2 / 2 where the curvature vector moves by D.  So the
-    change is free if both its ends have D s^2 / 4 to spare at every s: each place is nearer than that to the
-    same place of one of them.  Else it is halved, until the tip moves by less than FINEST_MM; it is halved
-    until the tip moves by less than `finest` in any case.
+    A point `s` mm from the base moves by at most D s^2 / 2 where the curvature vector moves by D.  So a part
+    of the change is free if both its ends have D s^2 / 4 to spare at every s: each place is nearer than that
+    to the same place of one of them.  Else the part is halved, until the tip moves by less than FINEST_MM.
+    The tip never moves by more than `finest` in one part.
     """
-    most = max(abs(bend), abs(to_bend))
-    u = to_bend / length * math.cos(to_twist)
-    v = to_bend / length * math.sin(to_twist)
-    if room_along(walls, radius, base, u, v, 0.0, length, 0.0, longest_step) < 0.0:
+    if along_setting(walls, radius, length, base, to_twist, to_bend, 0.0, longest_step) < 0.0:
         return BLOCKED
-    change = math.hypot(to_bend - bend, most * (to_twist - twist)) / length
-    pieces = 1
-    while 0.5 * change / pieces * length * length > finest:
-        pieces *= 2
-    while True:
-        growth = 0.25 * change / pieces
-        least = math.inf
-        for n in range(pieces + 1):
-            t = n / pieces
-            kappa = (bend + t * (to_bend - bend)) / length
-            angle = twist + t * (to_twist - twist)
-            u = kappa * math.cos(angle)
-            v = kappa * math.sin(angle)
-            room = room_along(walls, radius, base, u, v, 0.0, length, growth, longest_step)
-            if room < 0.0:
-                if room_along(walls, radius, base, u, v, 0.0, length, 0.0, longest_step) < 0.0:
-                    return BLOCKED
-                least = BLOCKED
-                break
-            least = min(least, room)
-        if least >= 0.0:
-            return least
-        if 2.0 * growth * length * length < FINEST_MM:
+    most_bend = max(abs(bend), abs(to_bend))
+    change = math.hypot(to_bend - bend, most_bend * (to_twist - twist)) / length
+    moved = 0.5 * change * length * length
+    longest = 1.0 if moved <= finest else finest / moved
+    least = math.inf
+    done, part, proved = 0.0, longest, -1.0
+    while done < 1.0:
+        part = min(part, 1.0 - done)
+        growth = 0.25 * change * part
+        room = math.inf
+        if growth > proved:
+            at_twist, at_bend = twist + done * (to_twist - twist), bend + done * (to_bend - bend)
+            room = along_setting(walls, radius, length, base, at_twist, at_bend, growth, longest_step)
+        if room >= 0.0:
+            to = 1.0 if part == 1.0 - done else done + part
+            at_twist, at_bend = twist + to * (to_twist - twist), bend + to * (to_bend - bend)
+            after = along_setting(walls, radius, length, base, at_twist, at_bend, growth, longest_step)
+            if after >= 0.0:
+                least = min(least, room, after)
+                done, part, proved = to, min(2.0 * part, longest), growth
+                continue
+            if along_setting(walls, radius, length, base, at_twist, at_bend, 0.0, longest_step) < 0.0:
+                return BLOCKED
+        if part * moved < FINEST_MM:
             return BLOCKED
-        pieces *= 2
+        part *= 0.5
+    return least
 
 
 @inner_kernel
@@ -223,18 +230,15 @@ def motion_room(walls, radius, length, entry, states, finest, longest_step, wher
         else:
             room = math.inf
         if room >= 0.0 and advance <= 0.0 and not last:
+            twist, bend, to_twist, to_bend = states[n, 1], states[n, 2], states[n + 1, 1], states[n + 1, 2]
             room = change_room(
-                walls,
-                radius,
-                length,
-                base,
-                states[n, 1],
-                states[n, 2],
-                states[n + 1, 1],
-                states[n + 1, 2],
-                finest,
-                longest_step,
+                walls, radius, length, base, twist, bend, to_twist, to_bend, finest, longest_step
             )
+            if room < 0.0:
+                # Short parts ask for room in more places: some changes are free by long parts only.
+                room = change_room(
+                    walls, radius, length, base, twist, bend, to_twist, to_bend, math.inf, math.inf
+                )
         if room < 0.0:
             where[0] = n
             return BLOCKED

@@ -10,7 +10,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.typed import Float
-from stages.scope.kernels.body import move_along, nearest_setting, point_along, room_along, turn_room
+from stages.scope.kernels.body import move_along, nearest_setting, point_along, room_along, room_at, turn_room
 
 BASE, U, V, TWIST, BEND, TIP, HEADING, NEAR, COST, ROOM, CURVATURE = 0, 12, 13, 14, 15, 16, 19, 22, 23, 24, 25
 COLUMNS = 26
@@ -24,6 +24,8 @@ CHANGE_COST = 0.3
 """Cost of a change in place for each mm that the tip moves: as bad as half the room off the axis."""
 HOLD_COST = 0.05
 """Cost of any change: small, so that twist and bend are held where that does."""
+PROBES = 4
+"""Before an arc is walked along it is looked at in so many places: most blocked ones are blocked there."""
 WIDE_ANGLE = 0.06
 """1 - cos of 20 degrees: a tip that looks so far aside costs as much as one that is at the wall."""
 
@@ -123,9 +125,12 @@ def same(a, b):
 @inner_kernel
 def follow(walls, device, before, state, by_straight, step):
     """Prove the way from one state to the next, and fill in its least room; tell whether it is free."""
-    room = room_along(
-        walls, device.radius, before, state[U], state[V], 0.0, device.length + step, 0.0, math.inf
-    )
+    far = device.length + step
+    for n in range(1, PROBES):
+        x, y, z = point_along(before, state[U], state[V], far * (1.0 - n / PROBES))
+        if room_at(walls, device.radius, x, y, z) < 0.0:
+            return False
+    room = room_along(walls, device.radius, before, state[U], state[V], 0.0, far, 0.0, math.inf)
     if room < 0.0:
         return False
     changed = state[TWIST] != before[TWIST] or state[BEND] != before[BEND]

@@ -1,78 +1,191 @@
-"""The tips that a bronchoscope reaches from states by twisting and bending in place."""
+"""The tips that a bronchoscope reaches from states by twisting and bending in place, one of each kind."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.typed import Bool, Float, Int
 from stages.scope.kernels.body import move_along, nearest_setting, turn_room
-from stages.scope.kernels.growth import BEND, ROOM, TWIST, U, V
+from stages.scope.kernels.growth import BEND, CURVATURE, ROOM, TWIST, U, V
 from stages.scope.kernels.shifting import put_tip
 
+POLAR_RAD = math.radians(15.0)
+"""Tips are told apart by rings of so many degrees about the direction of the airway."""
+AZIMUTHS = 8
+SIDES = 3
+"""And by whether they lie on the axis, or beside it before or behind the direction they are turned to."""
+OFF_AXIS_MM = 1.0
+"""Nearer to the axis tips count as on it: about a voxel and a half."""
+TRIES = 12
+"""So many of a kind are tried before a kind is given up: most are refused for the same wall."""
+TWIST_TO, BEND_TO, BY_STRAIGHT, TIP_ROOM, TIP_CURVATURE, SOURCE = 9, 10, 11, 12, 13, 14
+TIP_COLUMNS = 15
+"""Columns of a tip: point, direction and +x, twist and bend to which the section turns, whether it is
+straightened before, room on the whole way, largest curvature of the body, and the state before."""
+
+
+class Places(NamedTuple):
+    """Where tips may be, for kernels: N tree points, sorted into cells as wide as tips may be off the axis.
+
+    points, tangents, first, second : (N, 3), the last three at right angles; wanted : (N,), whether tips may
+    be there; slots : (2, N), where along the tree a point is, for tips that look along it and for others;
+    low : (3,), corner of the cells; begins : (ci, cj, ck + 1), where those of a cell begin in `order` (N,).
+    """
+
+    points: Float
+    tangents: Float
+    first: Float
+    second: Float
+    wanted: Bool
+    slots: Int
+    low: Float
+    begins: Int
+    order: Int
+    off_axis_mm: float
+    least_cosine: float
+
+
+@inner_kernel
+def nearest_place(places, x, y, z):
+    """Return the nearest tree point, -1 if a tip would be too far off the axis."""
+    cell = places.off_axis_mm
+    best = cell * cell
+    nearest = -1
+    i = int(math.floor((x - places.low[0]) / cell))
+    j = int(math.floor((y - places.low[1]) / cell))
+    k = int(math.floor((z - places.low[2]) / cell))
+    ni, nj, nk = places.begins.shape
+    for a in range(max(i - 1, 0), min(i + 2, ni)):
+        for b in range(max(j - 1, 0), min(j + 2, nj)):
+            row = places.begins[a, b]
+            for at in range(row[min(max(k - 1, 0), nk - 1)], row[min(max(k + 2, 0), nk - 1)]):
+                n = places.order[at]
+                p = places.points[n]
+                d2 = (p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - z) ** 2
+                if d2 < best or (d2 == best and (nearest < 0 or n < nearest)):
+                    best = d2
+                    nearest = n
+    return nearest
+
+
+@inner_kernel
+def kind_of(places, near, tip):
+    """Return the group of a tip that is nearest to a tree point, and what the tip costs within it.
+
+    Tips that lie on the axis and look along it are a kind of their own, with places of their own.  The
+    others differ by angle from the axis, by the direction they are turned to, and by the side they lie on.
+    The group is -1 if the tip looks too far aside.
+    """
+    axis, first, second = places.tangents[near], places.first[near], places.second[near]
+    p = places.points[near]
+    x, y, z = tip[0] - p[0], tip[1] - p[1], tip[2] - p[2]
+    cosine = tip[3] * axis[0] + tip[4] * axis[1] + tip[5] * axis[2]
+    if cosine < places.least_cosine:
+        return -1, 0.0
+    polar = math.acos(min(cosine, 1.0))
+    ring = int(math.floor(polar / POLAR_RAD + 0.5))
+    along = x * axis[0] + y * axis[1] + z * axis[2]
+    off2 = max(x * x + y * y + z * z - along * along, 0.0)
+    cost = off2 + (0.3 * abs(polar - ring * POLAR_RAD) / POLAR_RAD) ** 2
+    side = 0
+    if off2 > OFF_AXIS_MM**2:
+        towards = x * tip[3] + y * tip[4] + z * tip[5] - along * cosine
+        side = 1 if towards >= 0.0 else 2
+    if ring == 0 and side == 0:
+        return places.slots[0, near], cost
+    spoke = 0
+    if ring > 0:
+        azimuth = math.atan2(
+            tip[3] * second[0] + tip[4] * second[1] + tip[5] * second[2],
+            tip[3] * first[0] + tip[4] * first[1] + tip[5] * first[2],
+        )
+        spoke = int(math.floor((azimuth / (2.0 * math.pi) + 0.5) * AZIMUTHS)) % AZIMUTHS
+    return places.slots[1, near] + (ring * AZIMUTHS + spoke) * SIDES + side, cost
+
+
+@inner_kernel
+def setting_beside(device, most_curvature, state, offset, own):
+    """Return curvature vector, twist, bend and by_straight of a section beside that of a state.
+
+    The bend is infinite if there is no such section; `own` takes the state's own twist and bend.
+    """
+    u = state[U] + offset[0]
+    v = state[V] + offset[1]
+    twist, bend, straight = state[TWIST], state[BEND], False
+    if not own:
+        twist, bend, straight = nearest_setting(
+            twist, bend, u, v, device.length, device.least_bend, device.most_bend
+        )
+    elif not device.least_bend <= bend <= device.most_bend:
+        bend = math.inf
+    if math.hypot(u, v) > most_curvature:
+        bend = math.inf
+    return u, v, twist, bend, straight
+
 
 @numba.njit(cache=True)
-def tips_beside(device, most_curvature, states, offsets, out):
-    """Fill tips `(N, C, 11)` of curvatures beside those of states: point, direction, vector, settings.
+def sort_tips(device, most_curvature, states, offsets, places, best, costs):
+    """Put the cheapest tips beside states into groups `best` (G, TRIES), by rising `costs` (G, TRIES).
 
-    `offsets` (C, 2) are added to the curvature vector.  The columns are point, forward, u, v, twist, bend and
-    whether the change goes by the straight section; the bend is infinite if there is no such tip.
+    A tip is the number n * C + c of state n and offset c; `offsets` (C, 2) are added to the curvature vector,
+    the first of them stands for the state's own section.  -1 is no tip; such costs are infinite.
     """
-    scratch = np.zeros(12)
+    scratch, tip = np.zeros(12), np.zeros(6)
+    most = best.shape[1]
     for n in range(states.shape[0]):
         for c in range(offsets.shape[0]):
-            u = states[n, U] + offsets[c, 0]
-            v = states[n, V] + offsets[c, 1]
-            row = out[n, c]
-            twist, bend, straight = nearest_setting(
-                states[n, TWIST], states[n, BEND], u, v, device.length, device.least_bend, device.most_bend
-            )
-            if c == 0:
-                twist, bend, straight = states[n, TWIST], states[n, BEND], False
-                if not device.least_bend <= bend <= device.most_bend:
-                    bend = math.inf
-            if math.hypot(u, v) > most_curvature:
-                bend = math.inf
+            u, v, _, bend, _ = setting_beside(device, most_curvature, states[n], offsets[c], c == 0)
+            if not math.isfinite(bend):
+                continue
             move_along(states[n], u, v, device.length, scratch)
+            near = nearest_place(places, scratch[9], scratch[10], scratch[11])
+            if near < 0 or not places.wanted[near]:
+                continue
             for k in range(3):
-                row[k] = scratch[9 + k]
-                row[3 + k] = scratch[6 + k]
-            row[6], row[7], row[8], row[9], row[10] = u, v, twist, bend, 1.0 if straight else 0.0
+                tip[k] = scratch[9 + k]
+                tip[3 + k] = scratch[6 + k]
+            group, cost = kind_of(places, near, tip)
+            if group < 0 or cost >= costs[group, most - 1]:
+                continue
+            at = most - 1
+            while at > 0 and cost < costs[group, at - 1]:
+                costs[group, at] = costs[group, at - 1]
+                best[group, at] = best[group, at - 1]
+                at -= 1
+            costs[group, at] = cost
+            best[group, at] = n * offsets.shape[0] + c
 
 
 @numba.njit(cache=True)
-def first_free(walls, device, states, tips, groups, tries, kept, rooms):
-    """Mark in `kept` (T,) the first tip of each group that is proved reachable in place, with its room.
+def first_free(walls, device, most_curvature, states, offsets, best, tips, near, places):
+    """Fill `tips` (G, TIP_COLUMNS) with the first proved tip of each group, and `near` with its tree point.
 
-    states : (T, COLUMNS) the state of each tip; groups : (T,) rising numbers; at most `tries` are tried.
+    The tree point is -1 where none of a group is proved.
     """
-    done = -1
-    last = -1
-    tried = 0
-    for t in range(tips.shape[0]):
-        if groups[t] != last:
-            last = groups[t]
-            tried = 0
-        if groups[t] == done or tried == tries:
-            continue
-        tried += 1
-        state = states[t]
-        room = turn_room(
-            walls, device.radius, device.length, state,
-            state[TWIST], state[BEND], tips[t, 8], tips[t, 9], tips[t, 10] > 0.0,
-        )  # fmt: skip
-        if room >= 0.0:
-            kept[t] = True
-            rooms[t] = min(room, state[ROOM])
-            done = groups[t]
-
-
-@numba.njit(cache=True)
-def tip_frames(length, states, tips):
-    """Return point, direction and +x `(T, 9)` of tips: the frame that twist and bend turn."""
-    out = np.zeros((tips.shape[0], 9))
     scratch = np.zeros(12)
-    for t in range(tips.shape[0]):
-        put_tip(states[t], tips[t, 8], tips[t, 9], length, out[t], scratch)
-    return out
+    for group in range(best.shape[0]):
+        near[group] = -1
+        for number in best[group]:
+            if number < 0:
+                break
+            n, c = number // offsets.shape[0], number % offsets.shape[0]
+            state, row = states[n], tips[group]
+            u, v, twist, bend, straight = setting_beside(device, most_curvature, state, offsets[c], c == 0)
+            room = turn_room(
+                walls, device.radius, device.length, state, state[TWIST], state[BEND], twist, bend, straight
+            )
+            if room < 0.0:
+                continue
+            move_along(state, u, v, device.length, scratch)
+            near[group] = nearest_place(places, scratch[9], scratch[10], scratch[11])
+            put_tip(state, twist, bend, device.length, row, scratch)
+            row[TWIST_TO], row[BEND_TO], row[BY_STRAIGHT] = twist, bend, 1.0 if straight else 0.0
+            row[TIP_ROOM] = min(room, state[ROOM])
+            row[TIP_CURVATURE] = max(state[CURVATURE], math.hypot(u, v))
+            row[SOURCE] = n
+            break

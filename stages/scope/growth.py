@@ -96,7 +96,7 @@ class Growth:
     def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, passable: Bool, device: Device) -> None:
         self._walls, self._tree, self._device = walls, tree, device
         self._tried, self._passable = tried, passable
-        self._offsets = rings(RINGS_PER_MM, SPOKES)
+        self._offsets = np.vstack([np.zeros((1, 2)), rings(RINGS_PER_MM, SPOKES)])
         self._rows: list[Float] = []
         self._parents: list[Int] = []
         self._straight: list[Bool] = []

@@ -22,10 +22,12 @@ MEMORY = 0.5
 """Share of the cost of the state before that is added: a good state does not make up for a bad way."""
 CHANGE_COST = 0.3
 """Cost of a change in place for each mm that the tip moves: as bad as half the room off the axis."""
-HOLD_COST = 0.05
-"""Cost of any change: small, so that twist and bend are held where that does."""
+HOLD_COST = 6.0
+"""Cost of any change: more than most places cost, so that hands turn and bend only where they must."""
 PROBES = 4
 """Before an arc is walked along it is looked at in so many places: most blocked ones are blocked there."""
+TWIST_COST = 2.0
+"""Cost of a twist by 1 rad: half a turn costs as much as a change of the handle alone."""
 WIDE_ANGLE = 0.06
 """1 - cos of 20 degrees: a tip that looks so far aside costs as much as one that is at the wall."""
 
@@ -150,8 +152,9 @@ def follow(walls, device, before, state, by_straight, step):
 def candidates(device, route, states, offsets, step, found, by_straight):
     """Fill the candidates `(N * C, COLUMNS)` that follow states `(N, COLUMNS)`.
 
-    Each advances by a step with the curvature it has, or one beside that which leads to the route ahead;
-    `offsets` (C, 2) are added to the latter, the first row is not used.
+    Each advances by a step with the curvature it has, with another bend at the twist it has, or with a
+    curvature beside that which leads to the route ahead; `offsets` (C, 2) are added to that, the first two
+    are zero.
     """
     count = offsets.shape[0]
     scratch = np.zeros(12)
@@ -166,7 +169,12 @@ def candidates(device, route, states, offsets, step, found, by_straight):
             u *= shrink
             v *= shrink
             twist, bend, straight = before[TWIST], before[BEND], False
-            if c > 0:
+            if c == 1:
+                # The handle alone: what of the way to the route lies in the plane in which the tip bends.
+                kappa = u * math.cos(twist) + v * math.sin(twist)
+                bend = min(max(kappa * device.length, device.least_bend), device.most_bend)
+                u, v = bend / device.length * math.cos(twist), bend / device.length * math.sin(twist)
+            elif c > 1:
                 twist, bend, straight = nearest_setting(
                     twist, bend, u, v, device.length, device.least_bend, device.most_bend
                 )
@@ -177,6 +185,7 @@ def candidates(device, route, states, offsets, step, found, by_straight):
             change = 0.5 * math.hypot(u - before[U], v - before[V]) * device.length**2
             state[COST] = settle(route, device.length, state, scratch)
             state[COST] += MEMORY * before[COST] + CHANGE_COST * change + (HOLD_COST if c > 0 else 0.0)
+            state[COST] += TWIST_COST * abs(twist - before[TWIST])
             if not math.isfinite(bend):
                 state[COST] = math.inf
             by_straight[n * count + c] = straight

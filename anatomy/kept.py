@@ -6,12 +6,13 @@ version, and goes when the lung goes.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from anatomy.errors import FileError
-from anatomy.io.files import atomic_write
+from anatomy.io.files import write_text
 
 if TYPE_CHECKING:
     from anatomy.organ import Organ
@@ -39,9 +40,7 @@ def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
     except (OSError, ValueError, KeyError, TypeError):
         pass
     values = make()
-    try:
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps({"version": version, "values": values}), encoding="ascii")
-    except FileError:
-        pass  # A cache that cannot be written, or a lung that another process has just removed.
+    # A cache may be read-only, and another process may just have removed the lung.
+    with contextlib.suppress(FileError):
+        write_text(path, json.dumps({"version": version, "values": values}))
     return values

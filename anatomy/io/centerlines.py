@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import FileError, FrameError
 from anatomy.grid import transform_points
-from anatomy.io.files import atomic_write, require_suffix
+from anatomy.io.files import require_suffix, write_text
 from anatomy.io.frames import LPS_FROM, Frame
 from anatomy.io.vtk_xml import VtkFile, VtkPiece, read_vtk_xml
 from anatomy.tree import tree_from_graph
@@ -171,8 +171,7 @@ def write_centerlines(path: str | Path, tree: AirwayTree) -> None:
             "",
         )
     )
-    with atomic_write(path) as temporary:
-        temporary.write_text(content, encoding="ascii")
+    write_text(path, content)
 
 
 def _data_array(kind: str, name: str, values: Iterable[float], components: int = 1) -> str:

@@ -6,11 +6,13 @@ import hashlib
 import json
 import os
 import secrets
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from anatomy.errors import FileError
+from anatomy.errors import FileError, SettingsError
 
 
 def sha256(path: str | Path) -> str:
@@ -45,6 +47,30 @@ def read_text(path: str | Path) -> str:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
+
+
+def read_toml(
+    path: str | Path, *, remedy: str, expected: str = "UTF-8 text in TOML syntax"
+) -> dict[str, Any]:
+    """Read a TOML file; `expected` and `remedy` are for the message.
+
+    Raises
+    ------
+    SettingsError
+        If it is not TOML.
+    FileError
+        If it cannot be read.
+    """
+    path = require_file(path)
+    try:
+        with path.open("rb") as stream:
+            return tomllib.load(stream)
+    except OSError as error:
+        raise unreadable(path, error) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(
+            f"{path} is not valid TOML ({error})", expected=expected, remedy=remedy
+        ) from error
 
 
 def unreadable(path: str | Path, error: Exception) -> FileError:
@@ -121,6 +147,18 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True) if path.parent.is_dir() else None
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write UTF-8 text, all of it or nothing.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
 def write_json(path: str | Path, value: object) -> None:
     """Write plain values as indented JSON, all of it or nothing.
 
@@ -129,8 +167,7 @@ def write_json(path: str | Path, value: object) -> None:
     FileError
         If the file cannot be written.
     """
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(value, indent=2) + "\n")
 
 
 def _unwritable(path: Path, error: OSError) -> FileError:

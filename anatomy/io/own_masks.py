@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from pydantic import Field
 
 from anatomy.errors import AnatomyError, FileError, SettingsError
 from anatomy.io.assembly import assemble, require_cost
-from anatomy.io.files import read_text, sha256
+from anatomy.io.files import read_toml, sha256
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume
 from anatomy.io.label_names import stored_names
@@ -126,14 +125,11 @@ def _thick_slices(distance_mm: float) -> tuple[str, ...]:
 
 
 def _read_description(path: Path) -> PatientFile:
-    try:
-        content = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(
-            f"{path} is not TOML: {error}",
-            expected='lines such as lumen = "airway.nii.gz"',
-            remedy="`lungaccess template patient` prints a complete file to start from",
-        ) from error
+    content = read_toml(
+        path,
+        expected='lines such as lumen = "airway.nii.gz"',
+        remedy="`lungaccess template patient` prints a complete file to start from",
+    )
     try:
         return parse(PatientFile, content, path.name)
     except SettingsError as error:

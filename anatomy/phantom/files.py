@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from anatomy.grid import Volume
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.files import require_writable_folder, write_text
 from anatomy.io.images import write_volume
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.phantom.branching import Centerlines
@@ -49,14 +49,9 @@ def write_phantom(phantom: Phantom, folder: str | Path) -> Path:
     for name, volume in volumes.items():
         if volume is not None:
             write_volume(folder / f"{name}.nii.gz", volume)
-    _write_text(folder / "truth.json", json.dumps(_truth(phantom)))
-    _write_text(folder / DESCRIPTION, _description(phantom))
+    write_text(folder / "truth.json", json.dumps(_truth(phantom)))
+    write_text(folder / DESCRIPTION, _description(phantom))
     return folder
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _description(phantom: Phantom) -> str:

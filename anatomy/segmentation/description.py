@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 
-from anatomy.io.files import atomic_write, sha256
+from anatomy.io.files import sha256, write_text
 from anatomy.segmentation.folder import SegmentationFolder
 from anatomy.typed import Float
 
@@ -36,8 +36,7 @@ class Description:
             return True
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
         self._folder.save(description=[*written[-1:], digest])
-        with atomic_write(self._path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(self._path, text)
         self._aside.unlink(missing_ok=True)
         return False
 

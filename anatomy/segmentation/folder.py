@@ -13,7 +13,7 @@ import numpy as np
 
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Grid, Volume
-from anatomy.io.files import atomic_write, read_text, require_writable_folder, sha256
+from anatomy.io.files import atomic_write, read_text, require_writable_folder, sha256, write_text
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
 from anatomy.typed import Array
 
@@ -123,8 +123,7 @@ class SegmentationFolder:
     def save(self, **others: Any) -> None:
         """Write the record, with further entries if given."""
         self._record.update(others)
-        with atomic_write(self.path / STATE) as temporary:
-            temporary.write_text(json.dumps(self._record, indent=1) + "\n", encoding="utf-8")
+        write_text(self.path / STATE, json.dumps(self._record, indent=1) + "\n")
 
     def recorded(self, entry: str) -> Any:
         """Return an entry of the record, or None."""

@@ -59,8 +59,6 @@ def segment_vessels(
     lungs: Mask,
     airways: Airways,
     *,
-    threshold: float = VESSEL_THRESHOLD,
-    large_radius_mm: float = LARGE_RADIUS_MM,
     threads: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Vessels:
@@ -74,10 +72,6 @@ def segment_vessels(
         Both lungs, filled.
     airways : Airways
         Its lumen and wall never become vessel.
-    threshold : float
-        Vesselness from which a voxel counts as vessel.
-    large_radius_mm : float
-        Radius from which a vessel is large.
     threads : int
         0 for all processors; the result does not depend on it.
     progress : callable or None
@@ -101,7 +95,7 @@ def segment_vessels(
     lung_hu = space.hu[space.n_scales > 0]
     solid = space.hu >= towards_blood(lung_hu, SOLID_SHARE)
     best, response, at_scale = _responses(space, solid & ~airway, progress)
-    large = _large(space, solid, airway, response, at_scale, large_radius_mm)
+    large = _large(space, solid, airway, response, at_scale)
     best[airway] = 0.0
     edges = (space.hu >= towards_blood(lung_hu, EDGE_SHARE)) & ~airway & (space.n_scales > 0)
     for _ in range(EDGE_VOXELS):
@@ -110,9 +104,11 @@ def segment_vessels(
     found = space.whole(best, shape)
     everywhere = np.zeros(shape, dtype=np.bool_, order="F")
     everywhere[space.box] = large.T
-    mask = found >= np.float32(threshold)
+    mask = found >= np.float32(VESSEL_THRESHOLD)
     warnings = () if large.any() else ("No large vessel was found: is the CT one of the chest?",)
-    return Vessels(vesselness=found, large=everywhere, mask=mask, threshold=threshold, warnings=warnings)
+    return Vessels(
+        vesselness=found, large=everywhere, mask=mask, threshold=VESSEL_THRESHOLD, warnings=warnings
+    )
 
 
 def towards_blood(lung_hu: Int16 | Float32, share: float) -> float:
@@ -158,24 +154,22 @@ def _add_large(
     space.share(lambda first, last: add_large_response(image, space.hu, first, last, *given))
 
 
-def _large(
-    space: ScaleSpace, solid: Mask, airway: Mask, response: Float32, at_scale: UInt8, radius_mm: float
-) -> Mask:
-    """Return the large vessels in the box: the solid voxels within `radius_mm` of what tells their inside.
+def _large(space: ScaleSpace, solid: Mask, airway: Mask, response: Float32, at_scale: UInt8) -> Mask:
+    """Return the large vessels in the box: solid voxels within `LARGE_RADIUS_MM` of what tells their inside.
 
-    That is a great R_L at a large scale, or the centre of a solid ball of `radius_mm`: where vessels are
+    That is a great R_L at a large scale, or the centre of a solid ball of that radius: where vessels are
     wider than the greatest scale R_L has faded, and at their edges smaller scales respond most.  The ball
     must have its centre in the lung and in no airway, but may reach beyond: at the hilum the lung's mask cuts
     through vessels, and masks of walls reach into the vessels beside them.
     """
     tissue = (space.n_scales > 0) & ~airway
-    first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= radius_mm - SIGMA_TOLERANCE_MM)
+    first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= LARGE_RADIUS_MM - SIGMA_TOLERANCE_MM)
     sides, h = space.spacing_mm[::-1], float(space.spacing_mm.mean())
     inside = (response >= LARGE_RESPONSE) & (at_scale >= first)
-    inside |= tissue & (_distance_mm(solid, sides, space.threads) >= radius_mm + 0.5 * h)
+    inside |= tissue & (_distance_mm(solid, sides, space.threads) >= LARGE_RADIUS_MM + 0.5 * h)
     if not inside.any():
         return inside
-    found = solid & tissue & (_distance_mm(~inside, sides, space.threads) <= radius_mm)
+    found = solid & tissue & (_distance_mm(~inside, sides, space.threads) <= LARGE_RADIUS_MM)
     return _without_small(found, LEAST_LARGE_MM3 / float(np.prod(sides)))
 
 

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from anatomy.io.files import write_text
 from anatomy.records import frozen_value
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -177,7 +178,7 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
             target_lps=target.lps_mm,
         )
     record = plan_tables.plan_record(found, lung, appraisal, request.out, request.files)
-    write_summary(record, request.out / SUMMARY_FILE)
+    write_text(request.out / SUMMARY_FILE, terminal.json_text(record))
     if not request.output.json:
         show_plan(found, lung, appraisal)
     write_history(found, history, lung, appraisal, request)
@@ -200,14 +201,6 @@ def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal) -> None:
         terminal.say(" ".join(plan.system_choice))
     terminal.show(plan_tables.plan_tables(plan, lung))
     terminal.show_warnings(lung.warnings)
-
-
-def write_summary(record: dict[str, Any], path: Path) -> None:
-    """Write what `--json` prints to a file, all or nothing."""
-    from anatomy.io.files import atomic_write
-
-    with atomic_write(path) as temporary:
-        temporary.write_text(terminal.json_text(record), encoding="utf-8", newline="\n")
 
 
 def write_history(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,6 +91,16 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
         ),
         ("needle", plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"),
     ]
+
+
+def arcs_table(arcs: Iterable[Sequence[float]]) -> Table:
+    """Return the arcs of a needle, each with its length in mm, roll in rad and curvature in 1/mm."""
+    rows = [
+        (f"{n}", f"{math.degrees(roll):.1f}", f"{length:.2f}", f"{1.0 / bend:.1f}" if bend else "straight")
+        for n, (length, roll, bend) in enumerate(arcs, start=1)
+    ]
+    headings = ("", "roll first, deg", "insert, mm", "radius, mm")
+    return terminal.table("arcs of the needle", headings, rows)
 
 
 def show_appraisal(appraisal: Appraisal) -> None:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numba
-import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc
-from anatomy.kernels.compiling import inner_kernel
-from anatomy.kernels.field import distance_bound, exact_distance
-from anatomy.kernels.labels import LUMEN
-from stages.needle.kernels import single_arc_exceeds
+from anatomy.kernels.field import distance_bound
+from stages.needle.kernels import exact_gap, single_arc_exceeds
 
 # Columns of `found`.
 SHORTFALL = 0
@@ -28,25 +25,6 @@ FIRST_LABEL, WORST_LABEL = 0, 1
 
 STEP_MM = 0.5
 """Less than a voxel, so that no structure is passed over."""
-
-_NOBODY = np.int64(-1)
-_LUMEN = np.int64(LUMEN)
-
-
-@inner_kernel
-def _clearance(obstacles, required, radius, in_exit, branch, x, y, z):
-    """Return the clearance in excess of what is required at a point, at most 0, and the label too near."""
-    clearance, labels, geometry, bits = obstacles
-    if distance_bound(clearance, geometry, x, y, z) >= required:
-        return 0.0, 0
-    spared = branch if in_exit else _NOBODY
-    distance, label = exact_distance(labels, geometry, x, y, z, bits, spared, required)
-    gap = distance - required
-    if in_exit:
-        lumen, lumen_label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, required)
-        if lumen - radius < gap:
-            gap, label = lumen - radius, lumen_label
-    return min(gap, 0.0), label
 
 
 @numba.njit(cache=True, nogil=True)
@@ -77,10 +55,9 @@ def look_along_arcs(obstacles, limits, positions, tangents, branches, target, fo
         for m in range(count + 1):
             s = length * m / count
             x, y, z = point_on_arc(pose, bend, s)
-            in_exit = branches[n] >= 0 and s < limits.exempt_mm
-            gap, label = _clearance(
-                obstacles, limits.required_mm, limits.radius_mm, in_exit, branches[n], x, y, z
-            )
+            if distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) >= limits.required_mm:
+                continue
+            gap, label, _distance, _needed = exact_gap(obstacles, limits, s, x, y, z, branches[n])
             if gap >= 0.0:
                 continue
             if labels[n, FIRST_LABEL] == 0:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import atomic_write
+from anatomy.io.files import write_text
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Float
@@ -125,5 +125,4 @@ def save_advice(advice: ScopeAdvice, folder: Path) -> None:
     """
     contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: camera_flight(advice.path).markups()}
     for name, content in contents.items():
-        with atomic_write(folder / name) as temporary:
-            temporary.write_text(json.dumps(content, indent=1))
+        write_text(folder / name, json.dumps(content, indent=1))

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import tomllib
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
 from anatomy.errors import SettingsError
-from anatomy.io.files import read_text
+from anatomy.io.files import read_toml
 from anatomy.records import frozen_value
 from anatomy.settings import impossible, parse, settings, text, to_mapping
 from lungaccess.problem.system import System, load_system
@@ -121,10 +119,7 @@ def load_tubes(name_or_path: str | os.PathLike[str]) -> System | BareTubes:
     """
     given = os.fspath(name_or_path)
     if given.endswith(".toml"):
-        try:
-            mapping = tomllib.loads(read_text(Path(given)))
-        except tomllib.TOMLDecodeError:
-            mapping = {}  # load_system says what is wrong with the file
+        mapping = read_toml(given, remedy=_REMEDY)
         if isinstance(mapping.get("tubes"), list):
             return parse(BareTubes, mapping, given, remedy=_REMEDY)
     return load_system(given)

@@ -95,11 +95,9 @@ def plain(part: Record) -> Any:
 
 def save(plan: Record, path: str | os.PathLike[str]) -> None:
     """Write `plan` beside `path` under a temporary name, then put it in place."""
-    from anatomy.io.files import atomic_write
+    from anatomy.io.files import write_text
 
-    text = to_json(plan)
-    with atomic_write(os.fspath(path)) as temporary:
-        temporary.write_text(text, encoding="ascii", newline="\n")
+    write_text(os.fspath(path), to_json(plan))
 
 
 def load(cls: type[P], path: str | os.PathLike[str]) -> P:

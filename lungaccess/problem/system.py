@@ -13,7 +13,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.errors import SettingsError
+from anatomy.io.files import read_toml
 from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, settings, switch, text, to_mapping
 from anatomy.suggestion import did_you_mean
@@ -227,12 +228,12 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     """
     given = os.fspath(name_or_path)
     if given in shipped_names():
-        content = preset_text(given).encode("utf-8")
+        mapping = tomllib.loads(preset_text(given))
     elif isinstance(name_or_path, str) and not given.endswith(".toml"):
         raise _unknown(given)
     else:
-        content = _read(Path(name_or_path))
-    loaded = _parse_toml(content, given)
+        mapping = read_toml(Path(name_or_path), remedy=_REMEDY)
+    loaded = parse(System, mapping, given, remedy=_REMEDY)
     if fissures_allowed is None or fissures_allowed == loaded.fissures_allowed:
         return loaded
     rule = "fissures may be crossed" if fissures_allowed else "fissures are obstacles"
@@ -245,24 +246,3 @@ def system_fingerprint(system: System) -> str:
         to_mapping(system), sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False
     )
     return hashlib.sha256(canonical.encode("ascii")).hexdigest()
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise FileError(
-            f"The device file {path} cannot be read ({error.strerror})",
-            expected="a readable .toml file",
-            remedy="Check the path",
-        ) from error
-
-
-def _parse_toml(content: bytes, where: str) -> System:
-    try:
-        mapping = tomllib.loads(content.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(
-            f"{where} is not valid TOML ({error})", expected="UTF-8 text in TOML syntax", remedy=_REMEDY
-        ) from error
-    return parse(System, mapping, where, remedy=_REMEDY)

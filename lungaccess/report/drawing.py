@@ -16,6 +16,8 @@ from lungaccess.report.views import View
 
 BAR_LENGTHS_MM = (1, 2, 5, 10, 20, 50, 100)
 """Round lengths of a scale bar; the longest that fits is taken."""
+BORDER_MM = 4.0
+"""Room for the letters at the edges of an anatomical picture."""
 ROUNDING_PIXELS = 0.8
 """Silhouettes lose the steps of their pixels, and nothing that is larger."""
 
@@ -23,6 +25,16 @@ ROUNDING_PIXELS = 0.8
 def title(axes: Axes, text: str) -> None:
     """Put a heading above a panel."""
     axes.set_title(text, fontsize=10.5, fontweight="bold", color=style.INK, loc="left", pad=5)
+
+
+def graph(axes: Axes, horizontal: str, vertical: str) -> None:
+    """Label the axes of a graph, which has a grid and no frame."""
+    axes.set_xlabel(horizontal, fontsize=8.5)
+    axes.set_ylabel(vertical, fontsize=8.5)
+    axes.tick_params(labelsize=8)
+    axes.grid(color="#E6E6E6", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def dress(axes: Axes, view: View, *, ticks: bool) -> None:
@@ -99,6 +111,15 @@ def fit(axes: Axes, low: Float, high: Float) -> None:
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
     axes.set_aspect("equal", adjustable="box")
+
+
+def fit_around(axes: Axes, footprint: Footprint | None, uv: Float) -> None:
+    """Show a footprint and points `(N, 2)` whole, with a border."""
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    if footprint is not None:
+        left, right, bottom, top = footprint.extent_mm
+        low, high = np.minimum(low, [left, bottom]), np.maximum(high, [right, top])
+    fit(axes, low - BORDER_MM, high + BORDER_MM)
 
 
 def see_through(

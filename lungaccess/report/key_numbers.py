@@ -85,7 +85,7 @@ def _limit_rows(appraisal: Appraisal) -> tuple[str, list[Row]]:
 
 
 def _clearance_rows(plan: Plan) -> tuple[str, list[Row]]:
-    return "Least distance stated by the plan / required", [
+    return "Least distance stated / required", [
         (f"{device} to {STRUCTURES.get(name, name)}", f"{value:.2f} / {_least(plan, device, name)}")
         for device, distances in plan.clearance_mm.items()
         for name, value in distances.items()

@@ -64,11 +64,7 @@ def _starts_panel(axes: Axes, explanation: Explanation, layers: Layers, view: Vi
             colour = START_COLOURS[tuple(FAILS)[code]]
             axes.scatter(dots[:, 0], dots[:, 1], s=7, c=colour, lw=0, zorder=5 + len(FAILS) - code)
     _paths(axes, explanation, view)
-    low = high = view.project(explanation.target.lps_mm)
-    if lung is not None:
-        left, right, bottom, top = lung.extent_mm
-        low, high = np.minimum(low, [left, bottom]), np.maximum(high, [right, top])
-    drawing.fit(axes, low - 4.0, high + 4.0)
+    drawing.fit_around(axes, lung, view.project(explanation.target.lps_mm)[None])
     drawing.dress(axes, view, ticks=True)
     drawing.title(axes, f"Starts of the needle: {view.name}")
 

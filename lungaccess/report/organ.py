@@ -55,6 +55,6 @@ def _panel(axes: Axes, organ: Organ, layers: Layers, view: View) -> None:
         shown += [tail, tip]
     for point in organ.targets_lps:
         drawing.target_mark(axes, view.project(point))
-    drawing.fit(axes, np.min(shown, axis=0) - 4.0, np.max(shown, axis=0) + 4.0)
+    drawing.fit_around(axes, None, np.array(shown))
     drawing.dress(axes, view, ticks=True)
     drawing.title(axes, view.name)

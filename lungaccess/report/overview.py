@@ -67,14 +67,8 @@ def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
     """Draw anatomy and all three stages as seen along a view."""
     frame = layers.footprint("lung", view) or layers.footprint("airway", view)
     scope = view.project(plan.curves().scope.points_lps)
-    if frame is None:
-        low, high = scope.min(axis=0), scope.max(axis=0)
-    else:
-        left, right, bottom, top = frame.extent_mm
-        low = np.minimum([left, bottom], scope.min(axis=0))
-        high = np.maximum([right, top], scope.max(axis=0))
     drawing.anatomy_seen_through(axes, layers, view)
-    drawing.fit(axes, low - 4.0, high + 4.0)
+    drawing.fit_around(axes, frame, scope)
     _nodule(axes, layers, view)
     _stages(axes, plan, view, scope)
     drawing.target_mark(axes, view.project(np.asarray(plan.target_lps)))

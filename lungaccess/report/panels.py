@@ -72,12 +72,7 @@ def _exempt_span(axes: Axes, plan: Plan, tube_arc: Float) -> None:
 def _label_clearance(axes: Axes) -> None:
     drawing.title(axes, "Distance of the device's axis to each structure")
     note = "mm beyond the tube tip (negative: along the tube)\nblue: pierced wall is exempt; dotted: exit"
-    axes.set_xlabel(note, fontsize=8)
-    axes.set_ylabel("mm", fontsize=8.5)
-    axes.tick_params(labelsize=8)
-    axes.grid(color="#E6E6E6", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    drawing.graph(axes, note, "mm")
     axes.legend(fontsize=8, loc="upper right", framealpha=0.92, ncols=2, borderpad=0.5, handlelength=2.4)
 
 

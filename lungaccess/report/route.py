@@ -26,6 +26,7 @@ GRAPHS_IN = ((0.9, 0.95, 6.2, 2.1), (8.3, 0.95, 6.2, 2.1))
 FLAT = View(name="The drawing", right=np.array([1.0, 0, 0]), up=np.array([0, -1.0, 0]))
 PER_SPAN = 16
 """Points drawn for each span of the spline."""
+ALONG = "length along the curve, mm"
 AROUND_MM = 6.0
 """Border around the route in a picture."""
 
@@ -111,7 +112,8 @@ def _curvature_graph(axes: Axes, route: Route) -> None:
         axes.plot(along, curve.curvature_per_mm(parameters), color=colour, lw=1.4)
     axes.axhline(limit, color=style.INK, lw=1.0, ls=(0, (4, 3)))
     axes.set_ylim(0.0, 3.0 * limit)
-    _label(axes, "curvature, 1/mm")
+    drawing.graph(axes, ALONG, "curvature, 1/mm")
+    axes.margins(x=0.0)
 
 
 def _wall_graph(axes: Axes, centreline: Centreline, route: Route) -> None:
@@ -121,16 +123,8 @@ def _wall_graph(axes: Axes, centreline: Centreline, route: Route) -> None:
         axes.plot(along, np.maximum(depth, -1.0), color=colour, lw=1.4)
     axes.axhline(route.limits.needed_mm, color=style.INK, lw=1.0, ls=(0, (4, 3)))
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    _label(axes, "distance to the wall, mm")
-
-
-def _label(axes: Axes, quantity: str) -> None:
-    axes.set_xlabel("length along the curve, mm", fontsize=9)
-    axes.set_ylabel(quantity, fontsize=9)
-    axes.tick_params(labelsize=8)
+    drawing.graph(axes, ALONG, "distance to the wall, mm")
     axes.margins(x=0.0)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
 
 
 def _legend() -> list[Line2D | Patch]:

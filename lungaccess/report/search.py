@@ -29,11 +29,7 @@ def cost_over_time_png(
         _steps(axes, found, history[-1].elapsed_s, objective)
     else:
         axes.text(0.5, 0.5, "no plan was found", ha="center", va="center", transform=axes.transAxes)
-    axes.set_xlabel("planning time (s)")
-    axes.set_ylabel(objective)
-    axes.grid(color="#E6E6E6", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    drawing.graph(axes, "planning time (s)", objective)
     drawing.title(axes, "Best cost over planning time")
     return style.save_png(figure, path)
 

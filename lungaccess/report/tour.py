@@ -64,12 +64,7 @@ def _panel(axes: Axes, answer: TourAnswer, tree: AirwayTree, layers: Layers, vie
             ends[1, 0], ends[1, 1], str(number), ha="center", va="center", color="white", fontsize=10,
             fontweight="bold", zorder=11,
         )  # fmt: skip
-    drawn = view.project(np.vstack((answer.lesions_lps, tree.points_lps)))
-    low, high = drawn.min(axis=0), drawn.max(axis=0)
-    if lung is not None:
-        left, right, bottom, top = lung.extent_mm
-        low, high = np.minimum(low, (left, bottom)), np.maximum(high, (right, top))
-    drawing.fit(axes, low - 4.0, high + 4.0)
+    drawing.fit_around(axes, lung, view.project(np.vstack((answer.lesions_lps, tree.points_lps))))
     drawing.dress(axes, view, ticks=False)
     drawing.title(axes, view.name)
     drawing.scale_bar(axes)

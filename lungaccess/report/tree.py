@@ -74,11 +74,7 @@ def _tree_panel(
     for gap in tree.report.gaps_bridged:
         u, v = view.project(np.asarray(gap.position_lps))
         axes.plot(u, v, marker="x", ms=7, color="#00A0A0", mew=1.8, ls="none", zorder=9)
-    low, high = points.min(axis=0), points.max(axis=0)
-    if lung is not None:
-        left, right, bottom, top = lung.extent_mm
-        low, high = np.minimum(low, [left, bottom]), np.maximum(high, [right, top])
-    drawing.fit(axes, low - 4.0, high + 4.0)
+    drawing.fit_around(axes, lung, points)
     drawing.dress(axes, view, ticks=True)
     drawing.title(axes, view.name)
 

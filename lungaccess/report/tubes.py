@@ -175,12 +175,7 @@ def _outermost_first(equilibrium: Equilibrium) -> list[tuple[int, Tube, Float]]:
 
 def _dress(axes: Axes, title: str, horizontal: str, vertical: str) -> None:
     drawing.title(axes, title)
-    axes.set_xlabel(horizontal, fontsize=8.5)
-    axes.set_ylabel(vertical, fontsize=8.5)
-    axes.tick_params(labelsize=8)
-    axes.grid(color="#E6E6E6", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    drawing.graph(axes, horizontal, vertical)
 
 
 def _key(axes: Axes, equilibrium: Equilibrium, notes: Sequence[str], *, with_ghosts: bool) -> None:

@@ -7,7 +7,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
@@ -105,12 +104,6 @@ def assess(
     """
     stated = model or ErrorModel()
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
-    if samples < 1:
-        raise SettingsError(
-            f"The number of samples is {samples}",
-            expected="at least 1",
-            remedy="Choose a count such as 10000",
-        )
     draws = Draws(samples, assessor.n_arcs, seed)
     outcomes = assessor.outcomes(draws.scaled(stated.sizes, stated.curvature_factors))
     touched = {name: share_of((outcomes.touched & flag) != 0) for name, flag in assessor.structures.items()}

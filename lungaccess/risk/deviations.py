@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from anatomy.errors import SettingsError
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
@@ -89,9 +90,20 @@ class Draws:
         N and A of `Deviations`.
     seed : int
         The same seed gives the same numbers.
+
+    Raises
+    ------
+    SettingsError
+        If there are to be none.
     """
 
     def __init__(self, count: int, n_arcs: int, seed: int) -> None:
+        if count < 1:
+            raise SettingsError(
+                f"The number of samples is {count}",
+                expected="at least 1",
+                remedy="Choose a count such as 10000",
+            )
         rng = np.random.Generator(np.random.PCG64(seed))
         shapes = no_deviations(count, n_arcs)
         self._uniform = rng.uniform(size=count)

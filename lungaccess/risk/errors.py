@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import replace
 from typing import Annotated
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import read_text
+from anatomy.io.files import read_toml
 from anatomy.settings import impossible, parse, quantity, settings, text
 
 _REMEDY = "`lungaccess template errors` prints a complete file to start from"
@@ -147,14 +145,8 @@ def load_errors(path: str | os.PathLike[str]) -> ErrorModel:
     FileError
         If the file cannot be read.
     """
-    content = read_text(os.fspath(path))
-    try:
-        mapping = tomllib.loads(content)
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(
-            f"{os.fspath(path)} is not valid TOML ({error})",
-            expected="one line a key, such as scope_position_mm = 1.0",
-            remedy=_REMEDY,
-        ) from error
+    mapping = read_toml(
+        os.fspath(path), expected="one line a key, such as scope_position_mm = 1.0", remedy=_REMEDY
+    )
     named = {"name": os.path.basename(path), **mapping}
     return parse(ErrorModel, named, os.fspath(path), remedy=_REMEDY)

@@ -98,8 +98,6 @@ def find_tolerances(
             expected="above 0 and below 1",
             remedy="Choose a share such as 0.95",
         )
-    if samples < 1:
-        raise SettingsError(f"The number of samples is {samples}", expected="at least 1")
     stated = model or ErrorModel()
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
     draws = Draws(samples, assessor.n_arcs, seed)

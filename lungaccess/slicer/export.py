@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from anatomy.io.centerlines import write_centerlines
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.files import require_writable_folder, write_text
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.checking import CheckReport, check
@@ -91,11 +91,11 @@ def export_slicer(
     devices = plan.curves(STEP_MM)
     items = _write_devices(plan, devices, target, refused=not report.accepted)
     items += _write_anatomy(lung, target, tell)
-    _write_text(target / SCENE_FILE, scene(items))
-    _write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
+    write_text(target / SCENE_FILE, scene(items))
+    write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
     plan.save(target / PLAN_FILE)
     files = (SCENE_FILE, *(item.file for item in items), ROUTE_FILE, PLAN_FILE, README_FILE)
-    _write_text(target / README_FILE, readme(plan, report, files))
+    write_text(target / README_FILE, readme(plan, report, files))
     tell("done", 1.0)
     return Exported(files=files, report=report)
 
@@ -137,9 +137,4 @@ def _write_anatomy(lung: Lung, folder: Path, tell: Progress) -> list[Item]:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    _write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")

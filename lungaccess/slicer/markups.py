@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from anatomy.typed import Float
 from lungaccess.plans.curves import DeviceCurve
 from lungaccess.plans.plan import Plan
 from stages.scope.advisor import MARKUPS_SCHEMA
@@ -18,7 +19,8 @@ def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
     axes of the device.  `Radius` is the radius of the device at each point.
     """
     points = [
-        _point(number, f"{curve.name} {along:.1f} mm", frame)
+        _point(number, f"{curve.name} {along:.1f} mm", frame[:3, 3])
+        | {"orientation": frame[:3, :3].ravel().tolist()}
         for number, (frame, along) in enumerate(
             zip(curve.lps_from_device, curve.arc_length_mm.tolist(), strict=True), start=1
         )
@@ -40,26 +42,15 @@ def points_of_interest(plan: Plan) -> dict[str, Any]:
         ("exit through the wall", plan.tube.exit.point_lps),
         ("target", plan.target_lps),
     )
-    points = [
-        {
-            "id": f"{number}",
-            "label": name,
-            "position": place.tolist(),
-            "locked": True,
-            "visibility": True,
-            "positionStatus": "defined",
-        }
-        for number, (name, place) in enumerate(places, start=1)
-    ]
+    points = [_point(number, name, place) for number, (name, place) in enumerate(places, start=1)]
     return _file("Fiducial", "points", points, TARGET_COLOUR, labels=True, measurements=[])
 
 
-def _point(number: int, label: str, frame: Any) -> dict[str, Any]:
+def _point(number: int, label: str, place: Float) -> dict[str, Any]:
     return {
         "id": f"{number}",
         "label": label,
-        "position": frame[:3, 3].tolist(),
-        "orientation": frame[:3, :3].ravel().tolist(),
+        "position": place.tolist(),
         "locked": True,
         "visibility": True,
         "positionStatus": "defined",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field
 
 from anatomy.errors import LungaccessError, SettingsError
-from anatomy.io.files import read_text
+from anatomy.io.files import read_toml
 from anatomy.settings import impossible, parse, quantity, settings, switch, text
 from stages.needle import NEEDLE_PLANNERS, OMPL_PLANNERS, Objective
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
@@ -206,12 +205,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         If the file cannot be read.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(
-            f"{path} is not valid TOML ({error})", remedy=_REMEDY, expected="UTF-8 text in TOML syntax"
-        ) from error
+    content = read_toml(path, remedy=_REMEDY)
     if "folder" in content:
         raise SettingsError(
             f"{path}: folder is not a setting", remedy=_REMEDY, expected="the keys of a study"

@@ -63,11 +63,6 @@ class Equilibrium:
         tip[:3, :2] = tip[:3, :2] @ np.array([[cosine, -sine], [sine, cosine]])
         return read_only(tip)
 
-    @property
-    def tube_tips_mm(self) -> Float:
-        """Where each tube ends, `(n, 3)` mm."""
-        return self.backbone(self.beta_mm + self.mechanics.lengths_mm)
-
     @cached_property
     def least_determinant(self) -> float:
         """Least of the determinants along the tubes; -inf where two directions lose stability at once."""

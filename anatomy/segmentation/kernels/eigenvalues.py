@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from anatomy.kernels.compiling import inner_kernel
 
@@ -42,12 +41,3 @@ def eigenvalues(xx, yy, zz, xy, xz, yz):
     elif abs(middle) > abs(last):
         middle, last = last, middle
     return scale * first, scale * middle, scale * last
-
-
-@njit(cache=True, nogil=True)
-def eigenvalues_of(matrices, values):
-    """Fill `values` `(N, 3)` float64, by magnitude, from the symmetric `matrices` `(N, 3, 3)` float64."""
-    for n in range(matrices.shape[0]):
-        m = matrices[n]
-        first, middle, last = eigenvalues(m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2])
-        values[n, 0], values[n, 1], values[n, 2] = first, middle, last

@@ -117,6 +117,7 @@ def needle(
 
 def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
     """Return what a needle planner found: the outcome, and the path arc by arc."""
+    from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.one_stage import obstruction_rows
     from lungaccess.plans.costs import costs_in_words
 
@@ -143,19 +144,7 @@ def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
         ("turning in all", f"{np.degrees(path.accumulated_turn_rad):.1f} deg"),
     ]
     rows += costs_in_words(answer.known_costs)
-    arcs = [
-        (
-            f"{n}",
-            f"{np.degrees(roll):.1f}",
-            f"{length:.2f}",
-            f"{1.0 / curvature:.1f}" if curvature else "straight",
-        )
-        for n, (length, roll, curvature) in enumerate(path.arcs, start=1)
-    ]
-    return [
-        terminal.table("needle", ("", ""), rows),
-        terminal.table("arcs", ("", "roll first, deg", "insert, mm", "radius, mm"), arcs),
-    ]
+    return [terminal.table("needle", ("", ""), rows), arcs_table(path.arcs)]
 
 
 def _start_pose(lung: Organ, start: str, frame: Frame) -> Float:

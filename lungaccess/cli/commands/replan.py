@@ -98,6 +98,7 @@ def _measured(scope: str | None, tube: str | None, frame: Frame) -> Float:
 
 
 def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
+    from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.plans.costs import costs_in_words, known_costs
 
     rows, tube, needle = [], found.tube, found.needle
@@ -119,17 +120,8 @@ def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
         for name, each in found.clearance_mm.items()
     ]
     rows += costs_in_words(known_costs(found.costs, has_map=has_map))
-    arcs = [
-        (
-            f"{n}",
-            f"{np.degrees(arc.roll_rad):.1f}",
-            f"{arc.length_mm:.2f}",
-            f"{1.0 / arc.curvature_per_mm:.1f}" if arc.curvature_per_mm else "straight",
-        )
-        for n, arc in enumerate(() if needle is None else needle.arcs, start=1)
-    ]
     tables = [terminal.table("the rest, proved", ("", ""), rows)]
-    if arcs:
-        headings = ("", "roll first, deg", "insert, mm", "radius, mm")
-        tables.append(terminal.table("arcs of the needle", headings, arcs))
+    if needle is not None:
+        arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in needle.arcs]
+        tables.append(arcs_table(arcs))
     return tables

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.io.files import atomic_write
+from anatomy.io.files import write_text
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 
@@ -46,7 +46,6 @@ def template(
     if out is None:
         terminal.console.file.write(text)
         return ExitCode.OK
-    with atomic_write(out) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(out, text)
     terminal.say(f"Written to {out}")
     return ExitCode.OK

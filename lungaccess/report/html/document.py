@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import atomic_write
+from anatomy.io.files import write_text
 from lungaccess.report.pack import script_text
 
 SHARED_MODULES = (
@@ -89,7 +89,5 @@ def write_page(
             "script": bundle([*SHARED_MODULES, *modules]),
         },
     )
-    target = Path(path)
-    with atomic_write(target) as temporary:
-        temporary.write_text(whole, encoding="utf-8", newline="\n")
-    return target
+    write_text(os.fspath(path), whole)
+    return Path(path)

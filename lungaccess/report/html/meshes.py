@@ -194,9 +194,3 @@ def _differences(faces: Int) -> Int:
     """Return small numbers: the first vertex against the face before, the others against the first."""
     first = faces[:, 0]
     return np.stack([np.diff(first, prepend=0), faces[:, 1] - first, faces[:, 2] - first])
-
-
-def faces_from_differences(differences: Int) -> Int:
-    """Return the `(F, 3)` faces of which `packed_surface` stores the differences `(3, F)`."""
-    first = np.cumsum(differences[0].astype(np.int64))
-    return np.stack([first, first + differences[1], first + differences[2]], axis=1)

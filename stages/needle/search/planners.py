@@ -24,36 +24,23 @@ class MakeSearch(Protocol):
         """Return a search for paths of low cost; the same seed repeats it."""
 
 
-def _rrt(environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST) -> Search:
-    return RestartingRRT(environment, query, seed=seed, objective=objective)
+def _makes(
+    cls: type[RestartingRRT] | type[PortfolioSearch] | type[ResolutionSearch] | type[Decision],
+) -> MakeSearch:
+    """Return what makes searches of a class; in the resolution search nothing is random."""
+
+    def make(
+        environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
+    ) -> Search:
+        if issubclass(cls, ResolutionSearch):
+            return cls(environment, query, objective=objective)
+        return cls(environment, query, seed=seed, objective=objective)
+
+    return make
 
 
-def _ao_rrt(
-    environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
-) -> Search:
-    return OptimalSearch(environment, query, seed=seed, objective=objective)
-
-
-def _optimal(
-    environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
-) -> Search:
-    return PortfolioSearch(environment, query, seed=seed, objective=objective)
-
-
-def _resolution(
-    environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
-) -> Search:
-    # Nothing in it is random.
-    return ResolutionSearch(environment, query, objective=objective)
-
-
-def _decide(
-    environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
-) -> Search:
-    return Decision(environment, query, seed=seed, objective=objective)
-
-
-PLANNERS: dict[str, MakeSearch] = dict(
-    zip(OUR_PLANNERS, (_rrt, _ao_rrt, _optimal, _resolution, _decide), strict=True)
-)
+SEARCHES = (RestartingRRT, OptimalSearch, PortfolioSearch, ResolutionSearch, Decision)
+PLANNERS: dict[str, MakeSearch] = {
+    name: _makes(cls) for name, cls in zip(OUR_PLANNERS, SEARCHES, strict=True)
+}
 """See docs/explanation/needle.md."""

@@ -99,9 +99,7 @@ class Advisor:
         """The navigation field of the goal."""
         return self.environment.field
 
-    def advise(
-        self, state: ScopeState, *, own: Motion | None = None, rng: np.random.Generator | None = None
-    ) -> Advice:
+    def advise(self, state: ScopeState, *, own: Motion | None = None) -> Advice:
         """Return the best motion from any state whose tip is in the lumen, and evaluate the user's own one.
 
         Where no candidate is valid the look-ahead is halved, down to the smallest voxel side (not in
@@ -111,8 +109,6 @@ class Advisor:
         ----------
         own : Motion, optional
             A motion that the user is about to make, evaluated at its own advance, at most the look-ahead.
-        rng : numpy Generator, optional
-            Moves the candidates at random within their spacing.
 
         Raises
         ------
@@ -127,7 +123,7 @@ class Advisor:
                 expected="a tip in the airways that hang together with the trachea",
                 remedy="Check the frame of the scope's position",
             )
-        found = self._weigh(state, rng)
+        found = self._weigh(state)
         choice: tuple[Action, Motion | None, float] = self._choose(found, state)
         action, motion, cost = ("arrived", None, 0.0) if voxel == self.goal.voxel else choice
         return Advice(
@@ -135,11 +131,11 @@ class Advisor:
             motion=motion,
             cost=cost,
             candidates=found,
-            own=None if own is None else self._evaluate(state, own, rng),
+            own=None if own is None else self._evaluate(state, own),
             distance_mm=float(np.linalg.norm(tip - self.goal.centre_lps)),
         )
 
-    def _weigh(self, state: ScopeState, rng: np.random.Generator | None) -> Candidates:
+    def _weigh(self, state: ScopeState) -> Candidates:
         """Return the candidates of the longest look-ahead at which one is valid, or of the least."""
         look_ahead = self.options.look_ahead_mm
         least = (
@@ -148,7 +144,7 @@ class Advisor:
             else float(self.environment.lumen.grid.spacing_mm.min())
         )
         while True:
-            found, _ = evaluate_motions(self.environment, state, look_ahead, self.options.weights, rng=rng)
+            found, _ = evaluate_motions(self.environment, state, look_ahead, self.options.weights)
             if found.best >= 0 or look_ahead <= least:
                 return found
             look_ahead = max(0.5 * look_ahead, least)
@@ -161,12 +157,10 @@ class Advisor:
         )
         return "pull back", back, 0.0
 
-    def _evaluate(
-        self, state: ScopeState, own: Motion, rng: np.random.Generator | None
-    ) -> MotionEvaluation | None:
+    def _evaluate(self, state: ScopeState, own: Motion) -> MotionEvaluation | None:
         most = self.options.look_ahead_mm
         ahead = min(own.advance_mm, most) if own.advance_mm > 0.0 else most
-        return evaluate_motions(self.environment, state, ahead, self.options.weights, rng=rng, own=own)[1]
+        return evaluate_motions(self.environment, state, ahead, self.options.weights, own=own)[1]
 
     def path(self, start: ScopeState, *, seed: int = 0) -> ScopePath:
         """Return the path from a state to the goal, or to the nearest point that was reached.

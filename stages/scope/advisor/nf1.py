@@ -107,7 +107,7 @@ class NavigationField:
     clearance : (N,) float64
         L1 distance to the wall in this metric.
     largest_clearance : float
-        C_max of eq. 2.
+        C_max of eq. 2: half the largest clearance in the lumen.
     potential : (N,) float64
     """
 
@@ -130,12 +130,7 @@ class NavigationField:
 
 
 def navigation_field(
-    lumen: Lumen,
-    goal: int,
-    *,
-    kind: Kind = "clearance",
-    metric: Metric = "mm",
-    largest_clearance: float | None = None,
+    lumen: Lumen, goal: int, *, kind: Kind = "clearance", metric: Metric = "mm"
 ) -> NavigationField:
     """Compute NF1, or the clearance-based NF1 [Rosell2012, eq. 2], from a goal voxel.
 
@@ -145,8 +140,6 @@ def navigation_field(
         Number of an interior voxel.
     kind, metric : str
         See `NavigationField`.
-    largest_clearance : float, optional
-        C_max in the unit of the metric; half the largest clearance in the lumen if None.
     """
     if not 0 <= goal < lumen.count:
         raise TargetError(
@@ -154,7 +147,7 @@ def navigation_field(
         )
     steps = np.ones(3) if metric == "voxels" else np.array(lumen.grid.spacing_mm)
     clearance = lumen.clearance(steps)
-    most = 0.5 * float(clearance.max()) if largest_clearance is None else float(largest_clearance)
+    most = 0.5 * float(clearance.max())
     weights = entering_costs(clearance, most) if kind == "clearance" else np.ones(lumen.count)
     potential = np.zeros(lumen.count)
     extremes = np.array([steps.min() * weights.min(), steps.max() * weights.max()])

@@ -24,6 +24,8 @@ BEND_STEP_RAD = math.radians(7.5)
 """Steps of twist and bend that are tried: directions are then at most about 8 degrees from one tried."""
 LEAN_RAD = math.radians(15.0)
 """How far the base of the bending tip may lean from the axis of the airway behind it."""
+SHAFT_MM = 5.0
+"""So much of the body behind the bending tip is straight and must fit, too."""
 ASIDE = 6
 """Directions in which tip and base are moved and tilted."""
 
@@ -68,9 +70,7 @@ class Orientability:
         return bool(self.possible.any()) and self.angle_rad(direction) <= tolerance_rad
 
 
-def measure_orientability(
-    environment: ScopeEnvironment, tree: AirwayTree, point: int, *, shaft_mm: float = 5.0
-) -> Orientability:
+def measure_orientability(environment: ScopeEnvironment, tree: AirwayTree, point: int) -> Orientability:
     """Return the directions in which a scope can point whose tip is at a tree point or beside it.
 
     The tip may lie aside from the medial axis as far as the clearance beside the scope allows.  The base
@@ -84,8 +84,6 @@ def measure_orientability(
         Its model and lumen count, not its goal.
     point : int
         Index of a tree point.
-    shaft_mm : float
-        So much of the body behind the bending tip is straight and must fit, too.
     """
     model = environment.model
     base = _base_frame(tree, point, model.length_mm)
@@ -94,7 +92,7 @@ def measure_orientability(
     bends = _steps(math.radians(model.bend_low_deg), math.radians(model.bend_high_deg), BEND_STEP_RAD)
     fits = np.zeros((len(twists), len(bends)), dtype=bool)
     bases = np.array([turned.ravel() for turned in _leaning(base)])
-    pointable(environment.arrays, environment.scope, bases, tips, float(shaft_mm), twists, bends, fits)
+    pointable(environment.arrays, environment.scope, bases, tips, SHAFT_MM, twists, bends, fits)
     twist, bend = (values.ravel() for values in np.meshgrid(twists, bends, indexing="ij"))
     frame = np.eye(4)
     frame[:3, :3] = base

@@ -141,7 +141,7 @@ def test_broken_toml_bare_targets_and_missing_files_are_refused(own_folder):
     with pytest.raises(FileError, match=r"missing\.nrrd"):
         load_patient(own_folder)
     (own_folder / "patient.toml").write_text("lumen = ")
-    with pytest.raises(SettingsError, match="not TOML"):
+    with pytest.raises(SettingsError, match="not valid TOML"):
         load_patient(own_folder)
 
 

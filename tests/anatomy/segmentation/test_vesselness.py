@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from anatomy.errors import AnatomyError, GridMismatchError
-from anatomy.segmentation.kernels.eigenvalues import eigenvalues_of
+from anatomy.segmentation.kernels.eigenvalues import eigenvalues
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace, discrete_gaussian
 from anatomy.segmentation.vesselness import vesselness
 from tests.anatomy.segmentation.shapes import distance_to_surface
@@ -26,10 +27,14 @@ def by_magnitude(matrices: np.ndarray) -> np.ndarray:
     return np.take_along_axis(values, np.argsort(np.abs(values), axis=1), axis=1)
 
 
+@numba.njit
+def compiled(xx, yy, zz, xy, xz, yz):  # type: ignore[no-untyped-def]
+    return eigenvalues(xx, yy, zz, xy, xz, yz)
+
+
 def closed_form(matrices: np.ndarray) -> np.ndarray:
-    values = np.full((len(matrices), 3), np.nan)
-    eigenvalues_of(np.ascontiguousarray(matrices, dtype=np.float64), values)
-    return values
+    rows = matrices.astype(np.float64)
+    return np.array([compiled(m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]) for m in rows])
 
 
 def require_equal_eigenvalues(matrices: np.ndarray) -> None:

@@ -128,9 +128,9 @@ def test_unknown_names_list_the_presets() -> None:
 
 
 def test_missing_file_is_a_file_error(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="cannot be read"):
+    with pytest.raises(FileError, match="There is no file"):
         load_system(tmp_path / "absent.toml")
-    with pytest.raises(FileError, match="cannot be read"):
+    with pytest.raises(FileError, match="There is no file"):
         load_system(str(tmp_path / "absent.toml"))
 
 

@@ -276,7 +276,7 @@ def test_along_the_tubes() -> None:
     assert np.allclose(torsion[0], torsion[2]), "torsion is constant behind the front plate"
     determinants = found.determinant(np.linspace(-610.0, found.length_mm, 60))
     assert determinants[-1] == 1.0 and determinants.min() >= found.least_determinant - 1e-9
-    assert np.allclose(found.tube_tips_mm[0], found.base_from_tip[:3, 3], atol=1e-9)
+    assert np.allclose(found.backbone([found.length_mm])[0], found.base_from_tip[:3, 3], atol=1e-9)
     frames = found.frames(np.linspace(0.0, found.length_mm, 40))
     assert np.allclose(frames[:, :3, :3] @ frames[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-12)
 

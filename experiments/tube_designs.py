@@ -8,7 +8,6 @@ What is finished is kept in a file beside the result, and a run that was stopped
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,14 +15,11 @@ from typing import Any
 
 import lungaccess as la
 from anatomy.errors import SettingsError
-from anatomy.io.files import atomic_write
-from anatomy.lung import Lung
 from anatomy.settings import override
 from experiments.support.anatomies import anatomy, default_anatomies
+from experiments.support.reached import FinishedCounts
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.problem.peripheral import peripheral_targets
-from lungaccess.problem.system import System, system_fingerprint
-from stages.needle import direct_arcs, needle_environment
+from lungaccess.problem.system import System
 
 TARGETS_A_LUNG, QUICK_TARGETS_A_LUNG = 50, 3
 BASE = "ultrathin"
@@ -79,37 +75,6 @@ def _changed(system: System, changes: Mapping[str, Any]) -> System | None:
         return None
 
 
-def reached_of(lung: Lung, system: System, per_lung: int, seed: int) -> int:
-    """Return how many of the peripheral targets a single arc reaches."""
-    atlas = la.build_atlas(lung, system)
-    environment = needle_environment(lung, system.needle, system.margins, with_fissures=atlas.with_fissures)
-    entries, reached = atlas.deployments, 0
-    for target in peripheral_targets(lung, per_lung, seed):
-        near, _ = atlas.index.holding(environment, target)
-        at = (entries.positions[near], entries.tangents[near], entries.branch[near])
-        blockers, _, _ = direct_arcs(environment, *at, target)
-        reached += bool((blockers == 0).any())
-    return reached
-
-
-class Finished:
-    """Counts that are kept in a file, one a lung, system, seed and number of targets."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._counts: dict[str, int] = json.loads(file.read_text()) if file.exists() else {}
-
-    def count(self, lung: Lung, system: System, per_lung: int, seed: int) -> int:
-        """Return the count, as kept or else made and kept."""
-        key = f"{lung.key} {system_fingerprint(system)} {per_lung} {seed}"
-        if key not in self._counts:
-            self._counts[key] = reached_of(lung, system, per_lung, seed)
-            self._file.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_write(self._file) as temporary:
-                temporary.write_text(json.dumps(self._counts, indent=1))
-        return self._counts[key]
-
-
 def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
@@ -127,7 +92,7 @@ def main() -> None:
             "reached": "by a single arc that is proved clear, from a deployment of the atlas",
         },
     )  # fmt: skip
-    finished = Finished(Path(options.results) / setting / "tube_designs_finished" / "counts.json")
+    finished = FinishedCounts(Path(options.results) / setting / "tube_designs_finished" / "counts.json")
     for name in patients:
         lung = anatomy(name)
         for design, system in designs():

@@ -26,7 +26,15 @@ PAPERS = {
     "Li et al. 2021": ("li2021_route",),
     "Pan et al. 2025": ("pan2025_tour",),
 }
-OUR_OWN = ("reachability_by_device", "tube_designs", "needle_planners", "tube_speed", "closed_loop", "growth")
+OUR_OWN = (
+    "reachability_by_device",
+    "coverage_by_device",
+    "tube_designs",
+    "needle_planners",
+    "tube_speed",
+    "closed_loop",
+    "growth",
+)
 SETTINGS = ("full", "quick")
 OUR_TITLE = "Our own studies"
 HEAD = """# Results

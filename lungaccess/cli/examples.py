@@ -17,6 +17,7 @@ EXAMPLES = MappingProxyType(
         "plan": "lungaccess plan PATIENT --nodule --budget 5 --out plan",
         "check": "lungaccess check plan/plan.json PATIENT",
         "report": "lungaccess report plan/plan.json PATIENT",
+        "steps": "lungaccess steps plan/plan.json PATIENT",
         "risk": "lungaccess risk plan/plan.json PATIENT --samples 2000",
         "export": "lungaccess export plan/plan.json PATIENT --slicer slicer",
         "alternatives": "lungaccess alternatives PATIENT --nodule --count 5 --out plans",

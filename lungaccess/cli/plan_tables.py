@@ -30,6 +30,7 @@ def plan_record(
 ) -> dict[str, Any]:
     """Return what a command that planned found and wrote; lengths in mm, times in s."""
     from lungaccess.plans.costs import known_costs
+    from lungaccess.plans.scope_steps import motion_record
 
     return {
         "found": True,
@@ -46,6 +47,7 @@ def plan_record(
         "clearance_mm": {device: dict(values) for device, values in plan.clearance_mm.items()},
         "iterations": plan.iterations,
         "timing": dict(plan.timing),
+        "scope_motion": motion_record(plan, lung.tree),
     }
 
 
@@ -68,12 +70,29 @@ def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
     what = "the tubes beyond the lumen" if plan.needle is None else "the needle"
     return [
         terminal.table("The stages", ("stage", "what to do"), _stage_rows(plan)),
+        steps_table(plan, lung),
         terminal.table(
             f"Costs of {what} (made small: {Objective.of(plan.objective).words})",
             ("cost", "value"),
             costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None)),
         ),
     ]
+
+
+def steps_table(plan: Plan, lung: Lung) -> Table:
+    """Return step by step what hands do with the bronchoscope."""
+    from lungaccess.plans.insertion import scope_motion
+    from lungaccess.plans.scope_steps import handle_words, scope_steps
+
+    steps = scope_steps(scope_motion(plan), lung.tree)
+    rows = [(str(number), one.text) for number, one in enumerate(steps, start=1)]
+    made = terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows)
+    made.caption = (
+        f"{handle_words(plan)} Up, down and o'clock are those of the picture; twist 0 is as the scope enters "
+        "the trachea, and inserted lengths count from there."
+    )
+    made.caption_justify = "left"
+    return made
 
 
 def _stage_rows(plan: Plan) -> list[terminal.Row]:

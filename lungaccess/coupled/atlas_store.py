@@ -17,7 +17,7 @@ from stages.needle import StartIndex
 from stages.scope import ScopeMotions, prover_of
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, shapes_digest
 
-FORMAT = 8
+FORMAT = 9
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 
 

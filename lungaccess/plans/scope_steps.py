@@ -10,6 +10,9 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
+from lungaccess.plans.insertion import scope_motion
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion
 
 MERGED_RAD = math.radians(8.0)
@@ -38,8 +41,8 @@ class ScopeStep:
         Bend at begin and end; positive is towards the top of the picture, and negative is down.
     goes_on : str
         Where in the picture the airway goes on as the step begins.
-    generation : int
-        Of the airway in which the tip is at the end.
+    branch, generation : int
+        Of the airway in which the tip is at the end; branches go by their numbers, as in the whole plan.
     first_state, last_state : int
         The states of the plan that it merges.
     """
@@ -50,6 +53,7 @@ class ScopeStep:
     from_bend_deg: float
     to_bend_deg: float
     goes_on: str
+    branch: int
     generation: int
     first_state: int
     last_state: int
@@ -96,7 +100,7 @@ def scope_steps(motion: ScopeMotion, tree: AirwayTree) -> tuple[ScopeStep, ...]:
     tips, states = motion.tips, motion.states
     ends = merged_states(states)
     places = np.linalg.norm(tips[ends, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
-    generations = tree.generation[tree.branch_of_point[places]]
+    branches = tree.branch_of_point[places]
     angles = np.degrees(states)
     return tuple(
         ScopeStep(
@@ -106,12 +110,45 @@ def scope_steps(motion: ScopeMotion, tree: AirwayTree) -> tuple[ScopeStep, ...]:
             from_bend_deg=float(angles[first, 2]),
             to_bend_deg=float(angles[last, 2]),
             goes_on=_goes_on(tips, states[:, 0], first),
-            generation=int(generation),
+            branch=int(branch),
+            generation=int(tree.generation[branch]),
             first_state=int(first),
             last_state=int(last),
         )
-        for first, last, generation in zip(ends[:-1], ends[1:], generations[1:], strict=True)
+        for first, last, branch in zip(ends[:-1], ends[1:], branches[1:], strict=True)
     )
+
+
+def handle_factor(plan: Plan) -> float:
+    """Return by how much more the handle bends the section while the plan's tubes are in it, 1 or more."""
+    return bend_factor(plan.system, *plan.tube.insertions_mm(plan.system.tubes))
+
+
+def handle_words(plan: Plan) -> str:
+    """Say how the handle is set while the tubes go in, which straighten the section."""
+    bend_deg, factor = float(np.degrees(plan.scope.states[-1, 2])), handle_factor(plan)
+    if abs(bend_deg) < ROUNDED_DEG:
+        return "The tip is straight, and tubes in the channel leave it so."
+    return (
+        f"Tubes in the channel straighten the tip: as they go in, set the handle up to {factor:.2f} times as "
+        f"far, as for {bend_words(bend_deg * factor)} without them, so that the picture stays and the tip "
+        f"keeps {bend_words(bend_deg)}."
+    )
+
+
+def motion_record(plan: Plan, tree: AirwayTree) -> dict[str, object]:
+    """Return a plan's motion of the bronchoscope as plain values: steps for hands, all states for motors."""
+    advance, (twist, bend) = plan.scope.states[:, 0], np.degrees(plan.scope.states[:, 1:]).T
+    return {
+        "steps": [one.as_json() for one in scope_steps(scope_motion(plan), tree)],
+        "states": [
+            {"advance_mm": float(a), "twist_deg": float(t), "bend_deg": float(b)}
+            for a, t, b in zip(advance, twist, bend, strict=True)
+        ],
+        "lps_from_entry": plan.scope.lps_from_entry.tolist(),
+        "bending_length_mm": plan.system.scope.bending_length_mm,
+        "handle_factor_with_tubes": handle_factor(plan),
+    }
 
 
 def merged_states(states: Float) -> Int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -148,25 +147,16 @@ def key_section(plan: Plan, lung: Lung) -> str:
 def instructions_section(plan: Plan, lung: Lung) -> str:
     """Return step by step how hands bring the scope to where the plan has its tip."""
     from lungaccess.plans.insertion import scope_motion
-    from lungaccess.plans.scope_steps import bend_words, scope_steps
-    from lungaccess.problem.channel import bend_factor
+    from lungaccess.plans.scope_steps import handle_words, scope_steps
 
-    steps, bend_deg = scope_steps(scope_motion(plan), lung.tree), math.degrees(plan.scope.states[-1, 2])
-    factor = bend_factor(plan.system, *plan.tube.insertions_mm(plan.system.tubes))
-    handle = (
-        ""
-        if abs(bend_deg) < 0.5
-        else (
-            f" The tubes straighten the section: to keep its bend at {bend_words(bend_deg)} with them in it, "
-            f"set the handle to {bend_words(factor * bend_deg)}."
-        )
-    )
+    steps = scope_steps(scope_motion(plan), lung.tree)
     note = (
         f"These steps merge the {plural(len(plan.scope.states), 'state')} of the plan, which are proved; "
         "within a step all changes evenly. Up, down and o'clock are those of the scope's picture; twist 0 "
-        f"is as the scope enters the trachea, and inserted lengths count from there.{handle}"
+        "is as the scope enters the trachea, and inserted lengths count from there."
     )
-    return f"{words.steps(one.text for one in steps)}<p class='note'>{words.text(note)}</p>"
+    texts = [*(one.text for one in steps), handle_words(plan)]
+    return f"{words.steps(texts)}<p class='note'>{words.text(note)}</p>"
 
 
 def risk_section(report: RiskReport | None) -> str:

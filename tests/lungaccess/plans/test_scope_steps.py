@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lungaccess.plans.scope_steps import merged_states, scope_steps
+from lungaccess.plans.plan import Plan
+from lungaccess.plans.scope_steps import (
+    handle_factor,
+    handle_words,
+    merged_states,
+    motion_record,
+    scope_steps,
+)
 from stages.scope import ScopeMotion
 
 SECTION_MM = 14.0
@@ -87,3 +94,23 @@ def test_a_way_round_in_place_is_kept() -> None:
 def test_twists_of_a_straight_tip_are_no_steps_of_their_own() -> None:
     rows = np.array([[n, (-1.0) ** n, 0.0] for n in range(8)], dtype=float)
     assert merged_states(rows).tolist() == [0, 7]
+
+
+def test_the_handle_makes_up_for_the_tubes(toy_plan: Plan) -> None:
+    """Section and tubes together are stiffer than the section alone."""
+    factor = handle_factor(toy_plan)
+    bend = float(np.degrees(toy_plan.scope.states[-1, 2]))
+    assert 1.0 < factor < 5.0
+    words = handle_words(toy_plan)
+    if abs(bend) < 0.5:
+        assert "leave it so" in words
+    else:
+        assert f"{factor:.2f} times" in words and f"{abs(bend * factor):.0f}°" in words
+
+
+def test_programs_get_every_state(toy_plan: Plan, toy_lung: Any) -> None:
+    record = motion_record(toy_plan, toy_lung.tree)
+    states = [[each["advance_mm"], each["twist_deg"], each["bend_deg"]] for each in record["states"]]
+    assert np.allclose(np.array(states) * [1.0, np.pi / 180.0, np.pi / 180.0], toy_plan.scope.states)
+    assert record["steps"][-1]["branch"] == toy_plan.scope.branches[-1]
+    assert record["steps"][-1]["inserted_mm"] == toy_plan.scope.states[-1, 0]

@@ -1,0 +1,58 @@
+"""How many peripheral targets a system reaches, kept in a file: a study that was stopped goes on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import lungaccess as la
+from anatomy.errors import SettingsError
+from anatomy.io.files import atomic_write
+from anatomy.lung import Lung
+from lungaccess.coupled.atlas import require_same
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.system import System, system_fingerprint
+from stages.needle import direct_arcs, needle_environment
+
+
+def reached_of(atlas: la.Atlas, system: System, per_lung: int, seed: int) -> int:
+    """Return how many of the peripheral targets a single arc of a system's needle reaches from an atlas."""
+    lung = atlas.lung
+    environment = needle_environment(lung, system.needle, system.margins, with_fissures=atlas.with_fissures)
+    entries, reached = atlas.deployments, 0
+    for target in peripheral_targets(lung, per_lung, seed):
+        near, _ = atlas.index.holding(environment, target)
+        at = (entries.positions[near], entries.tangents[near], entries.branch[near])
+        blockers, _, _ = direct_arcs(environment, *at, target)
+        reached += bool((blockers == 0).any())
+    return reached
+
+
+class FinishedCounts:
+    """Counts that are kept in a file, one a lung, system, seed and number of targets."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._counts: dict[str, int] = json.loads(file.read_text()) if file.exists() else {}
+        self._atlas: la.Atlas | None = None
+
+    def count(self, lung: Lung, system: System, per_lung: int, seed: int) -> int:
+        """Return the count, as kept or else made and kept."""
+        key = f"{lung.key} {system_fingerprint(system)} {per_lung} {seed}"
+        if key not in self._counts:
+            self._counts[key] = reached_of(self._atlas_of(lung, system), system, per_lung, seed)
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(self._file) as temporary:
+                temporary.write_text(json.dumps(self._counts, indent=1))
+        return self._counts[key]
+
+    def _atlas_of(self, lung: Lung, system: System) -> la.Atlas:
+        """Return the atlas made last if it holds for a system, which may differ in its needle."""
+        try:
+            if self._atlas is not None:
+                require_same(self._atlas, lung, system)
+                return self._atlas
+        except SettingsError:
+            pass
+        self._atlas = la.build_atlas(lung, system)
+        return self._atlas

@@ -17,7 +17,8 @@ from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import check_rigid, check_same_pose
 from lungaccess.checking.shapes import Curve
 from lungaccess.checking.space import Select, airway_except, branch_of, has, labels_at
-from lungaccess.checking.twisted import SWEEP_TOLERANCE_MM, check_twisted
+from lungaccess.checking.sweep import check_sweep
+from lungaccess.checking.twisted import check_twisted
 from lungaccess.checking.wall_exit import Exit, check_exit, check_wall_run
 from lungaccess.plans.plan import Plan
 
@@ -57,7 +58,7 @@ def check_deployment(plan: Plan, environment: Environment, found: Findings) -> F
     check_channel(plan, found)
     if tube.shape is None:
         _check_strain(plan, found)
-        beside_mm = _check_sweep(plan, found)
+        beside_mm = _replay(plan, found)
     else:
         derived = check_twisted(plan, curve, found)
         if derived is None:
@@ -119,7 +120,7 @@ def _check_strain(plan: Plan, found: Findings) -> None:
     found.at_most("tube.strain", max(strains), tubes.max_strain, "", "largest strain of the tube material")
 
 
-def _check_sweep(plan: Plan, found: Findings) -> float:
+def _replay(plan: Plan, found: Findings) -> float:
     """Replay the deployment and return how far the tubes get from their final shape."""
     tube, tubes = plan.tube, plan.system.tubes
     outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
@@ -129,16 +130,7 @@ def _check_sweep(plan: Plan, found: Findings) -> float:
     for bend in bends:
         distances = shapes.distance_to_polyline(shapes.planar_shape(bend, SWEEP_POINT_MM), final)
         sweep, leader = max(sweep, float(distances.max())), max(leader, float(distances[-1]))
-    limit = tubes.max_lateral_sweep_mm
-    detail = f"sideways motion while the tubes are deployed, {len(bends)} steps replayed"
-    found.at_most("tube.sweep.limit", sweep, limit, "mm", detail, SWEEP_TOLERANCE_MM)
-    detail = "sideways motion as stated"
-    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm", detail)
-    stated = ((tube.lateral_sweep_mm, sweep, "sweep"), (tube.follow_the_leader_error_mm, leader, "leader"))
-    for value, recomputed, name in stated:
-        detail = "not less than recomputed"
-        found.at_least(f"tube.{name}.stated", value, recomputed, "mm", detail, SWEEP_TOLERANCE_MM)
-    return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)
+    return check_sweep(plan, sweep, leader, len(bends), found)
 
 
 def _check_containment(plan: Plan, curve: Curve, labels: Labels, way_out: Exit, found: Findings) -> None:

@@ -12,14 +12,13 @@ from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, angle_between
 from lungaccess.checking.shapes import Curve, distance_to_polyline, radius_at
+from lungaccess.checking.sweep import check_sweep
 from lungaccess.plans.plan import Plan
 from stages.tube.device import Tube
 
 if TYPE_CHECKING:
     from stages.tube.casadi_shape import DerivedShape
 
-SWEEP_TOLERANCE_MM = 0.02
-"""So much less may a replay at steps find than a planner that takes the largest sweep."""
 SHAPE_TOLERANCE_MM = 1e-3
 """Two integrations of one equilibrium differ by far less; so much more than stated may the arcs be off."""
 DETERMINANT_TOLERANCE = 0.05
@@ -60,7 +59,7 @@ def check_twisted(plan: Plan, curve: Curve, found: Findings) -> float | None:
     )
     off_mm = _check_arcs(plan, curve, derived, found)
     _check_strain(plan, derived, found)
-    return off_mm + _check_sweep(plan, derived, found)
+    return off_mm + _replay(plan, derived, found)
 
 
 def _check_arcs(plan: Plan, curve: Curve, derived: DerivedShape, found: Findings) -> float:
@@ -87,25 +86,15 @@ def _check_arcs(plan: Plan, curve: Curve, derived: DerivedShape, found: Findings
     return off
 
 
-def _check_sweep(plan: Plan, derived: DerivedShape, found: Findings) -> float:
+def _replay(plan: Plan, derived: DerivedShape, found: Findings) -> float:
     """Compare every step of the way with the final place; return how far the tubes get from it."""
-    tube, limit = plan.tube, plan.system.tubes.max_lateral_sweep_mm
-    final = derived.points_mm
-    sweep = leader = 0.0
+    final, sweep, leader = derived.points_mm, 0.0, 0.0
     for body in derived.way:
         arc = np.linspace(0.0, body[-1, 0], max(int(np.ceil(body[-1, 0] / SPACING_MM)), 1) + 1)
         points = np.stack([np.interp(arc, body[:, 0], axis) for axis in body[:, 1:].T], axis=1)
         sweep = max(sweep, float(np.linalg.norm(points - derived.at(arc), axis=1).max()))
         leader = max(leader, float(distance_to_polyline(points, final).max()))
-    detail = f"sideways motion while the tubes are deployed, {len(derived.way)} steps replayed"
-    found.at_most("tube.sweep.limit", sweep, limit, "mm", detail, SWEEP_TOLERANCE_MM)
-    detail = "sideways motion as stated"
-    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm", detail)
-    stated = ((tube.lateral_sweep_mm, sweep, "sweep"), (tube.follow_the_leader_error_mm, leader, "leader"))
-    for value, recomputed, name in stated:
-        detail = "not less than recomputed"
-        found.at_least(f"tube.{name}.stated", value, recomputed, "mm", detail, SWEEP_TOLERANCE_MM)
-    return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)
+    return check_sweep(plan, sweep, leader, len(derived.way), found)
 
 
 def _check_strain(plan: Plan, derived: DerivedShape, found: Findings) -> None:

@@ -33,18 +33,8 @@ def open_atlas(
 ) -> Atlas:
     """Return the atlas from the cache, or make and keep it.
 
-    A system that differs in its needle alone finds the same file.  Parameters as those of
-    `lungaccess.coupled.atlas.build_atlas`.
-
-    Parameters
-    ----------
-    cache : Path, optional
-        Folder of the cache; `anatomy.cache.default_cache()` if None.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    A system that differs in its needle alone finds the same file.  Parameters and errors are those of
+    `lungaccess.coupled.atlas.build_atlas` and, for the cache, of `anatomy.kept_records.kept_record`.
     """
     prover_of(lung, system.scope)  # Here: the first plan does not wait for it.
     depends_on = {

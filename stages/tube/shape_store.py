@@ -27,17 +27,8 @@ def open_shapes(
 ) -> TubeShapes:
     """Return the shapes of a design from the cache, or make and keep them.
 
-    Parameters and errors are those of `stages.tube.shapes.tube_shapes`.
-
-    Parameters
-    ----------
-    cache : Path, optional
-        Folder of the cache; `anatomy.cache.default_cache()` if None.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Parameters and errors are those of `stages.tube.shapes.tube_shapes` and, for the cache, of
+    `anatomy.kept_records.kept_record`.
     """
     limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
 

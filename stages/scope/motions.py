@@ -167,7 +167,7 @@ def find_motions(
         Bends farthest down and up of the section at the tip, where tubes in it take some; those of the scope
         by default.
     spacing_mm : float
-        Distance between tips along a branch.
+        Distance between tips along a branch; those turned aside are twice as far apart.
     """
     passages = find_passages(lung, scope, reach_mm=reach_mm)
     walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)

@@ -15,8 +15,9 @@ from stages.scope.kernels.growth import Device
 from stages.scope.kernels.turning import Places
 from stages.scope.tip_region import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD
 
-TURNED_SPACING_MM = 2.0
-"""Spacing of turned tips: each place has many directions, and nearer ones give about the same poses."""
+TURNED_COARSER = 2.0
+"""Turned tips are so much farther apart: each place has many directions, and nearer ones give about the same
+poses."""
 TURN_RINGS_PER_MM = (0.004, 0.008, 0.014, 0.022, 0.032, 0.045, 0.06)
 """Curvatures beside that of a state: they turn the tip of a section of 15 mm by 3 to 50 degrees."""
 TURN_SPOKES = 12
@@ -69,7 +70,7 @@ def find_tips(
 def _places(tree: AirwayTree, wanted: Bool, spacing_mm: float) -> tuple[Places, int, int]:
     """Return where tips may be, how many groups there are of tips that look ahead, and how many in all."""
     ahead = _slots(tree, spacing_mm)
-    aside = _slots(tree, max(spacing_mm, TURNED_SPACING_MM))
+    aside = _slots(tree, TURNED_COARSER * spacing_mm)
     groups = int(ahead.max()) + 1
     helper = np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)]
     first = np.cross(tree.tangents, helper)

@@ -1,14 +1,15 @@
 """Attack the check: it must accept every plan of the planner, and refuse every mutated one.
 
-    python -m experiments.check_attack PATIENT|phantom [--plans 200] [--seed 0] [--out FILE] [--keep FOLDER]
+    python -m experiments.check_attack PATIENT|phantom [--plans 200] [--mutants 1] [--seed 0] [--out FILE]
+        [--keep FOLDER]
     python -m experiments.check_attack --table FILE
 
 Plans come in batches: a random system (a preset or one of its own), a coarse atlas, targets all over the
 lung, several plans a target from the diverse set of alternatives, the search, its refinement, Algorithm 1 of
-[Kuntz2015] and random needles of several arcs (`random_plans`).  Each is checked, and so is one random mutant
-of each (`mutants.all.MUTATIONS`).  A line of FILE is a plan; a batch follows from patient and number
-alone, and one that FILE holds is not made again, so that an interrupted run goes on where it was.  A plan
-that is refused and a mutant that is accepted are kept in FOLDER.
+[Kuntz2015] and random needles of several arcs (`random_plans`).  Each is checked, and so are random mutants
+of each (`mutants.all.MUTATIONS`).  A line of FILE is a plan or a mutant; a batch follows from patient and
+number alone, and one that FILE holds is not made again, so that an interrupted run goes on where it was.
+A plan that is refused and a mutant that is accepted are kept in FOLDER.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ class EditedLung:
         return getattr(self._lung, name)
 
 
-def attack(check: PlanCheck, patient: str, number: int, keep: Path) -> list[dict[str, Any]]:
-    """Make, check, mutate and check the plans of one batch; return a record of each."""
+def attack(check: PlanCheck, patient: str, number: int, mutants: int, keep: Path) -> list[dict[str, Any]]:
+    """Make, check, mutate and check the plans of one batch; return records of plans, and of their mutants."""
     rng = np.random.default_rng([number, *patient.encode()])
     records: list[dict[str, Any]] = []
     other: Plan | None = None
@@ -96,23 +97,24 @@ def attack(check: PlanCheck, patient: str, number: int, keep: Path) -> list[dict
             "refused_by": [each.name for each in report.refusals],
             "check_s": round(time.process_time() - began, 3),
         }
-        name = f"{patient}-{number}-{len(records)}.json"
+        records.append(record)
+        name = f"{patient}-{number}-{len(records)}"
         if not report.accepted:
-            plan.save(keep / f"refused-{name}")
-        else:
-            kind, mutant = mutate(Case(lung=check.lung, plan=plan, report=report, other=other or plan), rng)
+            plan.save(keep / f"refused-{name}.json")
+            continue
+        case = Case(lung=check.lung, plan=plan, report=report, other=other or plan)
+        for n in range(mutants):
+            kind, mutant = mutate(case, rng)
             verdict = check.of_mutant(mutant, system, asked_lps)
-            record |= {
-                "mutation": kind,
-                "mutant_accepted": verdict.accepted,
-                "mutant_refused_by": [each.name for each in verdict.refusals][:6],
-            }
+            record = {"patient": patient, "batch": number, "mutation": kind}
+            record["mutant_accepted"] = verdict.accepted
+            record["mutant_refused_by"] = [each.name for each in verdict.refusals][:6]
             if verdict.accepted:
-                plan.save(keep / f"original-{name}")
-                mutant.plan.save(keep / f"mutant-{kind}-{name}")
+                plan.save(keep / f"original-{name}.json")
+                mutant.plan.save(keep / f"mutant-{kind}-{name}-{n}.json")
                 if mutant.voxel is not None:
                     record |= {"voxel": mutant.voxel.tolist(), "label": mutant.label}
-        records.append(record)
+            records.append(record)
         other = plan
     return records
 
@@ -124,7 +126,7 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def run(patient: str, lung: Lung, plans: int, seed: int, out: Path, keep: Path) -> None:
+def run(patient: str, lung: Lung, plans: int, mutants: int, seed: int, out: Path, keep: Path) -> None:
     """Attack batch after batch until FILE has so many plans of the patient."""
     mine = [each for each in read(out) if each["patient"] == patient]
     done, total = {each["batch"] for each in mine}, sum("accepted" in each for each in mine)
@@ -135,8 +137,9 @@ def run(patient: str, lung: Lung, plans: int, seed: int, out: Path, keep: Path) 
         if number in done:
             continue
         began = time.process_time()
-        records = attack(check, patient, number, keep)
-        total += len(records)
+        records = attack(check, patient, number, mutants, keep)
+        made = sum("accepted" in each for each in records)
+        total += made
         seconds = round(time.process_time() - began, 1)
         records.append({"patient": patient, "batch": number, "batch_s": seconds})
         with out.open("a") as stream:
@@ -144,7 +147,7 @@ def run(patient: str, lung: Lung, plans: int, seed: int, out: Path, keep: Path) 
         refused = sum(not each.get("accepted", True) for each in records)
         through = sum(each.get("mutant_accepted", False) for each in records)
         print(
-            f"{patient} batch {number}: {len(records) - 1} plans ({total} in all), {refused} refused, "
+            f"{patient} batch {number}: {made} plans ({total} in all), {refused} refused, "
             f"{through} mutants let through, {seconds} s",
             flush=True,
         )
@@ -159,7 +162,7 @@ def table(records: Sequence[dict[str, Any]]) -> str:
         refused = sum(not each["accepted"] for each in mine)
         seconds = float(np.median([each["check_s"] for each in mine]))
         lines.append(f"{patient:28} {len(mine):8d} {refused:8d} {seconds:11.3f}")
-    mutants = [each for each in plans if "mutation" in each]
+    mutants = [each for each in records if "mutation" in each]
     lines += ["", "mutants", f"{'kind':28} {'checked':>8} {'accepted':>9}"]
     checked = Counter(each["mutation"] for each in mutants)
     through = Counter(each["mutation"] for each in mutants if each["mutant_accepted"])
@@ -173,6 +176,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("patient", nargs="?", help="folder of a patient, or phantom")
     parser.add_argument("--plans", type=int, default=200, help="plans of this patient in all")
+    parser.add_argument("--mutants", type=int, default=1, help="mutants of each plan")
     parser.add_argument("--seed", type=int, default=0, help="number of the first batch")
     parser.add_argument("--out", type=Path, default=Path("check-attack.jsonl"))
     parser.add_argument("--keep", type=Path, default=Path("check-attack-kept"))
@@ -190,7 +194,7 @@ def main() -> None:
     else:
         name, lung = Path(words.patient).name, la.load_patient(words.patient)
     words.keep.mkdir(parents=True, exist_ok=True)
-    run(name, lung, words.plans, words.seed, words.out, words.keep)
+    run(name, lung, words.plans, words.mutants, words.seed, words.out, words.keep)
     sys.stdout.write(table(read(words.out)) + "\n")
 
 

@@ -127,7 +127,7 @@ def test_a_run_that_was_interrupted_goes_on(
     files = [tmp_path / name for name in ("at-once.jsonl", "in-parts.jsonl")]
     for file, parts in zip(files, [(4,), (2, 4)], strict=True):
         for plans in parts:
-            check_attack.run("small", small_lung, plans, 0, file, tmp_path)
+            check_attack.run("small", small_lung, plans, 2, 0, file, tmp_path)
     records = [[_lasting(each) for each in check_attack.read(file)] for file in files]
     assert records[0] == records[1]
     assert sum("accepted" in each for each in records[0]) == 4

@@ -16,9 +16,9 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
-from lungaccess.coupled import Alternative, alternatives, with_front
+from lungaccess.coupled import Alternative, DirectArcs, alternatives, with_front
 from lungaccess.coupled.kernels.separation import choose_separated
-from lungaccess.coupled.search.separated_arcs import _branches_first, _lines, _samples
+from lungaccess.coupled.search.separated_arcs import SAMPLES, _branches_first, _samples
 from stages.needle.path import direct_path
 from tests.lungaccess.coupled.planning import SYSTEM
 from tests.lungaccess.resample import needle_walk
@@ -123,7 +123,8 @@ def test_lines_are_the_arcs() -> None:
         atlas=SimpleNamespace(deployments=entries),
         task=SimpleNamespace(target=SimpleNamespace(lps_mm=target)),
     )
-    for line, position, tangent in zip(_lines(arcs, np.arange(20)), entries.positions, tangents, strict=True):
+    lines = DirectArcs.lines(arcs, np.arange(20), SAMPLES)
+    for line, position, tangent in zip(lines, entries.positions, tangents, strict=True):
         frame = np.eye(4)
         frame[:3, 2] = tangent
         frame[:3, 0] = np.linalg.svd(tangent[None])[2][1]

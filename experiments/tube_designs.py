@@ -1,4 +1,4 @@
-"""Which design of tubes reaches most of the periphery: 20 designs in one bronchoscope.
+"""Which design of tubes reaches most of the periphery: 25 designs in one bronchoscope.
 
     python -m experiments.tube_designs [--quick] [--results FOLDER] [--patients NAME ...]
 
@@ -55,6 +55,15 @@ ALONE: Mapping[str, Mapping[str, Any]] = {
     "one tube curved by 1/22 mm": {"precurvature_per_mm": 0.045},
 }
 """Designs in which the preset's inner tube is the only one, with what differs."""
+TURNED_BASE = "curved-outer"
+TURNED: Mapping[str, Mapping[str, Any]] = {
+    "two curved tubes turned each by itself (the preset)": {},
+    "the same, outer tube straight": {"outer.curved_length_mm": 0.0, "outer.precurvature_per_mm": 0.0},
+    "the same, outer tube curved by 1/100 mm": {"outer.precurvature_per_mm": 0.01},
+    "the same, outer tube curved over 40 mm": {"outer.curved_length_mm": 40.0},
+    "the same, tubes of 400 and 440 mm": {"outer.length_mm": 400.0, "inner.length_mm": 440.0},
+}
+"""Designs with a curved outer tube in the same bronchoscope: what differs from their preset, by key."""
 
 
 def designs() -> Iterator[tuple[str, System | None]]:
@@ -66,6 +75,9 @@ def designs() -> Iterator[tuple[str, System | None]]:
     for name, changes in ALONE.items():
         where = {key: "tubes." if key == "max_extension_mm" else "tubes.inner." for key in changes}
         yield name, _changed(alone, {where[key] + key: value for key, value in changes.items()})
+    turned = la.load_system(TURNED_BASE, fissures_allowed=True)
+    for name, changes in TURNED.items():
+        yield name, _changed(turned, {f"tubes.{key}": value for key, value in changes.items()})
 
 
 def _changed(system: System, changes: Mapping[str, Any]) -> System | None:

@@ -51,16 +51,17 @@ def _fissures(plan: Plan) -> str:
 
 
 def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
-    scope, tube = plan.scope, plan.tube
-    names, insertions = "outer / inner", f"{tube.outer_insertion_mm:.1f} / {tube.inner_insertion_mm:.1f} mm"
-    if plan.system.tubes.outer is None:
-        names, insertions = "length", f"{tube.inner_insertion_mm:.1f} mm"
+    scope, tube, tubes = plan.scope, plan.tube, plan.system.tubes
+    names = " / ".join(name for name, _tube in tubes.named) if tubes.outer is not None else "length"
+    insertions = " / ".join(f"{length:.1f}" for length in tube.insertions_mm(tubes)) + " mm"
+    rotations = [tube.rotation_rad] if tube.shape is None else tube.rotations_rad(tubes)
+    turned = " / ".join(f"{np.degrees(angle):.1f}°" for angle in rotations)
     scope_rows = [
         ("airway generation at the tip", f"{scope.generation}"),
         ("advance beyond the carina", f"{scope.length_from_carina_mm:.1f} mm"),
     ]
     tube_rows = [
-        ("rotation", f"{np.degrees(tube.rotation_rad):.1f}°"),
+        ("rotation", turned),
         (f"{names} beyond scope", insertions),
         ("pierced branch", f"{tube.exit.branch}"),
     ]

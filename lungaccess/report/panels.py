@@ -51,10 +51,10 @@ def clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:
 
 def _required_line(axes: Axes, plan: Plan, tube_arc: Float, along: Float) -> None:
     """Draw the least distance of the axis (radius, margins and sweep), which steps at each tube end."""
-    required, sweep_mm = plan.required_clearance_mm, plan.tube.lateral_sweep_mm
-    outer_end = plan.tube.outer_insertion_mm - tube_arc[-1]
-    places = [along[0], max(outer_end, along[0]), 0.0]
-    levels = [required["outer_tube"] + sweep_mm, required["inner_tube"] + sweep_mm]
+    required, beside_mm = plan.required_clearance_mm, plan.tube.clearance_loss_mm
+    tubes = plan.system.tubes
+    ends = [max(length - tube_arc[-1], along[0]) for length in plan.tube.insertions_mm(tubes)]
+    places, levels = [along[0], *ends], [required[f"{name}_tube"] + beside_mm for name, _tube in tubes.named]
     if plan.needle is not None:
         places, levels = [*places, along[-1]], [*levels, required["needle"]]
     for start, stop, level in zip(places[:-1], places[1:], levels, strict=True):

@@ -59,9 +59,15 @@ def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
 
 
 def _bending_plane(plan: Plan, tube: Float) -> Float:
-    """Return points that span the plane of a planar tube, also where its bend is slight."""
+    """Return points that span the plane in which a tube bends, also where its bend is slight.
+
+    Tubes that are not planar bend most nearly in the plane of the scope's direction and their own tip.
+    """
     pose = np.asarray(plan.scope.lps_from_scope_tip)
     angle = plan.tube.rotation_rad
+    if plan.tube.shape is not None:
+        aside = pose[:3, :2].T @ (tube[-1] - tube[0])
+        angle = float(np.arctan2(aside[1], aside[0]))
     sideways = pose[:3, 0] * np.cos(angle) + pose[:3, 1] * np.sin(angle)
     start, length = pose[:3, 3], float(np.linalg.norm(tube[-1] - tube[0])) + 1.0
     return np.stack([start, start + length * pose[:3, 2], start + length * sideways])
@@ -86,13 +92,15 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     body, tube, needle = plan.curves()
     scope = view.project(body.points_lps)
     tube_uv, needle_uv = view.project(tube.points_lps), view.project(needle.points_lps)
-    outer = tube_uv[tube.arc_length_mm <= plan.tube.outer_insertion_mm + SHORTEST_MM]
+    inserted = plan.tube.insertions_mm(system.tubes)
+    ends = [int((tube.arc_length_mm <= length + SHORTEST_MM).sum()) for length in inserted]
     drawing.ribbon(axes, scope, system.scope.radius_mm, style.SCOPE, fill=0.35, order=6)
-    drawing.ribbon(axes, outer, system.tubes.outermost.radius_mm, style.TUBE, fill=0.45, order=7)
-    drawing.ribbon(axes, tube_uv, system.tubes.inner.radius_mm, style.TUBE, fill=0.9, order=8)
     required = plan.required_clearance_mm
-    drawing.dashed_band(axes, outer, required["outer_tube"], 5)
-    drawing.dashed_band(axes, tube_uv[len(outer) - 1 :], required["inner_tube"], 5)
+    for (name, each), begin, end in zip(system.tubes.named, [0, *ends], ends, strict=False):
+        inmost = name == "inner"
+        fill, order = (0.9, 8) if inmost else (0.45, 7)
+        drawing.ribbon(axes, tube_uv[:end], each.radius_mm, style.TUBE, fill=fill, order=order)
+        drawing.dashed_band(axes, tube_uv[max(begin - 1, 0) : end], required[f"{name}_tube"], 5)
     if system.needle is not None:
         drawing.ribbon(axes, needle_uv, system.needle.radius_mm, style.NEEDLE, fill=0.9, order=9)
         drawing.dashed_band(axes, needle_uv, required["needle"], 5)

@@ -11,7 +11,6 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
-from lungaccess.risk.deviations import Draws
 from lungaccess.risk.errors import CURVATURE, ErrorModel
 from lungaccess.risk.statistics import Share, share_of
 
@@ -104,7 +103,7 @@ def assess(
     """
     stated = model or ErrorModel()
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
-    draws = Draws(samples, assessor.n_arcs, seed)
+    draws = assessor.draws(samples, seed)
     outcomes = assessor.outcomes(draws.scaled(stated.sizes, stated.curvature_factors))
     touched = {name: share_of((outcomes.touched & flag) != 0) for name, flag in assessor.structures.items()}
     kinds = assessor.kinds if each_kind else ()
@@ -147,7 +146,7 @@ def safest(
     assessed = []
     for each in plans:
         assessor = RiskAssessor(each, lung, radius_mm=radius_mm)
-        draws = Draws(samples, assessor.n_arcs, seed)
+        draws = assessor.draws(samples, seed)
         assessed.append((each, assessor.success(draws, stated.sizes, stated.curvature_factors)))
     return tuple(sorted(assessed, key=lambda pair: -pair[1].value))
 

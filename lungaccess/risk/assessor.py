@@ -15,7 +15,7 @@ from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
-from lungaccess.risk.deviations import TUBE_PIECES, Deviations, Draws, deviated_pieces, deviated_starts
+from lungaccess.risk.deviations import Deviations, Draws, deviated_pieces, deviated_starts, no_deviations
 from lungaccess.risk.errors import OF_NEEDLE, UNITS
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.statistics import Share, share_of
@@ -81,6 +81,7 @@ class RiskAssessor:
             raise SettingsError("The needle of the plan has no arc", expected="at least one arc")
         self.plan = plan
         self.n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
+        self._n_twisted = 0 if plan.tube.shape is None else len(plan.system.tubes.nested)
         self.kinds = tuple(name for name in UNITS if plan.needle is not None or name not in OF_NEEDLE)
         self.radius_mm, self.radius_origin = (
             goal_radius(lung, plan) if radius_mm is None else (float(radius_mm), "given")
@@ -98,6 +99,14 @@ class RiskAssessor:
         )
         self._forbidden_flags = sum(self.structures[name] for name in self.forbidden)
 
+    def draws(self, count: int, seed: int) -> Draws:
+        """Return random numbers for `count` sets of errors; the same seed gives the same."""
+        return Draws(count, self.n_arcs, seed, self._n_twisted)
+
+    def no_deviations(self, count: int) -> dict[str, Float]:
+        """Return the fields of `Deviations` for `count` sets without any error."""
+        return no_deviations(count, self.n_arcs, self._n_twisted)
+
     def outcomes(self, deviations: Deviations) -> Outcomes:
         """Follow deviated plans through all three stages."""
         starts, pieces = deviated_starts(self.plan, deviations), deviated_pieces(self.plan, deviations)
@@ -108,11 +117,12 @@ class RiskAssessor:
     def _followed(self, starts: Float, pieces: Float, *, enough: int) -> tuple[Int, Float]:
         """Return what chains touch `(N,)` and where they end `(N, 3)`; see `kernel.follow`."""
         touched, ends = np.zeros(len(starts), dtype=np.int64), np.zeros((len(starts), 3))
+        n_tube = pieces.shape[1] - self.n_arcs
         exempt_mm = float(self.plan.exemption.needle_length_mm)
 
         def follow(part: slice) -> None:
             kernel.follow(
-                self._obstacles, self._depth, self._mediastinal, starts[part], pieces[part], TUBE_PIECES,
+                self._obstacles, self._depth, self._mediastinal, starts[part], pieces[part], n_tube,
                 exempt_mm, enough, touched[part], ends[part],
             )  # fmt: skip
 

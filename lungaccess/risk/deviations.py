@@ -13,9 +13,10 @@ from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.errors import UNITS
 from lungaccess.risk.kernels import deviation as kernel
+from lungaccess.risk.twisted import twisted_pieces
 
 TUBE_PIECES = 4
-"""Arcs of the tubes, see `stages.tube.device.TubeArcs`."""
+"""Arcs of planar tubes, see `stages.tube.device.TubeArcs`."""
 
 
 @frozen_record
@@ -29,9 +30,11 @@ class Deviations:
     tilt_rad : (N, 2) float64
         Rotation vector of the scope tip's tilt, along +x and +y of its frame.
     rotation_rad : (N,) float64
-        Added to the rotation of the tubes; it leaves the roll of the needle where it is.
-    insertion_mm : (N, 2) float64
-        Added to the insertions of outer and inner tube.
+        Added to the rotation of all tubes; it leaves the roll of the needle where it is.
+    relative_rad : (N, n) float64
+        Added to the rotation of each of n tubes that are not planar, the outermost first; n is 0 for planar.
+    insertion_mm : (N, 2 or n) float64
+        Added to the insertions of outer and inner tube, or of n tubes that are not planar.
     factor : (N,) float64
         Multiplies the curvature of all arcs.
     roll_rad, stop_mm : (N, A) float64
@@ -43,6 +46,7 @@ class Deviations:
     scope_mm: Float
     tilt_rad: Float
     rotation_rad: Float
+    relative_rad: Float
     insertion_mm: Float
     factor: Float
     roll_rad: Float
@@ -55,13 +59,20 @@ class Deviations:
         return len(self.factor)
 
 
-def no_deviations(count: int, n_arcs: int) -> dict[str, Float]:
-    """Return the fields of `Deviations` for `count` sets without any error."""
+def no_deviations(count: int, n_arcs: int, n_twisted: int = 0) -> dict[str, Float]:
+    """Return the fields of `Deviations` for `count` sets without any error.
+
+    Parameters
+    ----------
+    n_twisted : int
+        Number of tubes if they are not planar, else 0.
+    """
     return {
         "scope_mm": np.zeros((count, 3)),
         "tilt_rad": np.zeros((count, 2)),
         "rotation_rad": np.zeros(count),
-        "insertion_mm": np.zeros((count, 2)),
+        "relative_rad": np.zeros((count, n_twisted)),
+        "insertion_mm": np.zeros((count, n_twisted or 2)),
         "factor": np.ones(count),
         "roll_rad": np.zeros((count, n_arcs)),
         "stop_mm": np.zeros((count, n_arcs)),
@@ -90,6 +101,8 @@ class Draws:
         N and A of `Deviations`.
     seed : int
         The same seed gives the same numbers.
+    n_twisted : int
+        See `no_deviations`.
 
     Raises
     ------
@@ -97,7 +110,7 @@ class Draws:
         If there are to be none.
     """
 
-    def __init__(self, count: int, n_arcs: int, seed: int) -> None:
+    def __init__(self, count: int, n_arcs: int, seed: int, n_twisted: int = 0) -> None:
         if count < 1:
             raise SettingsError(
                 f"The number of samples is {count}",
@@ -105,9 +118,10 @@ class Draws:
                 remedy="Choose a count such as 10000",
             )
         rng = np.random.Generator(np.random.PCG64(seed))
-        shapes = no_deviations(count, n_arcs)
+        shapes = no_deviations(count, n_arcs, n_twisted)
         self._uniform = rng.uniform(size=count)
         self._normal = {name: rng.standard_normal(shapes[field].shape) for name, field in FIELD_OF.items()}
+        self._relative = rng.standard_normal(shapes["relative_rad"].shape)
         self._shapes = shapes
 
     def scaled(self, sizes: Mapping[str, float], factors: tuple[float, float]) -> Deviations:
@@ -123,6 +137,10 @@ class Draws:
         values = dict(self._shapes)
         for name, size in sizes.items():
             values[FIELD_OF[name]] = self._normal[name] * in_radians(name, size)
+            if name == "tube_rotation" and self._relative.size:
+                # Each tube is held by itself: none turns with another.
+                values[FIELD_OF[name]] = np.zeros(len(self._uniform))
+                values["relative_rad"] = self._relative * in_radians(name, size)
         values["factor"] = factors[0] + (factors[1] - factors[0]) * self._uniform
         return Deviations(**values)
 
@@ -153,26 +171,42 @@ def _rotated(direction: Float, vectors: Float) -> Float:
 
 
 def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
-    """Return the arcs `(N, 4 + A, 4)` of tubes and needle, see `lungaccess.risk.kernels.deviation`.
+    """Return the arcs `(N, T + A, 4)` of tubes and needle, see `lungaccess.risk.kernels.deviation`.
 
-    The radius of the tubes includes the sideways sweep of the plan.  Neither tube goes back behind the
-    scope tip, nor the inner behind the outer, nor the needle behind the end of an arc.
+    Planar tubes have T = 4 arcs.  The radius of the tubes includes the sideways sweep of the plan.  No tube
+    goes back behind the scope tip, nor one behind that around it, nor the needle behind the end of an arc.
     """
-    arcs = () if plan.needle is None else plan.needle.arcs
-    pieces = np.zeros((deviations.count, TUBE_PIECES + len(arcs), kernel.N_PIECE))
+    if plan.tube.shape is None:
+        tubes, rolled = _planar_pieces(plan, deviations), deviations.rotation_rad
+    else:
+        tubes, rolled = twisted_pieces(
+            plan, deviations.insertion_mm, deviations.relative_rad, deviations.rotation_rad
+        )
+    return np.concatenate([tubes, _needle_pieces(plan, deviations, rolled)], axis=1)
+
+
+def _planar_pieces(plan: Plan, deviations: Deviations) -> Float:
+    pieces = np.zeros((deviations.count, TUBE_PIECES, kernel.N_PIECE))
     outer = np.maximum(plan.tube.outer_insertion_mm + deviations.insertion_mm[:, 0], 0.0)
     inner = np.maximum(plan.tube.inner_insertion_mm + deviations.insertion_mm[:, 1], outer)
     tubes = plan.system.tubes.arcs(outer, inner)
-    pieces[:, :TUBE_PIECES, kernel.LENGTH] = tubes.length_mm
+    pieces[:, :, kernel.LENGTH] = tubes.length_mm
     pieces[:, 0, kernel.ROLL] = plan.tube.rotation_rad + deviations.rotation_rad
-    pieces[:, :TUBE_PIECES, kernel.CURVATURE] = tubes.curvature_per_mm
-    pieces[:, :TUBE_PIECES, kernel.RADIUS] = tubes.radius_mm + plan.tube.lateral_sweep_mm
-    pieces[:, TUBE_PIECES:, kernel.RADIUS] = plan.system.track_radius_mm
+    pieces[:, :, kernel.CURVATURE] = tubes.curvature_per_mm
+    pieces[:, :, kernel.RADIUS] = tubes.radius_mm + plan.tube.lateral_sweep_mm
+    return pieces
+
+
+def _needle_pieces(plan: Plan, deviations: Deviations, rolled_rad: Float) -> Float:
+    """Return the arcs `(N, A, 4)` of the needle behind tubes that end rolled too far by `(N,)`."""
+    arcs = () if plan.needle is None else plan.needle.arcs
+    pieces = np.zeros((deviations.count, len(arcs), kernel.N_PIECE))
+    pieces[:, :, kernel.RADIUS] = plan.system.track_radius_mm
     ends = np.cumsum([arc.length_mm for arc in arcs]) + deviations.stop_mm
     ends = np.maximum.accumulate(np.maximum(ends, 0.0), axis=1)
-    pieces[:, TUBE_PIECES:, kernel.LENGTH] = np.diff(ends, axis=1, prepend=0.0)
+    pieces[:, :, kernel.LENGTH] = np.diff(ends, axis=1, prepend=0.0)
     angles = np.cumsum([arc.roll_rad for arc in arcs]) + deviations.roll_rad
-    pieces[:, TUBE_PIECES:, kernel.ROLL] = np.diff(angles, axis=1, prepend=deviations.rotation_rad[:, None])
+    pieces[:, :, kernel.ROLL] = np.diff(angles, axis=1, prepend=rolled_rad[:, None])
     bends = np.array([arc.curvature_per_mm for arc in arcs])
-    pieces[:, TUBE_PIECES:, kernel.CURVATURE] = deviations.factor[:, None] * bends
+    pieces[:, :, kernel.CURVATURE] = deviations.factor[:, None] * bends
     return pieces

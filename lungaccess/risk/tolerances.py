@@ -14,7 +14,7 @@ from anatomy.records import frozen_value
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
-from lungaccess.risk.deviations import FIELD_OF, Deviations, Draws, in_radians, no_deviations
+from lungaccess.risk.deviations import FIELD_OF, Deviations, Draws, in_radians
 from lungaccess.risk.errors import CURVATURE, UNITS, ErrorModel
 from lungaccess.risk.statistics import Share
 
@@ -100,7 +100,7 @@ def find_tolerances(
         )
     stated = model or ErrorModel()
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
-    draws = Draws(samples, assessor.n_arcs, seed)
+    draws = assessor.draws(samples, seed)
     return tuple(_tolerance(assessor, draws, stated, name, probability) for name in assessor.kinds)
 
 
@@ -144,13 +144,13 @@ def _largest(holds: Callable[[float], bool], least: float, most: float) -> float
 def _margin(assessor: RiskAssessor, name: str) -> tuple[float, float]:
     """Return the sizes up to which errors of a kind never fail: of both signs, or of all directions."""
     field = FIELD_OF[name]
-    directions = _directions(name, assessor.n_arcs)
-    shape = no_deviations(1, assessor.n_arcs)[field].shape[1:]
+    shape = assessor.no_deviations(1)[field].shape[1:]
+    directions = _directions(name, shape[0] if shape else 1)
 
     def made(sizes: Float, chosen: Float) -> Deviations:
         scaled = np.array([in_radians(name, float(size)) for size in sizes])
         errors = (scaled[:, None, None] * chosen).reshape(-1, *shape)
-        return Deviations(**{**no_deviations(len(errors), assessor.n_arcs), field: errors})
+        return Deviations(**{**assessor.no_deviations(len(errors)), field: errors})
 
     if not shape or shape == (1,):
         low, high = (_unfailing(assessor, made, directions[[n]], LARGEST[UNITS[name]]) for n in (0, 1))
@@ -164,7 +164,7 @@ def _curvature_margin(assessor: RiskAssessor) -> tuple[float, float]:
 
     def made(sizes: Float, chosen: Float) -> Deviations:
         factors = np.maximum(1.0 + (sizes[:, None] * chosen[None, :, 0]).ravel(), 0.0)
-        return Deviations(**{**no_deviations(len(factors), assessor.n_arcs), "factor": factors})
+        return Deviations(**{**assessor.no_deviations(len(factors)), "factor": factors})
 
     below = _unfailing(assessor, made, np.array([[-1.0]]), 1.0)
     above = _unfailing(assessor, made, np.array([[1.0]]), LARGEST["factor"] - 1.0)
@@ -192,7 +192,7 @@ def _unfailing(
     return float(between[max(first_failure(between) - 1, 0)])
 
 
-def _directions(name: str, n_arcs: int) -> Float:
+def _directions(name: str, n: int) -> Float:
     """Return the unit errors `(D, n)` of a kind that are tried."""
     if name in ("scope_position", "target_position"):
         steps = np.array([step for step in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(step)])
@@ -202,7 +202,6 @@ def _directions(name: str, n_arcs: int) -> Float:
         return np.stack([np.cos(turns), np.sin(turns)], axis=1)
     if name == "tube_rotation":
         return np.array([[-1.0], [1.0]])
-    n = 2 if name == "tube_insertion" else n_arcs
     signs = (-1.0, 1.0)
     single = [sign * row for row in np.eye(n) for sign in signs]
     joint = [sign * np.ones(n) for sign in signs]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         insertion_stops,
         join_deployments,
     )
-    from stages.tube.design_shapes import shape_tree_of, shapes_digest, shapes_of
+    from stages.tube.design_shapes import coarser_shapes, shapes_digest, shapes_of
     from stages.tube.device import BentPiece, ConcentricTubes, Tube
     from stages.tube.environment import (
         DEFAULT_ROTATIONS,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from stages.tube.inverse import inverse_kinematics
     from stages.tube.kernels import TubeEnvironment
     from stages.tube.mechanics import Batch, TubeMechanics
-    from stages.tube.nearby import NearbyShape, NearbyShapes
+    from stages.tube.nearby import NearbyShape, NearbyShapes, Neighbourhood
     from stages.tube.nesting import check_nesting
     from stages.tube.parts import SlottedSegment, opposite_slots
     from stages.tube.placing import PlacedShapes, place_shapes

@@ -18,7 +18,7 @@ from anatomy.margins import Margins
 from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
 from stages.tube import kernels
-from stages.tube.design_shapes import shape_tree_of, shapes_of
+from stages.tube.design_shapes import coarser_shapes, shapes_of
 from stages.tube.device import ConcentricTubes
 from stages.tube.environment import (
     DEFAULT_ROTATIONS,
@@ -105,8 +105,7 @@ def enumerate_deployments(
     """Enumerate what the tubes can do from many scope tips.
 
     Of planar tubes only deployments without sideways sweep are enumerated: those whose tip stays within
-    `tracking_length_mm` of the scope tip.  Of any others, all shapes of the design are, whatever the spacing
-    of stops that is asked for.
+    `tracking_length_mm` of the scope tip.  Of any others, the shapes of the design at such stops are.
 
     Parameters
     ----------
@@ -124,7 +123,9 @@ def enumerate_deployments(
     """
     tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 9)
     if not tubes.planar:
-        return _enumerate_shapes(lung, tubes, margins, tips, with_fissures, rotations, progress)
+        return _enumerate_shapes(
+            lung, tubes, margins, tips, with_fissures, rotations, stop_spacing_mm, progress
+        )
     rotations = rotations if tubes.inner.bends else 1
     coarse: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
     angles = np.concatenate([coarse, coarse + math.pi / rotations])
@@ -181,10 +182,11 @@ def _enumerate_shapes(
     tips: Float,
     with_fissures: bool,
     rotations: int,
+    stop_spacing_mm: float,
     progress: Callable[[float], None] | None,
 ) -> Deployments:
-    """Place all shapes of a design at scope tips."""
-    shapes = shapes_of(tubes)
+    """Place shapes of a design at scope tips."""
+    members, shapes, tree = coarser_shapes(shapes_of(tubes), stop_spacing_mm)
     placed = place_shapes(
         lung,
         shapes,
@@ -194,7 +196,7 @@ def _enumerate_shapes(
         max_wall_run_mm=tubes.max_wall_run_mm,
         with_fissures=with_fissures,
         rotations=rotations if any(tube.bends for tube in tubes.nested) else 1,
-        tree=shape_tree_of(tubes),
+        tree=tree,
         progress=progress,
     )
     return Deployments(
@@ -202,7 +204,7 @@ def _enumerate_shapes(
         rotation_rad=placed.rotation_rad,
         outer_mm=read_only(shapes.insertions_mm[placed.shape, -1]),
         inner_mm=read_only(shapes.insertions_mm[placed.shape, 0]),
-        shape=placed.shape,
+        shape=read_only(members[placed.shape]),
         branch=placed.branch,
         exit_mm=placed.exit_mm,
         wall_angle_rad=placed.wall_angle_rad,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -9,10 +12,12 @@ from anatomy.errors import SettingsError
 from anatomy.grid import read_only
 from anatomy.records import frozen_record
 from anatomy.typed import Float
+from stages.tube.device import Tube
 from stages.tube.equilibrium import matrices
+from stages.tube.following import deploy
 from stages.tube.kernels import shapes as kernel
 from stages.tube.mechanics import TubeMechanics
-from stages.tube.sequences import BEND_RAD
+from stages.tube.sequences import BEND_RAD, together
 from stages.tube.shapes import TubeShapes
 
 ROOM = 4 * kernel.MOST_ARCS
@@ -35,6 +40,84 @@ class NearbyShape:
     arc_error_mm: float
 
 
+class Neighbourhood:
+    """One deployment of tubes, from which others nearby are reached straight.
+
+    Parameters
+    ----------
+    mechanics : TubeMechanics
+    insertions_mm, rotations_rad, tip_angles_rad : (n,) float64
+        Of that deployment, the innermost first; see `TubeShapes`.
+    """
+
+    def __init__(
+        self, mechanics: TubeMechanics, insertions_mm: Float, rotations_rad: Float, tip_angles_rad: Float
+    ) -> None:
+        self._mechanics, self._tips, self._turned = mechanics, tip_angles_rad, rotations_rad
+        self._radii = np.array([tube.radius_mm for tube in mechanics.tubes])
+        self._beta = insertions_mm - mechanics.lengths_mm
+
+    @classmethod
+    def of(cls, tubes: Sequence[Tube], insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> Neighbourhood:
+        """Return that of a deployment which is reached by the sequence `together`.
+
+        Raises
+        ------
+        SnapError
+            If the tubes snap on the way.
+        SettingsError
+            If the insertions are impossible.
+        """
+        mechanics, turned = TubeMechanics(tubes), np.array(rotations_rad, dtype=np.float64)
+        inserted = np.array(insertions_mm, dtype=np.float64)
+        deployed = deploy(mechanics, together(tubes, turned + BEND_RAD, inserted), step_rad=math.pi)
+        return cls(mechanics, inserted, turned, np.array(deployed.final.tip_angles_rad))
+
+    def at(self, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
+        """Return the shape of joint values, reached straight from that deployment; None if tubes snap.
+
+        Parameters
+        ----------
+        insertions_mm, rotations_rad : (n,) float64
+
+        Raises
+        ------
+        SettingsError
+            If numbers are missing or not finite, or the tubes get out of order.
+        """
+        mechanics = self._mechanics
+        out, turned = (np.array(values, dtype=np.float64) for values in (insertions_mm, rotations_rad))
+        for name, values in (("insertions", out), ("rotations", turned)):
+            if values.shape != (mechanics.count,) or not np.isfinite(values).all():
+                raise SettingsError(
+                    f"The {name} are {values.tolist()}", expected=f"{mechanics.count} finite numbers"
+                )
+        end = out - mechanics.lengths_mm
+        mechanics.check_shifts(end[None])
+        result, tips = np.zeros(kernel.SHAPE_COLUMNS), self._tips.copy()
+        room = ROOM
+        while True:
+            arcs = np.zeros((room, kernel.ARC_COLUMNS))
+            count = kernel.arcs_near(
+                mechanics.design, self._radii, self._turned + BEND_RAD, self._beta, turned - self._turned,
+                end, mechanics.step_rad, tips, result, arcs,
+            )  # fmt: skip
+            if count >= 0:
+                break
+            room, tips = 2 * room, self._tips.copy()
+        if count == 0:
+            return None
+        return NearbyShape(
+            insertions_mm=read_only(out),
+            rotations_rad=read_only(turned),
+            tip_angles_rad=read_only(tips),
+            arcs=read_only(arcs[:count].copy()),
+            scope_from_tip=read_only(matrices(result[None, kernel.TIP :])[0]),
+            least_determinant=float(result[kernel.LEAST]),
+            arc_error_mm=float(result[kernel.ERROR]),
+        )
+
+
 class NearbyShapes:
     """Finds shapes of joint values next to those of a grid.
 
@@ -45,7 +128,6 @@ class NearbyShapes:
     def __init__(self, shapes: TubeShapes) -> None:
         self.shapes = shapes
         self._mechanics = TubeMechanics(shapes.tubes)
-        self._radii = np.array([tube.radius_mm for tube in shapes.tubes])
 
     def at(self, shape: int, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
         """Return the shape of joint values, reached straight from a shape of the grid; None if tubes snap.
@@ -61,36 +143,8 @@ class NearbyShapes:
         SettingsError
             If numbers are missing or not finite, or the tubes get out of order.
         """
-        mechanics, near = self._mechanics, self.shapes
-        out, turned = (np.array(values, dtype=np.float64) for values in (insertions_mm, rotations_rad))
-        for name, values in (("insertions", out), ("rotations", turned)):
-            if values.shape != (mechanics.count,) or not np.isfinite(values).all():
-                raise SettingsError(
-                    f"The {name} are {values.tolist()}", expected=f"{mechanics.count} finite numbers"
-                )
-        end = out - mechanics.lengths_mm
-        mechanics.check_shifts(end[None])
-        result, tips = np.zeros(kernel.SHAPE_COLUMNS), near.tip_angles_rad[shape].copy()
-        base = near.rotations_rad[shape] + BEND_RAD
-        beta = near.insertions_mm[shape] - mechanics.lengths_mm
-        room = ROOM
-        while True:
-            arcs = np.zeros((room, kernel.ARC_COLUMNS))
-            count = kernel.arcs_near(
-                mechanics.design, self._radii, base, beta, turned - near.rotations_rad[shape], end,
-                mechanics.step_rad, tips, result, arcs,
-            )  # fmt: skip
-            if count >= 0:
-                break
-            room, tips = 2 * room, near.tip_angles_rad[shape].copy()
-        if count == 0:
-            return None
-        return NearbyShape(
-            insertions_mm=read_only(out),
-            rotations_rad=read_only(turned),
-            tip_angles_rad=read_only(tips),
-            arcs=read_only(arcs[:count].copy()),
-            scope_from_tip=read_only(matrices(result[None, kernel.TIP :])[0]),
-            least_determinant=float(result[kernel.LEAST]),
-            arc_error_mm=float(result[kernel.ERROR]),
+        near = self.shapes
+        around = Neighbourhood(
+            self._mechanics, near.insertions_mm[shape], near.rotations_rad[shape], near.tip_angles_rad[shape]
         )
+        return around.at(insertions_mm, rotations_rad)

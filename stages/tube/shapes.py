@@ -10,7 +10,8 @@ import itertools
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated
+from dataclasses import replace
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -146,6 +147,24 @@ class TubeShapes:
             follow_the_leader_error_mm=float(self.follow_the_leader_error_mm[shape]),
             arc_error_mm=float(self.arc_error_mm[shape]),
             least_determinant=float(self.least_determinant[shape]),
+        )
+
+    def subset(self, members: Int) -> TubeShapes:
+        """Return some of the deployments `(M,)` as a set."""
+        counts = np.diff(self.first_arc)[members]
+        chosen: dict[str, Any] = {
+            name: read_only(getattr(self, name)[members])
+            for name in (
+                "insertions_mm", "rotations_rad", "tip_angles_rad", "scope_from_tip", "least_determinant",
+                "lateral_sweep_mm", "follow_the_leader_error_mm", "strain", "arc_error_mm",
+            )
+        }  # fmt: skip
+        arcs = [self.arcs_of(shape) for shape in members.tolist()]
+        return replace(
+            self,
+            **chosen,
+            arcs=read_only(np.concatenate([self.arcs[:0], *arcs])),
+            first_arc=read_only(np.concatenate([[0], np.cumsum(counts)])),
         )
 
     def beside_mm(self) -> Float:

@@ -14,7 +14,7 @@ def limit_lower(case: Case, rng: Rng) -> Mutant | None:
     """The material stands less strain, or the channel less bend, than the way through the scope asks."""
     factor = 1.0 / far(rng, 1.05, 2.0)
     if rng.integers(2):
-        measured = max(_value(case, "tube.strain.outer"), _value(case, "tube.strain.inner"))
+        measured = max(_value(case, f"tube.strain.{name}") for name, _tube in case.plan.system.tubes.named)
         edits = {"tubes.max_strain": measured * factor, "tubes.max_channel_curvature_per_mm": None}
     else:
         edits = {"tubes.max_channel_curvature_per_mm": _value(case, "tube.channel") * factor}

@@ -10,11 +10,10 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng, direction, far, signed
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle, tube_points
 from lungaccess.plans.parts import NeedleArc, NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath
-from stages.tube.shape import centreline
 
 
 def tube_edited(case: Case, rng: Rng) -> Mutant | None:
@@ -60,14 +59,7 @@ def exit_at_a_corner(case: Case, rng: Rng) -> Mutant | None:
     """
     tube, lung = case.plan.tube, case.lung
     arc = np.arange(0.0, tube.inner_insertion_mm, 0.005)
-    points = centreline(
-        case.plan.system.tubes,
-        case.plan.scope.lps_from_scope_tip,
-        tube.rotation_rad,
-        tube.outer_insertion_mm,
-        tube.inner_insertion_mm,
-        arc,
-    )
+    points = tube_points(case.plan, arc)
     index = np.rint(lung.grid.ijk(points)).astype(np.int64)
     wet = (lung.labels[tuple(index.T)] & structures.LUMEN) != 0
     leaves = np.flatnonzero(wet[:-1] & ~wet[1:] & (arc[1:] < tube.exit.arc_length_mm - 0.05))

@@ -10,12 +10,11 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng, direction
-from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle
+from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle, tube_points
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 from stages.needle.path import ArcPath, direct_path
-from stages.tube.shape import centreline
 
 SAMPLE_MM = 0.05
 
@@ -120,14 +119,7 @@ def voxel_at_the_tube(case: Case, rng: Rng) -> Mutant | None:
     plan, tube = case.plan, case.plan.tube
     begin = tube.exit.arc_length_mm + 0.05
     arc = np.linspace(begin, tube.inner_insertion_mm, 200)
-    points = centreline(
-        plan.system.tubes,
-        plan.scope.lps_from_scope_tip,
-        tube.rotation_rad,
-        tube.outer_insertion_mm,
-        tube.inner_insertion_mm,
-        arc,
-    )
+    points = tube_points(plan, arc)
     relabel = foreign_airway(case, rng) if rng.integers(4) == 0 else obstacle(case, rng)
     within = plan.required_clearance_mm["inner_tube"] - 0.002
     return with_voxel(case, beside(points, np.gradient(points, axis=0), 0, within, rng), relabel)

@@ -105,7 +105,13 @@ def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
     if tube is not None:
         rows += [
             ("turn the tubes, from +x of the scope", f"{np.degrees(tube.rotation_rad):.1f} deg"),
+            *(
+                (f"turn the {name} tube on by", f"{np.degrees(angle):.1f} deg")
+                for name, angle in ({} if tube.shape is None else tube.shape.relative_rotations_rad).items()
+                if angle
+            ),
             ("outer tube", f"{tube.outer_insertion_mm:.1f} mm"),
+            *([("middle tube", f"{tube.middle_insertion_mm:.1f} mm")] if tube.middle_insertion_mm else []),
             ("inner tube", f"{tube.inner_insertion_mm:.1f} mm"),
             ("exit through branch", f"{tube.exit.branch}"),
         ]

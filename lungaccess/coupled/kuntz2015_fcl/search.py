@@ -84,6 +84,7 @@ class ReferenceSearch:
         rrt_time_s: float | None = None,
         obstacles: Obstacles | None = None,
     ) -> None:
+        task.system.tubes.require_planar("Algorithm 1 of [Kuntz2015]")
         if not (rrt_iterations if rrt_time_s is None else rrt_time_s) > 0:
             raise SettingsError("The RRT has no budget", expected="rrt_iterations or rrt_time_s above 0")
         if task.needle_planner:

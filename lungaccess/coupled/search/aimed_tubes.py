@@ -36,9 +36,15 @@ class TubeAiming:
     ----------
     objective : Objective
         By which deployments are cheap.
+
+    Raises
+    ------
+    SettingsError
+        If the tubes are not planar.
     """
 
     def __init__(self, lung: Lung, system: System, objective: Objective, *, with_fissures: bool) -> None:
+        system.tubes.require_planar("Aiming the tip of the tubes at a target, without a needle,")
         self._tube = (
             tube_environment(lung, with_fissures=with_fissures),
             tube_constants(system.tubes, system.margins),

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.errors import SettingsError
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
-from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces
+from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.report.pack import Packed, pack
 from stages.needle import Objective
 from stages.scope import ScopeMotion
-from stages.tube import centreline
+from stages.tube import Neighbourhood, centreline, points_on_arcs
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -105,12 +108,16 @@ def moved_mm(motion: ScopeMotion) -> Float:
 def _tubes(plan: Plan) -> Packed:
     """Return the tubes at every step of their deployment, each as `TUBE_POINTS` points of equal distance."""
     tube, pose = plan.tube, np.asarray(plan.scope.lps_from_scope_tip)
-    inner = _insertions(tube.outer_insertion_mm, tube.inner_insertion_mm)
+    inserted = plan.tube.insertions_mm(plan.system.tubes)
+    inner = _insertions(inserted)
     outer = np.minimum(inner, tube.outer_insertion_mm)
-    shapes_lps = [
-        centreline(plan.system.tubes, pose, tube.rotation_rad, o, i, np.linspace(0.0, i, TUBE_POINTS))
-        for o, i in zip(outer.tolist(), inner.tolist(), strict=True)
-    ]
+    if tube.shape is None:
+        shapes_lps = [
+            centreline(plan.system.tubes, pose, tube.rotation_rad, o, i, np.linspace(0.0, i, TUBE_POINTS))
+            for o, i in zip(outer.tolist(), inner.tolist(), strict=True)
+        ]
+    else:
+        shapes_lps = _twisted_shapes(plan, inner)
     return {
         "points": pack(np.array(shapes_lps), "f4"),
         "inner_mm": pack(inner, "f4"),
@@ -118,10 +125,29 @@ def _tubes(plan: Plan) -> Packed:
     }
 
 
-def _insertions(outer_mm: float, inner_mm: float) -> Float:
-    """Return insertions of the inner tube [Kuntz2015]: it goes out with the outer tube, then alone."""
+def _twisted_shapes(plan: Plan, inner_mm: Float) -> list[Float]:
+    """Return the tubes where the inner one is out so far: each stops at its own insertion."""
+    tube, tubes, pose = plan.tube, plan.system.tubes, np.asarray(plan.scope.lps_from_scope_tip)
+    inserted = np.array(tube.insertions_mm(tubes))[::-1]
+    turned = np.array(tube.rotations_rad(tubes))[::-1] - tube.rotation_rad
+    shapes = []
+    for out_mm in inner_mm.tolist():
+        if out_mm == 0.0:
+            shapes.append(np.repeat(pose[None, :3, 3], TUBE_POINTS, axis=0))
+            continue
+        reached = np.minimum(inserted, out_mm)
+        found = Neighbourhood.of(tubes.nested, reached, turned).at(reached, turned)
+        if found is None:
+            raise SettingsError("The tubes of the plan snap on the way", remedy="Check it: lungaccess check")
+        at_mm = np.linspace(0.0, out_mm, TUBE_POINTS)
+        shapes.append(points_on_arcs(np.asarray(found.arcs), pose, tube.rotation_rad, at_mm))
+    return shapes
+
+
+def _insertions(inserted_mm: Sequence[float]) -> Float:
+    """Return insertions of the inner tube: it goes out with those around it, which stop one by one."""
     parts = [np.zeros(1)]
-    for begin, end in ((0.0, outer_mm), (outer_mm, inner_mm)):
+    for begin, end in pairwise((0.0, *inserted_mm)):
         count = max(int(np.ceil((end - begin) / TUBE_STEP_MM)), 1)
         parts.append(np.linspace(begin, end, count + 1)[1:])
     return np.unique(np.concatenate(parts))
@@ -145,9 +171,9 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     along = np.concatenate([tube.arc_length_mm, start + needle.arc_length_mm[1:]])
     clearances = _clearances(plan, lung, points, along <= start + plan.exemption.needle_length_mm)
     clearances["airway"][along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
-    outer = plan.tube.outer_insertion_mm
-    needed, sweep_mm = plan.required_clearance_mm, plan.tube.lateral_sweep_mm
-    of_tube = np.where(along <= outer, needed["outer_tube"], needed["inner_tube"]) + sweep_mm
+    needed, beside_mm = plan.required_clearance_mm, plan.tube.clearance_loss_mm
+    tubes = plan.system.tubes
+    of_tube = tube_radii(plan.tube, tubes, along) + plan.system.margins.total_mm + beside_mm
     required = np.where(along <= start, of_tube, needed.get("needle", 0.0))
     limited = [v for k, v in clearances.items() if k != "fissure" or plan.fissures_are_obstacles]
     margin = np.min(limited, axis=0) - required

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from lungaccess.coupled.atlas import Atlas, motions_of
 from lungaccess.coupled.counterfactuals import Counterfactual, find_counterfactuals
-from lungaccess.coupled.search.aimed_tubes import NO_SOLUTION, REACH_MM, AimedTubes
+from lungaccess.coupled.search.aimed_tubes import NO_SOLUTION, AimedTubes
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.task import Task
@@ -64,7 +64,7 @@ def _explain_tubes(
     reasons = {
         **_scope_reasons(atlas),
         **{f"tube: {why}": count for why, count in atlas.deployments.refused.items()},
-        f"tube: scope tips with a deployment that ends within {REACH_MM:g} mm of the target": near,
+        "tube: scope tips with a deployment that ends near the target": near,
         **{f"tube, aimed at the target: {why}": count for why, count in sorted(blocked.items())},
     }
     advice = ""

@@ -43,7 +43,7 @@ def sections(explanation: Explanation) -> tuple[Section, ...]:
             rows=() if e.starts is None else tuple((why, str(n)) for why, n in e.starts.counts.items() if n),
         ),
         Section(
-            title="What a single arc reaches nearby",
+            title=f"What {_by(e)} nearby",
             headings=("where", "how much"),
             rows=tuple((share.region, share.words) for share in e.shares),
         ),
@@ -86,6 +86,11 @@ def _accepted(e: Explanation, name: str) -> str:
     return f"a plan that the check accepts; {how_often}"
 
 
+def _by(e: Explanation) -> str:
+    """Return what reaches the points around a target, with its verb."""
+    return "aimed tubes reach" if e.system.needle is None else "a single arc reaches"
+
+
 def _misses(e: Explanation) -> Iterator[Row]:
     arc, beyond, neighbour = e.blocked_arc, e.arc_beyond_limits, e.neighbour
     if arc is not None:
@@ -94,7 +99,7 @@ def _misses(e: Explanation) -> Iterator[Row]:
         yield "path to the target that exceeds the needle's limits least", beyond.needs, "obstacles ignored"
     if neighbour is not None:
         near = f"ends {neighbour.from_target_mm:.1f} mm from the target; {_file(e, neighbour.plan)}"
-        yield "nearest point found that a single arc reaches", near, place(neighbour.plan.target_lps)
+        yield f"nearest point found that {_by(e)}", near, place(neighbour.plan.target_lps)
 
 
 def _blocks(e: Explanation) -> Iterator[Row]:

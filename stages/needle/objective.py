@@ -63,7 +63,7 @@ TERMS = (
     Term(key="inverse_clearance", weight="inverse_clearance", words="integral of 1/clearance"),
     Term(key="cost_map", weight="cost_map", words="integral of the cost map", unit="mm", of_map=True),
     Term(key="voxel_sum", weight="voxel_sum", words="sum of the cost map over voxels", of_map=True),
-    Term(key="length_mm", weight="length", words="length of the needle", unit="mm"),
+    Term(key="length_mm", weight="length", words="length of the path", unit="mm"),
 )
 """Every cost of a needle path."""
 

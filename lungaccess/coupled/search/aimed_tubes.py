@@ -20,10 +20,11 @@ from stages.needle import ArcPath, Objective, Obstacles
 from stages.scope import ScopeTip
 from stages.tube import REASONS, Deployment, insertion_stops, tube_constants, tube_environment
 
-REACH_MM = 6.0
-"""From deployments whose tips are so near the tubes are aimed.  Where a scope tip has a deployment to the
-target, the atlas has one of that tip about so near: the tips of turned ones are up to 30 degrees, 5 mm at
-18 mm from the axis, and 4 mm of insertion apart."""
+STOPS_MM = 3.0
+TURN_RAD = math.pi / 12.0
+"""The tubes are aimed from deployments that end near the target: as near as one of the same scope tip ends to
+every point that the tubes can come to.  Stops of turned tips are 4 mm apart, 2.8 mm in both insertions from
+the middle between them, and their rotations 30 degrees apart."""
 STARTS_MM = 8.0
 """Spacing of the insertions from which the tubes are aimed from one pose: Newton's method goes as far."""
 NO_SOLUTION = "no insertions bring the tip of the tubes to the target"
@@ -95,6 +96,13 @@ class TubeAiming:
             inner_mm, (x, y, z), enough or len(row_of), found, why,
         )  # fmt: skip
         return found, why
+
+
+def near_mm(atlas: Atlas, point: Float) -> Float:
+    """Return how near to a point (3,) deployments have to end to be aimed at it, by their scope tips (S,)."""
+    tips = atlas.motions.tips
+    aside = np.linalg.norm(np.cross(point - tips[:, :3], tips[:, 3:6]), axis=1)
+    return np.asarray(STOPS_MM + TURN_RAD * aside)
 
 
 def nearest_of_each_tip(atlas: Atlas, entries: Int, away_mm: Float) -> Int:
@@ -180,7 +188,7 @@ class AimedTubes:
         entries = atlas.deployments
         away = np.linalg.norm(entries.positions - task.target.lps_mm, axis=1)
         self.nearest_mm = float(away.min(initial=math.inf))
-        near = np.flatnonzero(away <= REACH_MM)
+        near = np.flatnonzero(away <= near_mm(atlas, task.target.lps_mm)[entries.site])
         self.promising: Int = nearest_of_each_tip(atlas, near, away[near])
         self._aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
 

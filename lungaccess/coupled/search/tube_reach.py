@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -9,11 +11,17 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.aimed_tubes import COST, INNER, OUTER, ROTATION
-from lungaccess.coupled.search.aimed_tubes import REACH_MM, TubeAiming, nearest_of_each_tip, tips_of
+from lungaccess.coupled.search.aimed_tubes import TubeAiming, near_mm, nearest_of_each_tip, tips_of
 from lungaccess.plans.candidate import tubes_in_tissue
 from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, UNREACHED, Objective, Reached
 from stages.tube import DeploymentValidator
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+FIRST_MM, LAST_MM = 6.0, 12.0
+"""Deployments that end so near are tried first, because they are few and most points that are reached have
+one; then those up to the second distance, beyond which there are too many to try for every point."""
 STEP_MM = 0.25
 """Spacing of the points at which the clearance of the tubes is looked up; half of it is taken off."""
 CLEARANCE_CAP_MM = 5.0
@@ -65,14 +73,25 @@ class TubeReachScan:
 
     def _best(self, point: Float) -> tuple[int, float, float] | None:
         """Return entry, cost and clearance of the cheapest of some deployments to a point."""
-        atlas = self._atlas
         if self._tips is None:
             return None
-        close = np.array(self._tips.query_ball_point(point, REACH_MM, return_sorted=True), dtype=np.int64)
-        if not len(close):
+        for within_mm in (FIRST_MM, LAST_MM):
+            found = self._best_within(self._tips, point, within_mm)
+            if found is not None:
+                return found
+        return None
+
+    def _best_within(
+        self, places: cKDTree, point: Float, within_mm: float
+    ) -> tuple[int, float, float] | None:
+        """Return the same for deployments that end within a distance of the point."""
+        atlas, made = self._atlas, self._atlas.deployments
+        close = np.array(places.query_ball_point(point, within_mm, return_sorted=True), dtype=np.int64)
+        away_mm = np.linalg.norm(made.positions[close] - point, axis=1)
+        near = away_mm <= near_mm(atlas, point)[made.site[close]]
+        chosen = nearest_of_each_tip(atlas, close[near], away_mm[near])
+        if not len(chosen):
             return None
-        made = atlas.deployments
-        chosen = nearest_of_each_tip(atlas, close, np.linalg.norm(made.positions[close] - point, axis=1))
         tips, row_of = tips_of(atlas, chosen)
         found, _why = self._aiming.aim(
             point, tips, np.ones(len(tips), dtype=np.bool_), row_of, made.outer_mm[chosen],

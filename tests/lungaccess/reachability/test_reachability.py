@@ -116,7 +116,7 @@ def test_the_clearance_is_kept(
 
 def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     plain, searched, again = (
-        map_reach(small_lung, SYSTEM, spacing_mm=14.0, atlas=atlas, trees=trees) for trees in (0, 1, 1)
+        map_reach(small_lung, SYSTEM, spacing_mm=12.0, atlas=atlas, trees=trees) for trees in (0, 1, 1)
     )
     gained = searched.kinds.array == SEARCHED
     assert gained.any()
@@ -124,7 +124,7 @@ def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     assert np.array_equal(np.where(gained, UNREACHED, searched.kinds.array), plain.kinds.array)
     assert (searched.cost.array[gained] > 0.0).all() and (searched.clearance_mm.array[gained] > 0.0).all()
     assert np.array_equal(searched.cost.array, again.cost.array)
-    assert searched.gained_and_lost_ml(plain) == (gained.sum() * 14.0**3 / 1000.0, 0.0)
+    assert searched.gained_and_lost_ml(plain) == (gained.sum() * 12.0**3 / 1000.0, 0.0)
 
 
 class StoppedError(Exception):

@@ -63,7 +63,7 @@ def test_the_tip_of_the_tubes_is_at_the_target(
         assert poses[-1, :3, 3] == pytest.approx(plan.target_lps, abs=1e-6)
         assert lengths[-1] == pytest.approx(plan.tissue_mm)
         report = la.check(plan, small_lung, system=system, target_lps=plan.target_lps)
-        assert report.accepted, report
+        assert report.accepted, report.refusals
 
 
 def test_plans_become_better_and_are_the_same_again(

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from lungaccess.problem.patients import load_organ, load_patient
     from lungaccess.problem.peripheral import peripheral_targets
     from lungaccess.problem.preset_order import (
-        WHY_THIS_ORDER,
         Invasiveness,
         invasiveness,
         least_invasive_first,

@@ -8,13 +8,6 @@ from typing import NamedTuple
 
 from lungaccess.problem.system import System, load_system, preset_names
 
-WHY_THIS_ORDER = (
-    "A system is less invasive if it may cross no fissure; then if its outer tube, which pierces the airway "
-    "wall, is thinner; then if its needle, or without one its inner tube, is thinner; then if its "
-    "bronchoscope, which stays in the airways, is thinner; then if its needle, or without one its inner "
-    "tube, bends less tightly, since a bent device presses on the tissue beside it"
-)
-
 
 class Invasiveness(NamedTuple):
     """What a system does to the tissue; of two systems the smaller one is the less invasive.

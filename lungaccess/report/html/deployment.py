@@ -130,17 +130,15 @@ def _twisted_shapes(plan: Plan, inner_mm: Float) -> list[Float]:
     tube, tubes, pose = plan.tube, plan.system.tubes, np.asarray(plan.scope.lps_from_scope_tip)
     inserted = np.array(tube.insertions_mm(tubes))[::-1]
     turned = np.array(tube.rotations_rad(tubes))[::-1] - tube.rotation_rad
-    shapes = []
-    for out_mm in inner_mm.tolist():
-        if out_mm == 0.0:
-            shapes.append(np.repeat(pose[None, :3, 3], TUBE_POINTS, axis=0))
-            continue
-        reached = np.minimum(inserted, out_mm)
-        found = Neighbourhood.of(tubes.nested, reached, turned).at(reached, turned)
+    shapes = [np.repeat(pose[None, :3, 3], TUBE_POINTS, axis=0)]
+    around = Neighbourhood.of(tubes.nested, np.minimum(inserted, inner_mm[1]), turned)
+    for out_mm in inner_mm[1:].tolist():
+        found = around.at(np.minimum(inserted, out_mm), turned)
         if found is None:
             raise SettingsError("The tubes of the plan snap on the way", remedy="Check it: lungaccess check")
         at_mm = np.linspace(0.0, out_mm, TUBE_POINTS)
         shapes.append(points_on_arcs(np.asarray(found.arcs), pose, tube.rotation_rad, at_mm))
+        around = around.moved(found)
     return shapes
 
 

@@ -19,6 +19,7 @@ from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import point_target
 from lungaccess.reachability import UnreachableProof
 from lungaccess.report.html.deployment import packed_plan
+from lungaccess.report.pack import unpack
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.deviations import Deviations
 from stages.tube import DeploymentValidator, shapes_of
@@ -136,9 +137,8 @@ def test_without_errors_the_plan_is_carried_out(case: Case) -> None:
 
 def test_the_page_shows_the_tubes_where_they_end(case: Case) -> None:
     packed = packed_plan(case.plan, case.lung, "plan")
-    points = packed["tubes"]["points"]
-    assert points is not None
     curve = case.plan.curves().tubes
+    assert unpack(packed["tubes"]["points"])[-1, -1] == pytest.approx(curve.points_lps[-1], abs=0.02)
     assert curve.points_lps[-1] == pytest.approx(case.plan.tube.lps_from_tip[:3, 3], abs=1e-6)
     assert set(np.unique(curve.radius_mm)) == {0.475, 0.6}
 

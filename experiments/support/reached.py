@@ -7,7 +7,7 @@ from pathlib import Path
 
 import lungaccess as la
 from anatomy.errors import SettingsError
-from anatomy.io.files import atomic_write
+from anatomy.io.files import write_text
 from anatomy.lung import Lung
 from lungaccess.coupled.atlas import require_same
 from lungaccess.problem.peripheral import peripheral_targets
@@ -42,8 +42,7 @@ class FinishedCounts:
         if key not in self._counts:
             self._counts[key] = reached_of(self._atlas_of(lung, system), system, per_lung, seed)
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_write(self._file) as temporary:
-                temporary.write_text(json.dumps(self._counts, indent=1))
+            write_text(self._file, json.dumps(self._counts, indent=1))
         return self._counts[key]
 
     def _atlas_of(self, lung: Lung, system: System) -> la.Atlas:

@@ -195,8 +195,8 @@ def propose_designs(
     Raises
     ------
     SettingsError
-        If there is one tube, the insertions are impossible, the sweep is not finite, or no outer tube fits
-        into the channel.
+        If there is one tube, the tubes are not planar, the insertions are impossible, the sweep is not finite,
+        or no outer tube fits into the channel.
     """
     if tubes.outer is None:
         raise SettingsError(
@@ -204,6 +204,7 @@ def propose_designs(
             expected="an outer and an inner tube, whose sizes are varied",
             remedy="Add [tubes.outer] to the device file",
         )
+    tubes.require_planar("A comparison of designs")
     together(tubes.nested, 0.0, (inner_mm, outer_mm))
     if inner_mm == 0.0:
         raise SettingsError("The inner tube stays in the scope", expected="an insertion above 0")

@@ -195,8 +195,8 @@ def propose_designs(
     Raises
     ------
     SettingsError
-        If there is one tube, the tubes are not planar, the insertions are impossible, the sweep is not finite,
-        or no outer tube fits into the channel.
+        If there is one tube, the tubes are not planar, the insertions are impossible, the sweep is not
+        finite, or no outer tube fits into the channel.
     """
     if tubes.outer is None:
         raise SettingsError(

@@ -123,7 +123,7 @@ def test_the_command_leaves_what_it_learned_and_exits_1(
     said = capsys.readouterr().out
     stored = json.loads((tmp_path / "no_plan.json").read_text())
     assert all(part["outcome"] == "not tried" for part in stored["parts"]) and stored["parts"]
-    assert [each["tried"] for each in stored["presets"]] == [False] * 4
+    assert [each["tried"] for each in stored["presets"]] == [False] * 5
     if as_json:
         record = json.loads(said)
         assert record["headline"] == stored["headline"] and record["files"] == ["no_plan.json"]

@@ -25,6 +25,8 @@ from lungaccess.problem.target import Target, nodule_target, point_target
 from lungaccess.problem.task import Task
 from stages.needle import TERMS, ArcPath
 
+TWISTED = "curved-outer"
+"""A preset whose tubes are turned one against the other; it is asked for by name only."""
 TARGETS = 100
 PLANS_A_BATCH = 60
 AT_A_TIME = 5
@@ -35,9 +37,9 @@ JOINT_ITERATIONS = 402
 
 
 def random_system(rng: Rng) -> System:
-    """Return a preset, or one with other sizes, limits and margins."""
-    preset = la.load_system(str(rng.choice(la.preset_names())))
-    if rng.random() < 0.2 or preset.needle is None:
+    """Return a preset, or one with planar tubes and a needle with other sizes, limits and margins."""
+    preset = la.load_system(str(rng.choice([*la.preset_names(), TWISTED])))
+    if rng.random() < 0.2 or preset.needle is None or not preset.tubes.planar:
         return preset
     while True:
         scope, needle = preset.scope.outer_diameter_mm, preset.needle.diameter_mm
@@ -127,7 +129,8 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
             )
             yield from (each.plan for each in found)
             return
-        method = "kuntz2015" if kind > 0.7 and system.needle is not None else "atlas"
+        paper = kind > 0.7 and system.needle is not None and system.tubes.planar
+        method = "kuntz2015" if paper else "atlas"
         iterations = 200 if method == "kuntz2015" else int(rng.choice([1, 40, 150, JOINT_ITERATIONS]))
         found = la.plan(
             lung, system, target, objective=objective, method=method, seed=seed, iterations=iterations,

@@ -19,13 +19,14 @@ from experiments.support.mutants.all import MUTATIONS
 from experiments.support.mutants.mutant import Case
 from lungaccess.checking import Checker, check
 from lungaccess.plans.plan import Plan
+from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 PLANS_A_SYSTEM = 8
 MUTANTS_OF_A_KIND = 4
 
 
 def systems() -> list[la.System]:
-    """A preset, and a device of its own that may cross fissures and bends tightly."""
+    """A preset, one with two curved tubes, and a device that may cross fissures and bends tightly."""
     preset = la.load_system("ultrathin")
     own = {
         "name": "own",
@@ -36,7 +37,7 @@ def systems() -> list[la.System]:
         "tubes.inner.curved_length_mm": 20.0,
         "margins.registration_margin_mm": 0.2,
     }
-    return [preset, override(preset, own)]
+    return [preset, override(preset, own), two_curved_tubes()]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,8 @@ def made(small_lung: Lung) -> list[tuple[Any, Any, Plan]]:
     found = []
     for number, system in enumerate(systems()):
         rng = np.random.default_rng(number)
-        atlas = la.build_atlas(small_lung, system, rotations=12, stop_spacing_mm=4.0, site_spacing_mm=3.0)
+        coarse = {"rotations": 12, "stop_spacing_mm": 4.0, "site_spacing_mm": 3.0}
+        atlas = la.build_atlas(small_lung, system, **(coarse if system.tubes.planar else COARSE))
         mine: list[tuple[Any, Any, Plan]] = []
         while len(mine) < PLANS_A_SYSTEM or not any(len(plan.needle.arcs) > 1 for _, _, plan in mine):
             target = random_plans.random_target(small_lung, atlas, rng)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from experiments.support.mutants import twisted
 from experiments.support.mutants.mutant import Case
 from lungaccess.coupled.atlas_measures import tube_stability
 from lungaccess.one_stage.replan import replan_from_scope
-from lungaccess.problem.system import System, load_system
+from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
 from lungaccess.reachability import UnreachableProof
 from lungaccess.report.html.deployment import packed_plan
@@ -23,25 +22,19 @@ from lungaccess.report.pack import unpack
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.deviations import Deviations
 from stages.tube import DeploymentValidator, shapes_of
+from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def system() -> System:
-    """The preset with two curved tubes, a scope for a child's airways and a short reach."""
-    loaded = load_system("curved-outer")
-    tubes = replace(loaded.tubes, max_extension_mm=24.0)
-    needle = replace(loaded.needle, max_curvature_per_mm=1.0 / 50.0)
-    scope = replace(loaded.scope, outer_diameter_mm=2.0)
-    return replace(
-        loaded, name="two curved tubes", scope=scope, tubes=tubes, needle=needle, fissures_allowed=True
-    )
+    return two_curved_tubes()
 
 
 @pytest.fixture(scope="module")
 def atlas(small_lung: Lung, system: System) -> la.Atlas:
-    return la.build_atlas(small_lung, system, rotations=4, site_spacing_mm=4.0)
+    return la.build_atlas(small_lung, system, **COARSE)
 
 
 @pytest.fixture(scope="module")

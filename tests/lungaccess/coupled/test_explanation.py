@@ -189,7 +189,6 @@ class TestAdvice:
                     break
         assert seen == 3
 
-    @pytest.mark.slow
     def test_thinner_needles_and_scopes_and_crossing_a_fissure(self, small_lung: Lung, atlas_of: Any) -> None:
         seen = set()
         for target in random_targets(small_lung, 60, 0):

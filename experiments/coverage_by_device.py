@@ -10,17 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import lungaccess as la
 from anatomy.settings import override
-from experiments.support.anatomies import anatomy, default_anatomies
-from experiments.support.reached import FinishedCounts
-from experiments.support.results import Result, setting_of, study_parser, write_result
+from experiments.support.reached import run_study
 from lungaccess.problem.system import System
 
-TARGETS_A_LUNG, QUICK_TARGETS_A_LUNG = 50, 3
 RADII_MM = (121.0, 50.0)
 """Of the needle: those of [Kuntz2015] and of `flexure-needle`."""
 PLAIN = {
@@ -54,30 +50,16 @@ def systems(device: str) -> Iterator[tuple[str, System]]:
             yield words, replace(system, needle=replace(system.needle, max_curvature_per_mm=1.0 / radius))
 
 
+def all_systems() -> Iterator[tuple[str, System]]:
+    """Yield every device with every setting, in words, and its system."""
+    for device in DEVICES:
+        for words, system in systems(device):
+            yield f"{device}, {words}", system
+
+
 def main() -> None:
     """Run the study and store its result."""
-    parser = study_parser(__doc__)
-    parser.add_argument("--patients", nargs="+", default=default_anatomies())
-    options = parser.parse_args()
-    per_lung = QUICK_TARGETS_A_LUNG if options.quick else TARGETS_A_LUNG
-    patients = options.patients[:1] if options.quick else options.patients
-    setting = setting_of(options)
-    result = Result(
-        name="coverage_by_device", title="Peripheral targets within reach, by device",
-        setting=setting, seeds=[options.seed],
-        conditions={
-            "targets": f"{2 * per_lung} random peripheral points a patient",
-            "reached": "by a single arc that is proved clear, from a deployment of the atlas",
-        },
-    )  # fmt: skip
-    finished = FinishedCounts(Path(options.results) / setting / "coverage_by_device_finished" / "counts.json")
-    for name in patients:
-        lung = anatomy(name)
-        for device in DEVICES:
-            for words, system in systems(device):
-                count = finished.count(lung, system, per_lung, options.seed)
-                result.add(f"{lung.name}: {device}, {words}", 100.0 * count / (2 * per_lung), unit="%")
-    write_result(result, options.results)
+    run_study(__doc__, "coverage_by_device", "Peripheral targets within reach, by device", {}, all_systems)
 
 
 if __name__ == "__main__":

@@ -10,18 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.settings import override
-from experiments.support.anatomies import anatomy, default_anatomies
-from experiments.support.reached import FinishedCounts
-from experiments.support.results import Result, setting_of, study_parser, write_result
+from experiments.support.reached import run_study
 from lungaccess.problem.system import System
 
-TARGETS_A_LUNG, QUICK_TARGETS_A_LUNG = 50, 3
 BASE = "ultrathin"
 PLAIN = {"outer.slotted_segments": (), "inner.slotted_segments": (), "max_channel_curvature_per_mm": None}
 """Tubes without slots; the channel is as bent as their strain allows."""
@@ -89,32 +85,9 @@ def _changed(system: System, changes: Mapping[str, Any]) -> System | None:
 
 def main() -> None:
     """Run the study and store its result."""
-    parser = study_parser(__doc__)
-    parser.add_argument("--patients", nargs="+", default=default_anatomies())
-    options = parser.parse_args()
-    per_lung = QUICK_TARGETS_A_LUNG if options.quick else TARGETS_A_LUNG
-    patients = options.patients[:1] if options.quick else options.patients
-    setting = setting_of(options)
-    result = Result(
-        name="tube_designs", title="Peripheral targets within reach, by design of the tubes",
-        setting=setting, seeds=[options.seed],
-        conditions={
-            "system": f"{BASE}, with other tubes", "fissures": "may be crossed",
-            "targets": f"{2 * per_lung} random peripheral points a patient",
-            "reached": "by a single arc that is proved clear, from a deployment of the atlas",
-        },
-    )  # fmt: skip
-    finished = FinishedCounts(Path(options.results) / setting / "tube_designs_finished" / "counts.json")
-    for name in patients:
-        lung = anatomy(name)
-        for design, system in designs():
-            label = f"{lung.name}: {design}"
-            if system is None:
-                result.add(label, None, note="breaks its own limit of strain")
-                continue
-            count = finished.count(lung, system, per_lung, options.seed)
-            result.add(label, 100.0 * count / (2 * per_lung), unit="%")
-    write_result(result, options.results)
+    conditions = {"system": f"{BASE}, with other tubes", "fissures": "may be crossed"}
+    title = "Peripheral targets within reach, by design of the tubes"
+    run_study(__doc__, "tube_designs", title, conditions, designs)
 
 
 if __name__ == "__main__":

@@ -3,16 +3,58 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.io.files import write_text
 from anatomy.lung import Lung
+from experiments.support.anatomies import anatomy, default_anatomies
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.coupled.atlas import require_same
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, system_fingerprint
 from stages.needle import direct_arcs, needle_environment
+
+TARGETS_A_LUNG, QUICK_TARGETS_A_LUNG = 50, 3
+
+
+def run_study(
+    doc: str | None,
+    name: str,
+    title: str,
+    conditions: Mapping[str, str],
+    systems: Callable[[], Iterable[tuple[str, System | None]]],
+) -> None:
+    """Count what labelled systems reach on each patient, and store the result.
+
+    `systems` yields None for a system that breaks its own limits.
+    """
+    parser = study_parser(doc)
+    parser.add_argument("--patients", nargs="+", default=default_anatomies())
+    options = parser.parse_args()
+    per_lung = QUICK_TARGETS_A_LUNG if options.quick else TARGETS_A_LUNG
+    patients = options.patients[:1] if options.quick else options.patients
+    setting = setting_of(options)
+    result = Result(
+        name=name, title=title, setting=setting, seeds=[options.seed],
+        conditions={
+            **conditions,
+            "targets": f"{2 * per_lung} random peripheral points a patient",
+            "reached": "by a single arc that is proved clear, from a deployment of the atlas",
+        },
+    )  # fmt: skip
+    finished = FinishedCounts(Path(options.results) / setting / f"{name}_finished" / "counts.json")
+    for patient in patients:
+        lung = anatomy(patient)
+        for label, system in systems():
+            if system is None:
+                result.add(f"{lung.name}: {label}", None, note="breaks its own limit of strain")
+                continue
+            count = finished.count(lung, system, per_lung, options.seed)
+            result.add(f"{lung.name}: {label}", 100.0 * count / (2 * per_lung), unit="%")
+    write_result(result, options.results)
 
 
 def reached_of(atlas: la.Atlas, system: System, per_lung: int, seed: int) -> int:

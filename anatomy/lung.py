@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
@@ -11,8 +13,11 @@ from anatomy.lobes import LOBES
 from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
+from anatomy.structures import AIRWAY, OUTSIDE
 from anatomy.typed import Float
 
+HEIGHT_STEP = 4
+"""Every fourth voxel is looked at to find apex and base: within 2 mm or so of 250 mm."""
 NEAREST_LOBE_MM = 10.0
 """A place in no lobe, such as a bronchus or vessel, is named after a lobe that is as near as this."""
 
@@ -51,6 +56,23 @@ class Lung(Organ):
         ]
         facts = table(rows, f"Lung of {self.name}") + bullets("Warnings", self.warnings)
         return side_by_side(facts, self.tree.drawing())
+
+    @cached_property
+    def _apex_and_base(self) -> tuple[tuple[float, float], ...]:
+        """The height z in mm of apex and base of the right and of the left lung."""
+        step = self.labels[::HEIGHT_STEP, ::HEIGHT_STEP, ::HEIGHT_STEP]
+        points = self.grid.lps(HEIGHT_STEP * np.argwhere((step & (OUTSIDE | AIRWAY)) == 0))
+        left = points[:, 0] > self.tree.carina_lps[0]
+        sides = (each if len(each) else points for each in (points[~left], points[left]))
+        return tuple((float(each[:, 2].max()), float(each[:, 2].min())) for each in sides)
+
+    def height_share(self, point_lps: Float) -> float:
+        """Return how far a point `(3,)` LPS mm is from the apex, 0, to the base, 1, of its lung.
+
+        Left and right are those of the carina; a point beyond apex or base counts as there.
+        """
+        apex, base = self._apex_and_base[int(point_lps[0] > self.tree.carina_lps[0])]
+        return float(np.clip((apex - point_lps[2]) / max(apex - base, 1e-9), 0.0, 1.0))
 
     def lobe_at(self, point_lps: Float) -> str:
         """Return the name of the lobe that holds a point `(3,)` LPS mm or is near it; "" if not known."""

@@ -75,7 +75,7 @@ class Appraiser:
     lung : Lung
         The patient that the plans are for.
     errors : ErrorModel, optional
-        The errors of devices and target; the default ones, all of them assumptions, if None.
+        The errors of devices and target; the preset `breath-hold` if None.
     draws, seed : int
         Number of deviated plans of the estimate, and the seed of the random numbers; 0 draws for none.
 

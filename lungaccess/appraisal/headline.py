@@ -142,17 +142,13 @@ class Headline:
         model, label = self.risk.model, self.risk.model.label
         sizes = model.words(with_needle=self.risk.with_needle)
         last = "needle ends" if self.risk.with_needle else "tubes end"
-        source = (
-            f"All sizes of '{label}' are assumptions: {sizes}."
-            if model.is_default
-            else f"Errors of '{label}': {sizes}. A size that it does not state is an assumption."
-        )
+        assumed = ", ".join(kind.replace("_", " ") for kind in model.assumed)
         return (
             f"{plural(self.risk.samples, 'draw')}, seed {self.risk.seed}; the devices are not corrected on "
             "their way.",
             f"Success: the {last} within {self.risk.radius_mm:.1f} mm of the target "
             f"({self.risk.radius_origin}) and nothing forbidden is touched.",
-            source,
+            f"Errors of '{label}': {sizes}. Assumed, with no published source: {assumed or 'none'}.",
         )
 
     def to_mapping(self) -> dict[str, object]:
@@ -174,7 +170,7 @@ class Headline:
             "goal_radius_mm": None if risk is None else risk.radius_mm,
             "goal_radius_origin": None if risk is None else risk.radius_origin,
             "errors": None if risk is None else {**to_mapping(risk.model), "name": risk.model.label},
-            "errors_are_assumed": None if risk is None else risk.model.is_default,
+            "errors_assumed": None if risk is None else list(risk.model.assumed),
         }
 
 

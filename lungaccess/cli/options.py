@@ -176,15 +176,18 @@ class ErrorOptions:
     """How large the errors of devices and target are assumed to be."""
 
     errors: Annotated[
-        Path | None,
-        Parameter(help="TOML file of the error model; the default one, all of it assumed, if not given."),
-    ] = None
+        str,
+        Parameter(
+            help="Error model: a preset (breath-hold, expiratory-free, gated-ct, inspiratory-ct, "
+            "vision-only) or a TOML file."
+        ),
+    ] = "breath-hold"
 
     def load(self) -> ErrorModel:
         """Return the error model."""
-        from lungaccess.risk import ErrorModel, load_errors
+        from lungaccess.risk import load_errors
 
-        return ErrorModel() if self.errors is None else load_errors(self.errors)
+        return load_errors(self.errors)
 
 
 @Parameter(name="*")

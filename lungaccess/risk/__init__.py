@@ -9,8 +9,18 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.risk.assessment import MISSES, RiskReport, assess, safest
     from lungaccess.risk.assessor import STRUCTURES, Outcomes, RiskAssessor
-    from lungaccess.risk.deviations import Deviations, Draws
-    from lungaccess.risk.errors import CURVATURE, UNITS, ErrorModel, load_errors
+    from lungaccess.risk.deviations import Deviations
+    from lungaccess.risk.draws import Draws
+    from lungaccess.risk.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
+    from lungaccess.risk.errors import (
+        CURVATURE,
+        UNITS,
+        AngleError,
+        BreathingError,
+        CurvatureError,
+        ErrorModel,
+        PositionError,
+    )
     from lungaccess.risk.statistics import Share
     from lungaccess.risk.tolerances import LARGEST, Tolerance, find_tolerances
 

@@ -11,7 +11,8 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
-from lungaccess.risk.errors import CURVATURE, ErrorModel
+from lungaccess.risk.error_files import load_errors
+from lungaccess.risk.errors import ErrorModel
 from lungaccess.risk.statistics import Share, share_of
 
 DEFAULT_SAMPLES = 10_000
@@ -86,7 +87,7 @@ def assess(
     Parameters
     ----------
     model : ErrorModel, optional
-        The default one if None.
+        The preset `breath-hold` if None.
     samples : int
         Number of deviated plans.
     seed : int
@@ -101,13 +102,13 @@ def assess(
     PlanFileError, SettingsError
         See `RiskAssessor`; also if there are no samples.
     """
-    stated = model or ErrorModel()
+    stated = model or load_errors()
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
     draws = assessor.draws(samples, seed)
-    outcomes = assessor.outcomes(draws.scaled(stated.sizes, stated.curvature_factors))
+    outcomes = assessor.outcomes(draws.deviations(stated))
     touched = {name: share_of((outcomes.touched & flag) != 0) for name, flag in assessor.structures.items()}
     kinds = assessor.kinds if each_kind else ()
-    alone = {name: assessor.success(draws, *_one_kind(stated, name)) for name in kinds}
+    alone = {name: assessor.success(draws, stated.only(name)) for name in kinds}
     return RiskReport(
         model=stated,
         samples=samples,
@@ -142,17 +143,10 @@ def safest(
     lung, model, samples, seed, radius_mm
         See `assess`.
     """
-    stated = model or ErrorModel()
+    stated = model or load_errors()
     assessed = []
     for each in plans:
         assessor = RiskAssessor(each, lung, radius_mm=radius_mm)
         draws = assessor.draws(samples, seed)
-        assessed.append((each, assessor.success(draws, stated.sizes, stated.curvature_factors)))
+        assessed.append((each, assessor.success(draws, stated)))
     return tuple(sorted(assessed, key=lambda pair: -pair[1].value))
-
-
-def _one_kind(model: ErrorModel, name: str) -> tuple[dict[str, float], tuple[float, float]]:
-    """Return sizes and factors of a model in which all errors but one kind are 0."""
-    if name == CURVATURE:
-        return {}, model.curvature_factors
-    return {name: model.sizes[name]}, (1.0, 1.0)

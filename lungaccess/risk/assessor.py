@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,8 +14,10 @@ from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
-from lungaccess.risk.deviations import Deviations, Draws, deviated_pieces, deviated_starts, no_deviations
-from lungaccess.risk.errors import OF_NEEDLE, UNITS
+from lungaccess.risk.breathing import share_of_motion
+from lungaccess.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
+from lungaccess.risk.draws import Draws
+from lungaccess.risk.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.statistics import Share, share_of
 from stages.needle import Obstacles
@@ -53,7 +54,9 @@ class RiskAssessor:
     Attributes
     ----------
     kinds : tuple of str
-        The kinds of error that the devices of the plan can have.
+        The kinds of error that the devices of the plan can have, and that of the target.
+    stretch : float
+        See `Draws`.
 
     Parameters
     ----------
@@ -83,6 +86,9 @@ class RiskAssessor:
         self.n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
         self._n_twisted = 0 if plan.tube.shape is None else len(plan.system.tubes.nested)
         self.kinds = tuple(name for name in UNITS if plan.needle is not None or name not in OF_NEEDLE)
+        tip = np.asarray(plan.scope.lps_from_scope_tip)[:3, 3]
+        heights = (lung.height_share(np.asarray(plan.target_lps)), lung.height_share(tip))
+        self.stretch = share_of_motion(heights[0]) - share_of_motion(heights[1])
         self.radius_mm, self.radius_origin = (
             goal_radius(lung, plan) if radius_mm is None else (float(radius_mm), "given")
         )
@@ -99,9 +105,16 @@ class RiskAssessor:
         )
         self._forbidden_flags = sum(self.structures[name] for name in self.forbidden)
 
-    def draws(self, count: int, seed: int) -> Draws:
-        """Return random numbers for `count` sets of errors; the same seed gives the same."""
-        return Draws(count, self.n_arcs, seed, self._n_twisted)
+    def draws(self, count: int, seed: int, *, attempts_a_patient: int = 1) -> Draws:
+        """Return random numbers for `count` sets of errors, see `Draws`; the same seed gives the same."""
+        return Draws(
+            count,
+            self.n_arcs,
+            seed,
+            self._n_twisted,
+            stretch=self.stretch,
+            attempts_a_patient=attempts_a_patient,
+        )
 
     def no_deviations(self, count: int) -> dict[str, Float]:
         """Return the fields of `Deviations` for `count` sets without any error."""
@@ -151,11 +164,9 @@ class RiskAssessor:
         done[done] = (touched & self._forbidden_flags) == 0
         return done
 
-    def success(
-        self, draws: Draws, sizes: Mapping[str, float], factors: tuple[float, float] = (1.0, 1.0)
-    ) -> Share:
-        """Return the share of successes under errors of given sizes, see `Draws.scaled`."""
-        return share_of(self.successes(draws.scaled(sizes, factors)))
+    def success(self, draws: Draws, model: ErrorModel) -> Share:
+        """Return the share of successes under a model."""
+        return share_of(self.successes(draws.deviations(model)))
 
 
 def goal_radius(lung: Lung, plan: Plan) -> tuple[float, str]:

@@ -1,17 +1,12 @@
-"""Random deviations from a plan, and the deviated devices as arcs."""
+"""Deviations from a plan, and the deviated devices as arcs."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-
 import numpy as np
 
-from anatomy.errors import SettingsError
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
-from lungaccess.risk.errors import UNITS
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.twisted import twisted_pieces
 
@@ -90,64 +85,6 @@ FIELD_OF: dict[str, str] = {
     "target_position": "target_mm",
 }
 """The field of `Deviations` that holds each kind of error."""
-
-
-class Draws:
-    """Standard normal and uniform numbers, drawn once and scaled to any sizes of error.
-
-    Parameters
-    ----------
-    count, n_arcs : int
-        N and A of `Deviations`.
-    seed : int
-        The same seed gives the same numbers.
-    n_twisted : int
-        See `no_deviations`.
-
-    Raises
-    ------
-    SettingsError
-        If there are to be none.
-    """
-
-    def __init__(self, count: int, n_arcs: int, seed: int, n_twisted: int = 0) -> None:
-        if count < 1:
-            raise SettingsError(
-                f"The number of samples is {count}",
-                expected="at least 1",
-                remedy="Choose a count such as 10000",
-            )
-        rng = np.random.Generator(np.random.PCG64(seed))
-        shapes = no_deviations(count, n_arcs, n_twisted)
-        self._uniform = rng.uniform(size=count)
-        self._normal = {name: rng.standard_normal(shapes[field].shape) for name, field in FIELD_OF.items()}
-        self._relative = rng.standard_normal(shapes["relative_rad"].shape)
-        self._shapes = shapes
-
-    def scaled(self, sizes: Mapping[str, float], factors: tuple[float, float]) -> Deviations:
-        """Return deviations of given sizes.
-
-        Parameters
-        ----------
-        sizes : mapping of str to float
-            Standard deviation by kind, in the unit of `UNITS`; kinds left out have no error.
-        factors : (float, float)
-            Least and greatest factor of the needle's curvature.
-        """
-        values = dict(self._shapes)
-        for name, size in sizes.items():
-            values[FIELD_OF[name]] = self._normal[name] * in_radians(name, size)
-            if name == "tube_rotation" and self._relative.size:
-                # Each tube is held by itself: none turns with another.
-                values[FIELD_OF[name]] = np.zeros(len(self._uniform))
-                values["relative_rad"] = self._relative * in_radians(name, size)
-        values["factor"] = factors[0] + (factors[1] - factors[0]) * self._uniform
-        return Deviations(**values)
-
-
-def in_radians(name: str, size: float) -> float:
-    """Return the size of a kind of error in mm or rad, from mm or degrees."""
-    return math.radians(size) if UNITS[name] == "deg" else size
 
 
 def deviated_starts(plan: Plan, deviations: Deviations) -> Float:

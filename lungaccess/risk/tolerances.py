@@ -14,16 +14,20 @@ from anatomy.records import frozen_value
 from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
-from lungaccess.risk.deviations import FIELD_OF, Deviations, Draws, in_radians
-from lungaccess.risk.errors import CURVATURE, UNITS, ErrorModel
+from lungaccess.risk.deviations import FIELD_OF, Deviations
+from lungaccess.risk.draws import Draws
+from lungaccess.risk.error_files import load_errors
+from lungaccess.risk.errors import BREATHING, CURVATURE, UNITS, ErrorModel
 from lungaccess.risk.statistics import Share
 
 DEFAULT_PROBABILITY = 0.95
 """The usual level of confidence."""
 DEFAULT_SAMPLES = 2000
 """A share of 0.95 is then known to 1 % with 95 % confidence, at every size that is tried."""
-LARGEST = {"mm": 20.0, "deg": 90.0, "factor": 3.0}
+LARGEST = {"mm": 20.0, "deg": 90.0, "ln": 1.0}
 """Sizes beyond which no tolerance is looked for."""
+LARGEST_FACTOR = 3.0
+"""Factor of the curvature beyond which no margin is looked for."""
 BISECTIONS = 10
 """A tolerance is then known to a thousandth of the largest size."""
 LADDER = 64
@@ -40,11 +44,10 @@ class Tolerance:
     ----------
     kind, unit : str
         See `lungaccess.risk.errors.UNITS`.
-    stated : float or (float, float)
-        The size in the error model; for the curvature its two factors.
+    stated : float
+        The size in the error model, of patient and attempt together; see `lungaccess.risk.errors.Term`.
     largest : float
-        The largest standard deviation at which successes are that probable, at most `LARGEST`; 0 if none
-        was found.  For the curvature the largest `f` of factors uniform between 1 / f and f.
+        The largest size at which successes are that probable, at most `LARGEST`; 0 if none was found.
     margin : (float, float)
         Errors up to this size never fail: (below 0, above 0) for errors with a sign, the same twice for
         errors with directions; factors for the curvature.  Tried at steps and in some directions, not
@@ -55,7 +58,7 @@ class Tolerance:
 
     kind: str
     unit: str
-    stated: float | tuple[float, float]
+    stated: float
     probability: float
     largest: float
     margin: tuple[float, float]
@@ -74,7 +77,8 @@ def find_tolerances(
 ) -> tuple[Tolerance, ...]:
     """Return the tolerance of a plan to each kind of error alone.
 
-    The largest standard deviation is found by bisection over a scale, every size with the same draws.
+    The largest size is found by bisection over a scale, every size with the same draws.  Breathing is left
+    out: it is an error of the target in one direction.
 
     Parameters
     ----------
@@ -98,10 +102,11 @@ def find_tolerances(
             expected="above 0 and below 1",
             remedy="Choose a share such as 0.95",
         )
-    stated = model or ErrorModel()
+    stated = model or load_errors()
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
     draws = assessor.draws(samples, seed)
-    return tuple(_tolerance(assessor, draws, stated, name, probability) for name in assessor.kinds)
+    kinds = (kind for kind in assessor.kinds if kind != BREATHING)
+    return tuple(_tolerance(assessor, draws, stated, kind, probability) for kind in kinds)
 
 
 def _tolerance(
@@ -109,29 +114,25 @@ def _tolerance(
 ) -> Tolerance:
     unit = UNITS[name]
 
-    def share(size: float) -> Share:
-        if name == CURVATURE:
-            return assessor.success(draws, {}, (1.0 / size, size))
-        return assessor.success(draws, {name: size})
+    def holds(size: float) -> bool:
+        return assessor.success(draws, model.only(name, size)).value >= probability
 
-    curved = name == CURVATURE
-    least = 1.0 if curved else 0.0
     return Tolerance(
         kind=name,
         unit=unit,
-        stated=model.curvature_factors if curved else model.sizes[name],
+        stated=model.term(name).size,
         probability=probability,
-        largest=_largest(lambda size: share(size).value >= probability, least, LARGEST[unit]),
-        margin=_curvature_margin(assessor) if curved else _margin(assessor, name),
-        alone=assessor.success(draws, {}, model.curvature_factors) if curved else share(model.sizes[name]),
+        largest=_largest(holds, LARGEST[unit]),
+        margin=_curvature_margin(assessor) if name == CURVATURE else _margin(assessor, name),
+        alone=assessor.success(draws, model.only(name)),
     )
 
 
-def _largest(holds: Callable[[float], bool], least: float, most: float) -> float:
-    """Return the largest size between two that holds; `least` if none does."""
+def _largest(holds: Callable[[float], bool], most: float) -> float:
+    """Return the largest size up to another that holds; 0 if none does."""
     if holds(most):
         return most
-    low, high = least, most
+    low, high = 0.0, most
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         if holds(middle):
@@ -148,7 +149,7 @@ def _margin(assessor: RiskAssessor, name: str) -> tuple[float, float]:
     directions = _directions(name, shape[0] if shape else 1)
 
     def made(sizes: Float, chosen: Float) -> Deviations:
-        scaled = np.array([in_radians(name, float(size)) for size in sizes])
+        scaled = np.radians(sizes) if UNITS[name] == "deg" else sizes
         errors = (scaled[:, None, None] * chosen).reshape(-1, *shape)
         return Deviations(**{**assessor.no_deviations(len(errors)), field: errors})
 
@@ -167,7 +168,7 @@ def _curvature_margin(assessor: RiskAssessor) -> tuple[float, float]:
         return Deviations(**{**assessor.no_deviations(len(factors)), "factor": factors})
 
     below = _unfailing(assessor, made, np.array([[-1.0]]), 1.0)
-    above = _unfailing(assessor, made, np.array([[1.0]]), LARGEST["factor"] - 1.0)
+    above = _unfailing(assessor, made, np.array([[1.0]]), LARGEST_FACTOR - 1.0)
     return 1.0 - below, 1.0 + above
 
 

@@ -11,6 +11,7 @@ from lungaccess.checking import CheckReport, Finding
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.risk.assessment import RiskReport
+from lungaccess.risk.error_files import load_errors
 from lungaccess.risk.errors import ErrorModel
 from lungaccess.risk.statistics import Share
 
@@ -31,7 +32,7 @@ def make_risk(
         return Share(count=count, samples=draws)
 
     return RiskReport(
-        model=model or ErrorModel(),
+        model=model or load_errors(),
         samples=draws,
         seed=0,
         radius_mm=2.5,

@@ -113,7 +113,7 @@ def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:
         (
             each.kind.replace("_", " "),
             each.unit,
-            f"{each.stated:g}" if isinstance(each.stated, float) else "{:g} to {:g}".format(*each.stated),
+            f"{each.stated:g}",
             f"{100.0 * each.alone.value:.1f}",
             _largest(each),
             "{:.2f}, {:.2f}".format(*each.margin),
@@ -132,6 +132,4 @@ def _largest(tolerance: Tolerance) -> str:
 
     size = tolerance.largest
     more = "at least " if size >= LARGEST[tolerance.unit] else ""
-    if tolerance.kind == "needle_curvature":
-        return f"{more}{1.0 / size:.2f} to {size:.2f}"
     return f"{more}{size:.2f}"

@@ -177,7 +177,7 @@ def risk_section(report: RiskReport | None) -> str:
     sizes = report.model.words(with_needle=report.with_needle)
     note = (
         f"{report.samples} deviated plans, seed {report.seed}, open loop, errors of '{report.model.label}': "
-        f"{sizes}{', all of them assumed' if report.model.is_default else ''}. Radius of the "
+        f"{sizes}; of which assumed: {', '.join(report.model.assumed) or 'none'}. Radius of the "
         f"goal: {report.radius_origin}. The range is the 95 % interval."
     )
     return (

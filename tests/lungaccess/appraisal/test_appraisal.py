@@ -40,7 +40,7 @@ KEYS = {
     "goal_radius_mm",
     "goal_radius_origin",
     "errors",
-    "errors_are_assumed",
+    "errors_assumed",
 }
 
 
@@ -68,7 +68,7 @@ def test_a_good_plan_is_good_news() -> None:
     assert (headline.grade, headline.verdict) == (Grade.GOOD, "likely to succeed")
     assert headline.text == (
         "Geometry proved and checked. Estimated to succeed in 100 of 100 (95 % interval 99.8 to 100) under "
-        "the errors of 'default'; no draw failed."
+        "the errors of 'breath-hold'; no draw failed."
     )
 
 
@@ -99,15 +99,16 @@ def test_what_was_not_looked_at_is_never_good() -> None:
 
 def test_the_model_is_named_and_its_sizes_are_stated(tmp_path: Path) -> None:
     default = Headline.of(make_check(True), make_risk(5)).details
-    assert any("All sizes of 'default' are assumptions: scope tip 1 mm and 2°" in each for each in default)
-    (tmp_path / "measured.toml").write_text("scope_position_mm = 0.25\n")
+    assert any("Errors of 'breath-hold': scope tip 1.3 mm and 2°" in each for each in default)
+    assert any("Assumed, with no published source: scope direction, tube" in each for each in default)
+    (tmp_path / "measured.toml").write_text("[scope_position]\nattempt_mm = 0.25\n")
     of_file = load_errors(tmp_path / "measured.toml")
     assert of_file.label == "measured.toml"
     details = Headline.of(make_check(True), make_risk(5, model=of_file)).details
     assert any(each.startswith("Errors of 'measured.toml': scope tip 0.25 mm") for each in details)
-    (tmp_path / "named.toml").write_text('name = "expiration"\nscope_position_mm = 0.25\n')
+    (tmp_path / "named.toml").write_text('name = "expiration"\n[scope_position]\nattempt_mm = 0.25\n')
     assert load_errors(tmp_path / "named.toml").label == "expiration"
-    assert ErrorModel(scope_position_mm=0.25).label == "stated"
+    assert ErrorModel().label == "stated"
 
 
 @given(

@@ -34,7 +34,7 @@ BROKEN_TOML = {
     "broken.toml": 'name = "x\n[',
     "unknown_key.toml": 'name = "x"\nsurprise = 1\n',
     "wrong_types.toml": 'name = 3\nscope = "wide"\ntubes = 1\nlumen = 7\n',
-    "not_finite.toml": "scope_position_mm = nan\n[needle]\ndiameter_mm = -inf\n",
+    "not_finite.toml": "[scope_position]\nattempt_mm = nan\n[needle]\ndiameter_mm = -inf\n",
     "empty.toml": "",
 }
 

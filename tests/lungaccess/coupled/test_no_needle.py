@@ -185,13 +185,7 @@ def test_the_risk_has_only_errors_of_scope_tubes_and_target(
     plan = plans[0][-1]
     report = la.assess(plan, small_lung, samples=500)
     assert not any(name.startswith("needle") for name in report.alone)
-    none = la.ErrorModel(
-        scope_position_mm=0.0,
-        scope_direction_deg=0.0,
-        tube_rotation_deg=0.0,
-        tube_insertion_mm=0.0,
-        target_position_mm=0.0,
-    )
+    none = la.ErrorModel()
     exact = la.assess(plan, small_lung, model=none, samples=20)
     assert exact.miss_mm[0.95] < 1e-6 and exact.succeeds.value == 1.0
     assert exact.miss_mm[0.5] < report.miss_mm[0.5]

@@ -25,7 +25,7 @@ from experiments.support.anatomies import PHANTOM, anatomy, default_anatomies
 from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
 from experiments.support.insertion.figure import draw_insertions
 from experiments.support.insertion.repeated import Study, Summary, study, summary
-from experiments.support.insertion.truth import Errors, tilt
+from experiments.support.insertion.truth import Errors
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
@@ -33,6 +33,7 @@ from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform
 from stages.needle.query import Query
+from stages.needle.replanning.insertion import tilt
 from stages.needle.replanning.replanner import ITERATIONS, Replanner, ReplanSettings, with_reserve
 from stages.needle.search.base import RestartingRRT
 

@@ -16,14 +16,14 @@ from anatomy.grid import read_only
 from anatomy.kernels.field import bounds_at, exact_at
 from anatomy.records import frozen_record
 from anatomy.typed import Float
-from experiments.support.insertion.truth import Errors, Truth, tilt
+from experiments.support.insertion.truth import Errors, Truth
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import LENGTH, ROLL, ArcPath, arc_transform, bend_direction
+from stages.needle.path import ArcPath, bend_direction
 from stages.needle.query import Query
 from stages.needle.replanning.escaping import structure_name, with_limits
+from stages.needle.replanning.insertion import GAIN, Belief, TrueNeedle, steer
 from stages.needle.replanning.reaiming import pose_at
 from stages.needle.replanning.replanner import (
     DEFAULT_SETTINGS,
@@ -36,9 +36,6 @@ from stages.needle.replanning.replanner import (
 
 STEP_MM = 0.25
 TOLERANCE_MM = 2.0
-GAIN = 0.3
-"""Share of a measurement that is believed: over the few millimetres between two of them, dead reckoning
-is more exact than a tracker."""
 
 WIDEST_CLEARANCE_MM = 200.0
 
@@ -91,105 +88,30 @@ class Insertion:
         return structure_name(self.label) if self.label else ""
 
 
-class _Needle:
-    """The true needle: where its tip is, and whether it has hit something."""
+class _Needle(TrueNeedle):
+    """The true needle, and whether its surface has hit something."""
 
     def __init__(self, environment: NeedleEnvironment, query: Query, truth: Truth) -> None:
+        super().__init__(truth, query.lps_from_start, query.inserted_mm)
         self._environment = with_limits(environment, required_mm=environment.needle.radius_mm)
         self._branch = query.branch
-        self._truth = truth
-        self.frame = np.array(query.lps_from_start)
-        self.inserted_mm = query.inserted_mm
         self.frames, self.lengths = [self.frame], [self.inserted_mm]
-        self.label = 0
-
-    def roll(self, angle: float) -> None:
-        """Roll at the base."""
-        if angle != 0.0:
-            self.frame = self.frame @ arc_transform(0.0, angle, 0.0)
-            self._truth.roll()
 
     def insert(self, length: float, curvature: float) -> None:
-        """Insert by a small step; the needle's surface is judged along it, exactly."""
-        middle = self.inserted_mm + 0.5 * length
-        towards, bent = self._truth.bend(self.frame, curvature, middle)
-        normal = bend_direction(self.frame, towards)
-        bend = (bent, *(float(v) for v in normal))
-        self.label = int(
+        """Insert by a small step."""
+        super().insert(length, curvature)
+        self.frames.append(self.frame)
+        self.lengths.append(self.inserted_mm)
+
+    def touched(self, towards: float, curvature: float, length: float) -> int:
+        """Return the label of what the next arc hits, exactly."""
+        bend = (curvature, *(float(v) for v in bend_direction(self.frame, towards)))
+        return int(
             blocker_on_arc(
                 self._environment.obstacles, self._environment.limits, pose_at(self.frame), bend, length,
                 self.inserted_mm, self._branch,
             )
         )  # fmt: skip
-        self.frame = self.frame @ arc_transform(length, towards, bent) @ arc_transform(0.0, -towards, 0.0)
-        self.inserted_mm += length
-        self.frames.append(self.frame)
-        self.lengths.append(self.inserted_mm)
-
-
-class _Belief:
-    """Where the planner takes tip and target to be: dead reckoning, corrected by each measurement."""
-
-    def __init__(self, query: Query, gain: float) -> None:
-        self._gain = gain
-        self.frame = np.array(query.lps_from_start)
-        self.target = query.target
-
-    def roll(self, angle: float) -> None:
-        """Roll as commanded."""
-        self.frame = self.frame @ arc_transform(0.0, angle, 0.0)
-
-    def insert(self, length: float, curvature: float) -> None:
-        """Insert as commanded."""
-        self.frame = self.frame @ arc_transform(length, 0.0, curvature)
-
-    def correct(self, seen: Float, target: Float) -> None:
-        """Take a measurement into account; it says nothing about the roll."""
-        x, y, z = (float(v) for v in self.frame[:3, :3].T @ seen[:3, 2])
-        moved = self.frame[:3, 3] + self._gain * (seen[:3, 3] - self.frame[:3, 3])
-        self.frame = self.frame @ tilt(self._gain * math.atan2(math.hypot(x, y), z), math.atan2(y, x))
-        self.frame[:3, 3] = moved
-        self.target = self.target + self._gain * (target - self.target)
-
-
-class _Commands:
-    """What the needle is told to do: the arcs of a plan, in small pieces."""
-
-    def __init__(self, plan: ArcPath) -> None:
-        self._arcs = plan.arcs
-        self._arc = 0
-        self._done_mm = 0.0
-
-    @property
-    def finished(self) -> bool:
-        return self._arc >= len(self._arcs)
-
-    @property
-    def left_mm(self) -> float:
-        """What is left of the arc."""
-        return float(self._arcs[self._arc, LENGTH]) - self._done_mm
-
-    def give(self, needle: _Needle, belief: _Belief, longest_mm: float) -> None:
-        """Let the needle do a piece of the arc, and roll before a new one."""
-        length = min(longest_mm, self.left_mm)
-        if self.left_mm - length < index.MIN_ARC_MM:
-            length = self.left_mm
-        _length, roll, curvature = (float(v) for v in self._arcs[self._arc])
-        for body in (needle, belief):
-            if self._done_mm == 0.0:
-                body.roll(roll)
-            body.insert(length, curvature)
-        self._done_mm += length
-        if self.left_mm <= 0.0:
-            self._arc += 1
-            self._done_mm = 0.0
-
-    def rest(self, frame: Float) -> ArcPath:
-        """Return what is left, from another pose."""
-        arcs = np.array(self._arcs[self._arc :])
-        if self._done_mm > 0.0:
-            arcs[0, LENGTH], arcs[0, ROLL] = self.left_mm, 0.0
-        return ArcPath(lps_from_start=frame, arcs=arcs)
 
 
 def simulate(
@@ -247,43 +169,22 @@ def simulate(
         )
     longest_mm = environment.limits.max_length_mm
     truth = Truth(errors, query, longest_mm - query.inserted_mm, seed)
-    needle, belief, commands = _Needle(environment, query, truth), _Belief(query, gain), _Commands(plan)
+    needle, belief = _Needle(environment, query, truth), Belief(query, gain)
     replanner = Replanner(
         environment, query, plan, objective=objective, settings=replanning, iterations=iterations, seed=seed
     )
-    replans: list[Replan] = []
-    stopped: Failure | None = None
-    measure_mm = query.inserted_mm + errors.measure_every_mm if closed_loop else math.inf
-    while not (commands.finished or needle.label):
-        if needle.inserted_mm >= measure_mm - index.TINY:
-            measure_mm += errors.measure_every_mm
-            belief.correct(*truth.measure(needle.frame, needle.inserted_mm))
-            replans.append(replanner.replan(belief.frame, belief.target, needle.inserted_mm))
-            path = replans[-1].path
-            if path is not None:
-                commands = _Commands(path)
-                continue
-            if not _is_clear(environment, commands.rest(belief.frame), needle.inserted_mm, query.branch):
-                stopped = replans[-1].failure
-                break
-        if needle.inserted_mm >= longest_mm - index.MIN_ARC_MM:
-            stopped = Failure.OUT_OF_LENGTH
-            break
-        left_mm = min(measure_mm, longest_mm) - needle.inserted_mm
-        commands.give(needle, belief, min(step_mm, left_mm))
+    replans, stopped = steer(
+        environment,
+        truth,
+        needle,
+        belief,
+        plan,
+        replanner,
+        branch=query.branch,
+        step_mm=step_mm,
+        measure_every_mm=errors.measure_every_mm if closed_loop else math.inf,
+    )
     return _insertion(environment, query, needle, truth, stopped, tolerance_mm, replans)
-
-
-def _is_clear(environment: NeedleEnvironment, path: ArcPath, inserted_mm: float, branch: int) -> bool:
-    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
-        bend = (float(curvature), *(float(v) for v in bend_direction(frame, roll)))
-        pose = pose_at(frame)
-        if blocker_on_arc(
-            environment.obstacles, environment.limits, pose, bend, float(length), inserted_mm, branch
-        ):
-            return False
-        inserted_mm += float(length)
-    return True
 
 
 def _insertion(
@@ -293,7 +194,7 @@ def _insertion(
     truth: Truth,
     stopped: Failure | None,
     tolerance_mm: float,
-    replans: list[Replan],
+    replans: tuple[Replan, ...],
 ) -> Insertion:
     target = truth.target(needle.inserted_mm)
     error = float(np.linalg.norm(needle.frame[:3, 3] - target))
@@ -314,7 +215,7 @@ def _insertion(
         target_lps=read_only(target),
         tip_error_mm=error,
         clearance_mm=_smallest_clearance(environment, query.branch, frames[:, :3, 3], lengths),
-        replans=tuple(replans),
+        replans=replans,
     )
 
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float
-from stages.needle.path import arc_transform, bend_direction
+from stages.needle.path import bend_direction
 from stages.needle.query import Query
+from stages.needle.replanning.insertion import tilt
 
 KNOT_MM = 1.0
 """Spacing of the random walks; between two knots they are linear."""
@@ -176,10 +177,3 @@ def _walk(steps: Float) -> Float:
 def _direction(rng: np.random.Generator) -> Float:
     vector = rng.standard_normal(3)
     return np.asarray(vector / np.linalg.norm(vector))
-
-
-def tilt(angle: float, towards: float) -> Float:
-    """Return the rotation (4, 4) that tilts +z by an angle, towards a direction counted from +x."""
-    tilt = arc_transform(1.0, towards, angle)
-    tilt[:3, 3] = 0.0
-    return np.asarray(tilt @ arc_transform(0.0, -towards, 0.0))

@@ -92,7 +92,7 @@ def attack(check: PlanCheck, patient: str, number: int, mutants: int, keep: Path
             "system": system.name,
             "method": plan.method,
             "iterations": plan.iterations,
-            "arcs": len(plan.needle.arcs),
+            "arcs": 0 if plan.needle is None else len(plan.needle.arcs),
             "accepted": report.accepted,
             "refused_by": [each.name for each in report.refusals],
             "check_s": round(time.process_time() - began, 3),

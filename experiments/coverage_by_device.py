@@ -26,6 +26,7 @@ PLAIN = {
 }
 """Tubes without slots; the channel is as bent as their strain allows."""
 DEVICES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "tight-inner": ("tight-inner", {}),
     "ultrathin": ("ultrathin", {}),
     "stylet-needle": ("stylet-needle", {}),
     "lung-default": ("lung-default", {}),

@@ -46,7 +46,7 @@ EXAMPLES = MappingProxyType(
 """A command line for each command."""
 
 EXAMPLE_OF_ALL = f"Example: {EXAMPLES['demo']}"
-EXIT_CODES = "Exit codes: 0 a plan that the check accepts, 1 no plan or a refused one, 2 bad input."
+EXIT_CODES = "Exit codes: 0 done, any plan made is accepted by the check; 1 the answer is no; 2 bad input."
 
 START_PAGE = """\
 lungaccess plans the access to a lung nodule: bronchoscope, concentric tubes, steerable needle.

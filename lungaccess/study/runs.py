@@ -144,7 +144,8 @@ def runs_of(
     Raises
     ------
     LungaccessError
-        If a patient or a system cannot be read, a target cannot be understood, or there is no such nodule.
+        If a patient or a system cannot be read, a target cannot be understood, there is no such nodule, or a
+        planner needs a needle that a system does not have.
     """
     for case in study.case:
         (progress or (lambda _words: None))(f"targets of {case.name}")
@@ -152,6 +153,9 @@ def runs_of(
         patient = patient_of(case, folder, cache)
         name = str(folder / case.system) if case.system.endswith(".toml") else case.system
         system = load_system(name, fissures_allowed=case.fissures_allowed)
+        for planner in study.planner:
+            if planner.needs_a_needle:
+                system.require_needle(f"The planner {planner.name!r} of the study")
         targets = _targets(case, open_patient(patient, cache))
         for number, (point, origin) in enumerate(targets, start=1):
             yield from _runs_to(study, case, patient, system, number, point, origin)

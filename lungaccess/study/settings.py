@@ -124,6 +124,13 @@ class PlannerChoice:
         """Whether it is a planner of OMPL, whose random numbers can be seeded once in a process."""
         return (self.method if self.kind == "needle" else self.needle_planner) in OMPL_PLANNERS
 
+    @property
+    def needs_a_needle(self) -> bool:
+        """Whether it plans for no system that has none."""
+        from lungaccess.coupled.planner import NEED_A_NEEDLE
+
+        return self.kind == "needle" or bool(self.needle_planner) or self.method in NEED_A_NEEDLE
+
 
 @settings
 class Budget:

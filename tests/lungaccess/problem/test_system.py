@@ -40,7 +40,7 @@ def test_presets_ship_with_the_package() -> None:
         "ultrathin",
     )
     assert needle_preset_names() == ("med-rad-needle",)
-    assert tube_preset_names() == ("curved-outer",)
+    assert tube_preset_names() == ("curved-outer", "tight-inner")
 
 
 @pytest.mark.parametrize("name", shipped_names())

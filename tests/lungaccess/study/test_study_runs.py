@@ -102,6 +102,17 @@ def test_an_unknown_nodule_and_words_that_are_no_target(cache: Path) -> None:
         assert hasattr(caught.value, "remedy")
 
 
+@pytest.mark.parametrize(
+    "planner", [{"method": "kuntz2015"}, {"needle_planner": "rrt"}, {"kind": "needle", "method": "rrt"}]
+)
+def test_a_planner_of_needles_is_refused_before_any_run_of_a_system_without(
+    planner: dict[str, Any], cache: Path
+) -> None:
+    asked = content(case={"system": "tubes-only", "starts": [1]}, planner=[{"name": "mine", **planner}])
+    with pytest.raises(SettingsError, match="'mine' of the study"):
+        next(runs_of(study_of(asked), cache=cache))
+
+
 def test_other_files_than_those_of_the_study_are_refused(runs: list[Run], tmp_path: Path) -> None:
     patient = replace(runs[0].problem.patient, sources=(("labels", "0" * 64),))
     with pytest.raises(FileError, match="differ from those the study began with"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from anatomy import poses
 from anatomy.errors import FrameError, TargetError
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
+from anatomy.typed import Bool, Float, Int
 from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.coupled.search.aimed_tubes import AimedFromPose
@@ -63,27 +64,55 @@ class RestOfPlan:
 
     Parameters
     ----------
+    task : Task
+        What was asked.
     lps_from_measured : (4, 4) float64
-        The pose as it was taken: that of the scope's tip, or of the tube's tip where `tube` is None.
-    tube : TubeDeployment or None
-    needle : NeedlePath or None
-        None where the system has none, and the tip of the tubes is at the target.
+        The pose as it was taken: that of the scope's tip, or of the tube's tip where there is no deployment.
+    deployment : Deployment or None
+        Of the tubes, where they are left to do.
+    path : ArcPath
+        Of the needle, or without one of the tubes in tissue.
     branch : int
         Branch whose wall is exempt at the exit; -1 for none.
-    clearance_mm : mapping
-        As that of a plan.
-    costs : mapping of str to float
-        As those of a plan.
-    objective : str
     """
 
+    task: Task
     lps_from_measured: Float
-    tube: TubeDeployment | None
-    needle: NeedlePath | None
+    deployment: Deployment | None
+    path: ArcPath
     branch: int
-    clearance_mm: Mapping[str, Mapping[str, float]]
-    costs: Mapping[str, float]
-    objective: str
+
+    @cached_property
+    def tube(self) -> TubeDeployment | None:
+        """The tubes as a plan states them, None where they stand already."""
+        if self.deployment is None:
+            return None
+        return tube_part(self.task, self.lps_from_measured, self.deployment)
+
+    @cached_property
+    def needle(self) -> NeedlePath | None:
+        """The needle as a plan states it; None where the system has none, and the tubes end at the target."""
+        return None if self.task.system.needle is None else needle_part(self.path)
+
+    @cached_property
+    def clearance_mm(self) -> Mapping[str, Mapping[str, float]]:
+        """As that of a plan."""
+        clearance = {}
+        if self.task.system.needle is not None:
+            clearance["needle"] = needle_clearance_mm(self.task, self.path, self.branch)
+        if self.deployment is not None:
+            clearance["tube"] = tube_clearance_mm(self.task, self.lps_from_measured, self.deployment)
+        return clearance
+
+    @cached_property
+    def costs(self) -> Mapping[str, float]:
+        """As those of a plan."""
+        return stated_costs(self.task, self.deployment, self.path)
+
+    @property
+    def objective(self) -> str:
+        """The objective in words."""
+        return str(self.task.objective)
 
     @property
     def cost(self) -> float:
@@ -114,17 +143,21 @@ def replan_from_scope(
     *,
     objective: str | Objective = "inverse_clearance",
     seed: int = 0,
+    tries: int = TRIES,
 ) -> RestOfPlan:
     """Plan tubes and needle from where the tip of the scope really is.
 
-    The deployments from this one pose are enumerated as in an atlas; the cheapest clear direct arc is the
-    first answer, or what the needle's own search finds, and a local search improves it.  Without a needle the
-    tubes are aimed at the target.  The same input and seed give the same answer.
+    The deployments from this one pose are enumerated as in an atlas, as far as the target lies in the
+    needle's workspace; the cheapest clear direct arc is the first answer, or what the needle's own search
+    finds, and a local search improves it.  Without a needle the tubes are aimed at the target.  The same
+    input and seed give the same answer.
 
     Parameters
     ----------
     lps_from_scope_tip : (4, 4) float64
         The pose as measured: +z forward, +x the way a positive bend turns the tip, up in the picture.
+    tries : int
+        Variations of rotation, insertions and needle that improve the first answer; 0 for a faster one.
 
     Raises
     ------
@@ -136,16 +169,16 @@ def replan_from_scope(
         If pose or target lie outside the images, or the target in an obstacle.
     """
     frame = _rigid(lung, lps_from_scope_tip, "scope")
-    task = Task(
-        lung=lung, system=system, target=target, objective=Objective.of(objective), method="replan", seed=seed
-    )
+    task = _task(lung, system, target, objective, seed)
     evaluator = CandidateEvaluator(task)
-    search = _FromScope(evaluator, frame) if system.needle else AimedFromPose(evaluator, frame)
+    search = _FromScope(evaluator, frame, tries) if system.needle else AimedFromPose(evaluator, frame)
     found = search.best()
     if found is None:
         raise NoPlan(f"No plan from the scope's tip as measured: {search.why}", reasons=search.reasons)
     deployment, path = found
-    return _rest(task, frame, path, deployment.branch, deployment)
+    return RestOfPlan(
+        task=task, lps_from_measured=frame, deployment=deployment, path=path, branch=deployment.branch
+    )
 
 
 def replan_from_tube(
@@ -156,6 +189,7 @@ def replan_from_tube(
     *,
     objective: str | Objective = "inverse_clearance",
     seed: int = 0,
+    iterations: int = NEEDLE_ITERATIONS,
 ) -> RestOfPlan:
     """Plan the needle from where the tip of the tubes really is; see `replan_from_scope`.
 
@@ -167,20 +201,20 @@ def replan_from_tube(
     ----------
     lps_from_tip : (4, 4) float64
         The pose as measured; +z is the direction of insertion.
+    iterations : int
+        Of the needle's search, which begins with the direct arc.
     """
     frame = _rigid(lung, lps_from_tip, "tube")
-    task = Task(
-        lung=lung, system=system, target=target, objective=Objective.of(objective), method="replan", seed=seed
-    )
+    task = _task(lung, system, target, objective, seed)
     asked = needle_question(lung, system, frame, target.lps_mm)
     blocked = find_obstruction(asked.environment, asked.query)
     path = None
     if blocked is None or not blocked.proved:
         weighed = task.objective if lung.cost is not None else task.objective.without_map
         search = OptimalSearch(asked.environment, asked.query, seed=seed, objective=weighed)
-        while search.iterations < NEEDLE_ITERATIONS:
+        while search.iterations < iterations:
             before = search.iterations
-            search.advance(NEEDLE_ITERATIONS - before)
+            search.advance(iterations - before)
             if search.iterations == before:
                 break
         path = search.path
@@ -189,24 +223,40 @@ def replan_from_tube(
         blocked = blocked or easiest_obstruction(asked.environment, asked.query)
         why = "the search found no clear path" if blocked is None else reason_in_words(blocked)
         raise NoPlan(f"No needle path from the tube's tip as measured: {why}", reasons={f"needle: {why}": 1})
-    return _rest(task, frame, path, asked.query.branch, None)
+    return RestOfPlan(
+        task=task, lps_from_measured=frame, deployment=None, path=path, branch=asked.query.branch
+    )
+
+
+def _task(lung: Lung, system: System, target: Target, objective: str | Objective, seed: int) -> Task:
+    weighed = Objective.of(objective)
+    return Task(lung=lung, system=system, target=target, objective=weighed, method="replan", seed=seed)
 
 
 class _FromScope:
     """The search from one pose of the scope."""
 
-    def __init__(self, evaluator: CandidateEvaluator, frame: Float) -> None:
-        self._evaluator, self._frame, self._task = evaluator, frame, evaluator.task
+    def __init__(self, evaluator: CandidateEvaluator, frame: Float, tries: int) -> None:
+        self._evaluator, self._frame, self._task, self._tries = evaluator, frame, evaluator.task, tries
         system, self._target = self._task.system, self._task.target.lps_mm
         self._row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
+        self._outside = 0
         self.entries = enumerate_deployments(
-            self._task.lung, system.tubes, system.margins, self._row, with_fissures=self._task.with_fissures
-        )
-        lengths = workspace_lengths(
-            evaluator.environment, self.entries.positions, self.entries.tangents, self._target
-        )
+            self._task.lung, system.tubes, system.margins, self._row,
+            with_fissures=self._task.with_fissures, worthwhile=self._in_workspace,
+        )  # fmt: skip
+        lengths = self._lengths(self.entries.positions, self.entries.tangents)
         near = np.flatnonzero(np.isfinite(lengths))
         self._near: Int = near[np.argsort(lengths[near], kind="stable")]
+
+    def _lengths(self, positions: Float, tangents: Float) -> Float:
+        """Return the shortest lengths of needle to the target from tips, infinite outside the workspace."""
+        return workspace_lengths(self._evaluator.environment, positions, tangents, self._target)
+
+    def _in_workspace(self, positions: Float, tangents: Float) -> Bool:
+        holds = np.isfinite(self._lengths(positions, tangents))
+        self._outside = int(np.count_nonzero(~holds))
+        return holds
 
     def best(self) -> tuple[Deployment, ArcPath] | None:
         """Return the cheapest deployment and path found, None if there is none."""
@@ -249,7 +299,7 @@ class _FromScope:
     def _improved(self, deployment: Deployment, path: ArcPath) -> tuple[Deployment, ArcPath]:
         """Return what a local search makes of it, if that is cheaper and proved."""
         vias, points = np.zeros((MAX_VIAS, 3)), path.frames()[1:-1, :3, 3]
-        if len(points) > MAX_VIAS:
+        if len(points) > MAX_VIAS or not self._tries:
             return deployment, path
         vias[: len(points)] = points
         choice = np.array([0.0, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
@@ -262,7 +312,7 @@ class _FromScope:
         state = np.array([task.seed], dtype=np.uint64)
         count, cost = improve(
             tube, self._evaluator.needle_arrays, self._row, np.ones(1, dtype=np.bool_), choice, vias,
-            len(points), (x, y, z), TRIES, state,
+            len(points), (x, y, z), self._tries, state,
         )  # fmt: skip
         if not math.isfinite(cost):
             return deployment, path
@@ -287,9 +337,9 @@ class _FromScope:
     @property
     def why(self) -> str:
         """What prevents a plan, in words."""
-        if not self.entries.count:
+        if not self.entries.count and self.entries.candidates:
             most = max(self.entries.refused, key=lambda name: self.entries.refused[name], default="")
-            return f"no deployment of the tubes is allowed there, mostly because {most}"
+            return f"no deployment of the tubes towards the target is allowed there, mostly because {most}"
         if not len(self._near):
             return "the target lies outside the needle's workspace for every deployment of the tubes"
         return "every needle path tried from the tubes is blocked"
@@ -298,9 +348,8 @@ class _FromScope:
     def reasons(self) -> dict[str, int]:
         """How many deployments and arcs each reason ruled out."""
         reasons = {f"tube: {why}": count for why, count in self.entries.refused.items()}
-        reasons["needle: deployments whose workspace does not hold the target"] = self.entries.count - len(
-            self._near
-        )
+        outside = self._outside + self.entries.count - len(self._near)
+        reasons["needle: deployments whose workspace does not hold the target"] = outside
         named = self._evaluator.blocked.items()
         return reasons | {f"needle: arcs stopped by {name}": n for name, n in named if name != "nothing"}
 
@@ -325,21 +374,3 @@ def _rigid(lung: Lung, pose: ArrayLike, what: str) -> Float:
             remedy="Check the frame of its numbers, RAS or LPS, and the registration",
         )
     return poses.pose(matrix[:3, 3], nearest[:, 2], nearest[:, 0])
-
-
-def _rest(task: Task, frame: Float, path: ArcPath, branch: int, deployment: Deployment | None) -> RestOfPlan:
-    clearance, tube, needle = {}, None, None
-    if task.system.needle is not None:
-        clearance["needle"], needle = needle_clearance_mm(task, path, branch), needle_part(path)
-    if deployment is not None:
-        tube = tube_part(task, frame, deployment)
-        clearance["tube"] = tube_clearance_mm(task, frame, deployment)
-    return RestOfPlan(
-        lps_from_measured=frame,
-        tube=tube,
-        needle=needle,
-        branch=branch,
-        clearance_mm=clearance,
-        costs=stated_costs(task, deployment, path),
-        objective=str(task.objective),
-    )

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
+from anatomy.typed import Bool, Float, Int
 from stages.tube import kernels
 from stages.tube.design_shapes import coarser_shapes, shapes_of
 from stages.tube.device import ConcentricTubes
@@ -100,6 +101,7 @@ def enumerate_deployments(
     with_fissures: bool,
     rotations: int = DEFAULT_ROTATIONS,
     stop_spacing_mm: float = DEFAULT_STOP_MM,
+    worthwhile: Callable[[Float, Float], Bool] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Deployments:
     """Enumerate what the tubes can do from many scope tips.
@@ -118,6 +120,9 @@ def enumerate_deployments(
         same insertions are accepted at both: there the tube or its exit is near a limit.
     stop_spacing_mm : float
         Spacing of the insertions of both tubes.
+    worthwhile : callable, optional
+        Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are of use; of
+        planar tubes no others are looked at, but those between two rotations always are.
     progress : callable, optional
         Told the share of sites done.
     """
@@ -132,39 +137,44 @@ def enumerate_deployments(
     stops = insertion_stops(tubes, stop_spacing_mm)
     environment = tube_environment(lung, with_fissures=with_fissures)
     constants = tube_constants(tubes, margins)
-    most = len(stops) * (len(stops) + 1) // 2
-    if tubes.outer is None:
-        # One tube has the same shape wherever an outer one would end: only its own end is looked at.
-        constants[kernels.MAX_PROTRUSION] = 0.0
-        most = len(stops)
+    outer, inner, ends = _ends_at_stops(tubes, stop_spacing_mm)
+    every = np.zeros((len(angles), len(stops), len(stops)), dtype=np.bool_)
+    every[:, outer, inner] = True
     done = 0
 
     def one_site(site: int) -> tuple[Float, Int, int]:
         nonlocal done
         frame = frames.pose(tips[site, :3], tips[site, 3:6], tips[site, 6:])
+        normals = frames.bending_directions(frame, angles)
         refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
         work = np.zeros((2, kernels.N_TRACE))
+        wanted = every
+        if worthwhile:
+            wanted = np.zeros_like(every)
+            at, towards = _turned(ends, frame, normals)
+            wanted[:, outer, inner] = worthwhile(at, towards).reshape(len(angles), len(outer))
 
-        def rows_of(turns: Int) -> Float:
-            normals = frames.bending_directions(frame, angles[turns])
-            rows = np.zeros((most * len(turns), kernels.ENTRY_COLUMNS))
+        def rows_of(turns: Int) -> tuple[Float, int]:
+            chosen = wanted[turns]
+            most = int(np.count_nonzero(chosen))
+            rows = np.zeros((most, kernels.ENTRY_COLUMNS))
             count = kernels.enumerate_site(
-                environment, constants, tips[site, :6], normals, site, stops, rows, refused, work
-            )
+                environment, constants, tips[site, :6], normals[turns], site, stops, chosen, rows, refused,
+                work,
+            )  # fmt: skip
             found = rows[:count].copy()
             found[:, 1] = turns[found[:, 1].astype(np.int64)]
-            return found
+            return found, most
 
-        found = rows_of(np.arange(rotations))
-        between = _between_unlike(found, rotations, stops)
+        found, candidates = rows_of(np.arange(rotations))
+        between = np.arange(rotations) if worthwhile else _between_unlike(found, rotations, stops)
         if len(between):
-            found = np.concatenate([found, rows_of(rotations + between)])
-        if tubes.outer is None:
-            refused[kernels.PROTRUDES] = 0
+            further, more = rows_of(rotations + between)
+            found, candidates = np.concatenate([found, further]), candidates + more
         done += 1
         if progress and done % 50 == 0:
             progress(done / len(tips))
-        return found, refused, (rotations + len(between)) * (most - 1)
+        return found, refused, candidates
 
     with ThreadPoolExecutor(THREADS) as pool:
         parts = list(pool.map(one_site, range(len(tips))))
@@ -173,6 +183,36 @@ def enumerate_deployments(
     for _, counts, _ in parts:
         refused += counts
     return _as_deployments(rows, angles, refused, sum(candidates for _, _, candidates in parts))
+
+
+@lru_cache(maxsize=8)
+def _ends_at_stops(tubes: ConcentricTubes, stop_spacing_mm: float) -> tuple[Int, Int, Float]:
+    """Return which stops `(K,)` outer and inner planar tube stand at, and where the tip then is `(K, 4)`.
+
+    Position and tangent of the tip are each aside and ahead, in the plane of the bend.  One tube has the same
+    shape wherever an outer one would end: its outer stops are its inner ones.
+    """
+    stops = insertion_stops(tubes, stop_spacing_mm)
+    outer, inner = (each[1:] for each in np.triu_indices(len(stops)))
+    if tubes.outer is None:
+        outer = inner = np.arange(1, len(stops))
+    base, normal = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    constants = tube_constants(tubes, Margins())
+    poses = [
+        kernels.tip_pose(constants, base, normal, *ends)
+        for ends in zip(stops[outer].tolist(), stops[inner].tolist(), strict=True)
+    ]
+    return outer, inner, np.array(poses).reshape(-1, 6)[:, [0, 2, 3, 5]]
+
+
+def _turned(ends: Float, frame: Float, normals: Float) -> tuple[Float, Float]:
+    """Return positions and tangents `(T K, 3)`, LPS mm, of ends `(K, 4)` bent towards normals `(T, 3)`."""
+    aside, ahead = ends[:, 0::2], ends[:, 1::2]
+    at, towards = (
+        (normals[:, None] * aside[:, part, None] + frame[:3, 2] * ahead[:, part, None]).reshape(-1, 3)
+        for part in (0, 1)
+    )
+    return frame[:3, 3] + at, towards
 
 
 def _enumerate_shapes(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numba
 
+from anatomy.kernels.compiling import inner_kernel
 from stages.tube.kernels import planar
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
 from stages.tube.kernels.wall_exit import (
@@ -122,8 +123,17 @@ def _record(entries, row, site, rotation, outer, inner, trace, pose, reasons):
     return 1
 
 
+@inner_kernel
+def _last_row(wanted):
+    """Return the last row (S, S) in which anything is wanted, -1 if there is none."""
+    last = wanted.shape[0] - 1
+    while last >= 0 and not wanted[last].any():
+        last -= 1
+    return last
+
+
 @numba.njit(cache=True, nogil=True)
-def enumerate_site(environment, tubes, base, normals, site, stops, entries, reasons, work):
+def enumerate_site(environment, tubes, base, normals, site, stops, wanted, entries, reasons, work):
     """Enumerate the deployments from one site that follow their own track exactly.
 
     The outer tube stops at `stops[m]`, the inner at `stops[m + 1]` and beyond, up to the curved
@@ -140,8 +150,11 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
     site : int
     stops : (S,) float64
         Insertions in mm, increasing from 0.
+    wanted : (T, S, S) bool
+        Which are looked at, by rotation and the stops of outer and inner tube; none with the inner behind
+        the outer, or both at 0.
     entries : (rows, ENTRY_COLUMNS) float64
-        Receives the accepted deployments; at least `T S (S + 1) / 2` rows.
+        Receives the accepted deployments; at least as many rows as are wanted.
     reasons : (N_REASONS,) int64
         Counts the refused ones by reason.
     work : (2, N_TRACE) float64
@@ -158,24 +171,29 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
     n_stops = stops.shape[0]
     margin = tubes[planar.MARGIN]
     for t in range(normals.shape[0]):
+        outermost = _last_row(wanted[t])
         reset(outer_trace)
         pose = (base[0], base[1], base[2], base[3], base[4], base[5])
         towards = (normals[t, 0], normals[t, 1], normals[t, 2])
-        for m in range(n_stops):
+        for m in range(outermost + 1):
             if m > 0:
                 reason, pose, towards = advance(
                     environment, tubes, outer_trace, pose, towards, tubes[planar.OVERLAP_CURVATURE],
                     stops[m - 1], stops[m], tubes[planar.OUTER_RADIUS], margin,
                 )  # fmt: skip
                 if reason != ACCEPTED:
-                    reasons[reason] += (n_stops - m) * (n_stops - m + 1) // 2
+                    reasons[reason] += wanted[t, m:].sum()
                     break
-                count += _record(entries, count, site, t, stops[m], stops[m], outer_trace, pose, reasons)
+                if wanted[t, m, m]:
+                    count += _record(entries, count, site, t, stops[m], stops[m], outer_trace, pose, reasons)
+            innermost = n_stops - 1
+            while innermost > m and not wanted[t, m, innermost]:
+                innermost -= 1
             for n in range(work.shape[1]):
                 inner_trace[n] = outer_trace[n]
             inner_pose = pose
             inner_towards = towards
-            for e in range(m + 1, n_stops):
+            for e in range(m + 1, innermost + 1):
                 reason = PROTRUDES
                 if stops[e] - stops[m] <= tubes[planar.MAX_PROTRUSION]:
                     reason, inner_pose, inner_towards = advance(
@@ -184,9 +202,10 @@ def enumerate_site(environment, tubes, base, normals, site, stops, entries, reas
                         tubes[planar.INNER_RADIUS], margin,
                     )  # fmt: skip
                 if reason != ACCEPTED:
-                    reasons[reason] += n_stops - e
+                    reasons[reason] += wanted[t, m, e:].sum()
                     break
-                count += _record(
-                    entries, count, site, t, stops[m], stops[e], inner_trace, inner_pose, reasons
-                )
+                if wanted[t, m, e]:
+                    count += _record(
+                        entries, count, site, t, stops[m], stops[e], inner_trace, inner_pose, reasons
+                    )
     return count

@@ -195,8 +195,20 @@ class TestEnumeration:
         stops = np.linspace(0.0, 34.0, 18)
         rows = np.zeros((16 * 18 * 19 // 2, kernels.ENTRY_COLUMNS))
         reasons = np.zeros(kernels.N_REASONS, dtype=np.int64)
+        every = np.repeat(np.triu(np.ones((18, 18), dtype=bool))[None], 16, axis=0)
+        every[:, 0, 0] = False
+        work = np.zeros((2, kernels.N_TRACE))
         count = kernels.enumerate_site(
-            environment, numbers, base, normals, 7, stops, rows, reasons, np.zeros((2, kernels.N_TRACE))
+            environment,
+            numbers,
+            base,
+            normals,
+            7,
+            stops,
+            every,
+            rows,
+            reasons,
+            np.zeros((2, kernels.N_TRACE)),
         )
         found = {(int(row[1]), row[2], row[3]): row for row in rows[:count]}
         assert len(found) == count and (rows[:count, 0] == 7).all()
@@ -224,3 +236,12 @@ class TestEnumeration:
         assert reasons[kernels.NEAR_VESSEL] > 0
         if tubes is not TUBES:
             assert reasons[kernels.PROTRUDES] > 0
+        some = every & (rng.uniform(size=every.shape) < 0.05)
+        fewer, left_out = np.zeros_like(rows), np.zeros_like(reasons)
+        part = kernels.enumerate_site(
+            environment, numbers, base, normals, 7, stops, some, fewer, left_out, work
+        )
+        at = np.rint(rows[:count, 2:4] / stops[1]).astype(int)
+        chosen = some[rows[:count, 1].astype(int), at[:, 0], at[:, 1]]
+        assert (fewer[:part] == rows[:count][chosen]).all()
+        assert part + left_out.sum() == some.sum()

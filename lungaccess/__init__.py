@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     )
     from lungaccess.reachability import UnreachableProof, compare_reach, map_reach
     from lungaccess.report.html import plan_page
-    from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors
+    from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors, safe_start_region
     from lungaccess.slicer import export_slicer
     from lungaccess.study import read_study, run_study
     from stages.needle import Objective

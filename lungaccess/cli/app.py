@@ -34,6 +34,7 @@ from lungaccess.cli.commands.risk import risk
 from lungaccess.cli.commands.route import route
 from lungaccess.cli.commands.segment import segment
 from lungaccess.cli.commands.shapes import shapes
+from lungaccess.cli.commands.start_region import start_region
 from lungaccess.cli.commands.steps import steps
 from lungaccess.cli.commands.study import study
 from lungaccess.cli.commands.template import template
@@ -85,9 +86,9 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 
 for _command in (
     plan, needle, replan, certify, check, info, presets, template, phantom, demo, advise, alternatives, route,
-    tour, tubes, shapes, steps, risk, reach, segment, report, export, doctor, completion,
+    tour, tubes, shapes, steps, risk, start_region, reach, segment, report, export, doctor, completion,
 ):  # fmt: skip
-    app.command(_command, help_epilogue=epilogue(_command.__name__))
+    app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 app.command(study)
 app.command(benchmark)
 app.command(cache)

@@ -19,6 +19,7 @@ EXAMPLES = MappingProxyType(
         "report": "lungaccess report plan/plan.json PATIENT",
         "steps": "lungaccess steps plan/plan.json PATIENT",
         "risk": "lungaccess risk plan/plan.json PATIENT --samples 2000",
+        "start-region": "lungaccess start-region plan/plan.json PATIENT",
         "export": "lungaccess export plan/plan.json PATIENT --slicer slicer",
         "alternatives": "lungaccess alternatives PATIENT --nodule --count 5 --out plans",
         "needle": "lungaccess needle PATIENT --start plan/plan.json --nodule",

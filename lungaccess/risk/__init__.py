@@ -8,7 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.risk.assessment import MISSES, RiskReport, assess, safest
-    from lungaccess.risk.assessor import STRUCTURES, Outcomes, RiskAssessor
+    from lungaccess.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
     from lungaccess.risk.deviations import Deviations
     from lungaccess.risk.draws import Draws
     from lungaccess.risk.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
         ErrorModel,
         PositionError,
     )
+    from lungaccess.risk.start_bodies import proved_body, tried_body
+    from lungaccess.risk.start_region import safe_start_region
     from lungaccess.risk.statistics import Share
     from lungaccess.risk.tolerances import LARGEST, Tolerance, find_tolerances
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from anatomy.errors import SettingsError
 from anatomy.io.centerlines import write_centerlines
 from anatomy.io.files import require_writable_folder, write_text
 from anatomy.lung import Lung
@@ -14,6 +15,7 @@ from anatomy.records import frozen_value
 from lungaccess.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurves
 from lungaccess.plans.plan import Plan
+from lungaccess.risk import proved_body, safe_start_region, tried_body
 from lungaccess.slicer.custusx import route_text
 from lungaccess.slicer.markups import TARGET_COLOUR, curve_markup, points_of_interest
 from lungaccess.slicer.models import device_surface, structure_surface, write_ply
@@ -32,6 +34,9 @@ STRUCTURES: dict[str, tuple[tuple[float, float, float], float]] = {
     "nodule": (TARGET_COLOUR, 0.8),
 }
 """Models of the anatomy: colour and opacity."""
+
+PROVED_COLOUR, TRIED_COLOUR = (0.0, 0.45, 0.7), (0.94, 0.89, 0.26)
+"""Of the bodies of the safe start region."""
 
 STEP_MM = 1.0
 """Spacing of the control points of tubes and needle: fine enough to measure, few enough to read."""
@@ -90,6 +95,7 @@ def export_slicer(
     report = check(plan, lung)
     devices = plan.curves(STEP_MM)
     items = _write_devices(plan, devices, target, refused=not report.accepted)
+    items += _write_start_region(plan, lung, target) if report.accepted else []
     items += _write_anatomy(lung, target, tell)
     write_text(target / SCENE_FILE, scene(items))
     write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
@@ -114,6 +120,27 @@ def _write_devices(plan: Plan, devices: DeviceCurves, folder: Path, *, refused: 
     _write_json(folder / POINTS_FILE, _named(points_of_interest(plan), prefix))
     points = Item(kind="MarkupsFiducial", name=f"{prefix}points", file=POINTS_FILE, colour=TARGET_COLOUR)
     return [*items, points]
+
+
+def _write_start_region(plan: Plan, lung: Lung, folder: Path) -> list[Item]:
+    """Write the bodies of the safe start region; none for a plan without a needle."""
+    try:
+        region = safe_start_region(plan, lung)
+    except SettingsError:
+        return []
+    items = []
+    for name, body, colour in (
+        ("start_region_proved", proved_body(region), PROVED_COLOUR),
+        ("start_region_tried", tried_body(region), TRIED_COLOUR),
+    ):
+        if body is not None:
+            write_ply(folder / f"{name}.ply", body)
+            items.append(
+                Item(
+                    kind="Model", name=name.replace("_", " "), file=f"{name}.ply", colour=colour, opacity=0.4
+                )
+            )
+    return items
 
 
 def _named(markups: dict[str, Any], prefix: str) -> dict[str, Any]:

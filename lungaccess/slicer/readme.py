@@ -14,6 +14,8 @@ _MEANING = {
     "scope.ply": "the bronchoscope, true to its radius",
     "tubes.ply": "the tubes, true to their radius",
     "needle.ply": "the needle, true to its radius",
+    "start_region_proved.ply": "where the needle may start and head to, all of it proved",
+    "start_region_tried.ply": "places from which half of the tried directions have a clear path",
     "airway_tree.vtp": "centreline of the airways with Radius, Generation and Branch; hidden at first",
     "anatomy.seg.nrrd": "the masks that were planned on, one label a voxel, with names and terminology",
     "route_custusx.txt": "the route for CustusX and Fraxinus: x y z flag, from target to trachea",

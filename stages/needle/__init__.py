@@ -2,8 +2,9 @@
 
 A `Query` in a `NeedleEnvironment` is answered by a `Search`, by name in `PLANNERS`, which looks for an
 `ArcPath` of low `Objective`; `violation` and `path_costs` tell how good a path is, whoever found it.
-`NoPathProof` proves that there is none, `Replanner` plans again during the insertion, and `ReachScan` asks
-about many points at once.  The planners of OMPL are in `stages.needle.ompl`.
+`NoPathProof` proves that there is none, `Replanner` plans again during the insertion, `ReachScan` asks
+about many points at once, and `StartRegion` about many start poses.  The planners of OMPL are in
+`stages.needle.ompl`.
 """
 
 from __future__ import annotations
@@ -80,6 +81,9 @@ if TYPE_CHECKING:
     from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
     from stages.needle.search.successive_halving import successive_halving
     from stages.needle.start_index import StartIndex
+    from stages.needle.start_region import ProvedStarts, StartRegion, TriedStarts
+    from stages.needle.start_region_proof import prove_starts
+    from stages.needle.start_region_trial import try_starts
     from stages.needle.violations import violation
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -14,6 +14,7 @@ from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from stages.needle import StartRegion
 
 
 SURFACES_VERSION = 1
@@ -77,6 +78,18 @@ LOOKS = (
     ),
 )  # fmt: skip
 
+START_LOOKS = (
+    Look(
+        key="start-proved", name="Needle starts, all proved", colour="#0072B2", opacity=0.45, shown=True,
+        cell_mm=0.0, most_faces=5_000,
+    ),
+    Look(
+        key="start-tried", name="Places from which half of the tried directions have a path",
+        colour="#F0E442", opacity=0.25, shown=False, cell_mm=0.0, most_faces=20_000,
+    ),
+)  # fmt: skip
+"""Of the safe start region, whose bodies are small already."""
+
 
 def structure_meshes(lung: Lung) -> list[Packed]:
     """Return the surfaces of a patient's structures for a page, kept with it; those it lacks are left out."""
@@ -92,6 +105,18 @@ def _structure_meshes(lung: Lung) -> list[Packed]:
     return found
 
 
+def start_meshes(region: StartRegion) -> list[Packed]:
+    """Return the bodies of a safe start region for a page; those that are empty are left out."""
+    from lungaccess.risk import proved_body, tried_body
+
+    bodies = (proved_body(region), tried_body(region))
+    return [
+        packed_mesh(body.vertices_lps, body.faces, look)
+        for body, look in zip(bodies, START_LOOKS, strict=True)
+        if body is not None
+    ]
+
+
 def structure(lung: Lung, key: str) -> Volume | None:
     """Return the voxels of a structure that a page shows, None where the patient lacks it."""
     if key == "nodule":
@@ -102,8 +127,12 @@ def structure(lung: Lung, key: str) -> Volume | None:
 
 
 def packed_surface(volume: Volume, look: Look) -> Packed:
-    """Return the surface of a mask with its look; the triangles are counted first to last."""
-    vertices, faces = surface(volume, look)
+    """Return the surface of a mask with its look."""
+    return packed_mesh(*surface(volume, look), look)
+
+
+def packed_mesh(vertices: Float, faces: Int, look: Look) -> Packed:
+    """Return triangles with their look; they are counted first to last."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = np.maximum(high - low, 1e-6)
     return {

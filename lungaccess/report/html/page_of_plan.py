@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.errors import SettingsError
 from anatomy.records import frozen_record
 from anatomy.words import plural
 from lungaccess.appraisal import DRAWS, SEED, Appraiser
 from lungaccess.report.html import tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
 from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, write_page
-from lungaccess.report.html.meshes import structure_meshes
+from lungaccess.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.report.html.volumes import page_image
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from lungaccess.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
     from lungaccess.risk import ErrorModel
+    from stages.needle import StartRegion
 
 MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
 THICKER = "; seen from afar, devices are drawn thicker than they are"
@@ -90,6 +92,7 @@ def plan_page(
     appraiser = Appraiser(lung, chosen.errors, draws=chosen.risk_samples, seed=chosen.risk_seed)
     appraisals = [appraiser.appraise(each, each_kind=each is plan) for each in plans]
     first = appraisals[0]
+    region = start_region_of(plan, lung) if first.accepted else None
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
         "headline": words.headline(first.headline),
@@ -103,21 +106,35 @@ def plan_page(
         "instructions": tables.instructions_section(plan, lung)
         if chosen.instructions
         else "<p>Left out.</p>",
-        "risk": tables.risk_section(first.risk),
+        "risk": tables.risk_section(first.risk, "" if region is None else region.words),
         "provenance": tables.provenance_section(plan, lung),
     }
-    return write_page(path, "plan.html", MODULES, page_data(plans, appraisals, lung, chosen), parts)
+    return write_page(path, "plan.html", MODULES, page_data(plans, appraisals, lung, chosen, region), parts)
+
+
+def start_region_of(plan: Plan, lung: Lung) -> StartRegion | None:
+    """Return the safe start region of a plan; None where the plan has no needle or the region is refused."""
+    from lungaccess.risk import safe_start_region
+
+    try:
+        return safe_start_region(plan, lung)
+    except SettingsError:
+        return None
 
 
 def page_data(
-    plans: Sequence[Plan], appraisals: Sequence[Appraisal], lung: Lung, options: PageOptions
+    plans: Sequence[Plan],
+    appraisals: Sequence[Appraisal],
+    lung: Lung,
+    options: PageOptions,
+    region: StartRegion | None = None,
 ) -> dict[str, Any]:
     """Return what the scripts of the page draw, as plain JSON values."""
     near = np.concatenate([device_points(each) for each in plans])
     return {
         "page": "plan",
         "patient": lung.name,
-        "structures": structure_meshes(lung),
+        "structures": structure_meshes(lung) + ([] if region is None else start_meshes(region)),
         "plans": [
             {**packed_plan(each, lung, tables.plan_name(n)), **appraisal.to_mapping()}
             for n, (each, appraisal) in enumerate(zip(plans, appraisals, strict=True))

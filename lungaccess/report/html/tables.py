@@ -159,10 +159,14 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     return f"{words.steps(texts)}<p class='note'>{words.text(note)}</p>"
 
 
-def risk_section(report: RiskReport | None) -> str:
-    """Return how likely the plan succeeds if the devices deviate from it, or that it was not estimated."""
+def risk_section(report: RiskReport | None, start_words: str = "") -> str:
+    """Return how likely the plan succeeds if the devices deviate from it, or that it was not estimated.
+
+    `start_words` tell its safe start region.
+    """
+    of_start = f"<p>{words.text(start_words)}.</p>" if start_words else ""
     if report is None:
-        return "<p>Not estimated.</p>"
+        return f"{of_start}<p>Not estimated.</p>"
     rows = [("reaches the goal and touches nothing forbidden", _share(report.succeeds))]
     rows.append((f"ends within {report.radius_mm:.1f} mm of the target", _share(report.reaches)))
     rows += [
@@ -181,7 +185,7 @@ def risk_section(report: RiskReport | None) -> str:
         f"goal: {report.radius_origin}. The range is the 95 % interval."
     )
     return (
-        f"<p class='note'>{words.text(note)}</p>"
+        f"{of_start}<p class='note'>{words.text(note)}</p>"
         + words.pairs("If the devices deviate", rows)
         + words.pairs("Success with errors of one kind only", alone)
     )

@@ -1,0 +1,227 @@
+"""The safe start region: from which poses near a planned start the needle still reaches its target."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from anatomy.records import frozen_record
+from anatomy.typed import Float, Int, UInt8
+from stages.needle.kernels import start_trial as kernel
+from stages.needle.path import CURVATURE, ArcPath, arc_transform, direct_path
+from stages.needle.query import Query
+
+KINDS = {
+    kernel.DIRECT: "one arc",
+    kernel.VIA: "two or three arcs",
+    kernel.SEARCHED: "a search",
+    kernel.NO_PATH: "no path found",
+    kernel.START_BLOCKED: "start too near to an obstacle",
+    kernel.OUT_OF_REACH: "target out of reach",
+}
+"""What is told of a pose that was tried."""
+REACHING = (kernel.DIRECT, kernel.VIA, kernel.SEARCHED)
+
+LEAST_MM, LEAST_DEG = 0.1, 0.1
+"""Less is nothing that a hand could keep to, and is not told."""
+
+
+@frozen_record
+class ProvedStarts:
+    """Start poses that all have a clear path, by proof.
+
+    For every `n`: each pose at most `offsets_mm[n]` from the planned start whose direction is at most
+    `tilts_rad[n]` from the planned one.  The path goes by single arcs through `vias[n]` to the target.
+
+    Parameters
+    ----------
+    offsets_mm, tilts_rad : (K,) float64
+        Rising and falling; empty where nothing is proved.
+    vias : tuple of (V, 3) float64, LPS mm
+    """
+
+    offsets_mm: Float
+    tilts_rad: Float
+    vias: tuple[Float, ...]
+
+    @property
+    def best(self) -> int:
+        """The pair whose poses, as ball times cone, have the greatest volume; -1 for none."""
+        if not len(self.offsets_mm):
+            return -1
+        return int(np.argmax(self.offsets_mm**3 * (1.0 - np.cos(self.tilts_rad))))
+
+    @property
+    def offset_mm(self) -> float:
+        """Offset of the best pair; 0 where nothing is proved."""
+        return float(self.offsets_mm[self.best]) if self.best >= 0 else 0.0
+
+    @property
+    def tilt_rad(self) -> float:
+        """Tilt of the best pair; 0 where nothing is proved."""
+        return float(self.tilts_rad[self.best]) if self.best >= 0 else 0.0
+
+    @property
+    def volume(self) -> float:
+        """Volume of the best pair's poses, mm^3 times steradian."""
+        ball = 4.0 / 3.0 * math.pi * self.offset_mm**3
+        return ball * 2.0 * math.pi * (1.0 - math.cos(self.tilt_rad))
+
+
+@frozen_record
+class TriedStarts:
+    """Start poses that were tried one by one: places on a lattice in a ball, each with directions in a cone.
+
+    Every pose stands for the same volume of places and the same solid angle.
+
+    Parameters
+    ----------
+    offset_mm, tilt_rad : float
+        Radius of the ball and half angle of the cone.
+    positions : (P, 3) float64, LPS mm
+    tangents : (P, D, 3) float64
+        Unit vectors.
+    offsets_mm : (P,) float64, tilts_rad : (P, D) float64
+        From the planned start and direction.
+    kinds : (P, D) uint8
+        What was found, see `KINDS`; every path is proved clear.
+    spacing_mm : float
+        Of the lattice, whose axes are those of the start.
+    lattice : (P, 3) int64
+        Places on it.
+    """
+
+    offset_mm: float
+    tilt_rad: float
+    positions: Float
+    tangents: Float
+    offsets_mm: Float
+    tilts_rad: Float
+    kinds: UInt8
+    spacing_mm: float
+    lattice: Int
+
+    def share(self, offset_mm: float | None = None, tilt_rad: float | None = None) -> float:
+        """Return the share of poses with a path, of those up to an offset and a tilt; of all by default."""
+        near = self.offsets_mm <= (self.offset_mm if offset_mm is None else offset_mm)
+        straight = self.tilts_rad <= (self.tilt_rad if tilt_rad is None else tilt_rad)
+        part = np.isin(self.kinds[near[:, None] & straight], REACHING)
+        return float(part.mean()) if part.size else math.nan
+
+    @property
+    def share_by_place(self) -> Float:
+        """Share of directions with a path at each place, `(P,)`."""
+        return np.asarray(np.isin(self.kinds, REACHING).mean(axis=1))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of poses by what was found, see `KINDS`."""
+        return {words: int(np.count_nonzero(self.kinds == kind)) for kind, words in KINDS.items()}
+
+    def table(self, rings: int = 5) -> Float:
+        """Return shares `(rings, rings)`: rows by offset, columns by tilt, each in equal steps.
+
+        NaN where no pose lies.
+        """
+        far = np.minimum((self.offsets_mm / self.offset_mm * rings).astype(int), rings - 1)
+        wide = np.minimum((self.tilts_rad / self.tilt_rad * rings).astype(int), rings - 1)
+        ring = (far[:, None] * rings + wide).ravel()
+        poses = np.bincount(ring, minlength=rings * rings)
+        found = np.bincount(ring, np.isin(self.kinds, REACHING).ravel(), minlength=rings * rings)
+        shares = np.full(rings * rings, math.nan)
+        np.divide(found, poses, out=shares, where=poses > 0)
+        return shares.reshape(rings, rings)
+
+
+@frozen_record
+class StartRegion:
+    """From which poses near a planned start the needle reaches its target clear, within all limits.
+
+    Parameters
+    ----------
+    radius_mm : float
+        So far from the target a path may end.
+    max_curvature_per_mm : float
+        Of the needle.
+    """
+
+    lps_from_start: Float
+    target: Float
+    radius_mm: float
+    max_curvature_per_mm: float
+    proved: ProvedStarts
+    tried: TriedStarts
+
+    def path_from(self, lps_from_start: Float) -> ArcPath | None:
+        """Return the proved path from a start pose, None if the pose is in no proved part.
+
+        The path goes by single arcs through the via points to the target; where the last would have to bend
+        more than the needle can, it bends as much as that can, and ends within the radius.
+        """
+        query = Query(lps_from_start=lps_from_start, target=self.target)
+        frame, planned = query.lps_from_start, self.lps_from_start
+        offset = float(np.linalg.norm(frame[:3, 3] - planned[:3, 3]))
+        across = float(np.linalg.norm(np.cross(frame[:3, 2], planned[:3, 2])))
+        tilt = math.atan2(across, float(frame[:3, 2] @ planned[:3, 2]))
+        holding = (offset <= self.proved.offsets_mm) & (tilt <= self.proved.tilts_rad)
+        if not holding.any():
+            return None
+        arcs = []
+        for point in (*self.proved.vias[int(np.argmax(holding))], self.target):
+            arcs.append(np.array(direct_path(frame, point).arcs[0]))
+            frame = frame @ arc_transform(*arcs[-1])
+        arcs[-1][CURVATURE] = min(arcs[-1][CURVATURE], self.max_curvature_per_mm)
+        return ArcPath(lps_from_start=query.lps_from_start, arcs=np.array(arcs))
+
+    @property
+    def words(self) -> str:
+        """The region in one sentence."""
+        proved, tried = self.proved, self.tried
+        first = "No start off the plan by 0.1 mm and 0.1° is proved"
+        if proved.offset_mm >= LEAST_MM or math.degrees(proved.tilt_rad) >= LEAST_DEG:
+            first = (
+                f"The needle may start up to {_down(proved.offset_mm)} mm and "
+                f"{_down(math.degrees(proved.tilt_rad))}° from the plan, proved"
+            )
+        return (
+            f"{first}; {100.0 * tried.share():.0f} % of the poses up to {tried.offset_mm:g} mm and "
+            f"{math.degrees(tried.tilt_rad):g}° still have a clear path {self.aim}"
+        )
+
+    @property
+    def aim(self) -> str:
+        """Where the paths end, in words."""
+        return f"to within {self.radius_mm:.1f} mm of the target" if self.radius_mm else "to the target"
+
+    def record(self) -> dict[str, Any]:
+        """Return plain JSON values: poses in LPS mm, angles in degrees."""
+        proved, tried = self.proved, self.tried
+        table = [[None if math.isnan(v) else v for v in row] for row in tried.table().tolist()]
+        return {
+            "words": self.words,
+            "lps_from_start": self.lps_from_start.tolist(),
+            "target_lps": self.target.tolist(),
+            "radius_mm": self.radius_mm,
+            "proved": {
+                "offset_mm": proved.offset_mm,
+                "tilt_deg": math.degrees(proved.tilt_rad),
+                "volume_mm3_sr": proved.volume,
+                "offsets_mm": proved.offsets_mm.tolist(),
+                "tilts_deg": np.degrees(proved.tilts_rad).tolist(),
+            },
+            "tried": {
+                "offset_mm": tried.offset_mm,
+                "tilt_deg": math.degrees(tried.tilt_rad),
+                "poses": int(tried.kinds.size),
+                "share": tried.share(),
+                "counts": tried.counts,
+                "share_by_offset_and_tilt": table,
+            },
+        }
+
+
+def _down(value: float) -> str:
+    """Return a number with one digit, never more than it is."""
+    return f"{math.floor(10.0 * value) / 10.0:.1f}"

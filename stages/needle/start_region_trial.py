@@ -1,0 +1,135 @@
+"""Start poses near a planned one, tried one by one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from anatomy.grid import read_only
+from anatomy.typed import Float
+from stages.needle.environment import NeedleEnvironment
+from stages.needle.kernels import start_trial as kernel
+from stages.needle.kernels import tree
+from stages.needle.objective import SHORTEST
+from stages.needle.path import ArcPath
+from stages.needle.query import Query
+from stages.needle.search.base import RANDOM_SHARE
+from stages.needle.start_region import TriedStarts
+
+DIRECTIONS = 25
+"""Directions tried at each place: enough for shares in steps of 4 %, and for rings of 3 degrees in 15."""
+GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
+"""Directions that follow each other are turned by this angle: then they cover the cone evenly."""
+TURNS = (0.6180339887498949, 0.7548776662466927)
+"""From place to place the directions are shifted by these shares of a step and of a turn: together the
+places try many more: multiples of these numbers fall evenly between 0 and 1."""
+RING_MM = (0.0, 3.0, 6.0)
+"""How far beside the planned path via points lie: enough to pass a vessel of a few mm on its other side."""
+RING_SHARES = (0.25, 0.5, 0.75)
+RING_POINTS = 6
+FAR_MM, FAR_RAD = 20.0, math.radians(60.0)
+"""Poses farther away are no deviations of this start."""
+
+
+def try_starts(
+    environment: NeedleEnvironment,
+    query: Query,
+    path: ArcPath,
+    *,
+    offset_mm: float,
+    tilt_rad: float,
+    poses: int,
+    iterations: int,
+    seed: int,
+) -> TriedStarts:
+    """Try start poses around a planned one; the same input and seed give the same answer.
+
+    Parameters
+    ----------
+    path : ArcPath
+        The planned path; paths of several arcs are looked for through points on it and beside it.
+    offset_mm, tilt_rad : float
+        How far the poses may be from the planned start.
+    poses : int
+        About how many; they are `DIRECTIONS` at each place.
+    iterations : int
+        Of the RRT from each pose from which nothing simpler leads to the target; 0 for none.
+
+    Raises
+    ------
+    SettingsError
+        If a number is out of its range.
+    """
+    _require_ranges(offset_mm, tilt_rad, poses, iterations)
+    frame = query.lps_from_start
+    places = max(poses // DIRECTIONS, 1)
+    spacing = offset_mm * (4.0 / 3.0 * math.pi / places) ** (1.0 / 3.0)
+    reach = math.ceil(offset_mm / spacing)
+    steps = np.arange(-reach, reach + 1)
+    lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    offsets = spacing * np.linalg.norm(lattice, axis=1)
+    lattice, offsets = lattice[offsets <= offset_mm], offsets[offsets <= offset_mm]
+    positions = frame[:3, 3] + spacing * lattice @ frame[:3, :3].T
+    tilts, around = _directions(len(positions), tilt_rad)
+    local = np.stack([np.sin(tilts) * np.cos(around), np.sin(tilts) * np.sin(around), np.cos(tilts)], axis=-1)
+    tangents = local @ frame[:3, :3].T
+    kinds = np.zeros(len(positions) * DIRECTIONS, dtype=np.uint8)
+    rows = iterations * tree.ROWS_PER_STEP + kernel.ROWS
+    kernel.try_starts(
+        environment.obstacles, environment.limits, environment.objective_arrays(SHORTEST), query.branch,
+        np.repeat(positions, DIRECTIONS, axis=0), np.ascontiguousarray(tangents.reshape(-1, 3)),
+        _vias_around(path), query.goal, iterations, RANDOM_SHARE, seed,
+        np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64), kinds,
+    )  # fmt: skip
+    return TriedStarts(
+        offset_mm=offset_mm,
+        tilt_rad=tilt_rad,
+        positions=read_only(positions),
+        tangents=read_only(tangents),
+        offsets_mm=read_only(offsets),
+        tilts_rad=read_only(tilts),
+        kinds=read_only(kinds.reshape(len(positions), DIRECTIONS)),
+        spacing_mm=spacing,
+        lattice=read_only(lattice),
+    )
+
+
+def _directions(places: int, tilt_rad: float) -> tuple[Float, Float]:
+    """Return tilts and angles about the axis `(places, DIRECTIONS)`: each place covers the cone evenly."""
+    place = np.arange(places)[:, None]
+    rank = np.arange(DIRECTIONS) + (TURNS[0] * (place + 0.5)) % 1.0
+    tilts = np.arccos(1.0 - rank / DIRECTIONS * (1.0 - math.cos(tilt_rad)))
+    return tilts, GOLDEN_RAD * np.arange(DIRECTIONS) + 2.0 * math.pi * TURNS[1] * place
+
+
+def _vias_around(path: ArcPath) -> Float:
+    """Return the points `(V, 3)` that paths of several arcs are tried through: on the plan and beside it."""
+    points, lengths = path.sample(0.5)
+    places = [path.frames()[1:-1, :3, 3]]
+    x, y = path.lps_from_start[:3, 0], path.lps_from_start[:3, 1]
+    for radius in RING_MM:
+        for share in RING_SHARES:
+            centre = points[int(np.argmin(np.abs(lengths - share * lengths[-1])))]
+            angles = 2.0 * math.pi * np.arange(RING_POINTS if radius else 1) / RING_POINTS
+            places.append(centre + radius * (np.outer(np.cos(angles), x) + np.outer(np.sin(angles), y)))
+    return np.ascontiguousarray(np.vstack(places))
+
+
+def _require_ranges(offset_mm: float, tilt_rad: float, poses: int, iterations: int) -> None:
+    if not 0.0 < offset_mm <= FAR_MM:
+        raise SettingsError(
+            f"Start poses up to {offset_mm} mm away cannot be tried",
+            expected=f"above 0, at most {FAR_MM:g} mm",
+        )
+    if not 0.0 < tilt_rad <= FAR_RAD:
+        raise SettingsError(
+            f"Start poses tilted by up to {math.degrees(tilt_rad):g} degrees cannot be tried",
+            expected=f"above 0, at most {math.degrees(FAR_RAD):g} degrees",
+        )
+    if poses < DIRECTIONS or iterations < 0:
+        raise SettingsError(
+            f"{poses} start poses cannot be tried with {iterations} iterations of a search",
+            expected=f"at least {DIRECTIONS} poses, and 0 iterations or more",
+        )

@@ -10,10 +10,13 @@ from benchmarks.fresh import FreshProcess
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
+from stages.needle.path import blocker_on_path, direct_path
 from stages.needle.query import Query
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
+from stages.needle.start_region_proof import prove_starts
+from stages.needle.start_region_trial import try_starts
 
 RADIUS_MM = 60.0
 SIDE = 96
@@ -93,6 +96,32 @@ class Searches:
         proof = NoPathProof(self.environments[0], self.query)
         for _ in range(8):
             proof.advance()
+
+
+class StartRegions:
+    """From which poses the target is reached, around a start with obstacles beside the way."""
+
+    def setup(self) -> None:
+        """Make an environment whose direct path is clear, and compile."""
+        self.query = query()
+        self.path = direct_path(self.query.lps_from_start, self.query.target)
+        found = (made_environment(seed, balls=40) for seed in range(100))
+        self.environment = next(
+            each for each in found if blocker_on_path(each, self.path, self.query.branch) == 0
+        )
+        self.time_prove()
+        self.time_try_ten_thousand()
+
+    def time_prove(self) -> None:
+        """The proved part."""
+        prove_starts(self.environment, self.query, self.path)
+
+    def time_try_ten_thousand(self) -> None:
+        """10,000 poses, with a search of 100 iterations where nothing simpler leads to the target."""
+        try_starts(
+            self.environment, self.query, self.path,
+            offset_mm=5.0, tilt_rad=0.26, poses=10_000, iterations=100, seed=0,
+        )  # fmt: skip
 
 
 class Compile(FreshProcess):

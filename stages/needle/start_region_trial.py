@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
-from anatomy.typed import Float
+from anatomy.typed import Float, UInt8
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_trial as kernel
 from stages.needle.kernels import tree
@@ -75,14 +76,15 @@ def try_starts(
     tilts, around = _directions(len(positions), tilt_rad)
     local = np.stack([np.sin(tilts) * np.cos(around), np.sin(tilts) * np.sin(around), np.cos(tilts)], axis=-1)
     tangents = local @ frame[:3, :3].T
-    kinds = np.zeros(len(positions) * DIRECTIONS, dtype=np.uint8)
-    rows = iterations * tree.ROWS_PER_STEP + kernel.ROWS
-    kernel.try_starts(
-        environment.obstacles, environment.limits, environment.objective_arrays(SHORTEST), query.branch,
-        np.repeat(positions, DIRECTIONS, axis=0), np.ascontiguousarray(tangents.reshape(-1, 3)),
-        _vias_around(path), query.goal, iterations, RANDOM_SHARE, seed,
-        np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64), kinds,
-    )  # fmt: skip
+    kinds = try_poses(
+        environment,
+        query,
+        path,
+        np.repeat(positions, DIRECTIONS, axis=0),
+        tangents.reshape(-1, 3),
+        iterations=iterations,
+        seed=seed,
+    )
     return TriedStarts(
         offset_mm=offset_mm,
         tilt_rad=tilt_rad,
@@ -94,6 +96,38 @@ def try_starts(
         spacing_mm=spacing,
         lattice=read_only(lattice),
     )
+
+
+def try_poses(
+    environment: NeedleEnvironment,
+    query: Query,
+    path: ArcPath,
+    positions: ArrayLike,
+    tangents: ArrayLike,
+    *,
+    iterations: int,
+    seed: int,
+) -> UInt8:
+    """Tell for each of N start poses how a clear path was found, or why none was: `KINDS`, `(N,)`.
+
+    Parameters
+    ----------
+    query : Query
+        Of the planned start: its target, and the branch that it has pierced.
+    path, iterations, seed
+        See `try_starts`.
+    positions, tangents : (N, 3) float64
+        Points, LPS mm, and unit vectors.
+    """
+    places = np.array(positions, dtype=np.float64, order="C")
+    kinds = np.zeros(len(places), dtype=np.uint8)
+    rows = iterations * tree.ROWS_PER_STEP + kernel.ROWS
+    kernel.try_starts(
+        environment.obstacles, environment.limits, environment.objective_arrays(SHORTEST), query.branch,
+        places, np.array(tangents, dtype=np.float64, order="C"), _vias_around(path), query.goal, iterations,
+        RANDOM_SHARE, seed, np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64), kinds,
+    )  # fmt: skip
+    return kinds
 
 
 def _directions(places: int, tilt_rad: float) -> tuple[Float, Float]:

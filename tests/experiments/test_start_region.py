@@ -1,0 +1,32 @@
+"""The study of the safe start region: deviated tips and rank correlations with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import experiments.start_region as study
+import lungaccess as la
+from anatomy.lung import Lung
+from lungaccess.risk import RiskAssessor
+from lungaccess.risk.deviations import Deviations, deviated_pieces, deviated_starts
+
+
+def test_tubes_without_errors_end_where_the_plan_says(small_lung: Lung) -> None:
+    plan = next(la.plan(small_lung, la.load_system("ultrathin"), la.resolve_target(small_lung), iterations=1))
+    assessor = RiskAssessor(plan, small_lung)
+    none = Deviations(**assessor.no_deviations(1))
+    start, pieces = deviated_starts(plan, none)[0], deviated_pieces(plan, none)[0]
+    tip = study.tip_after(start, pieces[: len(pieces) - assessor.n_arcs])
+    np.testing.assert_allclose(tip[:3, 2:], plan.tube.lps_from_tip[:3, 2:], atol=1e-9)
+    assert 0.0 <= study.share_of_tips(plan, small_lung, 5.0) <= 1.0
+    region = la.safe_start_region(plan, small_lung)
+    assert study.share_at(plan, small_lung, region, 1.0) == 1.0
+
+
+def test_ranks_are_compared_within_a_group() -> None:
+    """The second patient is shifted: over all plans the order is lost, within each it is perfect."""
+    rows = [{"a": float(n), "b": float(n) ** 3} for n in range(5)]
+    rows += [{"a": 100.0 + n, "b": -100.0 + n} for n in range(5)]
+    assert study.correlation(rows, ["x"] * 5 + ["y"] * 5, "a", "b") == pytest.approx(1.0)
+    assert study.correlation(rows, ["x"] * 10, "a", "b") < 0.0

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         plan_tour,
         replan_from_scope,
         replan_from_tube,
+        safe_scope_region,
     )
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan

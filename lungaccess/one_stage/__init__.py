@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from lungaccess.one_stage.replan import RestOfPlan, replan_from_scope, replan_from_tube
     from lungaccess.one_stage.route import RouteSource, open_source, read_drawing, route_record, widest_end
     from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, ScopeAdvice, advise_scope, save_advice
+    from lungaccess.one_stage.scope_region import ScopeRegion, safe_scope_region
     from lungaccess.one_stage.shapes import design_shapes, save_shapes, shapes_record
     from lungaccess.one_stage.tour import (
         TourAnswer,

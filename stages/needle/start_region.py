@@ -111,6 +111,12 @@ class TriedStarts:
         return float(part.mean()) if part.size else math.nan
 
     @property
+    def share_of_free(self) -> float:
+        """Share of poses with a path among those that are not too near to an obstacle themselves."""
+        free = self.kinds != kernel.START_BLOCKED
+        return float(np.isin(self.kinds[free], REACHING).mean()) if free.any() else math.nan
+
+    @property
     def share_by_place(self) -> Float:
         """Share of directions with a path at each place, `(P,)`."""
         return np.asarray(np.isin(self.kinds, REACHING).mean(axis=1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,9 +64,42 @@ def try_starts(
     SettingsError
         If a number is out of its range.
     """
-    _require_ranges(offset_mm, tilt_rad, poses, iterations)
-    frame = query.lps_from_start
-    places = max(poses // DIRECTIONS, 1)
+
+    def tried(positions: Float, tangents: Float) -> UInt8:
+        return try_poses(environment, query, path, positions, tangents, iterations=iterations, seed=seed)
+
+    if iterations < 0:
+        raise SettingsError(f"A search cannot have {iterations} iterations", expected="0 or more")
+    return try_around(query.lps_from_start, tried, offset_mm=offset_mm, tilt_rad=tilt_rad, poses=poses)
+
+
+def try_around(
+    frame: Float,
+    tried: Callable[[Float, Float], UInt8],
+    *,
+    offset_mm: float,
+    tilt_rad: float,
+    poses: int,
+    directions: int = DIRECTIONS,
+) -> TriedStarts:
+    """Try poses around a pose: places on a lattice in a ball, each with directions spread evenly in a cone.
+
+    Parameters
+    ----------
+    frame : (4, 4) float64
+        +z is the axis of the cone.
+    tried : callable
+        Takes positions and tangents `(N, 3)` and returns `KINDS` `(N,)`.
+    directions : int
+        At each place.
+
+    Raises
+    ------
+    SettingsError
+        If a number is out of its range.
+    """
+    _require_ranges(offset_mm, tilt_rad, poses, directions)
+    places = max(poses // directions, 1)
     spacing = offset_mm * (4.0 / 3.0 * math.pi / places) ** (1.0 / 3.0)
     reach = math.ceil(offset_mm / spacing)
     steps = np.arange(-reach, reach + 1)
@@ -73,18 +107,10 @@ def try_starts(
     offsets = spacing * np.linalg.norm(lattice, axis=1)
     lattice, offsets = lattice[offsets <= offset_mm], offsets[offsets <= offset_mm]
     positions = frame[:3, 3] + spacing * lattice @ frame[:3, :3].T
-    tilts, around = _directions(len(positions), tilt_rad)
+    tilts, around = _directions(len(positions), directions, tilt_rad)
     local = np.stack([np.sin(tilts) * np.cos(around), np.sin(tilts) * np.sin(around), np.cos(tilts)], axis=-1)
     tangents = local @ frame[:3, :3].T
-    kinds = try_poses(
-        environment,
-        query,
-        path,
-        np.repeat(positions, DIRECTIONS, axis=0),
-        tangents.reshape(-1, 3),
-        iterations=iterations,
-        seed=seed,
-    )
+    kinds = tried(np.repeat(positions, directions, axis=0), tangents.reshape(-1, 3))
     return TriedStarts(
         offset_mm=offset_mm,
         tilt_rad=tilt_rad,
@@ -92,7 +118,7 @@ def try_starts(
         tangents=read_only(tangents),
         offsets_mm=read_only(offsets),
         tilts_rad=read_only(tilts),
-        kinds=read_only(kinds.reshape(len(positions), DIRECTIONS)),
+        kinds=read_only(kinds.reshape(len(positions), directions)),
         spacing_mm=spacing,
         lattice=read_only(lattice),
     )
@@ -130,12 +156,12 @@ def try_poses(
     return kinds
 
 
-def _directions(places: int, tilt_rad: float) -> tuple[Float, Float]:
-    """Return tilts and angles about the axis `(places, DIRECTIONS)`: each place covers the cone evenly."""
+def _directions(places: int, count: int, tilt_rad: float) -> tuple[Float, Float]:
+    """Return tilts and angles about the axis `(places, count)`: each place covers the cone evenly."""
     place = np.arange(places)[:, None]
-    rank = np.arange(DIRECTIONS) + (TURNS[0] * (place + 0.5)) % 1.0
-    tilts = np.arccos(1.0 - rank / DIRECTIONS * (1.0 - math.cos(tilt_rad)))
-    return tilts, GOLDEN_RAD * np.arange(DIRECTIONS) + 2.0 * math.pi * TURNS[1] * place
+    rank = np.arange(count) + (TURNS[0] * (place + 0.5)) % 1.0
+    tilts = np.arccos(1.0 - rank / count * (1.0 - math.cos(tilt_rad)))
+    return tilts, GOLDEN_RAD * np.arange(count) + 2.0 * math.pi * TURNS[1] * place
 
 
 def _vias_around(path: ArcPath) -> Float:
@@ -151,7 +177,7 @@ def _vias_around(path: ArcPath) -> Float:
     return np.ascontiguousarray(np.vstack(places))
 
 
-def _require_ranges(offset_mm: float, tilt_rad: float, poses: int, iterations: int) -> None:
+def _require_ranges(offset_mm: float, tilt_rad: float, poses: int, directions: int) -> None:
     if not 0.0 < offset_mm <= FAR_MM:
         raise SettingsError(
             f"Start poses up to {offset_mm} mm away cannot be tried",
@@ -162,8 +188,5 @@ def _require_ranges(offset_mm: float, tilt_rad: float, poses: int, iterations: i
             f"Start poses tilted by up to {math.degrees(tilt_rad):g} degrees cannot be tried",
             expected=f"above 0, at most {math.degrees(FAR_RAD):g} degrees",
         )
-    if poses < DIRECTIONS or iterations < 0:
-        raise SettingsError(
-            f"{poses} start poses cannot be tried with {iterations} iterations of a search",
-            expected=f"at least {DIRECTIONS} poses, and 0 iterations or more",
-        )
+    if poses < directions:
+        raise SettingsError(f"{poses} start poses cannot be tried", expected=f"at least {directions}")

@@ -35,10 +35,14 @@ def start_region(
             "of the goal, as of `risk`."
         ),
     ] = None,
+    scope: Annotated[
+        bool, Parameter(help="Whether poses of the scope's tip are tried as well, which takes some seconds.")
+    ] = False,
     seed: Annotated[Seed, Parameter(help="Seed of the search.")] = 0,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Tell from which poses near its start the needle of a stored plan still reaches the target, clear."""
+    from lungaccess.one_stage import safe_scope_region
     from lungaccess.plans.plan import Plan
     from lungaccess.risk import safe_start_region
 
@@ -49,10 +53,17 @@ def start_region(
             stored, lung, radius_mm=radius, offset_mm=distance, tilt_deg=tilt, poses=poses,
             iterations=iterations, seed=seed,
         )  # fmt: skip
+    of_scope = None
+    if scope:
+        with progress("trying poses of the scope"):
+            of_scope = safe_scope_region(stored, lung, seed=seed)
     if output.json:
-        terminal.show_json(region.record())
+        told = {} if of_scope is None else {"scope": of_scope.record()}
+        terminal.show_json({**region.record(), **told})
     else:
         terminal.say(f"{region.words}.")
+        if of_scope is not None:
+            terminal.say(f"{of_scope.words}.")
         terminal.show([_proved_table(region), _tried_table(region), _counts_table(region)])
     return ExitCode.OK
 

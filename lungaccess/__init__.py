@@ -57,6 +57,7 @@ if TYPE_CHECKING:
         presets_by_invasiveness,
         resolve_target,
     )
+    from lungaccess.procedure import Procedure, load_procedure, simulate_procedure
     from lungaccess.reachability import UnreachableProof, compare_reach, map_reach
     from lungaccess.report.html import plan_page
     from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors, safe_start_region

@@ -105,16 +105,13 @@ class RiskAssessor:
         )
         self._forbidden_flags = sum(self.structures[name] for name in self.forbidden)
 
-    def draws(self, count: int, seed: int, *, attempts_a_patient: int = 1) -> Draws:
-        """Return random numbers for `count` sets of errors, see `Draws`; the same seed gives the same."""
-        return Draws(
-            count,
-            self.n_arcs,
-            seed,
-            self._n_twisted,
-            stretch=self.stretch,
-            attempts_a_patient=attempts_a_patient,
-        )
+    def draws(self, count: int, seed: int, *, attempt: int = 0, n_arcs: int | None = None) -> Draws:
+        """Return random numbers for `count` sets of errors, see `Draws`; the same seed gives the same.
+
+        They are for the arcs of the plan if `n_arcs` is None.
+        """
+        arcs = self.n_arcs if n_arcs is None else n_arcs
+        return Draws(count, arcs, seed, self._n_twisted, stretch=self.stretch, attempt=attempt)
 
     def no_deviations(self, count: int) -> dict[str, Float]:
         """Return the fields of `Deviations` for `count` sets without any error."""
@@ -123,17 +120,16 @@ class RiskAssessor:
     def outcomes(self, deviations: Deviations) -> Outcomes:
         """Follow deviated plans through all three stages."""
         starts, pieces = deviated_starts(self.plan, deviations), deviated_pieces(self.plan, deviations)
-        touched, ends = self._followed(starts, pieces, enough=0)
+        touched, ends = self.follow(starts, pieces, pieces.shape[1] - self.n_arcs)
         targets = self.plan.target_lps + deviations.target_mm
         return Outcomes(touched=touched, miss_mm=np.linalg.norm(ends - targets, axis=1))
 
-    def _followed(self, starts: Float, pieces: Float, *, enough: int) -> tuple[Int, Float]:
+    def follow(self, starts: Float, pieces: Float, n_tube: int, *, enough: int = 0) -> tuple[Int, Float]:
         """Return what chains touch `(N,)` and where they end `(N, 3)`; see `kernel.follow`."""
         touched, ends = np.zeros(len(starts), dtype=np.int64), np.zeros((len(starts), 3))
-        n_tube = pieces.shape[1] - self.n_arcs
         exempt_mm = float(self.plan.exemption.needle_length_mm)
 
-        def follow(part: slice) -> None:
+        def follow_part(part: slice) -> None:
             kernel.follow(
                 self._obstacles, self._depth, self._mediastinal, starts[part], pieces[part], n_tube,
                 exempt_mm, enough, touched[part], ends[part],
@@ -141,7 +137,7 @@ class RiskAssessor:
 
         bounds = np.linspace(0, len(starts), THREADS + 1).astype(int)
         with ThreadPoolExecutor(THREADS) as pool:
-            list(pool.map(follow, (slice(a, b) for a, b in zip(bounds, bounds[1:], strict=False))))
+            list(pool.map(follow_part, (slice(a, b) for a, b in zip(bounds, bounds[1:], strict=False))))
         return touched, ends
 
     def succeeded(self, outcomes: Outcomes) -> Bool:
@@ -160,7 +156,8 @@ class RiskAssessor:
         kernel.find_ends(starts, pieces, ends)
         targets = self.plan.target_lps + deviations.target_mm
         done = np.asarray(np.linalg.norm(ends - targets, axis=1) <= self.radius_mm)
-        touched, _ends = self._followed(starts[done], pieces[done], enough=self._forbidden_flags)
+        n_tube = pieces.shape[1] - self.n_arcs
+        touched, _ends = self.follow(starts[done], pieces[done], n_tube, enough=self._forbidden_flags)
         done[done] = (touched & self._forbidden_flags) == 0
         return done
 

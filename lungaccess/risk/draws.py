@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from anatomy.errors import SettingsError
@@ -37,8 +35,8 @@ class Draws:
         See `no_deviations`.
     stretch : float
         By how much of the patient's motion by breathing the target moves farther than the scope's tip.
-    attempts_a_patient : int
-        How many attempts after each other belong to one patient; with 1, N patients are drawn.
+    attempt : int
+        Number of the attempt on the same N patients: what is drawn for each attempt has other numbers.
 
     Raises
     ------
@@ -54,17 +52,17 @@ class Draws:
         n_twisted: int = 0,
         *,
         stretch: float = 0.0,
-        attempts_a_patient: int = 1,
+        attempt: int = 0,
     ) -> None:
-        if count < 1 or attempts_a_patient < 1:
+        if count < 1:
             raise SettingsError(
-                f"The number of samples is {count}, with {attempts_a_patient} attempts a patient",
-                expected="at least 1 of each",
+                f"The number of samples is {count}",
+                expected="at least 1",
                 remedy="Choose a count such as 10000",
             )
         self.count = count
         self._seed, self._n_arcs, self._n_twisted = seed, n_arcs, n_twisted
-        self._stretch, self._attempts = stretch, attempts_a_patient
+        self._stretch, self._attempt = stretch, attempt
         self._made: dict[tuple[str, int], Float] = {}
 
     def deviations(self, model: ErrorModel) -> Deviations:
@@ -115,13 +113,10 @@ class Draws:
     def _normal(self, kind: str, level: int, shape: tuple[int, ...]) -> Float:
         """Return the numbers of a kind at a level, the same at each call."""
         if (kind, level) not in self._made:
-            stream = np.random.SeedSequence(self._seed, spawn_key=(list(UNITS).index(kind), level))
-            rng = np.random.Generator(np.random.PCG64(stream))
-            if level == PATIENT:
-                drawn = _columns(rng, math.ceil(self.count / self._attempts), shape[1:])
-                self._made[kind, level] = np.repeat(drawn, self._attempts, axis=0)[: self.count]
-            else:
-                self._made[kind, level] = _columns(rng, self.count, shape[1:])
+            attempt = 0 if level == PATIENT else self._attempt
+            key = (list(UNITS).index(kind), level, attempt)
+            rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self._seed, spawn_key=key)))
+            self._made[kind, level] = _columns(rng, self.count, shape[1:])
         return self._made[kind, level]
 
 

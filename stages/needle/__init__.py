@@ -65,6 +65,7 @@ if TYPE_CHECKING:
         Reached,
         ReachScan,
     )
+    from stages.needle.replanning.insertion import GAIN, Belief, TrueNeedle, steer, tilt
     from stages.needle.replanning.replanner import (
         DEFAULT_SETTINGS,
         Failure,

@@ -31,6 +31,7 @@ FACADES = (
     "lungaccess.one_stage",
     "lungaccess.plans",
     "lungaccess.problem",
+    "lungaccess.procedure",
     "lungaccess.reachability",
     "lungaccess.risk",
     "lungaccess.study",

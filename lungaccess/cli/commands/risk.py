@@ -8,14 +8,15 @@ from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Positive, Probability, Samples, Seed
+from lungaccess.cli.numbers import Positive, Probability, Processes, Samples, Seed
 from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
+from lungaccess.cli.procedure_tables import plain_share, procedure_record, procedure_tables, share_row
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.risk import RiskReport, Share, Tolerance
+    from lungaccess.risk import RiskReport, Tolerance
 
 
 def risk(
@@ -23,7 +24,17 @@ def risk(
     patient: PatientOfPlan,
     *,
     errors: ErrorOptions = ErrorOptions(),
-    samples: Annotated[Samples, Parameter(help="Number of deviated plans.")] = 10_000,
+    procedure: Annotated[
+        str,
+        Parameter(
+            help="What is measured and planned again on the way: a preset (closed-loop, measured-scope, "
+            "measured-tip, open-loop) or a TOML file."
+        ),
+    ] = "open-loop",
+    samples: Annotated[
+        Samples | None,
+        Parameter(help="Number of deviated plans; 10000, or 1000 procedures that measure on their way."),
+    ] = None,
     radius: Annotated[
         Positive | None,
         Parameter(
@@ -34,15 +45,37 @@ def risk(
         Probability, Parameter(help="Probability of success that the tolerances keep.")
     ] = 0.95,
     seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
+    processes: Annotated[Processes, Parameter(help="How many processes share procedures that measure.")] = 1,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Estimate how likely a stored plan succeeds if the devices deviate from it, open loop."""
+    """Estimate how likely a stored plan succeeds if the devices deviate from it."""
     from lungaccess.plans.plan import Plan
+    from lungaccess.procedure import load_procedure, simulate_procedure
+    from lungaccess.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.risk import assess, find_tolerances
+    from lungaccess.risk.assessment import DEFAULT_SAMPLES
 
-    model = errors.load()
+    model, followed = errors.load(), load_procedure(procedure)
     stored = Plan.load(plan)
     lung = output.load(patient)
+    if not followed.is_open_loop:
+        with progress(f"simulating procedures '{followed.name}'"):
+            found = simulate_procedure(
+                stored,
+                lung,
+                errors=model,
+                procedure=followed,
+                samples=samples or PROCEDURES,
+                seed=seed,
+                radius_mm=radius,
+                processes=processes,
+            )
+        if output.json:
+            terminal.show_json(procedure_record(found))
+        else:
+            terminal.show(procedure_tables(found))
+        return ExitCode.OK
+    samples = samples or DEFAULT_SAMPLES
     with progress("deviating the plan"):
         report = assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
     with progress("looking for the largest errors"):
@@ -66,9 +99,9 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
         "seed": report.seed,
         "radius_mm": report.radius_mm,
         "radius_origin": report.radius_origin,
-        "succeeds": _plain(report.succeeds),
-        "reaches": _plain(report.reaches),
-        "touches": {name: _plain(share) for name, share in report.touches.items()},
+        "succeeds": plain_share(report.succeeds),
+        "reaches": plain_share(report.reaches),
+        "touches": {name: plain_share(share) for name, share in report.touches.items()},
         "forbidden": list(report.forbidden),
         "miss_mm": {f"{share:g}": miss for share, miss in report.miss_mm.items()},
         "tolerances": [
@@ -79,26 +112,21 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
                 "probability": each.probability,
                 "largest": each.largest,
                 "margin": list(each.margin),
-                "succeeds_with_it_alone": _plain(report.alone[each.kind]),
+                "succeeds_with_it_alone": plain_share(report.alone[each.kind]),
             }
             for each in kept
         ],
     }
 
 
-def _plain(share: Share) -> dict[str, object]:
-    return {"probability": share.value, "interval_95": list(share.interval)}
-
-
 def _outcome_table(report: RiskReport) -> Table:
-    def row(name: str, share: Share) -> terminal.Row:
-        low, high = share.interval
-        return name, f"{100.0 * share.value:.2f}", f"{100.0 * low:.2f} to {100.0 * high:.2f}"
-
-    rows = [row("succeeds", report.succeeds), row(f"ends within {report.radius_mm:.2f} mm", report.reaches)]
+    rows = [
+        share_row("succeeds", report.succeeds),
+        share_row(f"ends within {report.radius_mm:.2f} mm", report.reaches),
+    ]
     for name, share in report.touches.items():
         words = name if name.startswith("stays") else f"touches {name}"
-        rows.append(row(words if name in report.forbidden else f"{words} (allowed)", share))
+        rows.append(share_row(words if name in report.forbidden else f"{words} (allowed)", share))
     rows += [
         (f"{100.0 * share:.0f} % end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()
     ]

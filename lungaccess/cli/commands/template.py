@@ -12,10 +12,11 @@ from anatomy.io.files import write_text
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 
-Kind = Literal["patient", "errors", "study", "tubes", "lesions", "pose", "contours"]
+Kind = Literal["patient", "errors", "procedure", "study", "tubes", "lesions", "pose", "contours"]
 FILES = {
     "patient": "patient.toml",
     "errors": "errors.toml",
+    "procedure": "procedure.toml",
     "study": "study.toml",
     "tubes": "tubes.toml",
     "lesions": "lesions.txt",
@@ -29,9 +30,9 @@ def template(
     kind: Annotated[
         Kind,
         Parameter(
-            help="patient: a folder of own masks; errors: sizes of errors for `risk`; study: many plans; "
-            "tubes: two tubes alone; lesions: points for `tour`; pose: a start for `needle`; contours: an "
-            "outlined nodule for `segment`."
+            help="patient: a folder of own masks; errors: sizes of errors for `risk`; procedure: what is "
+            "measured on the way, for `risk`; study: many plans; tubes: two tubes alone; lesions: points for "
+            "`tour`; pose: a start for `needle`; contours: an outlined nodule for `segment`."
         ),
     ],
     /,

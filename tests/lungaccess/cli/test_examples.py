@@ -20,6 +20,7 @@ from lungaccess.cli.commands.template import FILES
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage import load_tubes, read_lesions
+from lungaccess.procedure import load_procedure
 from lungaccess.risk import load_errors
 from lungaccess.study import read_study
 
@@ -99,6 +100,9 @@ def test_every_template_can_be_read(templates: Path) -> None:
 
     assert load_errors(templates / "errors.toml") == replace(
         load_errors("breath-hold"), name="errors.toml", description=""
+    )
+    assert load_procedure(templates / "procedure.toml") == replace(
+        load_procedure("closed-loop"), name="procedure.toml", description=""
     )
     assert read_study(templates / "study.toml").case
     assert load_tubes(templates / "tubes.toml").name == "curved pair"

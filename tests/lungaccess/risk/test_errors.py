@@ -136,9 +136,8 @@ def test_wrong_names_and_values_are_refused(tmp_path: Path) -> None:
             ErrorModel(**values)
     with pytest.raises(SettingsError):
         AngleError(attempt_deg=math.inf)
-    for count, attempts in ((0, 1), (1, 0)):
-        with pytest.raises(SettingsError, match="samples"):
-            Draws(count, 1, 0, attempts_a_patient=attempts)
+    with pytest.raises(SettingsError, match="samples"):
+        Draws(0, 1, 0)
 
 
 # Sizes -------------------------------------------------------------------------------------------
@@ -187,17 +186,14 @@ def test_some_needles_go_straight() -> None:
     assert np.array_equal(factor[factor > 0.0], bent[factor > 0.0])
 
 
-def test_attempts_of_one_patient_share_the_patients_part() -> None:
+def test_attempts_on_one_patient_share_the_patients_part() -> None:
     model = ErrorModel(target_position=PositionError(patient_mm=3.0, attempt_mm=4.0))
-    draws = Draws(COUNT, 1, 2, attempts_a_patient=4)
-    error = draws.deviations(model).target_mm.reshape(-1, 4, 3)
-    within = np.mean(error[:, 0] * error[:, 1])
-    assert within == pytest.approx(9.0, rel=0.15)
-    assert np.mean(error[:-1, 0] * error[1:, 0]) == pytest.approx(0.0, abs=1.5)
-    patients = draws.deviations(model.only("target_position")).target_mm
-    assert np.array_equal(patients.reshape(error.shape), error)
-    alone = draws.deviations(ErrorModel(target_position=PositionError(patient_mm=3.0))).target_mm
-    assert (np.ptp(alone.reshape(error.shape), axis=1) == 0.0).all()
+    first, second = (Draws(COUNT, 1, 2, attempt=n).deviations(model).target_mm for n in (0, 1))
+    assert np.mean(first * second) == pytest.approx(9.0, rel=0.15)
+    assert np.mean(first[1:] * second[:-1]) == pytest.approx(0.0, abs=1.0)
+    patients = ErrorModel(target_position=PositionError(patient_mm=3.0))
+    alike = [Draws(COUNT, 1, 2, attempt=n).deviations(patients).target_mm for n in (0, 1)]
+    assert np.array_equal(*alike)
 
 
 def test_what_a_needle_has_of_its_patient_is_the_same_in_all_arcs() -> None:

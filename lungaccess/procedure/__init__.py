@@ -1,0 +1,14 @@
+"""What a procedure measures and corrects on its way, and how often it then succeeds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.procedure.report import ProcedureReport, StageReport
+    from lungaccess.procedure.settings import Procedure, load_procedure, procedure_names
+    from lungaccess.procedure.simulation import simulate_procedure
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

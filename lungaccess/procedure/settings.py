@@ -1,0 +1,178 @@
+"""What a procedure measures after each stage, to what error, and whether it plans again from there."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from importlib import resources
+from typing import Annotated
+
+from anatomy.errors import SettingsError
+from anatomy.io.files import read_toml
+from anatomy.settings import parse, quantity, settings, switch, text
+from anatomy.suggestion import did_you_mean
+
+DEFAULT_PROCEDURE = "open-loop"
+_FOLDER = "presets/procedures"
+_REMEDY = "`lungaccess template procedure` prints a complete file to start from"
+
+_Measured = Annotated[bool, switch("whether the tip is measured, and the rest planned again from there")]
+_Position = Annotated[
+    float, quantity("standard deviation of the measured tip, along each axis", at_least=0.0, at_most=20.0)
+]
+_Direction = Annotated[
+    float, quantity("standard deviation of its direction, about each of two axes", at_least=0.0, at_most=45.0)
+]
+_Source = Annotated[str, text("where the errors of measuring come from, or 'assumption'")]
+
+
+@settings
+class ScopePlacing:
+    """What is done once the bronchoscope stands where the plan has it.
+
+    Parameters
+    ----------
+    measured : bool
+        Whether its tip is measured, and tubes and needle are planned again from there.
+    position_mm, direction_deg : float
+        Errors of measuring: of the position along each axis, of the direction about each of two axes.
+    placements : int
+        How often the scope may be placed.  It is moved away and placed again, at the same tip, where no path
+        is left from the pose as measured; every placement has errors of its own.
+    source : str
+        Where the errors of measuring come from.
+    """
+
+    measured: _Measured = False
+    position_mm: _Position = 0.0
+    direction_deg: _Direction = 0.0
+    placements: Annotated[
+        int, quantity("how often the bronchoscope may be placed", at_least=1, at_most=20)
+    ] = 1
+    source: _Source = "assumption"
+
+
+@settings
+class TubesOut:
+    """What is done once the tubes are out: the needle is planned again from their tip as measured."""
+
+    measured: _Measured = False
+    position_mm: _Position = 0.0
+    direction_deg: _Direction = 0.0
+    source: _Source = "assumption"
+
+
+@settings
+class Imaging:
+    """An image before the needle starts, in which the target is found again."""
+
+    measured: Annotated[bool, switch("whether the target is found again before the needle starts")] = False
+    position_mm: Annotated[
+        float, quantity("standard deviation of the target as found, along each axis", at_least=0, at_most=20)
+    ] = 0.0
+    source: _Source = "assumption"
+
+
+@settings
+class NeedleSteering:
+    """Whether the needle is measured and planned again while it is inserted.
+
+    Parameters
+    ----------
+    closed_loop : bool
+    measure_every_mm : float
+        Insertion between two measurements.
+    position_mm, direction_deg : float
+        Errors of measuring, as of `ScopePlacing`.
+    gain : float
+        Share of a measurement by which dead reckoning is corrected; 1 trusts the sensor alone.
+    source : str
+    """
+
+    closed_loop: Annotated[bool, switch("whether the needle is measured and planned again on its way")] = (
+        False
+    )
+    measure_every_mm: Annotated[
+        float, quantity("insertion between two measurements", at_least=1.0, at_most=500.0)
+    ] = 5.0
+    position_mm: _Position = 0.0
+    direction_deg: _Direction = 0.0
+    gain: Annotated[float, quantity("share of a measurement that is believed", above=0.0, at_most=1.0)] = 0.5
+    source: _Source = "assumption"
+
+
+@settings
+class Procedure:
+    """What is measured and corrected after each stage; without arguments nothing is.
+
+    Parameters
+    ----------
+    name, description : str
+        What it is, for people.
+    least_margin_share : float
+        Share of the margins that a path from a measured pose has to keep where none keeps them whole; margins
+        allow for errors that are known by then.
+    scope : ScopePlacing
+    tubes : TubesOut
+    imaging : Imaging
+    needle : NeedleSteering
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite or outside its range.
+    """
+
+    name: Annotated[str, text("what the procedure is called where its results are shown")] = "stated"
+    description: Annotated[str, text("one sentence for people", may_be_empty=True)] = ""
+    least_margin_share: Annotated[
+        float,
+        quantity("share of the margins that is kept where no path keeps them whole", at_least=0, at_most=1),
+    ] = 1.0
+    scope: ScopePlacing = ScopePlacing()
+    tubes: TubesOut = TubesOut()
+    imaging: Imaging = Imaging()
+    needle: NeedleSteering = NeedleSteering()
+
+    @property
+    def is_open_loop(self) -> bool:
+        """Whether nothing is measured, so that the plan is carried out as it stands."""
+        return not (self.scope.measured or self.tubes.measured or self.needle.closed_loop)
+
+
+def procedure_names() -> tuple[str, ...]:
+    """Return the names of the procedures that ship with the package, sorted."""
+    entries = (resources.files("lungaccess") / _FOLDER).iterdir()
+    return tuple(sorted(each.name[:-5] for each in entries if each.name.endswith(".toml")))
+
+
+def load_procedure(name_or_path: str | os.PathLike[str] = DEFAULT_PROCEDURE) -> Procedure:
+    """Read a procedure from a preset or from a TOML file; tables that are left out measure nothing.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        Name of a preset (see `procedure_names`), or path of a file that ends in ``.toml``.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such preset, the file is not TOML, or a value in it is wrong.
+    FileError
+        If the file cannot be read.
+    """
+    given = os.fspath(name_or_path)
+    if given in procedure_names():
+        written = (resources.files("lungaccess") / _FOLDER / f"{given}.toml").read_text(encoding="utf-8")
+        return parse(Procedure, tomllib.loads(written), given)
+    if isinstance(name_or_path, str) and not given.endswith(".toml"):
+        names = procedure_names()
+        raise SettingsError(
+            f"There is no procedure called {given!r}",
+            expected=f"a preset ({', '.join(names)}) or the path of a .toml file",
+            remedy=did_you_mean(given, names) or _REMEDY,
+        )
+    stated = read_toml(
+        given, expected="tables such as [scope] with lines such as measured = true", remedy=_REMEDY
+    )
+    return parse(Procedure, {"name": os.path.basename(given), **stated}, given, remedy=_REMEDY)

@@ -36,7 +36,7 @@ ORDER = ("pleura", "vessel", "airway", "fissure", "stays in the airway")
 
 
 class _Found(NamedTuple):
-    """What came of N procedures: flags touched, distance from the target, no path left, and their histories."""
+    """What came of N procedures: flags touched, distance from the target, no path left, and histories."""
 
     touched: Int
     miss_mm: Float

@@ -18,7 +18,7 @@ from anatomy.typed import Bool, Float, Int
 from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.coupled.search.aimed_tubes import AimedFromPose
-from lungaccess.coupled.search.local_search import path_through, tube_arguments
+from lungaccess.coupled.search.local_search import TubeChoice, path_through, tube_arguments
 from lungaccess.one_stage.needle import needle_question
 from lungaccess.one_stage.obstruction import reason_in_words
 from lungaccess.plans.assemble import (
@@ -44,7 +44,7 @@ from stages.needle import (
     violation,
     workspace_lengths,
 )
-from stages.tube import Deployment, enumerate_deployments, tube_constants, tube_environment
+from stages.tube import Deployment, design_arrays, enumerate_deployments
 
 SKEW = 0.02
 """A measured rotation may be off by so much, about a degree; it is replaced by the nearest rotation."""
@@ -302,26 +302,18 @@ class _FromScope:
         if len(points) > MAX_VIAS or not self._tries:
             return deployment, path
         vias[: len(points)] = points
-        choice = np.array([0.0, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
-        task, (x, y, z) = self._task, self._target.tolist()
-        tube = tube_arguments(
-            tube_environment(task.lung, with_fissures=task.with_fissures),
-            tube_constants(task.system.tubes, task.system.margins),
-            deployment.shape,
-        )
-        state = np.array([task.seed], dtype=np.uint64)
+        design, (x, y, z) = design_arrays(self._task.system.tubes), self._target.tolist()
+        choice = TubeChoice.of(design, deployment, 0.0)
+        if choice is None:
+            return deployment, path
+        state = np.array([self._task.seed], dtype=np.uint64)
         count, cost = improve(
-            tube, self._evaluator.needle_arrays, self._row, np.ones(1, dtype=np.bool_), choice, vias,
-            len(points), (x, y, z), self._tries, state,
+            tube_arguments(self._evaluator, design)(choice), self._evaluator.needle_arrays, self._row,
+            np.ones(1, dtype=np.bool_), choice.x, vias, len(points), (x, y, z), self._tries, state,
         )  # fmt: skip
         if not math.isfinite(cost):
             return deployment, path
-        rotation, outer, inner = choice[1:].tolist()
-        tubes, turned = self._evaluator.tubes, rotation % (2.0 * math.pi)
-        if deployment.shape is None:
-            found = tubes.validate(self._frame, turned, outer, inner)
-        else:
-            found = tubes.validate_shape(self._frame, turned, deployment.shape)
+        found = self._evaluator.tubes.choose(self._frame, *choice.numbers)
         if isinstance(found, str):
             return deployment, path
         better = path_through(found, vias[:count], self._target)

@@ -32,7 +32,7 @@ from stages.needle import (
     workspace_lengths,
 )
 from stages.scope import ScopeTip
-from stages.tube import Deployment, DeploymentValidator
+from stages.tube import Deployment, DeploymentValidator, TubeShape
 
 
 class NeedleArrays(NamedTuple):
@@ -121,7 +121,12 @@ class CandidateEvaluator:
         return Candidate(tip=tip, deployment=deployment, path=path)
 
     def direct(
-        self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float, shape: int = -1
+        self,
+        tip: ScopeTip,
+        rotation_rad: float,
+        outer_mm: float,
+        inner_mm: float,
+        shape: int | TubeShape = -1,
     ) -> Candidate | None:
         """Return a deployment with a direct arc to the target, None if the deployment is refused.
 

@@ -202,7 +202,7 @@ def tube_shapes(
     stops = _stops(mechanics, limits, grid)
     states, parents = _states(mechanics, stops)
     rotations = _rotations(mechanics.tubes, grid)
-    strained = _strained_radii(mechanics.tubes, float(stops[-1]))
+    strained = strained_radii(mechanics.tubes, float(stops[-1]))
 
     def with_rotations(base: Float) -> tuple[Float, Int, Float, Float]:
         return _follow(mechanics, strained, base + BEND_RAD, stops, states, parents)
@@ -235,7 +235,7 @@ def tube_shapes(
     )
 
 
-def _strained_radii(tubes: Sequence[Tube], longest_mm: float) -> Float:
+def strained_radii(tubes: Sequence[Tube], longest_mm: float) -> Float:
     """Return the strain of each tube for each 1/mm `(n,)`, mm, and check that slots change no shape."""
     softened, strained = [], []
     for tube in tubes:

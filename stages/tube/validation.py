@@ -91,9 +91,16 @@ class DeploymentValidator:
         self._tip = np.zeros(9)
 
     def choose(
-        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float, shape: int
+        self,
+        lps_from_scope_tip: Float,
+        rotation_rad: float,
+        outer_mm: float,
+        inner_mm: float,
+        shape: int | TubeShape,
     ) -> Deployment | str:
-        """Return an enumerated deployment, or the reason why it is refused; see `Deployments`."""
+        """Return a deployment by its shape, or by its place as in `Deployments`, or why it is refused."""
+        if not isinstance(shape, int):
+            return self.validate_shape(lps_from_scope_tip, rotation_rad, shape)
         if shape < 0:
             return self.validate(lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
         return self.validate_shape(lps_from_scope_tip, rotation_rad, shapes_of(self._tubes).member(shape))

@@ -1,12 +1,13 @@
 """Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
-`tube` is the tuple (environment, constants, arcs, beside): the first two are those of `stages.tube.kernels`,
-`arcs` (a, 4) and `beside` (mm) the shape of tubes that are not planar, as `validate_arcs` takes it; planar
-tubes have no arcs.  `needle` is a `lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x`
-holds a row of `scope_poses`, the rotation in rad, and the insertions of outer and inner tube in mm, which
-count for planar tubes only.  `vias` are points (LPS mm) through which single arcs lead from the tube to the
-target.  A row of `scope_poses` (9,) is a scope tip: point, unit tangent, and the unit vector across the
-tangent from which the rotation counts.
+`tube` is the tuple (environment, constants, design, near, shape): the first two are those of
+`stages.tube.kernels`.  The others count for tubes that are not planar: their `DesignArrays`, which are empty
+for planar tubes, a proved shape near that of the choice, and a shape that is filled with that of the choice.
+`needle` is a `lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x` holds a row of
+`scope_poses`, the rotation in rad, and the insertions of the tubes in mm, the outermost first; then, of tubes
+that are not planar, how far the rear end of each is turned beside that rotation, in rad.  `vias` are points
+(LPS mm) through which single arcs lead from the tube to the target.  A row of `scope_poses` (9,) is a scope
+tip: point, unit tangent, and the unit vector across the tangent from which the rotation counts.
 """
 
 from __future__ import annotations
@@ -23,10 +24,14 @@ from stages.tube.kernels import (
     BRANCH,
     MAX_EXTENSION,
     MAX_PROTRUSION,
+    near_shape,
+    required_beside,
+    take_over,
     tip_of_arcs,
     tip_pose,
     validate_arcs,
     validate_deployment,
+    whole_way,
 )
 
 SCOPE_POSE = 0
@@ -34,7 +39,7 @@ ROTATION = 1
 OUTER = 2
 INNER = 3
 N_CHOICE = 4
-"""Places of the numbers of a choice in `x`, and how many they are."""
+"""Places of the numbers of a choice of planar tubes in `x`, and how many they are."""
 
 ROUNDING = 1e-9
 """Share of each limit that stays unused, so that rounding does not carry a plan beyond the limit."""
@@ -98,17 +103,34 @@ def _needle_clear(needle, pose, vias, count, target, branch):
 
 
 @inner_kernel
+def _shape_nearby(design, near, shape, x):
+    """Fill `shape` with that of a choice; return whether there is one, and whether it is the one nearby."""
+    n = design.lengths.shape[0]
+    same = True
+    for i in range(n):
+        shape.joints[i] = x[OUTER + n - 1 - i]
+        shape.joints[n + i] = x[OUTER + 2 * n - 1 - i]
+        same = same and shape.joints[i] == near.joints[i] and shape.joints[n + i] == near.joints[n + i]
+    if same:
+        take_over(shape, near)
+        return True, True
+    return near_shape(design, near, shape), False
+
+
+@inner_kernel
 def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, cost_limit, trace, tip):
     """Return the cost of a choice if it is below `cost_limit` and all of it is proved; else infinity.
 
-    The fast tests come first: limits and cost of the needle, the deployment, the needle's clearance.
+    The fast tests come first: limits and cost of the needle, the deployment, the needle's clearance.  Of
+    tubes that are not planar the tip is that of a shape reached from the one nearby; only where it passes
+    those of the needle, the whole way to it is followed.
     """
-    environment, constants, arcs, beside = tube
-    planar = arcs.shape[0] == 0
+    environment, constants, design, near, shape = tube
+    planar = design.lengths.shape[0] == 0
     row = int(x[SCOPE_POSE])
-    outer, inner = x[OUTER], x[INNER]
     if row < 0 or row >= scope_poses.shape[0] or not allowed[row]:
         return math.inf
+    outer, inner = x[OUTER], x[INNER]
     if planar and (outer < 0.0 or outer > inner or inner > constants[MAX_EXTENSION]):
         return math.inf
     if planar and inner - outer > constants[MAX_PROTRUSION]:
@@ -120,10 +142,14 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
         c * base[7] + s * (base[5] * base[6] - base[3] * base[8]),
         c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
     )
+    proved = True
     if planar:
         pose = tip_pose(constants, base, normal, outer, inner)
     else:
-        pose = tip_of_arcs(base, normal, arcs)
+        found, proved = _shape_nearby(design, near, shape, x)
+        if not found:
+            return math.inf
+        pose = tip_of_arcs(base, normal, shape.arcs[: shape.number[0]])
     cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
     if cost == math.inf:
         return math.inf
@@ -131,9 +157,17 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
     if planar:
         reason = validate_deployment(environment, constants, base[:6], towards, outer, inner, trace, tip)
     else:
+        if not proved and not whole_way(design, shape):
+            return math.inf
+        beside, arcs = required_beside(shape), shape.arcs[: shape.number[0]]
         reason = validate_arcs(environment, constants, base[:6], towards, arcs, beside, trace, tip)
     if reason != ACCEPTED:
         return math.inf
+    if not proved:
+        pose = (tip[0], tip[1], tip[2], tip[3], tip[4], tip[5])
+        cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
+        if cost == math.inf:
+            return math.inf
     branch = int(trace[BRANCH])
     if not _needle_clear(needle, pose, vias, count, target, branch):
         return math.inf

@@ -17,13 +17,14 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
-from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, ROTATION, SCOPE_POSE, validated_cost
-from stages.tube.kernels import N_TRACE
+from lungaccess.coupled.kernels.candidate import INNER, OUTER, ROTATION, SCOPE_POSE, validated_cost
+from stages.tube.kernels import N_TRACE, take_member, take_over
 
 MAX_VIAS = 5
 """Size of the arrays of via points: a path of the local search has at most one arc more."""
 SCOPE_POSE_SPREAD = 8.0
 ROTATION_SPREAD_RAD = 0.14
+RELATIVE_SPREAD_RAD = 0.28
 INSERTION_SPREAD_MM = 1.5
 VIA_SPREAD_MM = 3.0
 """The largest standard deviations of a change.  The poses of a scope lie 0.25 mm of its motion apart."""
@@ -35,6 +36,8 @@ DROP_SHARE = 0.16
 TUBES_ONLY = 0.3
 NEEDLE_ONLY = 0.6
 """Below the first share of the other changes only the tubes are changed, between both only the needle."""
+OTHER_SHAPE = 0.05
+"""Of so many samples of tubes that are not planar the shape is another one, which takes ten times as long."""
 EACH_SHARE = 0.6
 """The probability with which each number is changed, so that most changes leave some numbers as they are."""
 
@@ -61,7 +64,25 @@ def _add_via(vias, count, start, target, spread, state):
 
 
 @inner_kernel
-def _vary(x, vias, count, start, target, state):
+def _vary_tubes(design, x, spread, state):
+    """Change rotation and insertions, and of tubes that are not planar how they are turned beside it."""
+    n = design.lengths.shape[0]
+    insertions = n if n > 0 else 2
+    if uniform(state) < EACH_SHARE:
+        x[ROTATION] += ROTATION_SPREAD_RAD * spread * _normal(state)
+    for m in range(OUTER, OUTER + insertions):
+        if uniform(state) < EACH_SHARE:
+            x[m] += INSERTION_SPREAD_MM * spread * _normal(state)
+    x[OUTER] = max(x[OUTER], 0.0)
+    for m in range(OUTER + insertions - 2, OUTER - 1, -1):
+        x[m] = min(x[m], x[m + 1])
+    for i in range(n):
+        if design.turned[i] and uniform(state) < EACH_SHARE:
+            x[OUTER + 2 * n - 1 - i] += RELATIVE_SPREAD_RAD * spread * _normal(state)
+
+
+@inner_kernel
+def _vary(design, x, vias, count, start, target, state):
     """Change a choice at random, by spreads from small to large; return how many vias it then has."""
     spread = math.exp(math.log(SMALLEST_SPREAD) * uniform(state))
     change = uniform(state)
@@ -76,13 +97,7 @@ def _vary(x, vias, count, start, target, state):
     if not TUBES_ONLY <= which < NEEDLE_ONLY:
         if uniform(state) < EACH_SHARE:
             x[SCOPE_POSE] = round(x[SCOPE_POSE] + SCOPE_POSE_SPREAD * spread * _normal(state))
-        if uniform(state) < EACH_SHARE:
-            x[ROTATION] += ROTATION_SPREAD_RAD * spread * _normal(state)
-        if uniform(state) < EACH_SHARE:
-            x[OUTER] = max(x[OUTER] + INSERTION_SPREAD_MM * spread * _normal(state), 0.0)
-        if uniform(state) < EACH_SHARE:
-            x[INNER] += INSERTION_SPREAD_MM * spread * _normal(state)
-        x[OUTER] = min(x[OUTER], x[INNER])
+        _vary_tubes(design, x, spread, state)
     if which >= TUBES_ONLY:
         for m in range(count):
             if uniform(state) < EACH_SHARE:
@@ -95,14 +110,15 @@ def _vary(x, vias, count, start, target, state):
 def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, state):
     """Improve a choice by a stochastic local search: vary it at random and keep what is cheaper.
 
-    A choice is kept only if it is proved: the tubes by `validate_deployment`, the needle by `blocker_on_arc`.
+    A choice is kept only if it is proved: the tubes by `validate_deployment`, or by their whole way and
+    `validate_arcs`, the needle by `blocker_on_arc`.  The shape nearby in `tube` becomes that of the choice.
 
     Parameters
     ----------
     scope_poses : (K, 9) float64
     allowed : (K,) bool
         Which of these poses the scope can take.
-    x : (4,) float64
+    x : (c,) float64
     vias : (MAX_VIAS, 3) float64
         Both receive the best choice.
     count : int
@@ -120,19 +136,21 @@ def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, s
     cost : float
         Its estimated cost; infinite if the choice given was refused, and all others too.
     """
+    _environment, _constants, design, near, shape = tube
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
     start = np.zeros(3)
     cost = validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, math.inf, trace, tip)
+    if cost < math.inf:
+        take_over(near, shape)
     start[:] = tip[:3]
     new_x = x.copy()
     new_vias = vias.copy()
     for _ in range(tries):
-        for m in range(N_CHOICE):
-            new_x[m] = x[m]
+        new_x[:] = x
         for m in range(count):
             new_vias[m] = vias[m]
-        new_count = _vary(new_x, new_vias, count, start, target, state)
+        new_count = _vary(design, new_x, new_vias, count, start, target, state)
         new_cost = validated_cost(
             tube, needle, scope_poses, allowed, new_x, new_vias, new_count, target, cost, trace, tip
         )
@@ -140,11 +158,32 @@ def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, s
             cost = new_cost
             count = new_count
             start[:] = tip[:3]
-            for m in range(N_CHOICE):
-                x[m] = new_x[m]
+            x[:] = new_x
+            take_over(near, shape)
             for m in range(count):
                 vias[m] = new_vias[m]
     return count, cost
+
+
+@inner_kernel
+def _draw(design, near, numbers, spreads, x, state):
+    """Draw a choice near a deployment with rotation and insertions `numbers`, and near its shape."""
+    n = design.lengths.shape[0]
+    x[ROTATION] = numbers[0] + spreads[0] * (2.0 * uniform(state) - 1.0)
+    if n == 0:
+        x[OUTER] = max(numbers[1] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
+        x[INNER] = max(numbers[2] + spreads[1] * (2.0 * uniform(state) - 1.0), x[OUTER])
+        return
+    for m in range(2 * n):
+        x[OUTER + m] = near.joints[n - 1 - m if m < n else 3 * n - 1 - m]
+    if uniform(state) >= OTHER_SHAPE:
+        return
+    for m in range(n):
+        x[OUTER + m] = max(x[OUTER + m] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
+        if m > 0:
+            x[OUTER + m] = max(x[OUTER + m], x[OUTER + m - 1])
+        if design.turned[n - 1 - m]:
+            x[OUTER + n + m] += spreads[0] * (2.0 * uniform(state) - 1.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -153,18 +192,15 @@ def sample_deployments(
     needle,
     scope_poses,
     pose_of,
-    rotations,
-    outers,
-    inners,
-    arcs,
-    first_arc,
-    beside,
+    numbers,
+    shapes,
     spreads,
     target,
     tries,
     cost_limit,
     state,
     best,
+    best_shape,
 ):
     """Sample deployments near given ones, each with a single arc to the target, and keep the cheapest.
 
@@ -174,49 +210,46 @@ def sample_deployments(
         Poses that the scope can take.
     pose_of : (N,) int64
         The row of `scope_poses` of each deployment.
-    rotations, outers, inners : (N,) float64
-        The deployments: rad, mm, mm.
-    arcs, first_arc, beside : (A, 4) float64, (N + 1,) int64, (N,) float64
-        The shapes of deployments that are not planar, which are kept, and where the arcs of each begin;
-        instead of those in `tube`.
+    numbers : (N, 3) float64
+        The deployments: rotation in rad, insertions of outer and inner tube in mm.
+    shapes : ManyShapes
+        Those of deployments that are not planar.
     spreads : (2,) float64
-        The largest change of rotation in rad and of insertions in mm.
+        The largest change of rotations in rad and of insertions in mm.
     target : tuple of 3 floats
     tries : int
     cost_limit : float
         Choices that cost as much or more are dropped.
     state : (1,) uint64
         State of the random numbers.
-    best : (4,) float64
+    best : (c,) float64
         Receives the cheapest choice.
+    best_shape : ShapeArrays
+        Receives its shape.
 
     Returns
     -------
-    cost : float
+    float
         Its estimated cost, or `cost_limit` if there is none.
-    near : int
-        The deployment near which it is, -1 if there is none.
     """
-    environment, constants, _arcs, _beside = tube
+    _environment, _constants, design, near, shape = tube
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
-    near = -1
-    x = np.zeros(N_CHOICE)
+    x = np.zeros(best.shape[0])
     vias = np.zeros((MAX_VIAS, 3))
     allowed = np.ones(scope_poses.shape[0], dtype=np.bool_)
     none = np.int64(0)
     for _ in range(tries):
         n = min(int(uniform(state) * pose_of.shape[0]), pose_of.shape[0] - 1)
         x[SCOPE_POSE] = pose_of[n]
-        x[ROTATION] = rotations[n] + spreads[0] * (2.0 * uniform(state) - 1.0)
-        x[OUTER] = max(outers[n] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
-        x[INNER] = max(inners[n] + spreads[1] * (2.0 * uniform(state) - 1.0), x[OUTER])
-        shaped = (environment, constants, arcs[first_arc[n] : first_arc[n + 1]], beside[n])
+        if design.lengths.shape[0] > 0:
+            take_member(near, shapes, n)
+        _draw(design, near, numbers[n], spreads, x, state)
         cost = validated_cost(
-            shaped, needle, scope_poses, allowed, x, vias, none, target, cost_limit, trace, tip
+            tube, needle, scope_poses, allowed, x, vias, none, target, cost_limit, trace, tip
         )
         if cost < cost_limit:
-            cost_limit, near = cost, n
-            for m in range(N_CHOICE):
-                best[m] = x[m]
-    return cost_limit, near
+            cost_limit = cost
+            best[:] = x
+            take_over(best_shape, shape)
+    return cost_limit

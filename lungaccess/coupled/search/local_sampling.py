@@ -8,15 +8,14 @@ import numpy as np
 
 from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kernels.candidate import N_CHOICE, SCOPE_POSE
+from lungaccess.coupled.kernels.candidate import SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import sample_deployments
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.entries import different
-from lungaccess.coupled.search.local_search import LocalSearch
+from lungaccess.coupled.search.local_search import LocalSearch, TubeChoice
 from lungaccess.plans.candidate import Candidate
 from stages.needle import Needle
-from stages.tube import ConcentricTubes, shapes_of
-from stages.tube.kernels import ARC_COLUMNS
+from stages.tube import NO_SHAPES, many_shapes, shapes_of
 
 MOST = 1000
 """Deployments of the atlas around which samples are drawn: about as many as one iteration has samples for."""
@@ -42,55 +41,41 @@ class LocalSampling:
     def __init__(
         self, local_search: LocalSearch, arcs: DirectArcs, chosen: Int, rng: np.random.Generator
     ) -> None:
-        self._kernel_arguments = local_search
+        self._local_search = local_search
         self._evaluator, self._rng = arcs.evaluator, rng
         entries, motions = arcs.atlas.deployments, arcs.atlas.motions
         numbers, self._pose_of = np.unique(entries.site[chosen], return_inverse=True)
         self._motions, self._numbers = motions, numbers
         self._poses = np.ascontiguousarray(motions.tips[numbers])
-        self._shapes = entries.shape[chosen]
-        self._deployed = (
-            entries.rotation_rad[chosen],
-            entries.outer_mm[chosen],
-            entries.inner_mm[chosen],
-            *_arcs_of(arcs.task.system.tubes, self._shapes),
+        self._deployed = np.column_stack(
+            [column[chosen] for column in (entries.rotation_rad, entries.outer_mm, entries.inner_mm)]
         )
+        tubes = arcs.task.system.tubes
+        self._shapes = NO_SHAPES if tubes.planar else many_shapes(shapes_of(tubes), entries.shape[chosen])
 
     def sample(self, cost_limit: float) -> Candidate | None:
         """Return the cheapest of TRIES samples if its estimated cost is below a limit."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
-        best = np.zeros(N_CHOICE)
-        cost, near = sample_deployments(
-            self._kernel_arguments.tube(),
-            self._kernel_arguments.needle,
+        search, best = self._local_search, TubeChoice.empty(self._local_search.design)
+        cost = sample_deployments(
+            search.tube(TubeChoice.empty(search.design)),
+            search.needle,
             self._poses,
             self._pose_of,
-            *self._deployed,
+            self._deployed,
+            self._shapes,
             SPREADS,
-            self._kernel_arguments.target,
+            search.target,
             TRIES,
             cost_limit,
             state,
-            best,
+            best.x,
+            best.shape,
         )
         if not cost < cost_limit:
             return None
-        rotation, outer, inner = best[1:].tolist()
-        tip = self._motions.tip(int(self._numbers[int(best[SCOPE_POSE])]))
-        return self._evaluator.direct(tip, rotation % (2.0 * math.pi), outer, inner, int(self._shapes[near]))
-
-
-def _arcs_of(tubes: ConcentricTubes, chosen: Int) -> tuple[Float, Int, Float]:
-    """Return the arcs of shapes, where those of each begin, and what must be free beside them.
-
-    Planar tubes have none.
-    """
-    if tubes.planar:
-        return np.zeros((0, ARC_COLUMNS)), np.zeros(len(chosen) + 1, dtype=np.int64), np.zeros(len(chosen))
-    shapes = shapes_of(tubes)
-    arcs = [shapes.arcs_of(shape) for shape in chosen.tolist()]
-    first = np.append(0, np.cumsum([len(each) for each in arcs])).astype(np.int64)
-    return np.concatenate([np.zeros((0, ARC_COLUMNS)), *arcs]), first, shapes.beside_mm()[chosen]
+        tip = self._motions.tip(int(self._numbers[int(best.x[SCOPE_POSE])]))
+        return self._evaluator.direct(tip, *best.numbers)
 
 
 def sampling_near_target(

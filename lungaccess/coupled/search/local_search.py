@@ -3,31 +3,96 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from anatomy.typed import Float, UInt64
-from lungaccess.coupled.kernels.candidate import INNER, N_CHOICE, OUTER, SCOPE_POSE
+from lungaccess.coupled.kernels.candidate import OUTER, ROTATION, SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from stages.needle import ArcPath, direct_path
 from stages.scope import TipRow, evenly
-from stages.tube import Deployment, TubeEnvironment, TubeShape, tube_constants, tube_environment
-from stages.tube.kernels import ARC_COLUMNS
+from stages.tube import (
+    Deployment,
+    DesignArrays,
+    ShapeArrays,
+    TubeEnvironment,
+    TubeShape,
+    deployed,
+    design_arrays,
+    shape_arrays,
+    shape_of_arrays,
+    tube_constants,
+    tube_environment,
+)
 
-TubeArguments = tuple[TubeEnvironment, Float, Float, float]
+TubeArguments = tuple[TubeEnvironment, Float, DesignArrays, ShapeArrays, ShapeArrays]
 """Tubes for the kernels; see `lungaccess.coupled.kernels.candidate`."""
 
 SHIFTS_MM = evenly(0.25, 4.0)
 """How much farther the scope may stop: a fraction of the 1 mm between the tips of an atlas, and several times
 as far as the next."""
-PERTURBATION = np.array([4.0, math.radians(15.0), 2.0, 2.0])
-"""Standard deviations of a perturbation: scope pose (rows), rotation, and insertions in mm.  They are a few
-steps of the atlas, so that the search leaves the neighbourhood of where it was."""
+PERTURBATION = (4.0, math.radians(15.0), 2.0, math.radians(30.0))
+"""Standard deviations of a perturbation: scope pose (rows), rotation, insertions in mm, and rotation of one
+tube against the others.  They are a few steps of the atlas, so that the search leaves the neighbourhood of
+where it was."""
 VIA_PERTURBATION_MM = 3.0
 """The same for each coordinate of a via point: the largest spread of a variation in the local search."""
+
+
+@dataclass(kw_only=True, eq=False)
+class TubeChoice:
+    """A place of the scope and a deployment from it, which the kernels change.
+
+    Parameters
+    ----------
+    x : (c,) float64
+        See `lungaccess.coupled.kernels.candidate`.
+    shape : ShapeArrays
+        That of tubes which are not planar.
+    """
+
+    x: Float
+    shape: ShapeArrays
+
+    @classmethod
+    def empty(cls, design: DesignArrays) -> TubeChoice:
+        """Return one without a deployment."""
+        n = len(design.lengths)
+        return cls(x=np.zeros(OUTER + (2 * n or 2)), shape=shape_arrays(design))
+
+    @classmethod
+    def of(cls, design: DesignArrays, deployment: Deployment, row: float) -> TubeChoice | None:
+        """Return that of a deployment; None if its way does not keep the limits when it is followed anew."""
+        made, shape = deployment.shape, shape_arrays(design)
+        joints = np.array([deployment.outer_mm, deployment.inner_mm])
+        if made is not None:
+            again = deployed(design, made.insertions_mm, made.rotations_rad)
+            if again is None:
+                return None
+            shape, joints = again, np.concatenate([made.insertions_mm[::-1], made.rotations_rad[::-1]])
+        return cls(x=np.concatenate([[row, deployment.rotation_rad], joints]), shape=shape)
+
+    @property
+    def numbers(self) -> tuple[float, float, float, int | TubeShape]:
+        """Rotation, insertions and shape, as `DeploymentValidator.choose` takes them."""
+        n, x = len(self.shape.tips), self.x.tolist()
+        rotation = x[ROTATION] % (2.0 * math.pi)
+        return rotation, x[OUTER], x[OUTER + (n or 2) - 1], shape_of_arrays(self.shape) if n else -1
+
+    def perturb(self, design: DesignArrays, rng: np.random.Generator) -> None:
+        """Move it some distance away at random."""
+        n, x = len(design.lengths), self.x
+        row, turn, insertion, relative = PERTURBATION
+        spreads = np.array([row, turn, *(insertion,) * (n or 2), *(relative * design.turned[::-1])])
+        x[:] = x + rng.standard_normal(len(x)) * spreads
+        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(SHIFTS_MM) - 1)
+        inserted = x[OUTER : OUTER + (n or 2)]
+        inserted[0] = max(inserted[0], 0.0)
+        inserted[:] = np.maximum.accumulate(inserted)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -36,7 +101,7 @@ class LocalSearchRun:
 
     Parameters
     ----------
-    x : (4,) float64
+    choice : TubeChoice
     vias : (MAX_VIAS, 3) float64
         The best choice so far; see `lungaccess.coupled.kernels.candidate`.
     count : int
@@ -45,17 +110,14 @@ class LocalSearchRun:
         Estimated cost of that choice; infinite before the search has begun.
     evaluated_cost : float
         The estimated cost at which the choice was last evaluated in full.
-    shape : TubeShape or None
-        That of tubes which are not planar; it is kept.
     """
 
     poses: TipRow
-    x: Float
+    choice: TubeChoice
     vias: Float
     count: int
     cost: float = math.inf
     evaluated_cost: float = math.inf
-    shape: TubeShape | None = None
 
 
 class LocalSearch:
@@ -72,42 +134,41 @@ class LocalSearch:
     """
 
     def __init__(self, evaluator: CandidateEvaluator, rng: np.random.Generator) -> None:
-        task = evaluator.task
         self._evaluator, self._rng = evaluator, rng
-        environment = tube_environment(task.lung, with_fissures=task.with_fissures)
-        self._tube = (environment, tube_constants(task.system.tubes, task.system.margins))
+        self.design = design_arrays(evaluator.task.system.tubes)
+        self._tube = tube_arguments(evaluator, self.design)
         self.needle = evaluator.needle_arrays
-        x, y, z = task.target.lps_mm.tolist()
+        x, y, z = evaluator.task.target.lps_mm.tolist()
         self.target = (x, y, z)
 
-    def tube(self, shape: TubeShape | None = None) -> TubeArguments:
-        """Return the tubes for the kernels, with their shape if they are not planar."""
-        return tube_arguments(*self._tube, shape)
+    def tube(self, choice: TubeChoice) -> TubeArguments:
+        """Return the tubes for the kernels, with the shape of a choice."""
+        return self._tube(choice)
 
     def begin(self, candidate: Candidate | None) -> LocalSearchRun | None:
         """Return a run from a candidate; None without one, or if its needle has too many arcs."""
         if candidate is None:
             return None
-        deployment = candidate.deployment
         points = candidate.path.frames()[1:-1, :3, 3]
         if len(points) > MAX_VIAS:
+            return None
+        choice = TubeChoice.of(self.design, candidate.deployment, float(len(SHIFTS_MM) // 2))
+        if choice is None:
             return None
         poses = self._evaluator.tip_rows.along(candidate.tip, SHIFTS_MM)
         vias = np.zeros((MAX_VIAS, 3))
         vias[: len(points)] = points
-        home = float(len(SHIFTS_MM) // 2)
-        x = np.array([home, deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm])
-        return LocalSearchRun(poses=poses, x=x, vias=vias, count=len(points), shape=deployment.shape)
+        return LocalSearchRun(poses=poses, choice=choice, vias=vias, count=len(points))
 
     def advance(self, run: LocalSearchRun, tries: int) -> None:
         """Evaluate so many variations of a run's choice, and keep the best."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
         run.count, run.cost = improve(
-            self.tube(run.shape),
+            self.tube(run.choice),
             self.needle,
             run.poses.tips,
             run.poses.proved,
-            run.x,
+            run.choice.x,
             run.vias,
             run.count,
             self.target,
@@ -117,36 +178,29 @@ class LocalSearch:
 
     def perturb(self, run: LocalSearchRun) -> None:
         """Move a run some distance away at random, and leave out some of its via points."""
-        x, drawn = run.x, self._rng.standard_normal(N_CHOICE)
-        x[:] = x + drawn * PERTURBATION
-        x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(SHIFTS_MM) - 1)
-        x[OUTER] = max(x[OUTER], 0.0)
-        x[INNER] = max(x[INNER], x[OUTER])
+        run.choice.perturb(self.design, self._rng)
         run.count = min(run.count, int(self._rng.integers(MAX_VIAS)))
         run.vias[: run.count] += VIA_PERTURBATION_MM * self._rng.standard_normal((run.count, 3))
         run.cost = run.evaluated_cost = math.inf
 
     def candidate(self, run: LocalSearchRun) -> Candidate | None:
         """Return a run's best choice as a candidate, in the numbers of a plan."""
-        index = int(run.x[SCOPE_POSE])
-        tip, (rotation, outer, inner) = self._evaluator.tip_rows.tip(run.poses, index), run.x[1:].tolist()
-        rotation %= 2.0 * math.pi
-        tubes, frame = self._evaluator.tubes, tip.lps_from_scope_tip
-        if run.shape is None:
-            deployment = tubes.validate(frame, rotation, outer, inner)
-        else:
-            deployment = tubes.validate_shape(frame, rotation, run.shape)
+        tip = self._evaluator.tip_rows.tip(run.poses, int(run.choice.x[SCOPE_POSE]))
+        deployment = self._evaluator.tubes.choose(tip.lps_from_scope_tip, *run.choice.numbers)
         if isinstance(deployment, str):
             return None
         path = path_through(deployment, run.vias[: run.count], self._evaluator.task.target.lps_mm)
         return Candidate(tip=tip, deployment=deployment, path=path)
 
 
-def tube_arguments(environment: TubeEnvironment, constants: Float, shape: TubeShape | None) -> TubeArguments:
-    """Return tubes as the kernels take them; see `lungaccess.coupled.kernels.candidate`."""
-    if shape is None:
-        return environment, constants, np.zeros((0, ARC_COLUMNS)), 0.0
-    return environment, constants, np.array(shape.arcs), shape.required_beside_mm
+def tube_arguments(
+    evaluator: CandidateEvaluator, design: DesignArrays
+) -> Callable[[TubeChoice], TubeArguments]:
+    """Return what gives the tubes of a task, with the shape of a choice, as the kernels take them."""
+    task, scratch = evaluator.task, shape_arrays(design)
+    environment = tube_environment(task.lung, with_fissures=task.with_fissures)
+    constants = tube_constants(task.system.tubes, task.system.margins)
+    return lambda choice: (environment, constants, design, choice.shape, scratch)
 
 
 def path_through(deployment: Deployment, vias: Float, target: Float) -> ArcPath:

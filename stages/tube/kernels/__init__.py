@@ -16,6 +16,16 @@ if TYPE_CHECKING:
         validate_arcs,
         validate_deployment,
     )
+    from stages.tube.kernels.one_shape import (
+        DesignArrays,
+        ManyShapes,
+        ShapeArrays,
+        near_shape,
+        required_beside,
+        take_member,
+        take_over,
+        whole_way,
+    )
     from stages.tube.kernels.planar import (
         CURVED_LENGTH,
         INNER_CURVATURE,

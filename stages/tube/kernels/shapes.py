@@ -66,7 +66,7 @@ def _largest(one, other):
 
 
 @inner_kernel
-def _reach(design, base, turn, begin, end, step, tip_angles):
+def reach(design, base, turn, begin, end, step, tip_angles):
     """Follow a branch of stable equilibria to rear ends at `end`, turned on by `turn`, in steps as needed.
 
     `tip_angles` are those at `begin`, where the rear ends are turned by `base`, and become those at the end.
@@ -103,7 +103,7 @@ def _reach(design, base, turn, begin, end, step, tip_angles):
 
 
 @inner_kernel
-def _largest_strain(design, strained, beta, cutting, nodes, steps):
+def largest_strain(design, strained, beta, cutting, nodes, steps):
     """Return the largest strain of bending ahead of the scope tip."""
     pieces, moments, directions, _count = cutting
     psi, rate = nodes[1], nodes[2]
@@ -195,7 +195,7 @@ def _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places):
 
 
 @inner_kernel
-def _lay_out(design, radii, beta, cutting, nodes, steps, poses, arcs, first, places, scratch):
+def lay_out(design, radii, beta, cutting, nodes, steps, poses, arcs, first, places, scratch):
     """Write the arcs of a deployment; return their number, -1 if there is no room, and their error in mm."""
     number, error = _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places)
     if number < 0:
@@ -294,7 +294,7 @@ def follow_all(
             continue
         begin, end = stops[states[parent]] - design[1], stops[states[state]] - design[1]
         tips[state] = tips[parent]
-        least, cutting, nodes, steps = _reach(design, base_angles, still, begin, end, step, tips[state])
+        least, cutting, nodes, steps = reach(design, base_angles, still, begin, end, step, tips[state])
         results[state, LEAST] = min(results[parent, LEAST], least)
         if least <= 0.0:
             continue
@@ -304,9 +304,9 @@ def follow_all(
         out = states[state, 0] + 1
         frames_at(cutting, nodes, steps, poses, stops[:out], found, angles, rates)
         bodies[state, :out] = found[:out, 9:]
-        strain = _largest_strain(design, strained, end, cutting, nodes, steps)
+        strain = largest_strain(design, strained, end, cutting, nodes, steps)
         results[state, STRAIN] = max(results[parent, STRAIN], strain)
-        number, error = _lay_out(
+        number, error = lay_out(
             design, radii, end, cutting, nodes, steps, poses, arcs, first[state], places, scratch
         )
         if number < 0:
@@ -345,7 +345,7 @@ def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, ar
         Number of arcs, 0 if the tubes snap on the way, -1 if there is no room.
     """
     n = base.shape[0]
-    least, cutting, nodes, steps = _reach(design, base, turn, beta, end, step, tip_angles)
+    least, cutting, nodes, steps = reach(design, base, turn, beta, end, step, tip_angles)
     result[LEAST], result[EXTENSION] = least, end[0] + design[1][0]
     if least <= 0.0:
         return 0
@@ -354,6 +354,6 @@ def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, ar
     result[TIP:] = poses[-1]
     places = np.zeros((2 * MOST_ARCS * (1 + n + 2 * design[2].shape[0]), 4))
     scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
-    number, error = _lay_out(design, radii, end, cutting, nodes, steps, poses, arcs, 0, places, scratch)
+    number, error = lay_out(design, radii, end, cutting, nodes, steps, poses, arcs, 0, places, scratch)
     result[ERROR] = error
     return number

@@ -11,7 +11,15 @@ from typing import Any
 
 import casadi
 
-from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM, SLOPE_MM, WALL_CONTACT_MM, Layout
+from lungaccess.refinement.layout import (
+    AXIS_DEGREE,
+    AXIS_SCALE_MM,
+    CURVE_DEGREE,
+    N_FEATURES,
+    SLOPE_MM,
+    WALL_CONTACT_MM,
+    Layout,
+)
 
 SERIES_TERMS = 14
 """Up to an angle of 2 pi the series are off by less than 1e-6."""
@@ -27,6 +35,11 @@ def _series(q: Any, first: int) -> Any:
     for k in reversed(range(SERIES_TERMS)):
         total = 1.0 - q / ((2 * k + first + 1) * (2 * k + first + 2)) * total if k < SERIES_TERMS - 1 else 1.0
     return total if first == 1 else 0.5 * total
+
+
+def _before(end: Any, s: Any) -> Any:
+    """Return 1 before the end of a tube and 0 behind it."""
+    return 0.5 + 0.5 * casadi.tanh((end - s) / RADIUS_STEP_MM)
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,8 @@ class Geometry:
         kappa = self._value("max_curvature_per_mm")
         self.bends = [(x[at["bend_x"]][a], x[at["bend_y"]][a]) for a in range(layout.arcs)]
         self._kappa = kappa
+        self.features: Any = self._features(x) if layout.tubes else None
+        self.middle = x[at["middle"]]
         self.tip = self._tube_tip()
         self.frames = self._needle_frames()
 
@@ -92,6 +107,39 @@ class Geometry:
         c, s = casadi.cos(self.rotation), casadi.sin(self.rotation)
         return Frame(x=c * x + s * y, y=c * y - s * x, z=z, point=rows[0])
 
+    def _features(self, x: Any) -> Any:
+        """Return the features of tubes that are not planar; see `lungaccess.refinement.shape_model`."""
+        moved = x[self._layout.joints] - self._value("model_centre")
+        pairs = [moved[a] * moved[b] for a in range(moved.shape[0]) for b in range(a, moved.shape[0])]
+        matrix = casadi.reshape(self._value("model"), self._layout.model_terms, N_FEATURES).T
+        return matrix @ casadi.vertcat(1.0, moved, *pairs)
+
+    @property
+    def beside(self) -> Any:
+        """What has to be free beside tubes that are not planar, mm."""
+        return self.features[-1]
+
+    def _modelled_tip(self) -> Frame:
+        scope, rows = self.scope_tip(), self.features[-10:-1]
+        point, z, x = (
+            rows[3 * m] * scope.x + rows[3 * m + 1] * scope.y + rows[3 * m + 2] * scope.z for m in range(3)
+        )
+        z = z / casadi.norm_2(z)
+        x = x - casadi.dot(x, z) * z
+        x = x / casadi.norm_2(x)
+        return Frame(x=x, y=casadi.cross(z, x), z=z, point=scope.point + point)
+
+    def _modelled_point(self, s: Any) -> Any:
+        """Return the point at arc length `s` by Clenshaw's sum of the Chebyshev polynomials."""
+        scope, at = self.scope_tip(), 2.0 * s / self.inner - 1.0
+        rows: Any = casadi.reshape(self.features[: 3 * (CURVE_DEGREE + 1)], 3, CURVE_DEGREE + 1)
+        one: Any = 0.0
+        two: Any = 0.0
+        for k in range(CURVE_DEGREE, 0, -1):
+            one, two = rows[:, k] + 2.0 * at * one - two, one
+        local = rows[:, 0] + at * one - two
+        return scope.point + local[0] * scope.x + local[1] * scope.y + local[2] * scope.z
+
     @property
     def straight(self) -> Any:
         """Length of the inner tube's straight part ahead of the scope."""
@@ -104,42 +152,49 @@ class Geometry:
         return straight, shared, s - straight - shared
 
     def _tube_tip(self) -> Frame:
+        if self._layout.tubes:
+            return self._modelled_tip()
         frame = self.scope_tip().along(0.0, 0.0, self.straight)
         frame = frame.along(self._value("shared_curvature_per_mm"), 0.0, self.outer - self.straight)
         return frame.along(self._value("inner_curvature_per_mm"), 0.0, self.inner - self.outer)
 
     def tube_point(self, s: Any) -> Any:
         """Return the point of the tubes at arc length `s`."""
+        if self._layout.tubes:
+            return self._modelled_point(s)
         straight, shared, free = self._tube_pieces(s)
         frame = self.scope_tip().along(0.0, 0.0, straight)
         frame = frame.along(self._value("shared_curvature_per_mm"), 0.0, shared)
         return frame.point_at(self._value("inner_curvature_per_mm"), 0.0, free)
 
     def outside(self) -> tuple[list[Any], list[Any]]:
-        """Return points of the tubes from the exit to the tip, and how much of the outer tube is there.
+        """Return points of the tubes from the exit to the tip, and by how much they are thicker there.
 
         The last one is the end of the outer tube.
         """
         count = self._layout.tube_points
         places = [self.exit + (self.inner - self.exit) * m / (count - 1) for m in range(count)]
-        shares = [self._outer_share(s) for s in places]
+        shares = [self._thicker_mm(s) for s in places]
         return (
             [self.tube_point(s) for s in [*places, casadi.fmax(self.outer, self.exit)]],
-            [*shares, self._outer_share(self.exit)],
+            [*shares, self._thicker_mm(self.exit)],
         )
 
     def before_exit(self) -> tuple[list[Any], list[Any]]:
         """Return the same for the last WALL_CONTACT_MM before the exit."""
         count = self._layout.wall_points
         places = [casadi.fmax(self.exit - WALL_CONTACT_MM * m / count, 0.0) for m in range(1, count + 1)]
-        return [self.tube_point(s) for s in places], [self._outer_share(s) for s in places]
+        return [self.tube_point(s) for s in places], [self._thicker_mm(s) for s in places]
 
     def at_exit(self) -> list[Any]:
         """Return the exit, and the points a little before and behind it."""
         return [self.tube_point(self.exit + shift) for shift in (0.0, -SLOPE_MM, SLOPE_MM)]
 
-    def _outer_share(self, s: Any) -> Any:
-        return 0.5 + 0.5 * casadi.tanh((self.outer - s) / RADIUS_STEP_MM)
+    def _thicker_mm(self, s: Any) -> Any:
+        thicker = self._value("outer_radius_step_mm") * _before(self.outer, s)
+        for m in range(self._layout.middle):
+            thicker += self._value("middle_radius_step_mm") * _before(self.middle[m], s)
+        return thicker
 
     def _needle_frames(self) -> list[Frame]:
         frames = [self.tip]

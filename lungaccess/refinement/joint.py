@@ -35,12 +35,9 @@ def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) ->
     Returns
     -------
     Candidate or None
-        Cheaper than the one given by BETTER or more, or None; always None for tubes that are not planar, and
-        for an objective that the program cannot express: see
-        `lungaccess.refinement.problem.program_weights`.
+        Cheaper than the one given by BETTER or more, or None; always None for an objective that the program
+        cannot express: see `lungaccess.refinement.problem.program_weights`.
     """
-    if candidate.deployment.shape is not None:
-        return None
     weights = program_weights(task)
     if len(candidate.path.arcs) > ARC_COUNTS[-1] or weights is None:
         return None
@@ -60,7 +57,8 @@ def _refined(
     _objective, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
     found = solver.solve(problem.start, problem.eased(values), problem.boxes)
     for placement in reconstruction.placements(found):
-        aimed = solver.solve(placement.x, problem.for_needle(placement.x, placement.tip), problem.boxes)
+        numbers = problem.for_needle(placement.x, placement.tip, placement.deployment.shape)
+        aimed = solver.solve(placement.x, numbers, problem.boxes)
         for share in NEEDLE_SHARES:
             new = reconstruction.candidate(placement, placement.x + share * (aimed - placement.x))
             if new is None:

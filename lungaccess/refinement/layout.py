@@ -22,6 +22,11 @@ WALL_CONTACT_MM = 6.0
 """Length of the tubes before the exit where they may touch the wall."""
 SLOPE_MM = 0.5
 """Step over which the share of lumen is compared at the exit."""
+CURVE_DEGREE = 12
+"""Of the polynomial of a shape that is not planar: it is then right to a hundredth of a millimetre, though
+curvature jumps where a tube ends."""
+N_FEATURES = 3 * (CURVE_DEGREE + 1) + 10
+"""Of such a shape: coefficients of its curve, the tip's point, direction and +x, and the space beside it."""
 
 
 @frozen_value
@@ -34,12 +39,16 @@ class Layout:
         Arcs of the needle.
     with_map : bool
         Whether the objective looks at a cost map.
+    tubes, turned : int
+        Of tubes that are not planar how many there are, and how many of them are turned against the others.
     zone_points, tube_points, wall_points : int
         Samples of the needle's exempt length, and of the tubes behind and before the exit.
     """
 
     arcs: int
     with_map: bool
+    tubes: int = 0
+    turned: int = 0
     zone_points: int = ZONE_POINTS
     tube_points: int = TUBE_POINTS
     wall_points: int = WALL_POINTS
@@ -57,12 +66,32 @@ class Layout:
             "lengths": slice(5, 5 + a),
             "bend_x": slice(5 + a, 5 + 2 * a),
             "bend_y": slice(5 + 2 * a, 5 + 3 * a),
+            "middle": slice(5 + 3 * a, 5 + 3 * a + self.middle),
+            "turned": slice(5 + 3 * a + self.middle, self.n_variables),
         }
+
+    @property
+    def joints(self) -> list[int]:
+        """Places of the joints of tubes that are not planar; see `ShapeModel`."""
+        at = self.variables
+        inserted = [at["outer"], *range(at["middle"].start, at["middle"].stop), at["inner"]]
+        return [*inserted[-self.tubes :], *range(at["turned"].start, at["turned"].stop)]
+
+    @property
+    def middle(self) -> int:
+        """Number of middle tubes."""
+        return max(self.tubes - 2, 0)
+
+    @property
+    def model_terms(self) -> int:
+        """Number of terms of the polynomials of tubes that are not planar."""
+        m = self.tubes + self.turned
+        return (m + 1) * (m + 2) // 2
 
     @property
     def n_variables(self) -> int:
         """Number of variables."""
-        return 5 + 3 * self.arcs
+        return 5 + 3 * self.arcs + self.middle + self.turned
 
     @property
     def arc_points(self) -> int:
@@ -88,6 +117,12 @@ class Layout:
             "weigh_length": 1,
             "weigh_map": 1,
         }
+        if self.tubes:
+            sizes |= {
+                "middle_radius_step_mm": 1,
+                "model_centre": self.tubes + self.turned,
+                "model": N_FEATURES * self.model_terms,
+            }
         for n in range(self.boxes):
             sizes[f"affine{n}"] = 12
             sizes[f"shape{n}"] = 3
@@ -122,6 +157,8 @@ class Layout:
             "tube": self.tube_points + 1,
             "wall": self.wall_points,
         }
+        if self.tubes:
+            sizes |= {"beside": 1, "middle": 2 * self.middle}
         return _in_a_row(sizes)
 
     @property

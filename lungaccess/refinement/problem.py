@@ -17,8 +17,9 @@ from lungaccess.refinement import boxes as fields
 from lungaccess.refinement.axis import LocalAxis, one_tip
 from lungaccess.refinement.curve import rows_of, split
 from lungaccess.refinement.layout import SLOPE_MM, WALL_CONTACT_MM, Layout, Numbers
+from lungaccess.refinement.shape_model import ShapeModel
 from stages.scope import ScopeTip
-from stages.tube import centreline, tracking_length_mm, tube_constants
+from stages.tube import TubeShape, design_arrays, tracking_length_mm, tube_constants
 from stages.tube import kernels as index
 
 ARC_COUNTS = (3, 5, 8)
@@ -33,6 +34,8 @@ SHORTEST_ARC_MM = 1.0
 NEEDLE_SLACK_MM = 0.02
 TUBE_SLACK_MM = 0.1
 """The program demands so much more clearance, for what lies between samples and between lattice points."""
+SWEEP_SLACK_MM = 0.02
+"""The program keeps so far from the limit of the sweep, which its model knows to a few hundredths."""
 CURVATURE_SLACK = 1e-3
 ANGLE_SLACK_RAD = math.radians(2.0)
 """The program keeps so far from the limits of curvature and wall angle, for the same reason."""
@@ -92,16 +95,26 @@ class Problem:
         arcs = next(count for count in ARC_COUNTS if count >= len(rows))
         self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
         rows = split(rows, arcs, self._exempt_mm)
-        self.layout = Layout(arcs=arcs, with_map=weights[2] > 0.0)
+        self.design, shape = design_arrays(self.task.system.tubes), deployment.shape
+        self.model = None if shape is None else ShapeModel(self.design, shape)
+        self.layout = Layout(
+            arcs=arcs,
+            with_map=weights[2] > 0.0,
+            tubes=len(self.design.lengths),
+            turned=int(self.design.turned.sum()),
+        )
         self.axis = LocalAxis(evaluator.tip_rows, candidate.tip)
         tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
         bends = rows[:, 1:].T / needle.max_curvature_per_mm
-        self.start = np.concatenate([[0.0], tubes, rows[:, 0], *bends])
+        further = np.zeros(self.layout.n_variables - 5 - 3 * arcs)
+        self.start = np.concatenate([[0.0], tubes, rows[:, 0], *bends, further])
+        if self.model is not None:
+            self.start[self.layout.joints] = self.model.centre
         self.boxes = self._cut_boxes()
         lower, upper = self._variable_bounds()
         least, most = self._constraint_bounds()
         self.numbers = Numbers(
-            parameters=self._parameters(self.axis.points, self.axis.tangents),
+            parameters=self._parameters(self.axis.points, self.axis.tangents, self.model),
             lower=lower,
             upper=upper,
             least=least,
@@ -119,16 +132,24 @@ class Problem:
             least[place] = np.minimum(least[place], values[place] - EASE)
         return replace(self.numbers, least=least)
 
-    def for_needle(self, x: Float, tip: ScopeTip) -> Numbers:
-        """Return the numbers for the needle alone, from the tubes of `x` and a tip that stay as they are."""
+    def for_needle(self, x: Float, tip: ScopeTip, shape: TubeShape | None) -> Numbers:
+        """Return the numbers for the needle alone, from the tubes of `x` and a tip that stay as they are.
+
+        Parameters
+        ----------
+        shape : TubeShape or None
+            That of tubes which are not planar.
+        """
         rows, numbers = self.layout.constraints, self.numbers
         lower, upper = numbers.lower.copy(), numbers.upper.copy()
         least, most = numbers.least.copy(), numbers.most.copy()
-        tubes = slice(0, self.layout.variables["lengths"].start)
+        tubes = np.r_[: self.layout.variables["lengths"].start, self.layout.joints]
         lower[tubes] = upper[tubes] = x[tubes]
-        for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall"):
-            least[rows[name]], most[rows[name]] = -np.inf, np.inf
-        parameters = self._parameters(*one_tip(tip))
+        for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall", "beside", "middle"):
+            if name in rows:
+                least[rows[name]], most[rows[name]] = -np.inf, np.inf
+        model = None if shape is None else ShapeModel(self.design, shape, constant=True)
+        parameters = self._parameters(*one_tip(tip), model)
         return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
 
     @property
@@ -166,15 +187,8 @@ class Problem:
         return tuple(boxes)
 
     def _tube_points(self, arc_lengths: Float) -> Float:
-        deployment = self._candidate.deployment
-        return centreline(
-            self.task.system.tubes,
-            self._candidate.tip.lps_from_scope_tip,
-            deployment.rotation_rad,
-            deployment.outer_mm,
-            deployment.inner_mm,
-            arc_lengths,
-        )
+        scope, tubes = self._candidate.tip.lps_from_scope_tip, self.task.system.tubes
+        return self._candidate.deployment.points(tubes, scope, arc_lengths)
 
     def _lumen_at_exit(self) -> tuple[float, float]:
         """Return the share of lumen at the exit, and its greatest slope there, per mm."""
@@ -186,8 +200,8 @@ class Problem:
         share = ndimage.map_coordinates(values, lattice.T, order=3, prefilter=False, mode="nearest")
         return float(share[0]), float(np.linalg.norm(share[1:4] - share[4:]) / (2.0 * SLOPE_MM))
 
-    def _parameters(self, points: Float, tangents: Float) -> Float:
-        """Return the parameters for an axis of the scope's tip given by coefficients."""
+    def _parameters(self, points: Float, tangents: Float, model: ShapeModel | None) -> Float:
+        """Return the parameters for an axis of the scope's tip given by coefficients and a model."""
         tubes = self.task.system.tubes
         constants = tube_constants(tubes, self.task.system.margins)
         clear, length, mapped = self._weights
@@ -207,6 +221,14 @@ class Problem:
             "weigh_length": length,
             "weigh_map": mapped,
         }
+        if model is not None:
+            radii = [
+                tubes.outermost.radius_mm,
+                (tubes.middle or tubes.inner).radius_mm,
+                tubes.inner.radius_mm,
+            ]
+            values["outer_radius_step_mm"], values["middle_radius_step_mm"] = -np.diff(radii)
+            values |= {"model_centre": model.centre, "model": model.matrix}
         for n, box in enumerate(self.boxes):
             values[f"affine{n}"] = box.lattice_from_lps.T
             values[f"shape{n}"] = box.shape
@@ -230,13 +252,23 @@ class Problem:
         for name, (low, high) in bounds.items():
             lower[at[name]], upper[at[name]] = low, high
         lower[at["lengths"].start] += self._exempt_mm
+        if self.model is not None:
+            joints = self.layout.joints
+            lower[joints], upper[joints] = self.model.lower, self.model.upper
+            inserted = joints[: self.layout.tubes]
+            lower[inserted] = np.maximum(lower[inserted], 0.0)
+            upper[inserted] = np.minimum(upper[inserted], self.longest_mm)
         return lower, upper
 
     def _constraint_bounds(self) -> tuple[Float, Float]:
         system, deployment = self.task.system, self._candidate.deployment
         needle, tubes, margin = self._needle, system.tubes, system.margins.total_mm
         level, slope = self._lumen_at_exit()
-        thick = tubes.inner.radius_mm + deployment.lateral_sweep_mm + TUBE_SLACK_MM
+        swept, allowed = deployment.lateral_sweep_mm, tubes.max_lateral_sweep_mm - SWEEP_SLACK_MM
+        if deployment.shape is not None:
+            # The sweep is a feature of the model instead, and the arcs' error with it.
+            allowed, swept = max(allowed, swept) + deployment.shape.arc_error_mm, 0.0
+        thick = tubes.inner.radius_mm + swept + TUBE_SLACK_MM
         clear = needle.radius_mm + margin + NEEDLE_SLACK_MM
         steep = math.sin(math.radians(tubes.min_wall_angle_deg) + ANGLE_SLACK_RAD)
         bounds = {
@@ -254,6 +286,8 @@ class Problem:
             "needle": (clear, np.inf),
             "tube": (thick + margin, np.inf),
             "wall": (thick, np.inf),
+            "beside": (-np.inf, allowed),
+            "middle": (0.0, np.inf),
         }
         least, most = np.zeros(self.layout.n_constraints), np.zeros(self.layout.n_constraints)
         for name, place in self.layout.constraints.items():

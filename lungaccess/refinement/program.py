@@ -10,6 +10,7 @@ the point.  At that point it has the derivatives of the spline, so what CasADi d
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -143,15 +144,15 @@ class Program:
         x, p = casadi.SX.sym("x", layout.n_variables), casadi.SX.sym("p", layout.n_parameters)
         geometry = Geometry(layout, x, p)
         needle, steps = geometry.needle_points()
-        tubes, shares = geometry.outside()
-        walls, wall_shares = geometry.before_exit()
+        tubes, thicker = geometry.outside()
+        walls, wall_thicker = geometry.before_exit()
         spared = needle[: layout.zone_points] + tubes
         looked = [needle, spared, walls, geometry.at_exit()] + ([needle] if layout.with_map else [])
         places = [self._on_lattice(p, n, points) for n, points in enumerate(looked)]
         seen = [casadi.SX.sym(f"seen{n}", LOOKED_UP, len(points)) for n, points in enumerate(looked)]
         fields = [_quadratic(*pair) for pair in zip(places, seen, strict=True)]
         f = self._objective(p, fields, steps)
-        g = self._constraints(p, geometry, fields, shares + wall_shares)
+        g = self._constraints(p, geometry, fields, thicker + wall_thicker)
         self._solver = self._connect(x, p, f, g, places, seen, iterations)
 
     def _on_lattice(self, p: Any, box: int, points: list[Any]) -> Any:
@@ -170,9 +171,16 @@ class Program:
             total += step * rate
         return total
 
-    def _constraints(self, p: Any, geometry: Geometry, fields: list[list[Any]], shares: list[Any]) -> Any:
+    def _constraints(self, p: Any, geometry: Geometry, fields: list[list[Any]], thicker: list[Any]) -> Any:
         zone = self.layout.zone_points
-        thicker = p[self.layout.parameters["outer_radius_step_mm"]]
+        further = []
+        if self.layout.tubes:
+            thicker = [step + geometry.beside for step in thicker]
+            ends = [geometry.outer, *casadi.vertsplit(geometry.middle), geometry.inner]
+            steps = (
+                [after - before for before, after in itertools.pairwise(ends)] if self.layout.middle else []
+            )
+            further = [geometry.beside, *steps]
         tubes = fields[SPARED][zone:] + fields[WALL]
         at_exit, before, behind = fields[LUMEN_SHARE]
         return casadi.vertcat(
@@ -188,7 +196,8 @@ class Program:
             (before - behind) / (2.0 * SLOPE_MM),
             *fields[SPARED][:zone],
             *fields[CLEARANCE][zone:],
-            *[c - thicker * share for c, share in zip(tubes, shares, strict=True)],
+            *[c - step for c, step in zip(tubes, thicker, strict=True)],
+            *further,
         )
 
     def _connect(

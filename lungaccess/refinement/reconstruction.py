@@ -13,6 +13,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.refinement.curve import aimed, path_of
 from lungaccess.refinement.problem import Problem
+from lungaccess.refinement.shape_model import joints_of
 from stages.scope import ScopeTip
 from stages.tube import Deployment
 
@@ -68,6 +69,8 @@ class Reconstruction:
             return None
         x[at["site"]] = 0.0
         x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm
+        if deployment.shape is not None:
+            x[self._problem.layout.joints] = joints_of(self._problem.design, deployment.shape)
         x[at["exit"]] = deployment.exit_mm
         return Placement(share=share, x=x, tip=tip, deployment=deployment)
 
@@ -88,6 +91,11 @@ class Reconstruction:
         at, frame = self._problem.layout.variables, tip.lps_from_scope_tip
         smooth = poses.pose(frame[:3, 3], frame[:3, 2], self._problem.sideways)
         bend = poses.bending_directions(smooth, x[at["rotation"]])[0]
+        if self._problem.model is not None:
+            shape = self._problem.model.shape_at(x[self._problem.layout.joints])
+            if shape is None:
+                return "the shape of the tubes keeps no limits"
+            return self._evaluator.tubes.validate_shape(frame, poses.roll_towards(frame, bend), shape)
         inner = min(max(float(x[at["inner"]]), 0.0), self._problem.longest_mm)
         outer = min(max(float(x[at["outer"]]), 0.0), inner)
         return self._evaluator.tubes.validate(frame, poses.roll_towards(frame, bend), outer, inner)

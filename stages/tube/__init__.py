@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         many_shapes,
         shape_arrays,
         shape_of_arrays,
+        with_any_sweep,
     )
     from stages.tube.parts import SlottedSegment, opposite_slots
     from stages.tube.placing import PlacedShapes, place_shapes

@@ -12,6 +12,7 @@ from stages.tube.kernels import one_shape as kernel
 from stages.tube.kernels import shapes as columns
 from stages.tube.kernels.one_shape import DesignArrays, ManyShapes, ShapeArrays
 from stages.tube.mechanics import TubeMechanics
+from stages.tube.sequences import BEND_RAD
 from stages.tube.shapes import TubeShapes, strained_radii
 
 WAY_STEP_MM = 2.0
@@ -37,7 +38,7 @@ def design_arrays(tubes: ConcentricTubes) -> DesignArrays:
     mechanics = TubeMechanics(tubes.nested)
     limits = np.zeros(kernel.N_LIMITS)
     limits[kernel.STEP], limits[kernel.STOP] = mechanics.step_rad, WAY_STEP_MM
-    limits[kernel.MAX_EXTENSION] = tubes.max_extension_mm
+    limits[kernel.BEND], limits[kernel.MAX_EXTENSION] = BEND_RAD, tubes.max_extension_mm
     limits[kernel.MAX_SWEEP], limits[kernel.MAX_STRAIN] = tubes.max_lateral_sweep_mm, tubes.max_strain
     bent = np.array([bool(tube.bends) for tube in tubes.nested])
     return DesignArrays(
@@ -47,6 +48,13 @@ def design_arrays(tubes: ConcentricTubes) -> DesignArrays:
         turned=bent & (np.cumsum(bent) > 1),
         limits=limits,
     )
+
+
+def with_any_sweep(design: DesignArrays) -> DesignArrays:
+    """Return a design whose tubes may sweep sideways as far as they like."""
+    limits = design.limits.copy()
+    limits[kernel.MAX_SWEEP] = np.inf
+    return design._replace(limits=limits)
 
 
 def shape_arrays(design: DesignArrays) -> ShapeArrays:

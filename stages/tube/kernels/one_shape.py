@@ -14,6 +14,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.typed import Bool, Float, Int
+from stages.tube.kernels.assembly import SHORTEST_PIECE_MM as SAME_MM
 from stages.tube.kernels.pose import frames_at, lay
 from stages.tube.kernels.shapes import (
     CURVATURE,
@@ -31,11 +32,10 @@ from stages.tube.kernels.shapes import (
     reach,
 )
 from stages.tube.kernels.sweep import sweep_of
-from stages.tube.nesting import SAME_MM
-from stages.tube.sequences import BEND_RAD
 
-STEP, STOP, MAX_EXTENSION, MAX_SWEEP, MAX_STRAIN, N_LIMITS = range(6)
-"""Places of the limits: the step of `assembly.cut`, the insertion of a step of the way, and what is kept."""
+STEP, STOP, BEND, MAX_EXTENSION, MAX_SWEEP, MAX_STRAIN, N_LIMITS = range(7)
+"""Places of the limits: the step of `assembly.cut`, the insertion of a step of the way, the rotation of a
+rear end at which the tube bends towards +x of the scope tip, and what is kept."""
 
 
 class DesignArrays(NamedTuple):
@@ -126,7 +126,7 @@ def near_shape(design, near, shape):
         return False
     shape.tips[:] = near.tips
     shape.number[0] = arcs_near(
-        (design.stiffness, design.lengths, design.bends), design.radii, near.joints[n:] + BEND_RAD,
+        (design.stiffness, design.lengths, design.bends), design.radii, near.joints[n:] + design.limits[BEND],
         near.joints[:n] - design.lengths, shape.joints[n:] - near.joints[n:],
         shape.joints[:n] - design.lengths, design.limits[STEP], shape.tips, shape.result, shape.arcs,
     )  # fmt: skip
@@ -145,7 +145,7 @@ def whole_way(design, shape):
         return False
     n = lengths.shape[0]
     arrays = design.stiffness, lengths, design.bends
-    base, still = joints[n:] + BEND_RAD, np.zeros(n)
+    base, still = joints[n:] + design.limits[BEND], np.zeros(n)
     steps_out = max(int(math.ceil(joints[0] / design.limits[STOP] - SAME_MM)), 1)
     spacing = joints[0] / steps_out
     stops = np.linspace(0.0, joints[0], steps_out + 1)

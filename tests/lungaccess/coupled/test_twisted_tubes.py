@@ -12,16 +12,22 @@ from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from experiments.support.mutants import twisted
 from experiments.support.mutants.mutant import Case
+from lungaccess.coupled import AtlasSearch
 from lungaccess.coupled.atlas_measures import tube_stability
+from lungaccess.coupled.search.local_search import LocalSearch
 from lungaccess.one_stage.replan import replan_from_scope
+from lungaccess.plans.assemble import assemble
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
+from lungaccess.problem.task import Task
 from lungaccess.reachability import UnreachableProof
+from lungaccess.refinement import refine
+from lungaccess.refinement.shape_model import ShapeModel, joints_of, terms
 from lungaccess.report.html.deployment import packed_plan
 from lungaccess.report.pack import unpack
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.deviations import Deviations
-from stages.tube import DeploymentValidator, shapes_of
+from stages.tube import DeploymentValidator, design_arrays, points_on_arcs, shapes_of
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 pytestmark = pytest.mark.slow
@@ -110,6 +116,62 @@ def test_joint_values_and_shapes_that_do_not_belong_together_are_refused(
         if mutant is not None:
             assert not la.check(mutant.plan, small_lung).accepted, mutant.plan.tube
             tried += 1
+
+
+def test_the_search_turns_and_inserts_each_tube(
+    small_lung: Lung, system: System, atlas: la.Atlas, plans: list[la.Plan]
+) -> None:
+    turned = []
+    for plan in plans:
+        task = Task(lung=small_lung, system=system, target=point_target(small_lung, plan.target_lps))
+        search = AtlasSearch(task, atlas)
+        begun = next(step.candidate for step in search.steps() if step.candidate is not None)
+        local_search, before = LocalSearch(search.evaluator, np.random.default_rng(0)), begun.deployment
+        run = local_search.begin(begun)
+        assert run is not None
+        for _ in range(6):
+            local_search.advance(run, 50)
+        found = local_search.candidate(run)
+        assert found is not None
+        assert search.evaluator.evaluate(found) < search.evaluator.evaluate(begun)
+        assert la.check(assemble(task, found, iteration=1, timing={}), small_lung).accepted
+        turned.append(np.ptp(found.deployment.shape.rotations_rad - before.shape.rotations_rad))
+    assert max(turned) > 0.01
+
+
+def test_refinement_moves_all_joints_and_is_proved(
+    small_lung: Lung, system: System, atlas: la.Atlas, plans: list[la.Plan]
+) -> None:
+    ratios, moved = [], []
+    for plan in plans:
+        task = Task(lung=small_lung, system=system, target=point_target(small_lung, plan.target_lps))
+        search = AtlasSearch(task, atlas)
+        begun = next(step.candidate for step in search.steps() if step.candidate is not None)
+        found, again = refine(task, begun), refine(task, begun)
+        if found is None:
+            continue
+        assert again is not None and again.path.arcs.tobytes() == found.path.arcs.tobytes()
+        ratios.append(search.evaluator.evaluate(found) / search.evaluator.evaluate(begun))
+        assert la.check(assemble(task, found, iteration=1, timing={}), small_lung).accepted
+        one, other = found.deployment.shape, begun.deployment.shape
+        moved.append(np.abs(one.insertions_mm - other.insertions_mm).max())
+        moved.append(np.ptp(one.rotations_rad - other.rotations_rad))
+    assert len(ratios) >= 2 and max(ratios) < 1.0 and min(ratios) < 0.97
+    assert max(moved[::2]) > 0.1 and max(moved[1::2]) > 0.01
+
+
+def test_the_model_of_shapes_is_that_of_the_mechanics(system: System) -> None:
+    design, shapes = design_arrays(system.tubes), shapes_of(system.tubes)
+    rng, off = np.random.default_rng(1), []
+    for number in rng.choice(np.flatnonzero(shapes.insertions_mm[:, 1] > 6.0), 6):
+        model = ShapeModel(design, shapes.member(int(number)))
+        for share in rng.uniform(-0.5, 0.5, (8, len(model.centre))):
+            made = model.shape_at(model.centre + share * (model.upper - model.centre))
+            if made is not None:
+                stated = model.matrix @ terms(joints_of(design, made) - model.centre)
+                tip = points_on_arcs(made.arcs, np.eye(4), 0.0, made.insertions_mm[:1])[0]
+                off.append(np.linalg.norm(stated[-10:-7] - tip))
+    assert len(off) > 30 and np.median(off) < 0.03 and max(off) < 0.3
 
 
 def test_without_errors_the_plan_is_carried_out(case: Case) -> None:

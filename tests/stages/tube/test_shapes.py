@@ -14,6 +14,7 @@ from anatomy.kernels.arcs import normal_on_arc, pose_on_arc
 from anatomy.margins import Margins
 from stages.tube import (
     BentPiece,
+    ConcentricTubes,
     NearbyShapes,
     ShapeGrid,
     ShapeLimits,
@@ -22,8 +23,11 @@ from stages.tube import (
     Tube,
     TubeMechanics,
     deploy,
+    deployed,
+    design_arrays,
     kernels,
     open_shapes,
+    shape_of_arrays,
     together,
     tube_constants,
     tube_shapes,
@@ -168,6 +172,26 @@ class TestBetween:
     def test_the_same_joint_values_are_the_shape(self, curved: TubeShapes) -> None:
         found = NearbyShapes(curved).at(40, curved.insertions_mm[40], curved.rotations_rad[40])
         assert found is not None and found.arcs == pytest.approx(curved.arcs_of(40), abs=1e-9)
+
+    def test_the_whole_way_is_that_of_the_grid(self) -> None:
+        made = tube_shapes(PAIR, ShapeLimits(max_extension_mm=20.0), ShapeGrid(stop_mm=2.0, rotations=6))
+        limits = made.limits
+        design = design_arrays(
+            ConcentricTubes(
+                inner=PAIR[0], outer=PAIR[1], max_extension_mm=limits.max_extension_mm,
+                max_lateral_sweep_mm=limits.max_lateral_sweep_mm, max_strain=limits.max_strain,
+            )
+        )  # fmt: skip
+        for member in range(3, made.count, 17):
+            found = deployed(design, made.insertions_mm[member], made.rotations_rad[member])
+            assert found is not None
+            one, other = shape_of_arrays(found), made.member(member)
+            assert one.arcs == pytest.approx(other.arcs, abs=1e-9)
+            assert one.lateral_sweep_mm == pytest.approx(other.lateral_sweep_mm, abs=1e-9)
+            assert one.least_determinant == pytest.approx(other.least_determinant, abs=1e-9)
+        assert deployed(design, np.array([20.0, 21.0]), np.zeros(2)) is None
+        tight = design._replace(limits=design.limits * np.where(np.arange(6) == 4, 1e-6, 1.0))
+        assert deployed(tight, np.array([18.0, 7.0]), np.array([0.0, 1.0])) is None
 
     def test_impossible_joint_values(self, curved: TubeShapes) -> None:
         n = len(curved.tubes)

@@ -83,7 +83,7 @@ if TYPE_CHECKING:
     from stages.needle.search.successive_halving import successive_halving
     from stages.needle.start_index import StartIndex
     from stages.needle.start_region import KINDS, REACHING, ProvedStarts, StartRegion, TriedStarts
-    from stages.needle.start_region_proof import prove_starts
+    from stages.needle.start_region_proof import prove_starts, proved_factor
     from stages.needle.start_region_trial import try_around, try_poses, try_starts
     from stages.needle.violations import violation
 

@@ -17,7 +17,7 @@ from stages.needle.kernels import tree
 from stages.needle.objective import SHORTEST
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
-from stages.needle.search.base import RANDOM_SHARE
+from stages.needle.search.base import MAX_NODES, RANDOM_SHARE
 from stages.needle.start_region import TriedStarts
 
 DIRECTIONS = 25
@@ -147,7 +147,7 @@ def try_poses(
     """
     places = np.array(positions, dtype=np.float64, order="C")
     kinds = np.zeros(len(places), dtype=np.uint8)
-    rows = iterations * tree.ROWS_PER_STEP + kernel.ROWS
+    rows = min(iterations * tree.ROWS_PER_STEP + kernel.ROWS, MAX_NODES)
     kernel.try_starts(
         environment.obstacles, environment.limits, environment.objective_arrays(SHORTEST), query.branch,
         places, np.array(tangents, dtype=np.float64, order="C"), _vias_around(path), query.goal, iterations,

@@ -36,7 +36,8 @@ SPARE_MM = 2.0 * MIN_GAP_MM
 WIDEST_TILT_RAD = math.radians(60.0)
 TILT_STEPS = 14
 """Halvings of the widest tilt: the largest is known to 0.004 degrees."""
-OFFSET_STEPS = 12
+FACTOR_STEPS = 12
+"""Halvings of a factor: an offset of at most 5 mm is known to 0.002 mm."""
 
 _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
@@ -222,15 +223,17 @@ def _cell_kept(limits, branch, arcs, cell, offset, tilt, turned, miss):
 
 
 @numba.njit(cache=True, nogil=True)
-def largest_offset(limits, branch, arcs, stations, count, angle, most):
-    """Return the largest offset in mm, at most `most`, that is proved for an exact direction."""
+def largest_factor(limits, branch, arcs, stations, count, angle, offset, tilt):
+    """Return the largest factor, at most 1, by which an offset and a tilt are proved together."""
     worst = np.zeros(1, dtype=np.int64)
     if not region_kept(limits, branch, arcs, stations, count, angle, 0.0, 0.0, worst):
         return 0.0
-    low, high = 0.0, most
-    for _ in range(OFFSET_STEPS):
+    if region_kept(limits, branch, arcs, stations, count, angle, offset, tilt, worst):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(FACTOR_STEPS):
         middle = 0.5 * (low + high)
-        if region_kept(limits, branch, arcs, stations, count, angle, middle, 0.0, worst):
+        if region_kept(limits, branch, arcs, stations, count, angle, middle * offset, middle * tilt, worst):
             low = middle
         else:
             high = middle

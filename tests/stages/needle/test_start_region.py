@@ -25,6 +25,7 @@ from stages.needle import (
     direct_path,
     environment_of_labels,
     prove_starts,
+    proved_factor,
     try_starts,
     violation,
     workspace_lengths,
@@ -169,6 +170,19 @@ def test_every_pose_of_the_proved_part_has_a_clear_path(
         beyond = points[lengths >= NEEDLE.exit_exemption_mm]
         gap = brute_clearance(canvas.labels, canvas.grid, beyond, OBSTACLES, 2.0)
         assert gap.min() >= REQUIRED_MM - 1e-9
+
+
+def test_the_factor_of_a_deviation_agrees_with_the_pairs() -> None:
+    rng = np.random.default_rng(1)
+    canvas = scene(rng, vessels=8)
+    environment = environment_of_labels(canvas.labels, canvas.grid, NEEDLE, required_clearance_mm=REQUIRED_MM)
+    query, path = Query(lps_from_start=START, target=TARGET, branch=0), planned_path(rng, 1)
+    proved = prove_starts(environment, query, path)
+    n = proved.best
+    for times in (0.5, 1.5, 4.0):
+        offset, tilt = times * proved.offsets_mm[n], times * proved.tilts_rad[n]
+        found = proved_factor(environment, query, path, offset_mm=offset, tilt_rad=tilt)
+        assert found == pytest.approx(min(1.0 / times, 1.0), abs=2e-3)
 
 
 def test_the_attack_has_something_to_attack() -> None:

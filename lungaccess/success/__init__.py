@@ -1,0 +1,12 @@
+"""Plans that succeed: the search for the plan whose procedure most often ends well under given errors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.success.planner import PlannedSuccess, plan_for_success
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -22,7 +22,7 @@ from lungaccess.success.estimate import ChanceEstimator
 from lungaccess.success.spread import Spread
 
 POOL = 150
-"""Candidates that a race begins with: the best by the estimate of first order is nearly always among so many."""
+"""Candidates that a race begins with: the best is nearly always among so many of first order."""
 A_TIP = 8
 """Of one scope tip so many: its deployments are alike, and other tips fail otherwise."""
 KEPT = (24, 6)
@@ -45,8 +45,8 @@ class Contender:
     candidate : Candidate or None
         None for a plan that another search made.
     plan : Plan
-        Where there is a candidate, without what takes long to state: clearances, costs and the motion's margin
-        are those of another plan.
+        Where there is a candidate, without what takes long to state: clearances, costs and the margin of
+        the motion are those of another plan.
     successes, samples : int
         By the draws that all have in common.
     """
@@ -97,8 +97,7 @@ class SuccessSearch:
             best = self._raced(first, rounds[0])
             yield best, 0
         started = [made for made in map(self._contender, pool.tolist()) if made]
-        cheapest = self._cheapest()
-        best = self._race([*started, *([cheapest] if cheapest else [])])
+        best = self._race([*started, self._cheapest()])
         yield best, 0
         yield from self._varied(best)
 
@@ -151,15 +150,14 @@ class SuccessSearch:
         made = replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption)
         return Contender(candidate=candidate, plan=made, successes=0, samples=1)
 
-    def _cheapest(self) -> Contender | None:
-        """Return the plan of least cost, None if there is only a direct arc and it is in the race anyway."""
-        task, last = self._task, None
-        for last in plan(
+    def _cheapest(self) -> Contender:
+        """Return the plan of least cost."""
+        task = self._task
+        plans = plan(
             task.lung, task.system, task.target, objective=task.objective, seed=task.seed,
             iterations=BY_COST, atlas=self._atlas, counterfactuals=self._counterfactuals,
-        ):  # fmt: skip
-            pass
-        return None if last is None else Contender(candidate=None, plan=last, successes=0, samples=1)
+        )  # fmt: skip
+        return Contender(candidate=None, plan=list(plans)[-1], successes=0, samples=1)
 
     def _raced(self, contender: Contender, samples: int) -> Contender:
         """Return a contender with its successes of so many draws."""
@@ -185,7 +183,9 @@ class SuccessSearch:
             best = better or best
             yield best, tried
 
-    def _variation(self, candidate: Candidate, turn_rad: float, shifts_mm: Sequence[float]) -> Contender | None:
+    def _variation(
+        self, candidate: Candidate, turn_rad: float, shifts_mm: Sequence[float]
+    ) -> Contender | None:
         """Return a candidate with other rotation and insertions, if it is proved."""
         old, evaluator = candidate.deployment, self._arcs.evaluator
         if old.shape is not None:

@@ -1,8 +1,8 @@
 """How errors spread along deployed devices, to first order: a fast estimate of the chance of success.
 
-It ranks candidates before any of them is simulated; nothing that a user sees is made of it.  Errors are taken
-as small and normal.  Then each point of a device has a normal error whose covariance is the sum over the kinds
-of error of `v v^T`, where `v` is what one standard deviation moves the point by.
+It ranks candidates before any of them is simulated; nothing that a user sees is made of it.  Errors are
+taken as small and normal.  Then each point of a device has a normal error whose covariance is the sum over
+the kinds of error of `v v^T`, where `v` is what one standard deviation moves the point by.
 """
 
 from __future__ import annotations
@@ -203,7 +203,9 @@ class Spread:
         """Return the least clearance `(N,)` of points, in standard deviations across the device."""
         names = ["vessel", "pleura", *(["fissure"] if self._with_fissures else [])]
         flat, shape = points.reshape(-1, 3), points.shape[:2]
-        clear = np.min([self._lung.fields[name].lower_bound_mm(flat) for name in names], axis=0).reshape(shape)
+        clear = np.min([self._lung.fields[name].lower_bound_mm(flat) for name in names], axis=0).reshape(
+            shape
+        )
         if airway:
             near = self._lung.fields["airway"].lower_bound_mm(flat).reshape(shape)
             exempt = self._system.require_needle("A chance").exit_exemption_mm
@@ -254,4 +256,3 @@ def _below(standard: Float) -> Float:
     from scipy.special import ndtr
 
     return np.asarray(ndtr(standard))
-

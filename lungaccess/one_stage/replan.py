@@ -15,7 +15,7 @@ from anatomy.errors import FrameError, TargetError
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Bool, Float, Int
-from lungaccess.coupled.kernels.direct_arcs import evaluate_arcs
+from lungaccess.coupled.kernels.direct_arcs import cost_bounds, evaluate_arcs
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.coupled.search.local_search import TubeChoice, path_through, tube_arguments
@@ -144,6 +144,7 @@ def replan_from_scope(
     objective: str | Objective = "inverse_clearance",
     seed: int = 0,
     tries: int = TRIES,
+    searches: int = SEARCHED,
 ) -> RestOfPlan:
     """Plan tubes and needle from where the tip of the scope really is.
 
@@ -158,6 +159,8 @@ def replan_from_scope(
         The pose as measured: +z forward, +x the way a positive bend turns the tip, up in the picture.
     tries : int
         Variations of rotation, insertions and needle that improve the first answer; 0 for a faster one.
+    searches : int
+        Deployments from which the needle's own search starts where no direct arc is clear.
 
     Raises
     ------
@@ -171,7 +174,9 @@ def replan_from_scope(
     frame = _rigid(lung, lps_from_scope_tip, "scope")
     task = _task(lung, system, target, objective, seed)
     evaluator = CandidateEvaluator(task)
-    search = _FromScope(evaluator, frame, tries) if system.needle else AimedFromPose(evaluator, frame)
+    search = (
+        _FromScope(evaluator, frame, tries, searches) if system.needle else AimedFromPose(evaluator, frame)
+    )
     found = search.best()
     if found is None:
         raise NoPlan(f"No plan from the scope's tip as measured: {search.why}", reasons=search.reasons)
@@ -236,8 +241,9 @@ def _task(lung: Lung, system: System, target: Target, objective: str | Objective
 class _FromScope:
     """The search from one pose of the scope."""
 
-    def __init__(self, evaluator: CandidateEvaluator, frame: Float, tries: int) -> None:
-        self._evaluator, self._frame, self._task, self._tries = evaluator, frame, evaluator.task, tries
+    def __init__(self, evaluator: CandidateEvaluator, frame: Float, tries: int, searches: int) -> None:
+        self._evaluator, self._frame, self._task = evaluator, frame, evaluator.task
+        self._tries, self._searches = tries, searches
         system, self._target = self._task.system, self._task.target.lps_mm
         self._row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
         self._outside = 0
@@ -248,6 +254,7 @@ class _FromScope:
         lengths = self._lengths(self.entries.positions, self.entries.tangents)
         near = np.flatnonzero(np.isfinite(lengths))
         self._near: Int = near[np.argsort(lengths[near], kind="stable")]
+        self._near_mm = lengths[self._near]
 
     def _lengths(self, positions: Float, tangents: Float) -> Float:
         """Return the shortest lengths of needle to the target from tips, infinite outside the workspace."""
@@ -264,26 +271,33 @@ class _FromScope:
         return None if first is None else self._improved(*first)
 
     def _direct(self) -> tuple[Deployment, ArcPath] | None:
-        """Return the proved direct arc of least estimated cost."""
-        near, entries = self._near, self.entries
-        blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
+        """Return the proved direct arc of least estimated cost, those of the least bounds looked at first."""
+        near, entries, needle = self._near, self.entries, self._evaluator.needle_arrays
         x, y, z = self._target.tolist()
-        evaluate_arcs(
-            self._evaluator.needle_arrays, entries.positions[near], entries.tangents[near],
-            entries.branch[near], (x, y, z), math.inf, math.inf, blockers, costs,
-        )  # fmt: skip
+        bounds = np.zeros(len(near))
+        cost_bounds(needle, entries.positions[near], self._near_mm, (x, y, z), bounds)
+        near = near[np.argsort(bounds, kind="stable")]
+        blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
+        # An arc that costs more than a clear one is of use only where the cheaper ones are not proved.
+        for slack in (1.0, math.inf):
+            evaluate_arcs(
+                needle, entries.positions[near], entries.tangents[near], entries.branch[near], (x, y, z),
+                slack, math.inf, blockers, costs,
+            )  # fmt: skip
+            clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
+            for n in clear[np.argsort(costs[clear], kind="stable")].tolist():
+                deployment = self._deployment(int(near[n]))
+                path = path_through(deployment, np.zeros((0, 3)), self._target)
+                if self._evaluator.proves(deployment, path):
+                    return deployment, path
+            if not len(clear):
+                break
         self._evaluator.count_blockers(blockers)
-        clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
-        for n in clear[np.argsort(costs[clear], kind="stable")].tolist():
-            deployment = self._deployment(int(near[n]))
-            path = path_through(deployment, np.zeros((0, 3)), self._target)
-            if self._evaluator.proves(deployment, path):
-                return deployment, path
         return None
 
     def _searched(self) -> tuple[Deployment, ArcPath] | None:
         """Return the first path that the needle's own search finds, the nearest deployments first."""
-        for entry in self._near[:SEARCHED].tolist():
+        for entry in self._near[: self._searches].tolist():
             deployment = self._deployment(int(entry))
             search = OptimalSearch(
                 self._evaluator.environment,

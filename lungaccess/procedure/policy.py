@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 
 import numpy as np
 
@@ -86,6 +87,11 @@ class History:
     corrected_mm: dict[str, list[float]] = field(default_factory=lambda: {stage: [] for stage in STAGES})
 
 
+from_scope = partial(replan_from_scope, tries=0, searches=0)
+"""The fastest answer: the cheapest clear direct arc.  On two patients no more procedures succeeded with what
+local search and the needle's own search add, at two to four times the work."""
+
+
 class Policy:
     """Carries out a plan in simulated procedures.
 
@@ -164,7 +170,7 @@ class Policy:
         plan = self._plan
         target = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
         history.corrected_mm[SCOPE].append(self._miss_from(measured))
-        rest = self._rest(history, SCOPE, replan_from_scope, measured, target)
+        rest = self._rest(history, SCOPE, from_scope, measured, target)
         if rest is None:
             return None
         scope = replace(plan.scope, lps_from_scope_tip=rest.lps_from_measured)

@@ -41,6 +41,15 @@ PatientFolder = Annotated[
 ]
 PlanFile = Annotated[Path, Parameter(help="The plan.json.")]
 PatientOfPlan = Annotated[Path, Parameter(help="Folder of the patient it was made for.")]
+ProcedureName = Annotated[
+    str,
+    Parameter(
+        help="What is measured and planned again on the way: a preset (closed-loop, measured-scope, "
+        "measured-tip, open-loop) or a TOML file."
+    ),
+]
+SUCCESS = "success"
+"""The objective that is no cost: the chance of success."""
 DEFAULT_SYSTEM = "lung-default"
 AUTO = "auto"
 """Stands for the least invasive preset that reaches the target."""
@@ -220,7 +229,8 @@ class SearchOptions(BudgetOptions):
         ObjectiveText,
         Parameter(
             help="What to make small: integral of 1/clearance, integral of the patient's cost map, its sum "
-            "over the voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5."
+            "over the voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5.  Or "
+            "success: the chance that the procedure succeeds is made large."
         ),
     ] = "inverse-clearance"
     method: Annotated[

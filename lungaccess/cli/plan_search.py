@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
+    from lungaccess.procedure import Procedure
     from lungaccess.report import CostPoint
     from lungaccess.risk import ErrorModel
+    from lungaccess.success import PlannedSuccess
 
 PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
 """The plan, saved as soon as there is one and again when there is a better one; how its cost fell."""
@@ -46,6 +48,21 @@ class Display(AbstractContextManager[Any], Protocol):
         """Show that the user ended the search."""
 
 
+@frozen_value
+class Found:
+    """A plan that a search found, and what it makes small: its cost, or its chance of failure.
+
+    Parameters
+    ----------
+    success : PlannedSuccess or None
+        None where a cost is made small.
+    """
+
+    plan: Plan
+    cost: float
+    success: PlannedSuccess | None = None
+
+
 class CostHistory:
     """Collects how the best cost falls while a search runs; its clock is that of the planner."""
 
@@ -64,12 +81,12 @@ class CostHistory:
         self._append(event.elapsed_s)
         self._display.update(event.message or event.phase, event.elapsed_s, event.iteration, self._best)
 
-    def on_plan(self, plan: Plan) -> None:
+    def on_plan(self, found: Found) -> None:
         """Take over a better plan."""
-        self._best, self._iteration = plan.cost, plan.iterations
-        elapsed_s = float(plan.timing["planning_s"])
+        self._best, self._iteration = found.cost, found.plan.iterations
+        elapsed_s = float(found.plan.timing["planning_s"])
         self._append(elapsed_s)
-        self._display.better(elapsed_s, plan.cost)
+        self._display.better(elapsed_s, found.cost)
 
     def _append(self, elapsed_s: float) -> None:
         self.points.append(self._point(elapsed_s=elapsed_s, iteration=self._iteration, best_cost=self._best))
@@ -77,7 +94,10 @@ class CostHistory:
 
 @frozen_value
 class PlanRequest:
-    """What to plan and where to; of several systems the least invasive that reaches the target is chosen."""
+    """What to plan and where to; of several systems the least invasive that reaches the target is chosen.
+
+    With a procedure the chance that it succeeds is made large, instead of a cost small.
+    """
 
     systems: tuple[System, ...]
     target: StatedTarget
@@ -86,6 +106,7 @@ class PlanRequest:
     out: Path
     output: PatientOptions
     pictures: bool = True
+    procedure: Procedure | None = None
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -95,7 +116,7 @@ class PlanRequest:
 
 def run_search(
     lung: Lung, target: Target, request: PlanRequest, display: Display
-) -> tuple[Plan, list[CostPoint]]:
+) -> tuple[Found, list[CostPoint]]:
     """Search until the budget is spent and return the best plan and the history of its cost.
 
     The first plan is saved as soon as it is found, and the best one at the end, whatever happens after.  An
@@ -109,13 +130,13 @@ def run_search(
     from lungaccess.plans.no_plan import NoPlan
 
     history = CostHistory(display)
-    best: Plan | None = None
+    best: Found | None = None
     with display:
         try:
             for found in _plans(lung, target, request, history):
                 first, best = best is None, found
                 if first:
-                    found.save(request.out / PLAN_FILE)
+                    found.plan.save(request.out / PLAN_FILE)
                 history.on_plan(found)
         except KeyboardInterrupt:
             if best is None:
@@ -123,13 +144,14 @@ def run_search(
             display.interrupted()
     if best is None:
         raise NoPlan("The search ended without a plan", reasons={}, advice="Give it more time")
-    best.save(request.out / PLAN_FILE)
+    best.plan.save(request.out / PLAN_FILE)
     return best, history.points
 
 
-def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Plan]:
-    """Return better and better plans with the request's system, or with the one that is chosen of several."""
+def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Found]:
+    """Yield better and better plans with the request's system, or with the one that is chosen of several."""
     from lungaccess.coupled import atlas_event, open_atlas, plan, plan_with_presets
+    from lungaccess.success import plan_for_success
 
     def atlas_of(system: System) -> Atlas:
         def on_share(share: float) -> None:
@@ -137,21 +159,31 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
 
         return open_atlas(lung, system, cache=request.output.cache, progress=on_share)
 
-    search = request.search
-    options: dict[str, Any] = {
-        "objective": search.objective,
-        "method": search.method,
-        "needle_planner": search.needle_planner or "",
+    search, system = request.search, request.systems[0]
+    limits: dict[str, Any] = {
         "seed": search.seed,
         "iterations": search.iterations,
         "time_s": search.time_s,
-        "processes": search.processes,
         "on_progress": history.on_progress,
     }
+    if request.procedure is not None:
+        for each in plan_for_success(
+            lung, system, target, errors=request.errors, procedure=request.procedure,
+            atlas=atlas_of(system), counterfactuals=False, **limits,
+        ):  # fmt: skip
+            yield Found(plan=each.plan, cost=1.0 - each.succeeds.value, success=each)
+        return
+    options = limits | {
+        "objective": search.objective,
+        "method": search.method,
+        "needle_planner": search.needle_planner or "",
+        "processes": search.processes,
+    }
     if len(request.systems) > 1:
-        return plan_with_presets(lung, target, systems=request.systems, atlas_of=atlas_of, **options)
-    system = request.systems[0]
-    return plan(lung, system, target, atlas=atlas_of(system), counterfactuals=False, **options)
+        plans = plan_with_presets(lung, target, systems=request.systems, atlas_of=atlas_of, **options)
+    else:
+        plans = plan(lung, system, target, atlas=atlas_of(system), counterfactuals=False, **options)
+    yield from (Found(plan=each, cost=each.cost) for each in plans)
 
 
 def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
@@ -166,7 +198,8 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
         If no plan was found.
     """
     target, search = request.target.resolve(lung), request.search
-    found, history = run_search(lung, target, request, SearchDisplay(search.time_s, search.iterations))
+    best, history = run_search(lung, target, request, SearchDisplay(search.time_s, search.iterations))
+    found = best.plan
     from lungaccess.appraisal import appraise  # After the search: the first plan does not wait for it.
 
     with progress("checking the plan and estimating its chance"):
@@ -178,10 +211,14 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
             target_lps=target.lps_mm,
         )
     record = plan_tables.plan_record(found, lung, appraisal, request.out, request.files)
+    if best.success is not None:
+        record["success"] = plan_tables.success_record(best.success)
     write_text(request.out / SUMMARY_FILE, terminal.json_text(record))
     if not request.output.json:
         show_plan(found, lung, appraisal)
-    write_history(found, history, lung, appraisal, request)
+        if best.success is not None:
+            terminal.say(plan_tables.success_words(best.success))
+    write_history(best, history, lung, appraisal, request)
     if request.output.json:
         terminal.show_json(record)
     else:
@@ -204,7 +241,7 @@ def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal) -> None:
 
 
 def write_history(
-    plan: Plan, history: list[CostPoint], lung: Lung, appraisal: Appraisal, request: PlanRequest
+    found: Found, history: list[CostPoint], lung: Lung, appraisal: Appraisal, request: PlanRequest
 ) -> None:
     """Write how the cost fell, and the pictures if they are wanted."""
     from lungaccess.report import cost_over_time_csv
@@ -212,13 +249,14 @@ def write_history(
     cost_over_time_csv(history, request.out / HISTORY_FILE)
     if request.pictures:
         with progress("drawing the plan"):
-            draw_plan(plan, history, lung, appraisal, request.out)
+            draw_plan(found, history, lung, appraisal, request.out)
 
 
-def draw_plan(plan: Plan, history: list[CostPoint], lung: Lung, appraisal: Appraisal, out: Path) -> None:
+def draw_plan(found: Found, history: list[CostPoint], lung: Lung, appraisal: Appraisal, out: Path) -> None:
     """Write the pictures of a plan and of its search into a folder."""
     from lungaccess.report import cost_over_time_png, overview_png, tree_png
 
-    overview_png(plan, lung, out / "overview.png", appraisal)
+    words = "chance of failure" if found.success else Objective.of(found.plan.objective).words
+    overview_png(found.plan, lung, out / "overview.png", appraisal)
     tree_png(lung, out / "tree.png")
-    cost_over_time_png(history, out / "cost_over_time.png", Objective.of(plan.objective).words)
+    cost_over_time_png(history, out / "cost_over_time.png", words)

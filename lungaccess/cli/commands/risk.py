@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Probability, Processes, Samples, Seed
-from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
+from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile, ProcedureName
 from lungaccess.cli.procedure_tables import plain_share, procedure_record, procedure_tables, share_row
 from lungaccess.cli.progress import progress
 
@@ -24,13 +24,7 @@ def risk(
     patient: PatientOfPlan,
     *,
     errors: ErrorOptions = ErrorOptions(),
-    procedure: Annotated[
-        str,
-        Parameter(
-            help="What is measured and planned again on the way: a preset (closed-loop, measured-scope, "
-            "measured-tip, open-loop) or a TOML file."
-        ),
-    ] = "open-loop",
+    procedure: ProcedureName = "open-loop",
     samples: Annotated[
         Samples | None,
         Parameter(help="Number of deviated plans; 10000, or 1000 procedures that measure on their way."),

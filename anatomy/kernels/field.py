@@ -44,7 +44,12 @@ ROUNDING = 1e-9
 """Searches go farther than what they may find by this share."""
 
 
-@numba.njit(cache=True, inline="never")
+@numba.njit(cache=True, inline="always", _nrt=False)
+def _squared_along(low, high, f):
+    return (1.0 - f) * float(low) * float(low) + f * float(high) * float(high)
+
+
+@numba.njit(cache=True, inline="never", _nrt=False)
 def interpolate_squared(field, geometry, x, y, z):
     """Return the interpolated squared distance and the variance term, in mm^2; (0, 0) off the grid."""
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
@@ -56,20 +61,17 @@ def interpolate_squared(field, geometry, x, y, z):
     ni, nj, nk = field.shape
     if not (0.0 <= u < ni - 1 and 0.0 <= v < nj - 1 and 0.0 <= w < nk - 1):
         return 0.0, 0.0
-    i = int(u)
-    j = int(v)
-    k = int(w)
-    fu = u - i
-    fv = v - j
-    fw = w - k
-    total = 0.0
-    for c in range(2):
-        wc = fw if c == 1 else 1.0 - fw
-        for b in range(2):
-            wb = fv if b == 1 else 1.0 - fv
-            low = np.float64(field[i, j + b, k + c])
-            high = np.float64(field[i + 1, j + b, k + c])
-            total += wc * wb * ((1.0 - fu) * low * low + fu * high * high)
+    fu = u - int(u)
+    fv = v - int(v)
+    fw = w - int(w)
+    # Unsigned: signed indices would be tested for being negative, which takes as long as all the rest.
+    i, j, k = np.uint64(u), np.uint64(v), np.uint64(w)
+    i1, j1, k1 = i + np.uint64(1), j + np.uint64(1), k + np.uint64(1)
+    # Written out, in this order: a loop over the corners takes twice as long.
+    total = (1.0 - fw) * (1.0 - fv) * _squared_along(field[i, j, k], field[i1, j, k], fu)
+    total += (1.0 - fw) * fv * _squared_along(field[i, j1, k], field[i1, j1, k], fu)
+    total += fw * (1.0 - fv) * _squared_along(field[i, j, k1], field[i1, j, k1], fu)
+    total += fw * fv * _squared_along(field[i, j1, k1], field[i1, j1, k1], fu)
     total /= UNITS_PER_MM * UNITS_PER_MM
     spread = (
         fu * (1.0 - fu) * geometry[0, 4] + fv * (1.0 - fv) * geometry[1, 4] + fw * (1.0 - fw) * geometry[2, 4]
@@ -77,21 +79,21 @@ def interpolate_squared(field, geometry, x, y, z):
     return total, spread
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, _nrt=False)
 def distance_bound(field, geometry, x, y, z):
     """Return a distance in mm that the true distance is never below; 0 outside the grid."""
     total, spread = interpolate_squared(field, geometry, x, y, z)
     return math.sqrt(max(total - spread, 0.0))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, _nrt=False)
 def distance_estimate(field, geometry, x, y, z):
     """Return a smooth estimate of the distance in mm, off by less than a voxel diagonal; no bound."""
     total, spread = interpolate_squared(field, geometry, x, y, z)
     return math.sqrt(max(total - 0.5 * spread, 0.0))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, _nrt=False)
 def label_at(labels, geometry, x, y, z):
     """Return the label of the voxel that holds a point; OUTSIDE beyond the grid."""
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
@@ -100,10 +102,10 @@ def label_at(labels, geometry, x, y, z):
     ni, nj, nk = labels.shape
     if not (0.0 <= u < ni and 0.0 <= v < nj and 0.0 <= w < nk):
         return OUTSIDE
-    return int(labels[int(u), int(v), int(w)])
+    return int(labels[np.uint64(u), np.uint64(v), np.uint64(w)])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, _nrt=False)
 def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
     """Search the voxels around a point for the nearest one with any of `bits`, as `geometry` takes them.
 
@@ -140,13 +142,15 @@ def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
         gw = max(abs(k + 0.5 - w) - half, 0.0) * sw
         if gw * gw >= best:
             continue
+        uk = np.uint64(k)
         for j in range(j0, j1 + 1):
             gv = max(abs(j + 0.5 - v) - half, 0.0) * sv
             g2 = gw * gw + gv * gv
             if g2 >= best:
                 continue
+            uj = np.uint64(j)
             for i in range(i0, i1 + 1):
-                label = int(labels[i, j, k])
+                label = int(labels[np.uint64(i), uj, uk])
                 hit = label & bits
                 if hit == 0:
                     continue

@@ -110,7 +110,7 @@ class _Simulator:
             self.assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs).deviations(model)
             for number in range(count)
         ]
-        self._starts = [deviated_starts(plan, each) for each in self._attempts]
+        self._starts = [deviated_starts(plan, lung, each) for each in self._attempts]
         self._policy = Policy(plan, lung, procedure, self.assessor.radius_mm)
 
     def run(self, processes: int) -> _Found:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.risk.assessment import MISSES, RiskReport, assess, safest
+    from lungaccess.risk.assessment import MISSES, RiskReport, assess, rare_touch, safest
     from lungaccess.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
     from lungaccess.risk.deviations import Deviations
     from lungaccess.risk.draws import Draws
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
         ErrorModel,
         PositionError,
     )
+    from lungaccess.risk.rare import RareShare, rare_share
+    from lungaccess.risk.sensitivity import Sensitivity, sensitivities
     from lungaccess.risk.start_bodies import proved_body, tried_body
     from lungaccess.risk.start_region import safe_start_region
     from lungaccess.risk.statistics import Share

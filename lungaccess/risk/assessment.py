@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import field
 from types import MappingProxyType
 
 import numpy as np
@@ -13,6 +14,8 @@ from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.error_files import load_errors
 from lungaccess.risk.errors import ErrorModel
+from lungaccess.risk.rare import RARE, Luck, RareShare, rare_share
+from lungaccess.risk.sensitivity import Sensitivity, sensitivities
 from lungaccess.risk.statistics import Share, share_of
 
 DEFAULT_SAMPLES = 10_000
@@ -47,6 +50,11 @@ class RiskReport:
         Whether the plan has a needle; its tubes end at the target where it has none.
     alone : mapping of str to Share
         Successes if there were errors of one kind only, by kind; empty if that was not asked for.
+    sensitivity : tuple of Sensitivity
+        What each kind of error does to success, the greatest first; empty if that was not asked for.
+    rare : mapping of str to RareShare
+        Touches, and failures, that happened in less than `RARE` of the draws, estimated with weights; empty
+        if that was not asked for.
     """
 
     model: ErrorModel
@@ -61,6 +69,8 @@ class RiskReport:
     miss_mm: Mapping[float, float]
     alone: Mapping[str, Share]
     with_needle: bool = True
+    sensitivity: tuple[Sensitivity, ...] = ()
+    rare: Mapping[str, RareShare] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def failures(self) -> tuple[tuple[str, Share], ...]:
@@ -95,7 +105,8 @@ def assess(
     radius_mm : float, optional
         Radius of the goal; see `RiskAssessor`.
     each_kind : bool
-        Whether success under errors of one kind only is estimated, too: eight times the work.
+        Whether success under errors of one kind only, sensitivities and rare touches are estimated, too:
+        some thirty times the work.
 
     Raises
     ------
@@ -109,6 +120,7 @@ def assess(
     touched = {name: share_of((outcomes.touched & flag) != 0) for name, flag in assessor.structures.items()}
     kinds = assessor.kinds if each_kind else ()
     alone = {name: assessor.success(draws, stated.only(name)) for name in kinds}
+    rare = [name for name, share in touched.items() if each_kind and share.value < RARE]
     return RiskReport(
         model=stated,
         samples=samples,
@@ -122,7 +134,25 @@ def assess(
         miss_mm=MappingProxyType({q: float(np.quantile(outcomes.miss_mm, q)) for q in MISS_QUANTILES}),
         alone=MappingProxyType(alone),
         with_needle=plan.needle is not None,
+        sensitivity=sensitivities(assessor, stated, samples, seed) if each_kind else (),
+        rare=MappingProxyType({name: rare_touch(assessor, stated, name, samples, seed) for name in rare}),
     )
+
+
+def rare_touch(
+    assessor: RiskAssessor, model: ErrorModel, structure: str, samples: int = DEFAULT_SAMPLES, seed: int = 0
+) -> RareShare:
+    """Return how likely a structure is touched, a name of `STRUCTURES`, by importance sampling.
+
+    Raises
+    ------
+    SettingsError
+        If there are no samples.
+    """
+    flag = assessor.structures[structure]
+    luck = Luck(lambda count: assessor.draws(count, seed), model)
+    happens = luck.event(lambda draws: (assessor.outcomes(draws.deviations(model)).touched & flag) != 0)
+    return rare_share(happens, luck.dimensions, samples, seed)
 
 
 def safest(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +17,11 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.breathing import share_of_motion
-from lungaccess.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
+from lungaccess.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations
 from lungaccess.risk.draws import Draws
 from lungaccess.risk.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.risk.kernels import deviation as kernel
+from lungaccess.risk.kernels.outcomes import find_outcomes, find_successes, follow_chains
 from lungaccess.risk.statistics import Share, share_of
 from stages.needle import Obstacles
 
@@ -92,11 +95,7 @@ class RiskAssessor:
         self.radius_mm, self.radius_origin = (
             goal_radius(lung, plan) if radius_mm is None else (float(radius_mm), "given")
         )
-        bits = obstacle_bits(lung.has_fissures)
-        field = lung.obstacle_field(with_fissures=True)
-        self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
-        self._depth = (lung.lumen_depth.corners, lung.lumen_depth.geometry)
-        self._mediastinal = lung.tree.mediastinal
+        self._deviated, self._judging = DeviatedPlan(plan), judging(plan, lung)
         self.structures = {
             name: flag for name, flag in STRUCTURES.items() if flag != FISSURE or lung.has_fissures
         }
@@ -104,6 +103,9 @@ class RiskAssessor:
             name for name in self.structures if name != "fissure" or plan.fissures_are_obstacles
         )
         self._forbidden_flags = sum(self.structures[name] for name in self.forbidden)
+        bits = obstacle_bits(lung.has_fissures)
+        field = lung.obstacle_field(with_fissures=True)
+        self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
 
     def draws(self, count: int, seed: int, *, attempt: int = 0, n_arcs: int | None = None) -> Draws:
         """Return random numbers for `count` sets of errors, see `Draws`; the same seed gives the same.
@@ -119,26 +121,24 @@ class RiskAssessor:
 
     def outcomes(self, deviations: Deviations) -> Outcomes:
         """Follow deviated plans through all three stages."""
-        starts, pieces = deviated_starts(self.plan, deviations), deviated_pieces(self.plan, deviations)
-        touched, ends = self.follow(starts, pieces, pieces.shape[1] - self.n_arcs)
-        targets = self.plan.target_lps + deviations.target_mm
-        return Outcomes(touched=touched, miss_mm=np.linalg.norm(ends - targets, axis=1))
+        touched, miss_mm = np.zeros(deviations.count, dtype=np.int64), np.zeros(deviations.count)
+        inputs = self._inputs(deviations)
 
-    def follow(self, starts: Float, pieces: Float, n_tube: int, *, enough: int = 0) -> tuple[Int, Float]:
-        """Return what chains touch `(N,)` and where they end `(N, 3)`; see `kernel.follow`."""
+        def find(part: slice) -> None:
+            find_outcomes(*inputs, part.start, touched[part], miss_mm[part])
+
+        _in_threads(find, deviations.count)
+        return Outcomes(touched=touched, miss_mm=miss_mm)
+
+    def follow(self, starts: Float, pieces: Float, n_tube: int) -> tuple[Int, Float]:
+        """Return what chains touch `(N,)` and where they end `(N, 3)`; see `kernels.deviation`."""
         touched, ends = np.zeros(len(starts), dtype=np.int64), np.zeros((len(starts), 3))
-        exempt_mm = float(self.plan.exemption.needle_length_mm)
-
-        def follow_part(part: slice) -> None:
-            kernel.follow(
-                self._obstacles, self._depth, self._mediastinal, starts[part], pieces[part], n_tube,
-                exempt_mm, enough, touched[part], ends[part],
-            )  # fmt: skip
-
-        bounds = np.linspace(0, len(starts), THREADS + 1).astype(int)
-        with ThreadPoolExecutor(THREADS) as pool:
-            list(pool.map(follow_part, (slice(a, b) for a, b in zip(bounds, bounds[1:], strict=False))))
+        follow_chains(starts, pieces, n_tube, self._obstacles, self._judging, touched, ends)
         return touched, ends
+
+    def _inputs(self, deviations: Deviations) -> tuple[Any, ...]:
+        """Return what both kernels take first; see `find_successes`."""
+        return (*self._deviated.kernel_inputs(deviations), self._obstacles, self._judging)
 
     def succeeded(self, outcomes: Outcomes) -> Bool:
         """Tell which `(N,)` end within the radius, leave the airway and touch nothing forbidden."""
@@ -151,19 +151,25 @@ class RiskAssessor:
 
         Those that miss the goal are not followed, and the others only up to the first forbidden touch.
         """
-        starts, pieces = deviated_starts(self.plan, deviations), deviated_pieces(self.plan, deviations)
-        ends = np.zeros((deviations.count, 3))
-        kernel.find_ends(starts, pieces, ends)
-        targets = self.plan.target_lps + deviations.target_mm
-        done = np.asarray(np.linalg.norm(ends - targets, axis=1) <= self.radius_mm)
-        n_tube = pieces.shape[1] - self.n_arcs
-        touched, _ends = self.follow(starts[done], pieces[done], n_tube, enough=self._forbidden_flags)
-        done[done] = (touched & self._forbidden_flags) == 0
+        done = np.zeros(deviations.count, dtype=bool)
+        inputs = self._inputs(deviations)
+
+        def find(part: slice) -> None:
+            find_successes(*inputs, self.radius_mm, self._forbidden_flags, part.start, done[part])
+
+        _in_threads(find, deviations.count)
         return done
 
     def success(self, draws: Draws, model: ErrorModel) -> Share:
         """Return the share of successes under a model."""
         return share_of(self.successes(draws.deviations(model)))
+
+
+def _in_threads(find: Callable[[slice], None], count: int) -> None:
+    """Have parts of `count` numbers found at the same time: what is found does not depend on the parts."""
+    bounds = np.linspace(0, count, THREADS + 1).astype(int).tolist()
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(find, map(slice, bounds[:-1], bounds[1:])))
 
 
 def goal_radius(lung: Lung, plan: Plan) -> tuple[float, str]:

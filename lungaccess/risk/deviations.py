@@ -4,14 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.lung import Lung
 from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.typed import Float, Int
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel
-from lungaccess.risk.twisted import twisted_pieces
+from lungaccess.risk.kernels.chain import TUBE_PIECES, Devices
+from lungaccess.risk.kernels.outcomes import N_START, Judging, find_pieces, find_starts
+from lungaccess.risk.twisted import twisted_shapes
 
-TUBE_PIECES = 4
-"""Arcs of planar tubes, see `stages.tube.device.TubeArcs`."""
+ROUNDING_MM = 1e-9
+"""The planned tip itself stands in the lumen, however its depth is rounded."""
+COLUMNS = (
+    "scope_mm",
+    "tilt_rad",
+    "rotation_rad",
+    "factor",
+    "target_mm",
+    "insertion_mm",
+    "roll_rad",
+    "stop_mm",
+)
+"""The fields of `Deviations` that become the row of a draw, in the order of `kernels.chain`."""
 
 
 @frozen_record
@@ -87,63 +101,92 @@ FIELD_OF: dict[str, str] = {
 """The field of `Deviations` that holds each kind of error."""
 
 
-def deviated_starts(plan: Plan, deviations: Deviations) -> Float:
-    """Return point, tangent and +x axis `(N, 9)` of the deviated scope tips, LPS mm."""
-    frame = np.asarray(plan.scope.lps_from_scope_tip)
-    vectors = deviations.tilt_rad @ frame[:3, :2].T
-    starts = np.zeros((deviations.count, 9))
-    starts[:, :3] = frame[:3, 3] + deviations.scope_mm
-    starts[:, 3:6] = _rotated(frame[:3, 2], vectors)
-    starts[:, 6:] = _rotated(frame[:3, 0], vectors)
+def deviated_starts(plan: Plan, lung: Lung, deviations: Deviations) -> Float:
+    """Return point, tangent and +x axis `(N, 9)` of the deviated scope tips, LPS mm.
+
+    The scope tip stands where the lumen is as deep as the scope's radius, or as deep as at the planned tip if
+    that is less: a shift ends where it would come out of that.
+    """
+    devices, errors, _which = DeviatedPlan(plan).kernel_inputs(deviations)
+    starts = np.zeros((deviations.count, N_START))
+    find_starts(devices, errors, judging(plan, lung), starts)
     return starts
-
-
-def _rotated(direction: Float, vectors: Float) -> Float:
-    """Turn one direction by many rotation vectors `(N, 3)`."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None]
-    axis = vectors / np.where(angle > 0.0, angle, 1.0)
-    along = (axis @ direction)[:, None]
-    turned = np.cos(angle) * direction + np.sin(angle) * np.cross(axis, direction)
-    return np.asarray(turned + (1.0 - np.cos(angle)) * along * axis)
 
 
 def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     """Return the arcs `(N, T + A, 4)` of tubes and needle, see `lungaccess.risk.kernels.deviation`.
 
     Planar tubes have T = 4 arcs.  The radius of the tubes includes the sideways sweep of the plan.  No tube
-    goes back behind the scope tip, nor one behind that around it, nor the needle behind the end of an arc.
+    goes back behind the scope tip, nor one behind that around it, nor the needle behind the end of an arc;
+    and nothing goes farther than the device can.
     """
-    if plan.tube.shape is None:
-        tubes, rolled = _planar_pieces(plan, deviations), deviations.rotation_rad
-    else:
-        tubes, rolled = twisted_pieces(
-            plan, deviations.insertion_mm, deviations.relative_rad, deviations.rotation_rad
-        )
-    return np.concatenate([tubes, _needle_pieces(plan, deviations, rolled)], axis=1)
-
-
-def _planar_pieces(plan: Plan, deviations: Deviations) -> Float:
-    pieces = np.zeros((deviations.count, TUBE_PIECES, kernel.N_PIECE))
-    outer = np.maximum(plan.tube.outer_insertion_mm + deviations.insertion_mm[:, 0], 0.0)
-    inner = np.maximum(plan.tube.inner_insertion_mm + deviations.insertion_mm[:, 1], outer)
-    tubes = plan.system.tubes.arcs(outer, inner)
-    pieces[:, :, kernel.LENGTH] = tubes.length_mm
-    pieces[:, 0, kernel.ROLL] = plan.tube.rotation_rad + deviations.rotation_rad
-    pieces[:, :, kernel.CURVATURE] = tubes.curvature_per_mm
-    pieces[:, :, kernel.RADIUS] = tubes.radius_mm + plan.tube.lateral_sweep_mm
+    devices, errors, which = DeviatedPlan(plan).kernel_inputs(deviations)
+    n_pieces = devices.n_tube + devices.needle.shape[0]
+    pieces = np.zeros((deviations.count, n_pieces, kernel.N_PIECE))
+    find_pieces(devices, errors, which, pieces)
     return pieces
 
 
-def _needle_pieces(plan: Plan, deviations: Deviations, rolled_rad: Float) -> Float:
-    """Return the arcs `(N, A, 4)` of the needle behind tubes that end rolled too far by `(N,)`."""
-    arcs = () if plan.needle is None else plan.needle.arcs
-    pieces = np.zeros((deviations.count, len(arcs), kernel.N_PIECE))
-    pieces[:, :, kernel.RADIUS] = plan.system.track_radius_mm
-    ends = np.cumsum([arc.length_mm for arc in arcs]) + deviations.stop_mm
-    ends = np.maximum.accumulate(np.maximum(ends, 0.0), axis=1)
-    pieces[:, :, kernel.LENGTH] = np.diff(ends, axis=1, prepend=0.0)
-    angles = np.cumsum([arc.roll_rad for arc in arcs]) + deviations.roll_rad
-    pieces[:, :, kernel.ROLL] = np.diff(angles, axis=1, prepend=rolled_rad[:, None])
-    bends = np.array([arc.curvature_per_mm for arc in arcs])
-    pieces[:, :, kernel.CURVATURE] = deviations.factor[:, None] * bends
-    return pieces
+def judging(plan: Plan, lung: Lung) -> Judging:
+    """Return what decides about a deviated plan in its lung."""
+    depth = lung.lumen_depth
+    planned = float(depth.lower_bound_mm(np.asarray(plan.scope.lps_from_scope_tip)[:3, 3])[0])
+    return Judging(
+        depth.corners,
+        depth.geometry,
+        min(plan.system.scope.radius_mm, planned) - ROUNDING_MM,
+        lung.tree.mediastinal,
+        float(plan.exemption.needle_length_mm),
+        np.array(plan.target_lps),
+    )
+
+
+class DeviatedPlan:
+    """A plan as kernels take it that deviate from it."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self._frame = np.array(plan.scope.lps_from_scope_tip)
+        arcs = () if plan.needle is None else plan.needle.arcs
+        self._needle = np.zeros((len(arcs), kernel.N_PIECE))
+        self._needle[:, 0] = np.cumsum([arc.length_mm for arc in arcs])
+        self._needle[:, 1] = np.cumsum([arc.roll_rad for arc in arcs])
+        self._needle[:, 2] = [arc.curvature_per_mm for arc in arcs]
+        self._needle[:, 3] = plan.system.track_radius_mm
+        self._tubes = np.zeros(0) if plan.tube.shape is not None else _tube_values(plan)
+
+    def kernel_inputs(self, deviations: Deviations) -> tuple[Devices, Float, Int]:
+        """Return the devices, the errors in rows, and the number of each draw's shape; see `Devices`."""
+        which, n_tube = np.zeros(deviations.count, dtype=np.int64), TUBE_PIECES
+        shapes, rolled = np.zeros((0, 0, kernel.N_PIECE)), np.zeros(0)
+        if self.plan.tube.shape is not None:
+            shapes, rolled, which = twisted_shapes(
+                self.plan, deviations.insertion_mm, deviations.relative_rad
+            )
+            n_tube = shapes.shape[1]
+        needle = self.plan.system.needle
+        longest = 0.0 if needle is None else needle.max_length_mm
+        devices = Devices(self._frame, self._tubes, self._needle, shapes, rolled, n_tube, longest)
+        return devices, np.column_stack([getattr(deviations, name) for name in COLUMNS]), which
+
+
+def _tube_values(plan: Plan) -> Float:
+    """Return what a kernel has to know of planar tubes `(11,)`, see `chain.Devices`."""
+    tube, tubes = plan.tube, plan.system.tubes
+    longest = tubes.max_extension_mm
+    outer_longest = longest if tubes.outer is None else min(longest, tubes.outer.length_mm)
+    return np.array(
+        [
+            tube.rotation_rad,
+            tube.outer_insertion_mm,
+            tube.inner_insertion_mm,
+            longest,
+            tubes.max_inner_protrusion_mm,
+            tubes.inner.curved_length_mm,
+            tubes.overlap_curvature_per_mm,
+            tubes.inner.precurvature_per_mm,
+            tubes.outermost.radius_mm + tube.lateral_sweep_mm,
+            tubes.inner.radius_mm + tube.lateral_sweep_mm,
+            outer_longest,
+        ]
+    )

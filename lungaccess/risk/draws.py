@@ -80,6 +80,18 @@ class Draws:
             values["target_mm"] = values["target_mm"] + self._breathed_mm(model)[:, None] * DOWN
         return Deviations(**values)
 
+    def numbers(self, model: ErrorModel) -> dict[tuple[str, int], Float]:
+        """Return the standard normal numbers `(N, ...)` that a model uses, by kind and level."""
+        own = Draws(self.count, self._n_arcs, self._seed, self._n_twisted, stretch=self._stretch)
+        own.deviations(model)
+        return own._made
+
+    def with_numbers(self, made: dict[tuple[str, int], Float]) -> Draws:
+        """Return draws with other numbers, by kind and level as `numbers` returns them."""
+        own = Draws(self.count, self._n_arcs, self._seed, self._n_twisted, stretch=self._stretch)
+        own._made = made
+        return own
+
     def _error(
         self, kind: str, shape: tuple[int, ...], distribution: str, patient: float, attempt: float
     ) -> Float:

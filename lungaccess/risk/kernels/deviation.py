@@ -1,20 +1,18 @@
-"""Compiled kernel of the risk: where plans with deviations end, and what they touch before.
+"""Compiled kernel of the risk: what a plan with deviations touches, followed from look to look.
 
-The tubes beyond the scope tip and the needle are one chain of arcs.  `pieces` is `(N, P, 4)`: for each of N
-deviated plans the length in mm, the roll in rad before it, the curvature in 1/mm and the radius in mm of
-each of P arcs; the first `n_tube` of them are the tubes.  `starts` is `(N, 9)`: scope tip, its unit tangent
-and the +x axis of its frame, LPS mm.
+The tubes beyond the scope tip and the needle are one chain of arcs.  `pieces` is `(P, 4)`: the length in mm,
+the roll in rad before it, the curvature in 1/mm and the radius in mm of each of P arcs; the first `n_tube` of
+them are the tubes.  `start` is `(9,)`: scope tip, its unit tangent and the +x axis of its frame, LPS mm.
 """
 
 from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import borrowing_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
 
@@ -41,14 +39,13 @@ _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
 
 
-@inner_kernel
-def _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm):
+@borrowing_kernel
+def _touch(labels, geometry, bits, touched, x, y, z, radius, spared, lumen_mm):
     """Add what a ball touches, and return how far no structure that is not yet touched can be met.
 
     The airway of the branch `spared` counts for nothing (-1: none is spared), but the lumen of any airway
     nearer than `lumen_mm` does (negative: it does not).
     """
-    _clearance, labels, geometry, bits = obstacles
     reach = radius + EXACT_REACH_MM
     gap = EXACT_REACH_MM
     left = bits & ~touched
@@ -72,18 +69,16 @@ def _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm):
     return touched, max(gap, STEP_MM)
 
 
-@inner_kernel
-def _in_lumen(obstacles, depth, x, y, z):
+@borrowing_kernel
+def _in_lumen(labels, geometry, corners, depth_geometry, x, y, z):
     """Return the step to the next point in a lumen, and the branch; NOT_IN_LUMEN outside of all."""
-    _clearance, labels, geometry, _bits = obstacles
     label = label_at(labels, geometry, x, y, z)
     if not label & LUMEN:
         return 0.0, NOT_IN_LUMEN
-    corners, depth_geometry = depth
     return max(distance_bound(corners, depth_geometry, x, y, z), STEP_MM), (label >> BRANCH_SHIFT) - 1
 
 
-@inner_kernel
+@borrowing_kernel
 def _bend(pose, nx, ny, nz, roll, kappa):
     """Return curvature and normal of an arc that begins with a roll from the normal `(nx, ny, nz)`."""
     c, s = math.cos(roll), math.sin(roll)
@@ -93,10 +88,38 @@ def _bend(pose, nx, ny, nz, roll, kappa):
     return kappa, c * nx + s * bx, c * ny + s * by, c * nz + s * bz
 
 
-@inner_kernel
-def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enough):
-    """Follow one chain; return what it touches and the point where it ends."""
-    clearance, _labels, geometry, bits = obstacles
+@borrowing_kernel
+def follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enough):
+    """Return what one chain touches.
+
+    A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
+    radius.  Judging begins where the tubes leave the lumen: the airway of the branch that they leave is
+    spared for the tubes and the first `exempt_mm` of the needle, except that behind the wall the tubes' axis
+    and the needle's surface may not enter a lumen again.  Clearance changes by no more than one moves, so
+    from one look to the next nothing is missed, but for what is touched over less than STEP_MM.
+
+    Parameters
+    ----------
+    obstacles : Obstacles
+        All structures that count.
+    depth : tuple
+        Lumen depth and its geometry.
+    mediastinal : (B,) bool
+        The branches that lie in the mediastinum: what leaves one of them pierces the pleura.
+    start : (9,) float64
+    pieces : (P, 4) float64
+    n_tube : int
+    exempt_mm : float
+    enough : int
+        Flags of which one ends the search for more; 0 to find all that is touched.
+
+    Returns
+    -------
+    int
+        The bits of the structures touched, with STAYS_INSIDE where the chain was not judged.
+    """
+    clearance, labels, geometry, bits = obstacles
+    corners, depth_geometry = depth
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
     nx, ny, nz = start[6], start[7], start[8]
     touched = 0
@@ -106,7 +129,8 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, eno
     left_at = 0.0
     tube_mm = pieces[:n_tube, LENGTH].sum()
     for p in range(pieces.shape[0]):
-        length, roll, kappa, radius = pieces[p]
+        length, roll = pieces[p, LENGTH], pieces[p, ROLL]
+        kappa, radius = pieces[p, CURVATURE], pieces[p, RADIUS]
         bend = _bend(pose, nx, ny, nz, roll, kappa)
         if p == n_tube and pierced == IN_LUMEN:
             touched |= STAYS_INSIDE
@@ -114,7 +138,7 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, eno
         while not touched & (STAYS_INSIDE | enough) and touched & bits != bits:
             x, y, z = point_on_arc(pose, bend, at)
             if pierced == IN_LUMEN:
-                step, here = _in_lumen(obstacles, depth, x, y, z)
+                step, here = _in_lumen(labels, geometry, corners, depth_geometry, x, y, z)
                 if here == NOT_IN_LUMEN:
                     if branch == IN_LUMEN:
                         touched |= STAYS_INSIDE
@@ -133,7 +157,7 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, eno
                         lumen_mm = radius
                     elif done + at > left_at + WALL_ZONE_MM:
                         lumen_mm = 0.0
-                    touched, step = _touch(obstacles, touched, x, y, z, radius, spared, lumen_mm)
+                    touched, step = _touch(labels, geometry, bits, touched, x, y, z, radius, spared, lumen_mm)
             if at >= length:
                 break
             at = min(at + step, length)
@@ -142,60 +166,4 @@ def _follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, eno
         done += length
     if n_tube == pieces.shape[0] and pierced == IN_LUMEN:
         touched |= STAYS_INSIDE
-    return touched, pose[0], pose[1], pose[2]
-
-
-@numba.njit(cache=True, nogil=True)
-def follow(obstacles, depth, mediastinal, starts, pieces, n_tube, exempt_mm, enough, touched, ends):
-    """Follow N deviated plans, and note what each touches and where it ends.
-
-    A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
-    radius.  Judging begins where the tubes leave the lumen: the airway of the branch that they leave is
-    spared for the tubes and the first `exempt_mm` of the needle, except that behind the wall the tubes' axis
-    and the needle's surface may not enter a lumen again.  Clearance changes by no more than one moves, so
-    from one look to the next nothing is missed, but for what is touched over less than STEP_MM.
-
-    Parameters
-    ----------
-    obstacles : Obstacles
-        All structures that count.
-    depth : tuple
-        Lumen depth and its geometry.
-    mediastinal : (B,) bool
-        The branches that lie in the mediastinum: what leaves one of them pierces the pleura.
-    starts : (N, 9) float64
-    pieces : (N, P, 4) float64
-    n_tube : int
-    exempt_mm : float
-    enough : int
-        Flags of which one ends the search for more; 0 to find all that is touched.
-    touched : (N,) int64
-        Receives the bits of the structures touched, with STAYS_INSIDE where the chain was not judged.
-    ends : (N, 3) float64, LPS mm
-        Receives the last points.
-    """
-    for n in range(starts.shape[0]):
-        found, x, y, z = _follow(
-            obstacles, depth, mediastinal, starts[n], pieces[n], n_tube, exempt_mm, enough
-        )
-        touched[n] = found
-        ends[n, 0] = x
-        ends[n, 1] = y
-        ends[n, 2] = z
-
-
-@numba.njit(cache=True, nogil=True)
-def find_ends(starts, pieces, ends):
-    """Note where N deviated plans end, as `follow` does; see there for the parameters."""
-    for n in range(starts.shape[0]):
-        start = starts[n]
-        pose = (start[0], start[1], start[2], start[3], start[4], start[5])
-        nx, ny, nz = start[6], start[7], start[8]
-        for p in range(pieces.shape[1]):
-            length, roll, kappa, _radius = pieces[n, p]
-            bend = _bend(pose, nx, ny, nz, roll, kappa)
-            nx, ny, nz = normal_on_arc(pose, bend, length)
-            pose = pose_on_arc(pose, bend, length)
-        ends[n, 0] = pose[0]
-        ends[n, 1] = pose[1]
-        ends[n, 2] = pose[2]
+    return touched

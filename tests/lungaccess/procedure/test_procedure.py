@@ -191,7 +191,7 @@ def test_the_tubes_end_where_the_plan_has_their_tip(plan: Plan, small_lung: Lung
 
     there = RiskAssessor(plan, small_lung)
     exact = there.draws(1, 0).deviations(ErrorModel())
-    start, pieces = deviated_starts(plan, exact)[0], deviated_pieces(plan, exact)[0]
+    start, pieces = deviated_starts(plan, small_lung, exact)[0], deviated_pieces(plan, exact)[0]
     tip = end_of(pose(start[:3], start[3:6], start[6:]), pieces[: len(pieces) - there.n_arcs])
     assert np.allclose(tip[:3, 3], plan.needle.lps_from_start[:3, 3], atol=1e-6)
 

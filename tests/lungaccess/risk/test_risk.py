@@ -16,6 +16,7 @@ from scipy.stats import binomtest, chi, norm
 import lungaccess as la
 from anatomy.errors import PlanFileError, SettingsError
 from anatomy.lung import Lung
+from anatomy.settings import override
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
@@ -23,13 +24,7 @@ from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessment import assess, safest
 from lungaccess.risk.assessor import RiskAssessor
-from lungaccess.risk.deviations import (
-    TUBE_PIECES,
-    Deviations,
-    deviated_pieces,
-    deviated_starts,
-    no_deviations,
-)
+from lungaccess.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
 from lungaccess.risk.draws import Draws
 from lungaccess.risk.error_files import load_errors
 from lungaccess.risk.errors import (
@@ -42,6 +37,7 @@ from lungaccess.risk.errors import (
     PositionError,
 )
 from lungaccess.risk.kernels import deviation as kernel
+from lungaccess.risk.kernels.chain import TUBE_PIECES
 from lungaccess.risk.statistics import Share
 from lungaccess.risk.tolerances import LARGEST, Tolerance, find_tolerances
 from stages.needle.path import arc_transform
@@ -78,12 +74,12 @@ def in_two(plan: Plan) -> Plan:
     return replace(plan, needle=replace(plan.needle, arcs=(half, other, *rest)))
 
 
-def chain(plan: Plan, deviations: Deviations, n: int) -> tuple[np.ndarray, np.ndarray]:
+def chain(plan: Plan, lung: Lung, deviations: Deviations, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return points every SAMPLES_MM of one deviated plan and their arc lengths, by 4x4 matrices."""
     frame = np.array(plan.scope.lps_from_scope_tip)
     tilt = frame[:3, :2] @ deviations.tilt_rad[n]
     frame[:3, :3] = Rotation.from_rotvec(tilt).as_matrix() @ frame[:3, :3]
-    frame[:3, 3] += deviations.scope_mm[n]
+    frame[:3, 3] = deviated_starts(plan, lung, deviations)[n, :3]
     points, lengths, total = [], [], 0.0
     for length, roll, curvature, _radius in deviated_pieces(plan, deviations)[n]:
         steps = np.linspace(0.0, length, 1 + max(1, math.ceil(length / SAMPLES_MM)))
@@ -109,16 +105,19 @@ def test_deviated_plans_end_where_matrices_say(plan: Plan, small_lung: Lung) -> 
     deviations = Draws(30, there.n_arcs, 5).deviations(load_errors())
     outcomes = there.outcomes(deviations)
     for n in range(30):
-        points, _lengths = chain(bent, deviations, n)
+        points, _lengths = chain(bent, small_lung, deviations, n)
         miss = np.linalg.norm(points[-1] - bent.target_lps - deviations.target_mm[n])
         assert outcomes.miss_mm[n] == pytest.approx(miss, abs=1e-6)
 
 
 def test_the_tubes_have_the_shape_of_the_tube_stage(plan: Plan) -> None:
     """Also where the straight part of the inner tube leaves the scope, or even the outer tube."""
+    # Rear ends in order: with a shorter outer tube the inner one may be that far ahead.
+    shorter = {"tubes.outer.length_mm": SYSTEM.tubes.outer.length_mm - 60.0}
+    ahead = override(SYSTEM, shorter)
     for outer, inner in ((3.0, 20.0), (10.0, 10.0), (15.0, 50.0), (4.0, 58.0), (0.0, 30.0)):
         tube = replace(plan.tube, outer_insertion_mm=outer, inner_insertion_mm=inner)
-        moved = replace(plan, tube=tube)
+        moved = replace(plan, tube=tube, system=ahead)
         nothing = Deviations(**no_deviations(1, len(plan.needle.arcs)))
         pieces = deviated_pieces(moved, nothing)[0, :TUBE_PIECES]
         frame = np.array(plan.scope.lps_from_scope_tip)
@@ -146,7 +145,7 @@ def test_what_is_touched_agrees_with_distances_to_all_voxels(plan: Plan, small_l
     for n in range(60):
         if outcomes.touched[n] & kernel.STAYS_INSIDE:
             continue
-        points, lengths = chain(plan, deviations, n)
+        points, lengths = chain(plan, small_lung, deviations, n)
         tube_mm = pieces[n, :TUBE_PIECES, kernel.LENGTH].sum()
         radius = np.where(lengths <= tube_mm, SYSTEM.tubes.inner.radius_mm, SYSTEM.needle.radius_mm)
         parts = {
@@ -169,12 +168,36 @@ def test_what_is_touched_agrees_with_distances_to_all_voxels(plan: Plan, small_l
     assert seen > 10
 
 
-def test_a_scope_outside_the_airway_deploys_nothing(assessor: RiskAssessor) -> None:
-    errors = no_deviations(1, assessor.n_arcs)
-    errors["scope_mm"] = np.array([[0.0, 0.0, 400.0]])
-    outcomes = assessor.outcomes(Deviations(**errors))
-    assert outcomes.touched[0] == kernel.STAYS_INSIDE
-    assert not assessor.succeeded(outcomes)[0]
+def test_a_scope_goes_as_far_as_the_lumen_lets_it(plan: Plan, small_lung: Lung) -> None:
+    """Its tip keeps the planned depth or its radius, on the way, too, and could not go farther."""
+    errors = no_deviations(200, 1)
+    errors["scope_mm"] = np.random.default_rng(4).normal(0.0, 3.0, (200, 3))
+    planned = np.array(plan.scope.lps_from_scope_tip)[:3, 3]
+    depth = small_lung.lumen_depth.lower_bound_mm
+    least = min(SYSTEM.scope.radius_mm, depth(planned)[0]) - 1e-6
+    made = deviated_starts(plan, small_lung, Deviations(**errors))[:, :3] - planned
+    shares = np.linalg.norm(made, axis=1) / np.linalg.norm(errors["scope_mm"], axis=1)
+    assert np.allclose(made, shares[:, None] * errors["scope_mm"], atol=1e-9)
+    assert (shares < 1.0 - 1e-9).sum() > 20 and (shares > 1.0 - 1e-9).sum() > 5
+    for share, moved, shift in zip(shares, made, errors["scope_mm"], strict=True):
+        way = planned + np.linspace(0.0, 1.0, 50)[:, None] * moved
+        # Between two looks, STEP_MM apart, the depth may be less by half of that.
+        assert depth(way).min() >= least - UNSEEN_MM
+        if share < 1.0 - 1e-9:
+            beyond = np.linspace(0.0, 2.0 * kernel.STEP_MM, 50)[:, None] * shift / np.linalg.norm(shift)
+            assert depth(planned + moved + beyond).min() < least + 1e-6
+
+
+def test_no_device_goes_farther_than_it_can(plan: Plan) -> None:
+    errors = no_deviations(2, len(plan.needle.arcs))
+    errors["insertion_mm"] = np.array([[400.0, 400.0], [-400.0, 400.0]])
+    errors["stop_mm"][:] = 1000.0
+    tubes = SYSTEM.tubes
+    pieces = deviated_pieces(plan, Deviations(**errors))
+    lengths = pieces[:, :TUBE_PIECES, kernel.LENGTH].sum(axis=1)
+    assert lengths[0] == pytest.approx(tubes.max_extension_mm)
+    assert lengths[1] == pytest.approx(min(tubes.max_extension_mm, tubes.max_inner_protrusion_mm))
+    assert pieces[:, TUBE_PIECES:, kernel.LENGTH].sum(axis=1) == pytest.approx(SYSTEM.needle.max_length_mm)
 
 
 def test_leaving_a_main_bronchus_pierces_the_pleura(plan: Plan, small_lung: Lung) -> None:
@@ -218,13 +241,13 @@ def test_rotation_of_the_tubes_leaves_the_needles_roll(plan: Plan) -> None:
     assert pieces[TUBE_PIECES, kernel.ROLL] == pytest.approx(plan.needle.arcs[0].roll_rad - 0.3)
 
 
-def test_nothing_goes_backwards(plan: Plan) -> None:
+def test_nothing_goes_backwards(plan: Plan, small_lung: Lung) -> None:
     bent = in_two(plan)
     draws = Draws(500, len(bent.needle.arcs), 3)
     far = PositionError(attempt_mm=20.0)
     deviations = draws.deviations(ErrorModel(tube_insertion=far, needle_insertion=far))
     assert (deviated_pieces(bent, deviations)[..., kernel.LENGTH] >= 0.0).all()
-    starts = deviated_starts(bent, draws.deviations(NOTHING.only("scope_direction", 40.0)))
+    starts = deviated_starts(bent, small_lung, draws.deviations(NOTHING.only("scope_direction", 40.0)))
     assert np.allclose(np.linalg.norm(starts[:, 3:6], axis=1), 1.0)
     assert np.allclose((starts[:, 3:6] * starts[:, 6:]).sum(axis=1), 0.0)
 

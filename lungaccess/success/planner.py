@@ -32,7 +32,7 @@ class PlannedSuccess:
     plan : Plan
         Proved as every plan; its costs are those of the objective "inverse_clearance".
     succeeds : Share
-        How many procedures succeed of draws that no search has seen.
+        How many procedures succeed of draws that no search has seen; few draws of the first plan.
     errors, procedure : str
         What the error model and the procedure are called.
     """
@@ -60,10 +60,10 @@ def plan_for_success(
 ) -> Iterator[PlannedSuccess]:
     """Plan all stages so that the procedure most often succeeds; yield each plan that is better.
 
-    All deployments of the atlas with a clear direct arc, and the plans of the search by cost, are ranked by
-    how errors spread along them to first order.  The best are raced with common random numbers: all have the
-    same luck, and fewer and fewer get more and more draws.  Then the best is varied.  What a plan states was
-    counted on draws that decided nothing.
+    All deployments of the atlas with a clear direct arc are ranked by how errors spread along them to first
+    order.  The best of them and the plan of least cost are compared by successive halving with common random
+    numbers: all have the same luck, and fewer and fewer get more and more draws.  Then the best is varied.
+    What a plan states was counted on draws that decided nothing.
 
     Parameters
     ----------
@@ -120,11 +120,12 @@ def _run(
         if iterations is not None and tried > iterations:
             break
         if best is None or contender.plan is not best.plan:
+            samples = estimator.halving.samples[0] if best is None else estimator.halving.fresh
             best = contender
             whole = search.finished(contender, tried, clock.elapsed_s)
             yield PlannedSuccess(
                 plan=whole,
-                succeeds=estimator.fresh(whole),
+                succeeds=estimator.fresh(whole, samples),
                 errors=estimator.errors.label,
                 procedure=estimator.procedure.name,
             )

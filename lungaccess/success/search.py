@@ -1,10 +1,12 @@
-"""The search for the plan that most often succeeds: a ranked pool, a race, and variation of the best."""
+"""The search for the plan that most often succeeds: ranking, successive halving, variation of the best."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import count, islice
 
 import numpy as np
 
@@ -21,12 +23,9 @@ from lungaccess.problem.task import Task
 from lungaccess.success.estimate import ChanceEstimator
 from lungaccess.success.spread import Spread
 
-POOL = 150
-"""Candidates that a race begins with: the best is nearly always among so many of first order."""
-A_TIP = 8
-"""Of one scope tip so many: its deployments are alike, and other tips fail otherwise."""
-KEPT = (24, 6)
-"""Candidates that are left after the first and the second round of a race."""
+MANY = 10.0
+"""With so many clear deployments at a scope tip, one is left after measuring in two of three cases; it only
+ranks."""
 BY_COST = 100
 """Iterations of the search by cost, whose best plan takes part."""
 TURN_RAD, SHIFT_MM = math.radians(10.0), 2.0
@@ -38,7 +37,7 @@ SMALLEST = 0.02
 
 @frozen_record
 class Contender:
-    """A candidate or a whole plan in the race, with its successes.
+    """A candidate or a whole plan with its successes.
 
     Parameters
     ----------
@@ -90,16 +89,15 @@ class SuccessSearch:
         NoPlan
             If no direct arc is clear and the search by cost finds nothing.
         """
-        rounds, best = self._estimator.rounds, None
-        pool = self._ranked(self._arcs.clear())
-        first = next((made for made in map(self._contender, pool.tolist()) if made), None)
+        halving, ranked = self._estimator.halving, self._ranked(self._arcs.clear())
+        pool = (made for made in map(self._contender, ranked.tolist()) if made)
+        first = next(pool, None)
         if first is not None:
-            best = self._raced(first, rounds[0])
-            yield best, 0
-        started = [made for made in map(self._contender, pool.tolist()) if made]
-        best = self._race([*started, self._cheapest()])
+            yield self._counted(first, halving.samples[0]), 0
+        started = [each for each in (first, *islice(pool, halving.pool - 1)) if each]
+        best = self._halved([*started, self._cheapest()])
         yield best, 0
-        yield from self._varied(best)
+        yield from self._challenged(best, pool)
 
     def finished(self, contender: Contender, iteration: int, elapsed_s: float) -> Plan:
         """Return the whole plan of a contender."""
@@ -109,18 +107,24 @@ class SuccessSearch:
         return assemble(self._task, contender.candidate, iteration=iteration, timing=timing)
 
     def _ranked(self, clear: Int) -> Int:
-        """Return the entries of the atlas that the race begins with, the most promising first."""
-        radius = self._radius_mm(clear)
-        target, procedure = self._task.target.lps_mm, self._estimator.procedure
-        chances = Spread(self._atlas, clear, target, self._estimator.errors, procedure, radius).chances
+        """Return entries of the atlas with a clear arc, the most promising first, some of each scope tip."""
+        estimator, target = self._estimator, self._task.target.lps_mm
+        spread = Spread(
+            self._atlas, clear, target, estimator.errors, estimator.procedure, self._radius_mm(clear)
+        )
+        site = self._atlas.deployments.site[clear]
+        chances = spread.chances
+        if estimator.procedure.scope.measured:
+            _sites, which, counts = np.unique(site, return_inverse=True, return_counts=True)
+            chances = chances * -np.expm1(-counts[which] / MANY)
         order = np.argsort(-chances, kind="stable")
-        site = self._atlas.deployments.site[clear[order]]
-        # The how manieth of its scope tip each is.
-        by_site = np.argsort(site, kind="stable")
-        starts = np.flatnonzero(np.append(True, np.diff(site[by_site]) != 0))[: len(site)]
-        rank = np.zeros(len(site), dtype=np.int64)
-        rank[by_site] = np.arange(len(site)) - np.repeat(starts, np.diff(np.append(starts, len(site))))
-        return np.asarray(clear[order][rank < A_TIP][:POOL])
+        taken: Counter[int] = Counter()
+        kept = []
+        for entry, at in zip(clear[order].tolist(), site[order].tolist(), strict=True):
+            taken[at] += 1
+            if taken[at] <= estimator.halving.of_a_tip:
+                kept.append(entry)
+        return np.array(kept, dtype=np.int64)
 
     def _radius_mm(self, clear: Int) -> float:
         """Return the radius of the goal."""
@@ -159,28 +163,37 @@ class SuccessSearch:
         )  # fmt: skip
         return Contender(candidate=None, plan=list(plans)[-1], successes=0, samples=1)
 
-    def _raced(self, contender: Contender, samples: int) -> Contender:
+    def _counted(self, contender: Contender, samples: int) -> Contender:
         """Return a contender with its successes of so many draws."""
         successes = self._estimator.successes(contender.plan, samples)
         return replace(contender, successes=successes, samples=samples)
 
-    def _race(self, contenders: Sequence[Contender]) -> Contender:
+    def _halved(self, contenders: Sequence[Contender]) -> Contender:
         """Return the best of several: in each round fewer of them have more draws."""
-        for samples, kept in zip(self._estimator.rounds, (*KEPT, 1), strict=True):
-            raced = [self._raced(each, samples) for each in contenders]
-            contenders = sorted(raced, key=lambda each: -each.successes)[:kept]
+        halving = self._estimator.halving
+        for samples, kept in zip(halving.samples, (*halving.kept, 1), strict=True):
+            counted = [self._counted(each, samples) for each in contenders]
+            contenders = sorted(counted, key=lambda each: -each.successes)[:kept]
         return contenders[0]
 
-    def _varied(self, best: Contender) -> Iterator[tuple[Contender, int]]:
-        """Vary the best contender for ever; yield it after each variation, and how many were tried."""
+    def _challenged(self, best: Contender, others: Iterator[Contender]) -> Iterator[tuple[Contender, int]]:
+        """Let variations of the best contender challenge it, and every other time one of the pool's rest.
+
+        Yield the best after each of them, and how many there were.
+        """
         rng = np.random.Generator(np.random.PCG64(self._task.seed))
-        size, tried = 1.0, 0
-        while best.candidate is not None and size > SMALLEST:
-            tried += 1
-            turn, *shifts = (rng.standard_normal(3) * (TURN_RAD, SHIFT_MM, SHIFT_MM) * size).tolist()
-            better = self._beats(best, self._variation(best.candidate, turn, shifts))
-            size = size if better else SHRINK * size
-            best = better or best
+        # What the tubes do is chosen anew from a measured scope: variations of it change little.
+        size, replanned = 1.0, self._estimator.procedure.scope.measured
+        for tried in count(1):
+            other = next(others, None) if tried % 2 or replanned or best.candidate is None else None
+            if other is None and (best.candidate is None or size < SMALLEST):
+                return
+            if other is not None:
+                best = self._beats(best, other) or best
+            elif best.candidate is not None:
+                turn, *shifts = (rng.standard_normal(3) * (TURN_RAD, SHIFT_MM, SHIFT_MM) * size).tolist()
+                better = self._beats(best, self._variation(best.candidate, turn, shifts))
+                size, best = (size, better) if better else (SHRINK * size, best)
             yield best, tried
 
     def _variation(
@@ -204,9 +217,9 @@ class SuccessSearch:
         """Return another contender if it succeeds more often: with few draws first, then with all of them."""
         if other is None:
             return None
-        few = self._estimator.rounds[1]
+        few = self._estimator.halving.samples[1]
         spread = math.sqrt(max(best.share * (1.0 - best.share), 0.01) / few)
-        if self._raced(other, few).share < best.share - 2.0 * spread:
+        if self._counted(other, few).share < best.share - 2.0 * spread:
             return None
-        whole = self._raced(other, best.samples)
+        whole = self._counted(other, best.samples)
         return whole if whole.successes > best.successes else None

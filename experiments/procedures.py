@@ -20,7 +20,7 @@ from lungaccess.problem.target import point_target
 from lungaccess.procedure import ProcedureReport, load_procedure, procedure_names, simulate_procedure
 from lungaccess.risk import error_preset_names, load_errors
 
-SIZES = {"quick": (2, 20), "full": (12, 200)}
+SIZES = {"quick": (2, 20), "full": (8, 100)}
 """Targets, and procedures for each target, error model and procedure."""
 ITERATIONS = 100
 

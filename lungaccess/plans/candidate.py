@@ -8,7 +8,7 @@ from lungaccess.plans.curves import deployed_pieces, pieces_beyond
 from lungaccess.problem.system import System
 from stages.needle import ArcPath
 from stages.scope import ScopeTip
-from stages.tube import Deployment
+from stages.tube import Deployment, pieces_of_arcs
 
 
 @frozen_record
@@ -33,8 +33,11 @@ class Candidate:
 
 def tubes_in_tissue(system: System, lps_from_scope_tip: Float, deployment: Deployment) -> ArcPath:
     """Return the tubes of a deployment, from where they leave the lumen to their tip, as a path."""
-    outer_mm, inner_mm = deployment.outer_mm, deployment.inner_mm
-    pieces = deployed_pieces(system.tubes, deployment.rotation_rad, outer_mm, inner_mm)
+    outer_mm, inner_mm, shape = deployment.outer_mm, deployment.inner_mm, deployment.shape
+    if shape is None:
+        pieces = deployed_pieces(system.tubes, deployment.rotation_rad, outer_mm, inner_mm)
+    else:
+        pieces = pieces_of_arcs(shape.arcs, deployment.rotation_rad)
     start, arcs = pieces_beyond(lps_from_scope_tip, pieces, deployment.exit_mm)
     return ArcPath(lps_from_start=start, arcs=arcs)
 

@@ -112,9 +112,16 @@ class CandidateEvaluator:
         beyond = path_beyond(path, wall_in_path_mm(self.task.system, deployment))
         return math.isfinite(map_integral(self.task.lung.cost, beyond))
 
-    def aimed(self, tip: ScopeTip, rotation_rad: float, outer_mm: float, inner_mm: float) -> Candidate | None:
-        """Return a deployment that is to end at the target itself, None if it is refused."""
-        deployment = self.tubes.validate(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm)
+    def aimed(
+        self,
+        tip: ScopeTip,
+        rotation_rad: float,
+        outer_mm: float,
+        inner_mm: float,
+        shape: int | TubeShape = -1,
+    ) -> Candidate | None:
+        """Return a deployment that is to end at the target itself, None if it is refused; see `direct`."""
+        deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm, shape)
         if isinstance(deployment, str):
             return None
         path = tubes_in_tissue(self.task.system, tip.lps_from_scope_tip, deployment)

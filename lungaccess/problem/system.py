@@ -76,13 +76,12 @@ class System:
 
     def _check_aim(self) -> None:
         """Without a needle the tip of the tubes must come to points in space, not on a line only."""
-        if not self.tubes.planar or self.tubes.outer is None or not self.tubes.inner.bends:
+        if self.tubes.outer is None or not any(tube.bends for tube in self.tubes.nested):
             raise impossible(
                 "needle",
                 None,
-                "the table [needle], or else a straight outer tube and an inner tube of one arc: the tip of "
-                "one tube or of straight ones comes only to a line or surface from each place of the scope, "
-                "and of others only some shapes are known",
+                "the table [needle], or else two tubes or three of which one is bent: the tip of one tube or "
+                "of straight ones comes only to a line or surface from each place of the scope",
             )
 
     def _check_needle(self, needle: Needle) -> None:

@@ -29,12 +29,13 @@ if TYPE_CHECKING:
     from stages.tube.errors import ConvergenceError
     from stages.tube.following import DeployedSequence, SnapError, deploy
     from stages.tube.inverse import inverse_kinematics
-    from stages.tube.kernels import DesignArrays, ShapeArrays, TubeEnvironment
+    from stages.tube.kernels import DesignArrays, ManyShapes, ShapeArrays, TubeEnvironment
     from stages.tube.mechanics import Batch, TubeMechanics
     from stages.tube.nearby import NearbyShape, NearbyShapes, Neighbourhood
     from stages.tube.nesting import check_nesting
     from stages.tube.one_shape import (
         NO_SHAPES,
+        copies,
         deployed,
         design_arrays,
         many_shapes,

@@ -106,7 +106,14 @@ def _stepped(model: CasadiTubes, base: Float, begin: Float, end: Float, tips: Fl
     while done < 1.0:
         to = min(done + share, 1.0)
         beta = begin + to * (end - begin) if to < 1.0 else end
-        found = model.solve(base, beta, tips)
+        try:
+            found = model.solve(base, beta, tips)
+        except ConvergenceError:
+            # Next to opposite tubes Newton's method needs a guess that is nearer.
+            if share <= LEAST_SHARE:
+                raise
+            share *= 0.5
+            continue
         jumped = float(np.abs(found.tip_angles_rad - tips).max())
         if found.determinant > 0.0 and jumped <= LARGEST_TURN_RAD:
             done, tips, least = to, found.tip_angles_rad, min(least, found.determinant)

@@ -91,6 +91,18 @@ def many_shapes(shapes: TubeShapes, members: Int) -> ManyShapes:
     )
 
 
+def copies(shape: ShapeArrays, count: int) -> ManyShapes:
+    """Return the same shape so many times."""
+    arcs = shape.arcs[: shape.number[0]]
+    return ManyShapes(
+        joints=np.tile(shape.joints, (count, 1)),
+        tips=np.tile(shape.tips, (count, 1)),
+        results=np.tile(shape.result, (count, 1)),
+        arcs=np.tile(arcs, (count, 1)),
+        first_arc=len(arcs) * np.arange(count + 1),
+    )
+
+
 def deployed(design: DesignArrays, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> ShapeArrays | None:
     """Return the shape of joint values, None if the tubes snap or a limit of the design is not kept.
 

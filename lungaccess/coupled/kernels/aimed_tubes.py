@@ -1,6 +1,6 @@
 """Compiled kernel of the search without a needle: it aims tubes at a target, validates and costs them.
 
-`tube` is the tuple (environment, constants) of `stages.tube.kernels`.
+`tube` is that of `lungaccess.coupled.kernels.candidate`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.arcs import normal_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels import cost_of_arc
 from stages.tube.kernels import (
@@ -20,14 +19,24 @@ from stages.tube.kernels import (
     N_TRACE,
     WALL_RUN,
     aim,
+    aim_shape,
+    bend_towards,
+    carried,
+    required_beside,
+    take_member,
     tube_pieces,
+    validate_arcs,
     validate_deployment,
 )
 
-ROTATION, OUTER, INNER, COST, N_AIMED = range(5)
-"""Columns of what is found."""
+ROTATION, OUTER, INNER, COST, JOINTS = range(5)
+"""Columns of what is found; tubes that are not planar have all their joints from JOINTS on."""
 MISSES = -1
 """Stands for a reason where no insertions bring the tip to the target."""
+SPOILT_WAY = -3
+"""Stands for a reason where the tubes would snap, sweep or be strained too much on their way there."""
+TIP_OFF_MM = 5e-7
+"""So far from the target may a tip be after its whole way was followed: half of what a proof allows."""
 NOT_TRIED = -2
 """Stands for a reason where the scope cannot take the tip, or enough were found before."""
 COST_STEP_MM = 0.5
@@ -35,26 +44,41 @@ COST_STEP_MM = 0.5
 
 
 @inner_kernel
-def _cost_beyond(obstacles, objective, constants, base, normal, outer, inner, begin):
-    """Return the weighted cost of the tubes' arcs from an arc length on."""
+def _cost_beyond(obstacles, objective, base, normal, pieces, begin):
+    """Return the weighted cost of the pieces of tubes from an arc length on."""
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])
-    towards = normal
+    across = normal
     total = 0.0
     first = True
-    for start, stop, kappa, _radius in tube_pieces(constants, outer, inner):
+    for start, stop, direction, kappa in pieces:
         if stop <= start:
             continue
         skipped = min(max(begin - start, 0.0), stop - start)
         for length, counts in ((skipped, False), (stop - start - skipped, True)):
             if length <= 0.0:
                 continue
-            bend = (kappa, towards[0], towards[1], towards[2])
+            bend = bend_towards(pose, across, direction, kappa)
             if counts:
                 total += cost_of_arc(obstacles, objective, COST_STEP_MM, pose, bend, length, first)
                 first = False
-            towards = normal_on_arc(pose, bend, length)
-            pose = pose_on_arc(pose, bend, length)
+            pose, across = carried(pose, across, bend, direction, length)
     return total
+
+
+@inner_kernel
+def _pieces_of(constants, outer, inner, shape):
+    """Return begin, end, direction and curvature of each piece of tubes `(P, 4)`."""
+    if shape.number[0] > 0:
+        pieces, at = np.zeros((shape.number[0], 4)), 0.0
+        for m in range(shape.number[0]):
+            length, direction, kappa, _radius = shape.arcs[m]
+            pieces[m] = np.array([at, at + length, direction, kappa])
+            at += length
+        return pieces
+    pieces = np.zeros((4, 4))
+    for m, (start, stop, kappa, _radius) in enumerate(tube_pieces(constants, outer, inner)):
+        pieces[m] = np.array([start, stop, 0.0, kappa])
+    return pieces
 
 
 @numba.njit(cache=True, nogil=True)
@@ -68,6 +92,7 @@ def aim_tubes(
     pose_of,
     outers,
     inners,
+    shapes,
     target,
     enough,
     found,
@@ -88,15 +113,18 @@ def aim_tubes(
         The row of `scope_poses` of each attempt.
     outers, inners : (N,) float64
         Insertions from which each begins, mm.
+    shapes : ManyShapes
+        The shapes from which they begin instead where tubes are not planar.
     target : tuple of 3 floats
     enough : int
         So many deployments end the attempts.
-    found : (N, N_AIMED) float64
+    found : (N, JOINTS + 2 n) float64
         Receives rotation, insertions and estimated cost; the cost is infinite where the tubes are refused.
     why : (N,) int64
-        Receives ACCEPTED, MISSES, NOT_TRIED, or the reason of `stages.tube.kernels`.
+        Receives ACCEPTED, MISSES, SPOILT_WAY, NOT_TRIED, or the reason of `stages.tube.kernels`.
     """
-    environment, constants = tube
+    environment, constants, design, near, shape = tube
+    n_tubes = design.lengths.shape[0]
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
     for n in range(pose_of.shape[0]):
@@ -106,9 +134,20 @@ def aim_tubes(
         if enough <= 0 or not allowed[pose_of[n]]:
             continue
         why[n] = MISSES
-        rotation, outer, inner, miss = aim(constants, base, target, outers[n], inners[n])
-        if not miss <= CLOSE_MM:
-            continue
+        if n_tubes == 0:
+            rotation, outer, inner, miss = aim(constants, base, target, outers[n], inners[n])
+            if not miss <= CLOSE_MM:
+                continue
+        else:
+            take_member(near, shapes, n)
+            rotation, miss, kept = aim_shape(design, near, shape, base, target)
+            if not miss <= TIP_OFF_MM:
+                continue
+            if not kept:
+                why[n] = SPOILT_WAY
+                continue
+            found[n, JOINTS:] = shape.joints
+            outer, inner = shape.joints[n_tubes - 1], shape.joints[0]
         c, s = math.cos(rotation), math.sin(rotation)
         normal = (
             c * base[6] + s * (base[4] * base[8] - base[5] * base[7]),
@@ -118,16 +157,20 @@ def aim_tubes(
         found[n, ROTATION] = rotation
         found[n, OUTER] = outer
         found[n, INNER] = inner
-        reason = validate_deployment(
-            environment, constants, base[:6], np.array(normal), outer, inner, trace, tip
-        )
+        towards = np.array(normal)
+        if n_tubes == 0:
+            reason = validate_deployment(environment, constants, base[:6], towards, outer, inner, trace, tip)
+        else:
+            beside, arcs = required_beside(shape), shape.arcs[: shape.number[0]]
+            reason = validate_arcs(environment, constants, base[:6], towards, arcs, beside, trace, tip)
         why[n] = reason
         if reason != ACCEPTED:
             continue
         left_at = trace[LEFT_AT]
-        cost = _cost_beyond(obstacles, weights, constants, base, normal, outer, inner, left_at)
+        pieces = _pieces_of(constants, outer, inner, shape)
+        cost = _cost_beyond(obstacles, weights, base, normal, pieces, left_at)
         if map_weights.map_integral > 0.0 or map_weights.voxel_sum > 0.0:
             behind = left_at + trace[WALL_RUN]
-            cost += _cost_beyond(obstacles, map_weights, constants, base, normal, outer, inner, behind)
+            cost += _cost_beyond(obstacles, map_weights, base, normal, pieces, behind)
         found[n, COST] = cost
         enough -= 1

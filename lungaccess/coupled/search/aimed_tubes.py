@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,14 +12,40 @@ from anatomy.poses import poses_on_pieces
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kernels.aimed_tubes import COST, INNER, MISSES, N_AIMED, OUTER, ROTATION, aim_tubes
+from lungaccess.coupled.kernels.aimed_tubes import (
+    COST,
+    INNER,
+    JOINTS,
+    MISSES,
+    OUTER,
+    ROTATION,
+    SPOILT_WAY,
+    aim_tubes,
+)
 from lungaccess.plans.candidate import Candidate, tubes_in_tissue
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.system import System
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, Objective, Obstacles
 from stages.scope import ScopeTip
-from stages.tube import REASONS, Deployment, insertion_stops, tube_constants, tube_environment
+from stages.tube import (
+    NO_SHAPES,
+    REASONS,
+    ConcentricTubes,
+    Deployment,
+    ManyShapes,
+    TubeShape,
+    copies,
+    deployed,
+    design_arrays,
+    insertion_stops,
+    many_shapes,
+    shape_arrays,
+    shape_of_arrays,
+    shapes_of,
+    tube_constants,
+    tube_environment,
+)
 
 STOPS_MM = 3.0
 TURN_RAD = math.pi / 12.0
@@ -27,7 +54,45 @@ every point that the tubes can come to.  Stops of turned tips are 4 mm apart, 2.
 the middle between them, and their rotations 30 degrees apart."""
 STARTS_MM = 8.0
 """Spacing of the insertions from which the tubes are aimed from one pose: Newton's method goes as far."""
+SHAPES_TRIED = 60
+"""Shapes of tubes that are not planar from which they are aimed from one pose, half a millisecond each."""
+NO_WAY = "on their way to the target the tubes would snap, sweep tissue or be strained too much"
 NO_SOLUTION = "no insertions bring the tip of the tubes to the target"
+
+
+class AimStarts(NamedTuple):
+    """Deployments from which the tubes are aimed, N of them.
+
+    Parameters
+    ----------
+    outer_mm, inner_mm : (N,) float64
+        Insertions of planar tubes.
+    shapes : ManyShapes
+        Those of tubes that are not planar.
+    """
+
+    outer_mm: Float
+    inner_mm: Float
+    shapes: ManyShapes
+
+    @classmethod
+    def of(cls, atlas: Atlas, entries: Int) -> AimStarts:
+        """Return entries (N,) of an atlas."""
+        made, tubes = atlas.deployments, atlas.system.tubes
+        shapes = NO_SHAPES if tubes.planar else many_shapes(shapes_of(tubes), made.shape[entries])
+        return cls(made.outer_mm[entries], made.inner_mm[entries], shapes)
+
+    @classmethod
+    def around(cls, tubes: ConcentricTubes, found: Float, count: int) -> AimStarts | None:
+        """Return `count` times what was found before; None if tubes that are not planar refuse it."""
+        shapes, ones = NO_SHAPES, np.ones(count)
+        if not tubes.planar:
+            design, n = design_arrays(tubes), len(tubes.nested)
+            made = deployed(design, found[JOINTS : JOINTS + n], found[JOINTS + n :])
+            if made is None:
+                return None
+            shapes = copies(made, count)
+        return cls(found[OUTER] * ones, found[INNER] * ones, shapes)
 
 
 class TubeAiming:
@@ -37,19 +102,12 @@ class TubeAiming:
     ----------
     objective : Objective
         By which deployments are cheap.
-
-    Raises
-    ------
-    SettingsError
-        If the tubes are not planar.
     """
 
     def __init__(self, lung: Lung, system: System, objective: Objective, *, with_fissures: bool) -> None:
-        system.tubes.require_planar("Aiming the tip of the tubes at a target, without a needle,")
-        self._tube = (
-            tube_environment(lung, with_fissures=with_fissures),
-            tube_constants(system.tubes, system.margins),
-        )
+        self._environment = tube_environment(lung, with_fissures=with_fissures)
+        self._constants = tube_constants(system.tubes, system.margins)
+        self._design = design_arrays(system.tubes)
         field, bits = lung.obstacle_field(with_fissures=with_fissures), obstacle_bits(with_fissures)
         self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
         weighed = objective.without_map if lung.cost is None else objective
@@ -58,14 +116,7 @@ class TubeAiming:
         self._weights = arrays._replace(map_integral=0.0, voxel_sum=0.0), of_map
 
     def aim(
-        self,
-        target: Float,
-        tips: Float,
-        allowed: Bool,
-        row_of: Int,
-        outer_mm: Float,
-        inner_mm: Float,
-        enough: int = 0,
+        self, target: Float, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts, enough: int = 0
     ) -> tuple[Float, Int]:
         """Aim the tubes at a point from scope tips.
 
@@ -77,23 +128,27 @@ class TubeAiming:
             Which of them the scope can take.
         row_of : (N,) int64
             The tip of each attempt.
-        outer_mm, inner_mm : (N,) float64
-            Insertions from which each begins.
+        starts : AimStarts
+            From which each begins.
         enough : int
             So many deployments end the attempts; 0 to make all of them.
 
         Returns
         -------
-        found : (N, N_AIMED) float64
-            Rotation in rad, insertions in mm and estimated cost, which is infinite where there is nothing.
+        found : (N, JOINTS + 2 n) float64
+            Rotation in rad, insertions in mm and estimated cost, which is infinite where there is nothing; of
+            tubes that are not planar all joints, too.
         why : (N,) int64
-            0 for a deployment that ends at the point, MISSES, NOT_TRIED, or why the tubes refuse it.
+            0 for a deployment that ends at the point, MISSES, SPOILT_WAY, NOT_TRIED, or why tubes refuse it.
         """
-        found, why = np.zeros((len(row_of), N_AIMED)), np.zeros(len(row_of), dtype=np.int64)
+        found = np.zeros((len(row_of), JOINTS + 2 * len(self._design.lengths)))
+        why = np.zeros(len(row_of), dtype=np.int64)
+        scratch = shape_arrays(self._design), shape_arrays(self._design)
+        tube = (self._environment, self._constants, self._design, *scratch)
         x, y, z = target.tolist()
         aim_tubes(
-            self._tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), outer_mm,
-            inner_mm, (x, y, z), enough or len(row_of), found, why,
+            tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), *starts,
+            (x, y, z), enough or len(row_of), found, why,
         )  # fmt: skip
         return found, why
 
@@ -106,9 +161,17 @@ def near_mm(atlas: Atlas, point: Float) -> Float:
 
 
 def nearest_of_each_tip(atlas: Atlas, entries: Int, away_mm: Float) -> Int:
-    """Return of entries (N,) of an atlas the nearest of each scope tip, the nearest first."""
+    """Return of entries (N,) of an atlas the nearest of each scope tip, the nearest first.
+
+    Where tubes are turned one against the other, it is the nearest of each tip and relative rotation.
+    """
     ordered = entries[np.argsort(away_mm, kind="stable")]
-    _sites, first = np.unique(atlas.deployments.site[ordered], return_index=True)
+    kinds, tubes = atlas.deployments.site[ordered], atlas.system.tubes
+    if not tubes.planar:
+        shapes = shapes_of(tubes)
+        turns = np.unique(shapes.rotations_rad, axis=0, return_inverse=True)[1].ravel()
+        kinds = kinds * (turns.max() + 1) + turns[atlas.deployments.shape[ordered]]
+    _kinds, first = np.unique(kinds, return_index=True)
     return ordered[np.sort(first)]
 
 
@@ -138,20 +201,17 @@ class AimedFromPose:
         """Return the cheapest proved deployment to the target, and its tubes in tissue."""
         task, frame = self._evaluator.task, self._frame
         aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
-        stops = insertion_stops(task.system.tubes, STARTS_MM)
-        outer, inner = (each.ravel() for each in np.meshgrid(stops, stops))
-        outer, inner = outer[outer <= inner].copy(), inner[outer <= inner].copy()
+        starts = self._starts()
+        count = len(starts.outer_mm)
         row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
         found, why = aiming.aim(
-            task.target.lps_mm, row, np.ones(1, dtype=np.bool_), np.zeros(len(outer), dtype=np.int64),
-            outer, inner,
-        )  # fmt: skip
+            task.target.lps_mm, row, np.ones(1, dtype=np.bool_), np.zeros(count, dtype=np.int64), starts
+        )
         self.reasons = {f"tube, aimed at the target: {name}": n for name, n in reasons_of(why).items()}
         for n in np.argsort(found[:, COST], kind="stable").tolist():
             if not np.isfinite(found[n, COST]):
                 break
-            rotation, outer_mm, inner_mm = found[n, [ROTATION, OUTER, INNER]].tolist()
-            made = self._evaluator.tubes.validate(frame, rotation, outer_mm, inner_mm)
+            made = self._evaluator.tubes.choose(frame, *chosen_of(task.system.tubes, found[n]))
             if isinstance(made, str):
                 continue
             path = tubes_in_tissue(task.system, frame, made)
@@ -162,11 +222,35 @@ class AimedFromPose:
             self.why = max(stopped, key=stopped.__getitem__)
         return None
 
+    def _starts(self) -> AimStarts:
+        """Return insertions all over the reach, or the shapes that, turned, end nearest to the target."""
+        tubes, target = self._evaluator.task.system.tubes, self._evaluator.task.target.lps_mm
+        if tubes.planar:
+            stops = insertion_stops(tubes, STARTS_MM)
+            outer, inner = (each.ravel() for each in np.meshgrid(stops, stops))
+            return AimStarts(outer[outer <= inner].copy(), inner[outer <= inner].copy(), NO_SHAPES)
+        shapes, seen = shapes_of(tubes), (target - self._frame[:3, 3]) @ self._frame[:3, :3]
+        tips = shapes.scope_from_tip[:, :3, 3]
+        aside = np.hypot(tips[:, 0], tips[:, 1]) - np.hypot(seen[0], seen[1])
+        near = np.argsort(np.hypot(aside, tips[:, 2] - seen[2]), kind="stable")[:SHAPES_TRIED]
+        inserted = shapes.insertions_mm[near]
+        return AimStarts(inserted[:, -1].copy(), inserted[:, 0].copy(), many_shapes(shapes, near))
+
+
+def chosen_of(tubes: ConcentricTubes, found: Float) -> tuple[float, float, float, int | TubeShape]:
+    """Return a row of what was found as `DeploymentValidator.choose` takes it."""
+    rotation, outer, inner = (float(found[column]) for column in (ROTATION, OUTER, INNER))
+    if tubes.planar:
+        return rotation, outer, inner, -1
+    n = len(tubes.nested)
+    made = deployed(design_arrays(tubes), found[JOINTS : JOINTS + n], found[JOINTS + n :])
+    return rotation, outer, inner, -1 if made is None else shape_of_arrays(made)
+
 
 def reasons_of(why: Int) -> dict[str, int]:
     """Return how many attempts (N,) each reason refused, in words."""
     codes, counts = np.unique(why, return_counts=True)
-    names = {MISSES: NO_SOLUTION, **REASONS}
+    names = {MISSES: NO_SOLUTION, SPOILT_WAY: NO_WAY, **REASONS}
     return {names[c]: n for c, n in zip(codes.tolist(), counts.tolist(), strict=True) if c in names}
 
 
@@ -194,23 +278,21 @@ class AimedTubes:
 
     def aim(self, entries: Int) -> tuple[Float, Int]:
         """Aim from entries of the atlas; see `aim_from`."""
-        made, (tips, row_of) = self.atlas.deployments, tips_of(self.atlas, entries)
+        tips, row_of = tips_of(self.atlas, entries)
         allowed = np.ones(len(tips), dtype=np.bool_)
-        return self.aim_from(tips, allowed, row_of, made.outer_mm[entries], made.inner_mm[entries])
+        return self.aim_from(tips, allowed, row_of, AimStarts.of(self.atlas, entries))
 
-    def aim_from(
-        self, tips: Float, allowed: Bool, row_of: Int, outer_mm: Float, inner_mm: Float
-    ) -> tuple[Float, Int]:
+    def aim_from(self, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts) -> tuple[Float, Int]:
         """Aim the tubes from scope tips, and count why they are refused; see `TubeAiming.aim`.
 
         Returns
         -------
-        found : (N, N_AIMED) float64
+        found : (N, JOINTS + 2 n) float64
         clear : (C,) int64
             The attempts with a deployment, the cheapest first.
         """
         target = self.task.target.lps_mm
-        found, why = self._aiming.aim(target, tips, allowed, row_of, outer_mm, inner_mm)
+        found, why = self._aiming.aim(target, tips, allowed, row_of, starts)
         self.evaluator.blocked.update(reasons_of(why))
         clear = np.flatnonzero(np.isfinite(found[:, COST]))
         return found, clear[np.argsort(found[clear, COST], kind="stable")]
@@ -253,5 +335,4 @@ class AimedTubes:
 
     def candidate(self, tip: ScopeTip, found: Float) -> Candidate | None:
         """Return a row of what was found as a candidate, None if the tubes are refused."""
-        rotation, outer, inner = (float(found[column]) for column in (ROTATION, OUTER, INNER))
-        return self.evaluator.aimed(tip, rotation, outer, inner)
+        return self.evaluator.aimed(tip, *chosen_of(self.task.system.tubes, found))

@@ -10,8 +10,15 @@ from numpy.typing import ArrayLike
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kernels.aimed_tubes import COST, INNER, OUTER, ROTATION
-from lungaccess.coupled.search.aimed_tubes import TubeAiming, near_mm, nearest_of_each_tip, tips_of
+from lungaccess.coupled.kernels.aimed_tubes import COST
+from lungaccess.coupled.search.aimed_tubes import (
+    AimStarts,
+    TubeAiming,
+    chosen_of,
+    near_mm,
+    nearest_of_each_tip,
+    tips_of,
+)
 from lungaccess.plans.candidate import tubes_in_tissue
 from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, UNREACHED, Objective, Reached
 from stages.tube import DeploymentValidator
@@ -94,9 +101,8 @@ class TubeReachScan:
             return None
         tips, row_of = tips_of(atlas, chosen)
         found, _why = self._aiming.aim(
-            point, tips, np.ones(len(tips), dtype=np.bool_), row_of, made.outer_mm[chosen],
-            made.inner_mm[chosen], self._enough,
-        )  # fmt: skip
+            point, tips, np.ones(len(tips), dtype=np.bool_), row_of, AimStarts.of(atlas, chosen), self._enough
+        )
         best = int(found[:, COST].argmin())
         if not np.isfinite(found[best, COST]):
             return None
@@ -108,7 +114,7 @@ class TubeReachScan:
         frame = atlas.motions.tip(int(atlas.deployments.site[entry])).lps_from_scope_tip
         system, fissures = atlas.system, atlas.with_fissures
         tubes = DeploymentValidator(atlas.lung, system.tubes, system.margins, with_fissures=fissures)
-        made = tubes.validate(frame, *(float(found[column]) for column in (ROTATION, OUTER, INNER)))
+        made = tubes.choose(frame, *chosen_of(system.tubes, found))
         if isinstance(made, str):
             return 0.0
         points, _mm = tubes_in_tissue(system, frame, made).sample(STEP_MM)

@@ -10,8 +10,8 @@ import numpy as np
 
 from anatomy.typed import Float, Int
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kernels.aimed_tubes import COST, INNER, OUTER
-from lungaccess.coupled.search.aimed_tubes import AimedTubes
+from lungaccess.coupled.kernels.aimed_tubes import COST
+from lungaccess.coupled.search.aimed_tubes import AimedTubes, AimStarts
 from lungaccess.coupled.search.base import Incumbent, Step, evaluated_step
 from lungaccess.coupled.search.entries import different
 from lungaccess.coupled.search.settings import ESTIMATE_SLACK
@@ -88,10 +88,10 @@ class TubeSearch:
         for shifts_mm in ROWS_MM:
             row = self._evaluator.tip_rows.along(tip, shifts_mm)
             numbers = np.arange(len(shifts_mm))
-            start = np.ones(len(shifts_mm))
-            rows, order = self._aimed.aim_from(
-                row.tips, row.proved, numbers, best[OUTER] * start, best[INNER] * start
-            )
+            starts = AimStarts.around(self._evaluator.task.system.tubes, best, len(shifts_mm))
+            if starts is None:
+                break
+            rows, order = self._aimed.aim_from(row.tips, row.proved, numbers, starts)
             if len(order) and rows[order[0], COST] < best[COST]:
                 best, tip = rows[order[0]], self._evaluator.tip_rows.tip(row, int(order[0]))
         if best is found or best[COST] > ESTIMATE_SLACK * self._incumbent.cost:

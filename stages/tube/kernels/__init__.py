@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from stages.tube.kernels.aiming import CLOSE_MM, aim
+    from stages.tube.kernels.aiming import CLOSE_MM, aim, aim_shape
     from stages.tube.kernels.deployment import (
         ENTRY_COLUMNS,
         ENTRY_TIP,
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
         tip_pose,
         tube_pieces,
     )
-    from stages.tube.kernels.shapes import ARC_COLUMNS
+    from stages.tube.kernels.shapes import ARC_COLUMNS, bend_towards, carried
     from stages.tube.kernels.wall_exit import (
         ACCEPTED,
         BRANCH,

@@ -101,7 +101,7 @@ class ManyShapes(NamedTuple):
 
 
 @inner_kernel
-def _possible(design, joints):
+def in_order(design, joints):
     """Tell whether tubes and their rear ends are in order and none is too far out."""
     n, lengths = design.lengths.shape[0], design.lengths
     for i in range(n):
@@ -122,7 +122,7 @@ def near_shape(design, near, shape):
     Returns whether there is such a shape; neither its sweep nor its strain is judged.
     """
     n = design.lengths.shape[0]
-    if not _possible(design, shape.joints):
+    if not in_order(design, shape.joints):
         return False
     shape.tips[:] = near.tips
     shape.number[0] = arcs_near(
@@ -141,7 +141,7 @@ def whole_way(design, shape):
     """
     shape.number[0] = 0
     joints, result, lengths = shape.joints, shape.result, design.lengths
-    if not _possible(design, joints):
+    if not in_order(design, joints):
         return False
     n = lengths.shape[0]
     arrays = design.stiffness, lengths, design.bends

@@ -52,6 +52,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
         "radius_mm": {
             "scope": plan.system.scope.radius_mm,
             "outer": plan.system.tubes.outermost.radius_mm,
+            "middle": (plan.system.tubes.middle or plan.system.tubes.inner).radius_mm,
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.track_radius_mm,
         },
@@ -122,6 +123,8 @@ def _tubes(plan: Plan) -> Packed:
         "points": pack(np.array(shapes_lps), "f4"),
         "inner_mm": pack(inner, "f4"),
         "outer_mm": pack(outer, "f4"),
+        "middle_mm": pack(np.minimum(inner, max(tube.outer_insertion_mm, tube.middle_insertion_mm)), "f4"),
+        "three": plan.system.tubes.middle is not None,
     }
 
 

@@ -21,10 +21,11 @@ export class Motion {
     [
       motion.route, motion.routeMm, motion.forward, motion.up, motion.tubes, motion.innerMm, motion.outerMm,
       motion.needle, motion.needleMm, motion.margin, motion.insertedMm, motion.sections, motion.shaft, motion.shaftMm,
+      motion.middleMm,
     ] = await Promise.all([
       scope.points, scope.arc_length_mm, scope.forward, scope.up, tubes.points, tubes.inner_mm, tubes.outer_mm,
       needle.points, needle.arc_length_mm, profile.margin_mm,
-      scope.inserted_mm, scope.sections, scope.shaft, scope.shaft_mm,
+      scope.inserted_mm, scope.sections, scope.shaft, scope.shaft_mm, tubes.middle_mm,
     ].map(unpack));
     motion.tubePoints = tubes.points.shape[1];
     motion.sectionPoints = scope.sections.shape[1];
@@ -53,10 +54,10 @@ export class Motion {
     const state = { position, stage, scopeMm, outerMm: Math.min(flush, ends.outer), innerMm, needleMm };
     state.scope = this.body(moved, scopeMm);
     state.camera = this.camera(moved);
-    [state.outer, state.inner] = share[0] < 1 ? [[], []] : this.tube(innerMm);
+    [state.outer, state.middle, state.inner] = share[0] < 1 ? [[], [], []] : this.tube(innerMm);
     state.needle = needleMm > 0 ? cut(this.needle, this.needleMm, needleMm) : [];
     state.needleColours = state.needle.map((_, n) => marginColour(this.margin[Math.min(n, this.margin.length - 1)]));
-    const line = [state.needle, state.inner, state.outer].find((points) => points.length > 1);
+    const line = [state.needle, state.inner, state.middle, state.outer].find((points) => points.length > 1);
     state.tip = line ? line[line.length - 1] : state.scope[state.scope.length - 1];
     state.direction = line ? unit(minus(line[line.length - 1], line[line.length - 2])) : state.camera.forward;
     return state;
@@ -86,29 +87,35 @@ export class Motion {
     return { eye: between(this.route), forward: unit(between(this.forward)), up: unit(between(this.up)) };
   }
 
-  // Return the points of the outer tube and of what the inner one reaches beyond it.
+  // Return the points of the outer tube, and of what the middle and the inner one reach beyond it.
   tube(innerMm) {
     const [n, share] = place(this.innerMm, innerMm);
     const next = Math.min(n + 1, this.innerMm.length - 1);
     const count = this.tubePoints;
-    const outerMm = this.outerMm[n] + share * (this.outerMm[next] - this.outerMm[n]);
+    const ends = [this.outerMm, this.middleMm].map((mm) => mm[n] + share * (mm[next] - mm[n]));
     const points = [];
     for (let k = 0; k < count; k++) {
       points.push(mix(point(this.tubes, n * count + k), point(this.tubes, next * count + k), share));
     }
-    const at = innerMm > 0 ? (outerMm / innerMm) * (count - 1) : 0;
-    const whole = Math.min(Math.floor(at), count - 1);
-    const border = mix(points[whole], points[Math.min(whole + 1, count - 1)], at - whole);
-    return [[...points.slice(0, whole + 1), border], outerMm < innerMm ? [border, ...points.slice(whole + 1)] : []];
+    const [outer, middle] = ends.map((mm) => {
+      const at = innerMm > 0 ? (mm / innerMm) * (count - 1) : 0;
+      const whole = Math.min(Math.floor(at), count - 1);
+      return { whole, border: mix(points[whole], points[Math.min(whole + 1, count - 1)], at - whole) };
+    });
+    return [
+      [...points.slice(0, outer.whole + 1), outer.border],
+      ends[0] < ends[1] ? [outer.border, ...points.slice(outer.whole + 1, middle.whole + 1), middle.border] : [],
+      ends[1] < innerMm ? [middle.border, ...points.slice(middle.whole + 1)] : [],
+    ];
   }
 
   // Say in words where the deployment is.
   words(state) {
     const mm = (value, end) => `${value.toFixed(1)} of ${end.toFixed(1)} mm`;
-    const { ends } = this;
+    const { ends } = this, [all, within] = this.plan.tubes.three ? ["All", "Inner and middle"] : ["Both", "Inner"];
     return [
-      `Scope: ${mm(state.scopeMm, ends.scope)}`, `Both tubes: ${mm(state.outerMm, ends.outer)}`,
-      `Inner tube: ${mm(state.innerMm, ends.inner)}`, `Needle: ${mm(state.needleMm, ends.needle)}`,
+      `Scope: ${mm(state.scopeMm, ends.scope)}`, `${all} tubes: ${mm(state.outerMm, ends.outer)}`,
+      `${within} tube: ${mm(state.innerMm, ends.inner)}`, `Needle: ${mm(state.needleMm, ends.needle)}`,
     ][state.stage];
   }
 

@@ -15,7 +15,7 @@ const DEVICES = [
   { key: "needle", name: "Needle, coloured by clearance", colour: "linear-gradient(90deg, #D81B60, #56B4E9)", shown: true },
   { key: "target", name: "Target", colour: "#39E0B0", shown: true },
 ];
-const OUTER = "#E69F00", INNER = "#F4C95D", OTHER = "#8A8F98", NEEDLE_INK = "#D81B60";
+const OUTER = "#E69F00", MIDDLE = "#EDB42E", INNER = "#F4C95D", OTHER = "#8A8F98", NEEDLE_INK = "#D81B60";
 const CHART = {
   airway: ["airway wall", "#3A9BD5", ""], vessel: ["vessel", "#D81B60", "9 4"],
   pleura: ["pleura", "#B8860B", "3 4"], fissure: ["fissure", "#785EF0", "12 4 3 4"],
@@ -150,6 +150,7 @@ class PlanPage extends AnatomyPage {
     };
     put("scope", followed && shown.scope, (s) => s.tube(state.scope, radius.scope, rgb("#0072B2")));
     put("outer", followed && shown.tubes, (s) => s.tube(state.outer, radius.outer, rgb(OUTER)));
+    put("middle", followed && shown.tubes, (s) => s.tube(state.middle, radius.middle, rgb(MIDDLE)));
     put("inner", followed && shown.tubes, (s) => s.tube(state.inner, radius.inner, rgb(INNER)));
     put("needle", followed && shown.needle, (s) => s.tube(state.needle, radius.needle, state.needleColours));
     put("others", true, (s) => this.otherPlans(s));
@@ -165,7 +166,7 @@ class PlanPage extends AnatomyPage {
       const end = motion.at(1);
       const radius = thickened(motion.plan.radius_mm, this.orbit.distance);
       if (this.shown.scope) solids.tube(end.scope, 0.6 * radius.scope, rgb(OTHER));
-      if (this.shown.tubes) solids.tube([...end.outer, ...end.inner], 0.8 * radius.inner, rgb("#C9A24A"));
+      if (this.shown.tubes) solids.tube([...end.outer, ...end.middle, ...end.inner], 0.8 * radius.inner, rgb("#C9A24A"));
       if (this.shown.needle) solids.tube(end.needle, 0.8 * radius.needle, end.needleColours);
     });
   }
@@ -177,6 +178,7 @@ class PlanPage extends AnatomyPage {
     const lines = [
       this.shown.scope && { points: state.scope, radius: radius.scope, colour: "#3FA9E8" },
       this.shown.tubes && { points: state.outer, radius: radius.outer, colour: OUTER },
+      this.shown.tubes && { points: state.middle, radius: radius.middle, colour: MIDDLE },
       this.shown.tubes && { points: state.inner, radius: radius.inner, colour: INNER },
       this.shown.needle && { points: state.needle, radius: radius.needle, colour: "#FF4081" },
     ].filter((line) => line && line.points.length > 1);

@@ -4,10 +4,11 @@
         [--system ultrathin] [--seed 22] [--keep FOLDER]
 
 One plan to each of many peripheral targets, fissures crossed.  Of each: the proved and the tried part, the
-chance of success open loop (`lungaccess.assess`, default errors), and the share of deviated tips of the tubes
-from which a needle that is planned anew from the tip as measured still arrives.  How tight the proved part is
-follows from poses on its border, and from others 1.5 and 2 times as far off.  Printed are the plans, and
-Spearman's rank correlations, over the ranks within each patient.  FOLDER keeps the plans.
+chance of success open loop (`lungaccess.assess`, default errors), the share of deviated tips of the tubes
+from which a needle still has a path, and the chance with a procedure that measures the tip, alone or after
+the scope (`lungaccess.simulate_procedure`).  How tight the proved part is follows from poses on its border,
+and from others 1.5 and 2 times as far off.  Printed are the plans, and Spearman's rank correlations, over
+the ranks within each patient.  FOLDER keeps the plans.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from anatomy.lung import Lung
 from anatomy.typed import Float
 from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.plan import Plan
+from lungaccess.procedure import load_procedure, simulate_procedure
+from lungaccess.procedure.settings import ScopePlacing
 from lungaccess.risk import RiskAssessor
 from lungaccess.risk.deviations import deviated_pieces, deviated_starts
 from stages.needle import (
@@ -42,6 +45,8 @@ from stages.needle import (
 
 DRAWS = 2000
 """Deviated plans: a share of one half is then known to 2 %."""
+PROCEDURES = 200
+"""Simulated procedures of a plan: one half is then known to 7 %, which is enough to rank."""
 MEASURES = (
     "proved factor", "proved volume", "proved offset", "proved tilt", "tried share", "tried near",
     "least clearance", "needle length", "cost",
@@ -51,7 +56,8 @@ WHOLE = {"offset_mm": 5.0, "tilt_rad": np.radians(7.0)}
 TIMES = (1.0, 1.5, 2.0)
 BORDER = 1000
 """Poses on the border of a proved part."""
-CHANCES = ("open loop", "tip measured")
+CHANCES = ("open loop", "path from tip", "tip measured", "measured-tip")
+"""Nothing measured; a path from the deviated tip; the tip alone measured; the preset procedure."""
 
 
 def plans_of(lung: Lung, system: la.System, count: int, iterations: int, seed: int) -> Iterator[Plan]:
@@ -102,8 +108,12 @@ def measured(plan: Plan, lung: Lung) -> tuple[dict[str, float], float]:
         "needle length": plan.needle.length_mm if plan.needle else 0.0,
         "cost": plan.cost,
         "open loop": la.assess(plan, lung, samples=DRAWS, each_kind=False).succeeds.value,
-        "tip measured": share_of_tips(plan, lung, region.radius_mm),
+        "path from tip": share_of_tips(plan, lung, region.radius_mm),
     }
+    whole = load_procedure("measured-tip")
+    for procedure in (replace(whole, name="tip measured", scope=ScopePlacing()), whole):
+        report = simulate_procedure(plan, lung, procedure=procedure, samples=PROCEDURES)
+        values[procedure.name] = report.succeeds.value
     values |= {f"at {far:g}": share_at(plan, lung, region, far) for far in TIMES}
     return values, spent
 

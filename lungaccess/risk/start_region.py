@@ -62,7 +62,9 @@ def safe_start_region(
     needle = plan.system.require_needle("A safe start region")
     if plan.needle is None or not plan.needle.arcs:
         raise SettingsError(
-            "The needle of the plan has no arc", expected="a needle that starts away from its target"
+            "The needle of the plan has no arc",
+            expected="a needle that starts away from its target",
+            remedy="Choose a plan whose needle leaves the tubes",
         )
     if lung.cost is not None and not np.isfinite(lung.cost.array).all():
         raise SettingsError(

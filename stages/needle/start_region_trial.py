@@ -69,7 +69,11 @@ def try_starts(
         return try_poses(environment, query, path, positions, tangents, iterations=iterations, seed=seed)
 
     if iterations < 0:
-        raise SettingsError(f"A search cannot have {iterations} iterations", expected="0 or more")
+        raise SettingsError(
+            f"A search cannot have {iterations} iterations",
+            expected="0 or more",
+            remedy="Choose 0 for no search, or 100",
+        )
     return try_around(query.lps_from_start, tried, offset_mm=offset_mm, tilt_rad=tilt_rad, poses=poses)
 
 
@@ -182,11 +186,17 @@ def _require_ranges(offset_mm: float, tilt_rad: float, poses: int, directions: i
         raise SettingsError(
             f"Start poses up to {offset_mm} mm away cannot be tried",
             expected=f"above 0, at most {FAR_MM:g} mm",
+            remedy="Choose a distance by which the start may really be off, such as 5 mm",
         )
     if not 0.0 < tilt_rad <= FAR_RAD:
         raise SettingsError(
             f"Start poses tilted by up to {math.degrees(tilt_rad):g} degrees cannot be tried",
             expected=f"above 0, at most {math.degrees(FAR_RAD):g} degrees",
+            remedy="Choose a tilt that may really occur, such as 15 degrees",
         )
     if poses < directions:
-        raise SettingsError(f"{poses} start poses cannot be tried", expected=f"at least {directions}")
+        raise SettingsError(
+            f"{poses} start poses cannot be tried",
+            expected=f"at least {directions}, the directions tried at one place",
+            remedy="Ask for thousands: a share is known to 1 % from 10,000",
+        )

@@ -133,7 +133,7 @@ def share_of_tips(plan: Plan, lung: Lung, radius_mm: float) -> float:
     """Return the share of deviated tips of the tubes from which a clear path is found."""
     assessor = RiskAssessor(plan, lung)
     deviations = assessor.draws(DRAWS, 0).deviations(la.load_errors())
-    starts, pieces = deviated_starts(plan, deviations), deviated_pieces(plan, deviations)
+    starts, pieces = deviated_starts(plan, lung, deviations), deviated_pieces(plan, deviations)
     tubes = pieces[:, : pieces.shape[1] - assessor.n_arcs]
     frames = np.stack([tip_after(start, arcs) for start, arcs in zip(starts, tubes, strict=True)])
     return share_of_poses(plan, lung, radius_mm, frames[:, :3, 3], frames[:, :3, 2])

@@ -16,7 +16,7 @@ def test_tubes_without_errors_end_where_the_plan_says(small_lung: Lung) -> None:
     plan = next(la.plan(small_lung, la.load_system("ultrathin"), la.resolve_target(small_lung), iterations=1))
     assessor = RiskAssessor(plan, small_lung)
     none = Deviations(**assessor.no_deviations(1))
-    start, pieces = deviated_starts(plan, none)[0], deviated_pieces(plan, none)[0]
+    start, pieces = deviated_starts(plan, small_lung, none)[0], deviated_pieces(plan, none)[0]
     tip = study.tip_after(start, pieces[: len(pieces) - assessor.n_arcs])
     np.testing.assert_allclose(tip[:3, 2:], plan.tube.lps_from_tip[:3, 2:], atol=1e-9)
     assert 0.0 <= study.share_of_tips(plan, small_lung, 5.0) <= 1.0

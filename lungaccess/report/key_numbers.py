@@ -55,7 +55,7 @@ def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
     names = " / ".join(name for name, _tube in tubes.named) if tubes.outer is not None else "length"
     insertions = " / ".join(f"{length:.1f}" for length in tube.insertions_mm(tubes)) + " mm"
     rotations = [tube.rotation_rad] if tube.shape is None else tube.rotations_rad(tubes)
-    turned = " / ".join(f"{np.degrees(angle):.1f}°" for angle in rotations)
+    turned = " / ".join(f"{np.degrees(angle) % 360.0:.1f}°" for angle in rotations)
     scope_rows = [
         ("airway generation at the tip", f"{scope.generation}"),
         ("advance beyond the carina", f"{scope.length_from_carina_mm:.1f} mm"),

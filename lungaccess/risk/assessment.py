@@ -53,8 +53,8 @@ class RiskReport:
     sensitivity : tuple of Sensitivity
         What each kind of error does to success, the greatest first; empty if that was not asked for.
     rare : mapping of str to RareShare
-        Touches, and failures, that happened in less than `RARE` of the draws, estimated with weights; empty
-        if that was not asked for.
+        Touches that happened in less than `RARE` of the draws, estimated with weights, where that is exact
+        enough; empty if that was not asked for.
     """
 
     model: ErrorModel
@@ -120,7 +120,8 @@ def assess(
     touched = {name: share_of((outcomes.touched & flag) != 0) for name, flag in assessor.structures.items()}
     kinds = assessor.kinds if each_kind else ()
     alone = {name: assessor.success(draws, stated.only(name)) for name in kinds}
-    rare = [name for name, share in touched.items() if each_kind and share.value < RARE]
+    seldom = [name for name, share in touched.items() if each_kind and share.value < RARE]
+    weighted = {name: rare_touch(assessor, stated, name, samples, seed) for name in seldom}
     return RiskReport(
         model=stated,
         samples=samples,
@@ -135,7 +136,7 @@ def assess(
         alone=MappingProxyType(alone),
         with_needle=plan.needle is not None,
         sensitivity=sensitivities(assessor, stated, samples, seed) if each_kind else (),
-        rare=MappingProxyType({name: rare_touch(assessor, stated, name, samples, seed) for name in rare}),
+        rare=MappingProxyType({name: each for name, each in weighted.items() if each.is_exact}),
     )
 
 

@@ -36,6 +36,8 @@ CENTRES = 32
 """Most centres of the mixture: one for each side from which a structure can be met."""
 APART = 0.8
 """Cosine of the least angle between centres: nearer ones describe one way to fail."""
+EXACT = 30
+"""Effective events from which the normal approximation is usually taken to hold."""
 HALVINGS = 12
 """Of the way to the origin; the rest is a thousandth of it."""
 
@@ -63,6 +65,11 @@ class RareShare:
     effective_samples: float
     samples: int
     centres: int
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether enough was found to believe the interval: else it may happen where nobody looked."""
+        return self.centres > 0 and self.effective_samples >= EXACT
 
 
 def rare_share(happens: Callable[[Float], Bool], dimensions: int, samples: int, seed: int) -> RareShare:

@@ -16,7 +16,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.risk import RiskReport, Tolerance
+    from lungaccess.risk import RareShare, RiskReport, Tolerance
 
 
 def risk(
@@ -79,7 +79,7 @@ def risk(
     if output.json:
         terminal.show_json(record(report, kept))
     else:
-        terminal.show([_outcome_table(report), _tolerance_table(kept)])
+        terminal.show([_outcome_table(report), _sensitivity_table(report), _tolerance_table(kept)])
     return ExitCode.OK
 
 
@@ -98,6 +98,25 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
         "touches": {name: plain_share(share) for name, share in report.touches.items()},
         "forbidden": list(report.forbidden),
         "miss_mm": {f"{share:g}": miss for share, miss in report.miss_mm.items()},
+        "rare": {
+            name: {
+                "probability": rare.value,
+                "interval_95": list(rare.interval),
+                "effective_samples": rare.effective_samples,
+                "centres": rare.centres,
+            }
+            for name, rare in report.rare.items()
+        },
+        "sensitivity": [
+            {
+                "kind": each.kind,
+                "first_order": each.first_order,
+                "total": each.total,
+                "changes": plain_share(each.changes),
+                "succeeds_with_it_alone": plain_share(each.alone),
+            }
+            for each in report.sensitivity
+        ],
         "tolerances": [
             {
                 "kind": each.kind,
@@ -120,7 +139,8 @@ def _outcome_table(report: RiskReport) -> Table:
     ]
     for name, share in report.touches.items():
         words = name if name.startswith("stays") else f"touches {name}"
-        rows.append(share_row(words if name in report.forbidden else f"{words} (allowed)", share))
+        words = words if name in report.forbidden else f"{words} (allowed)"
+        rows.append(_rare_row(words, report.rare[name]) if name in report.rare else share_row(words, share))
     rows += [
         (f"{100.0 * share:.0f} % end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()
     ]
@@ -128,6 +148,31 @@ def _outcome_table(report: RiskReport) -> Table:
         f"{report.samples} deviated plans, errors of '{report.model.label}'; radius: {report.radius_origin}"
     )
     return terminal.table(title, ("", "%", "95 % interval"), rows)
+
+
+def _rare_row(name: str, rare: RareShare) -> terminal.Row:
+    """Return name, per cent and interval of a probability estimated with weights, and how exact it is."""
+    low, high = rare.interval
+    return (
+        f"{name} (weighted)",
+        f"{100.0 * rare.value:.2g}",
+        f"{100.0 * low:.2g} to {100.0 * high:.2g}, as {rare.effective_samples:.0f} events",
+    )
+
+
+def _sensitivity_table(report: RiskReport) -> Table:
+    rows = [
+        (
+            each.kind.replace("_", " "),
+            f"{100.0 * each.alone.value:.1f}",
+            f"{100.0 * each.changes.value:.1f}",
+            f"{each.first_order:.2f}",
+            f"{each.total:.2f}",
+        )
+        for each in report.sensitivity
+    ]
+    headings = ("kind of error", "alone succeeds, %", "outcome changes, %", "first order", "total effect")
+    return terminal.table("What decides: each kind alone, and drawn anew among all others", headings, rows)
 
 
 def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lungaccess.checking import CheckReport
     from lungaccess.checking.findings import Finding
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk import RiskReport, Share
+    from lungaccess.risk import RiskReport, Sensitivity, Share
 
 AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
@@ -188,6 +188,32 @@ def risk_section(report: RiskReport | None, start_words: str = "") -> str:
         f"{of_start}<p class='note'>{words.text(note)}</p>"
         + words.pairs("If the devices deviate", rows)
         + words.pairs("Success with errors of one kind only", alone)
+        + sensitivity_bars(report.sensitivity)
+    )
+
+
+def sensitivity_bars(found: Sequence[Sensitivity]) -> str:
+    """Return a drawing of what each kind of error has to do with success, "" without any."""
+    if not found or not found[0].total:
+        return ""
+    most = max(1.0, found[0].total)
+    rows = []
+    for number, each in enumerate(found):
+        top, total, first = 20 * number, 220.0 * each.total / most, 220.0 * max(each.first_order, 0.0) / most
+        rows.append(
+            f'<text x="0" y="{top + 13}">{words.text(each.kind.replace("_", " "))}</text>'
+            f'<rect x="130" y="{top + 3}" width="{total:.1f}" height="13" fill="#9ecae1"/>'
+            f'<rect x="130" y="{top + 3}" width="{min(first, total):.1f}" height="13" fill="#2171b5"/>'
+            f'<text x="{136 + total:.1f}" y="{top + 13}">{each.total:.2f}</text>'
+        )
+    caption = (
+        "Share of the variance of success that goes with each kind of error: dark by itself, light together "
+        "with others."
+    )
+    return (
+        f'<figure><svg xmlns="http://www.w3.org/2000/svg" width="400" height="{20 * len(found) + 4}" '
+        f'role="img" aria-label="{caption}" font-size="12" fill="currentColor">{"".join(rows)}</svg>'
+        f"<figcaption>{caption}</figcaption></figure>"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -44,7 +44,7 @@ from stages.needle import (
     violation,
     workspace_lengths,
 )
-from stages.tube import Deployment, design_arrays, enumerate_deployments
+from stages.tube import Deployment, Deployments, design_arrays, enumerate_deployments
 
 SKEW = 0.02
 """A measured rotation may be off by so much, about a degree; it is replaced by the nearest rotation."""
@@ -56,6 +56,10 @@ TRIES = 400
 """Variations of rotation, insertions and needle that improve the first answer: some milliseconds."""
 NEEDLE_ITERATIONS = 1500
 """Iterations of the needle's search from a measured tip, as in a replan during insertion."""
+
+
+DeploymentRank = Callable[[Float, Deployments], Float]
+"""Tells from the row `(1, 9)` of a scope tip and N deployments how good `(N,)` each is."""
 
 
 @frozen_record
@@ -145,6 +149,7 @@ def replan_from_scope(
     seed: int = 0,
     tries: int = TRIES,
     searches: int = SEARCHED,
+    rank: DeploymentRank | None = None,
 ) -> RestOfPlan:
     """Plan tubes and needle from where the tip of the scope really is.
 
@@ -161,6 +166,9 @@ def replan_from_scope(
         Variations of rotation, insertions and needle that improve the first answer; 0 for a faster one.
     searches : int
         Deployments from which the needle's own search starts where no direct arc is clear.
+    rank : callable, optional
+        Tells from the row `(1, 9)` of the scope tip and N deployments with a clear direct arc how good each
+        is; the best is taken, instead of the cheapest, and not varied.
 
     Raises
     ------
@@ -175,7 +183,9 @@ def replan_from_scope(
     task = _task(lung, system, target, objective, seed)
     evaluator = CandidateEvaluator(task)
     search = (
-        _FromScope(evaluator, frame, tries, searches) if system.needle else AimedFromPose(evaluator, frame)
+        _FromScope(evaluator, frame, tries, searches, rank)
+        if system.needle
+        else AimedFromPose(evaluator, frame)
     )
     found = search.best()
     if found is None:
@@ -241,9 +251,16 @@ def _task(lung: Lung, system: System, target: Target, objective: str | Objective
 class _FromScope:
     """The search from one pose of the scope."""
 
-    def __init__(self, evaluator: CandidateEvaluator, frame: Float, tries: int, searches: int) -> None:
+    def __init__(
+        self,
+        evaluator: CandidateEvaluator,
+        frame: Float,
+        tries: int,
+        searches: int,
+        rank: DeploymentRank | None,
+    ) -> None:
         self._evaluator, self._frame, self._task = evaluator, frame, evaluator.task
-        self._tries, self._searches = tries, searches
+        self._tries, self._searches, self._rank = tries if rank is None else 0, searches, rank
         system, self._target = self._task.system, self._task.target.lps_mm
         self._row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
         self._outside = 0
@@ -279,13 +296,16 @@ class _FromScope:
         near = near[np.argsort(bounds, kind="stable")]
         blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
         # An arc that costs more than a clear one is of use only where the cheaper ones are not proved.
-        for slack in (1.0, math.inf):
+        for slack in (1.0, math.inf) if self._rank is None else (math.inf,):
             evaluate_arcs(
                 needle, entries.positions[near], entries.tangents[near], entries.branch[near], (x, y, z),
                 slack, math.inf, blockers, costs,
             )  # fmt: skip
             clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
-            for n in clear[np.argsort(costs[clear], kind="stable")].tolist():
+            worst = costs[clear]
+            if self._rank is not None:
+                worst = -self._rank(self._row, entries.only(near[clear]))
+            for n in clear[np.argsort(worst, kind="stable")].tolist():
                 deployment = self._deployment(int(near[n]))
                 path = path_through(deployment, np.zeros((0, 3)), self._target)
                 if self._evaluator.proves(deployment, path):

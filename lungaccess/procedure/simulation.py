@@ -111,7 +111,7 @@ class _Simulator:
             for number in range(count)
         ]
         self._starts = [deviated_starts(plan, lung, each) for each in self._attempts]
-        self._policy = Policy(plan, lung, procedure, self.assessor.radius_mm)
+        self._policy = Policy(plan, lung, model, procedure, self.assessor.radius_mm)
 
     def run(self, processes: int) -> _Found:
         """Return what comes of all procedures."""

@@ -20,8 +20,8 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.parts import Exemption
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
+from lungaccess.procedure.spread import Spread
 from lungaccess.success.estimate import ChanceEstimator
-from lungaccess.success.spread import Spread
 
 MANY = 10.0
 """With so many clear deployments at a scope tip, one is left after measuring in two of three cases; it only
@@ -109,10 +109,12 @@ class SuccessSearch:
     def _ranked(self, clear: Int) -> Int:
         """Return entries of the atlas with a clear arc, the most promising first, some of each scope tip."""
         estimator, target = self._estimator, self._task.target.lps_mm
+        chosen = self._atlas.deployments.only(clear)
+        site = chosen.site
         spread = Spread(
-            self._atlas, clear, target, estimator.errors, estimator.procedure, self._radius_mm(clear)
-        )
-        site = self._atlas.deployments.site[clear]
+            self._task.lung, self._task.system, self._atlas.motions.tips[site], chosen, target,
+            estimator.errors, estimator.procedure, self._radius_mm(clear),
+        )  # fmt: skip
         chances = spread.chances
         if estimator.procedure.scope.measured:
             _sites, which, counts = np.unique(site, return_inverse=True, return_counts=True)

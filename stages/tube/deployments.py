@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -79,6 +79,15 @@ class Deployments:
     def count(self) -> int:
         """Number of accepted deployments, E."""
         return len(self.site)
+
+    def only(self, chosen: Int) -> Deployments:
+        """Return some of them, by their numbers `(N,)`."""
+        arrays: dict[str, Any] = {
+            f.name: read_only(getattr(self, f.name)[chosen])
+            for f in fields(self)
+            if isinstance(getattr(self, f.name), np.ndarray)
+        }
+        return replace(self, **arrays)
 
     def choice(self, entry: int) -> tuple[float, float, float, int]:
         """Return rotation, insertions and shape of one, as `DeploymentValidator.choose` takes them."""

@@ -166,7 +166,7 @@ def test_a_scope_is_measured_in_the_lumen(plan: Plan, small_lung: Lung) -> None:
     from lungaccess.procedure import simulation
 
     simulator = simulation._Simulator(plan, small_lung, ErrorModel(), procedure, 20, 0, None)
-    simulator._policy = Recorded(plan, small_lung, procedure, 5.0)
+    simulator._policy = Recorded(plan, small_lung, ErrorModel(), procedure, 5.0)
     simulator.run(1)
     tips = np.array([each[:3, 3] for each in seen])
     assert len(tips) == 20 and np.linalg.norm(tips - tips.mean(axis=0), axis=1).max() > 0.2

@@ -1,8 +1,8 @@
 """How errors spread along deployed devices, to first order: a fast estimate of the chance of success.
 
-It ranks candidates before any of them is simulated; nothing that a user sees is made of it.  Errors are
-taken as small and normal.  Then each point of a device has a normal error whose covariance is the sum over
-the kinds of error of `v v^T`, where `v` is what one standard deviation moves the point by.
+It ranks candidates before any of them is simulated, and deployments from a scope's tip as measured.  Errors
+are taken as small and normal.  Then each point of a device has a normal error whose covariance is the sum
+over the kinds of error of `v v^T`, where `v` is what one standard deviation moves the point by.
 """
 
 from __future__ import annotations
@@ -12,12 +12,15 @@ from functools import cached_property
 
 import numpy as np
 
+from anatomy.lung import Lung
 from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
-from lungaccess.coupled.atlas import Atlas
+from anatomy.typed import Float
+from lungaccess.problem.system import System
+from lungaccess.problem.task import fissures_are_obstacles
 from lungaccess.procedure.settings import Procedure
 from lungaccess.risk.breathing import share_of_motion
 from lungaccess.risk.errors import BREATHING, CURVATURE, ErrorModel
+from stages.tube import Deployments
 
 TUBE_STATIONS, NEEDLE_STATIONS = 6, 24
 """Points at which clearance is compared with the errors: some mm apart, as vessels are wide."""
@@ -84,48 +87,68 @@ class Residuals:
 
 
 class Spread:
-    """Candidates of an atlas for one target, with what the errors do to each.
+    """Direct arcs of the needle from deployments to one target, with what the errors do to each.
 
     Parameters
     ----------
-    entries : (N,) int64
-        Deployments of the atlas with a clear direct arc to the target.
+    tips : (N, 9) float64
+        Point, direction and +x of the scope tip of each deployment, LPS mm.
+    deployments : Deployments
+        N of them.
     radius_mm : float
         Radius of the goal.
     """
 
     def __init__(
         self,
-        atlas: Atlas,
-        entries: Int,
+        lung: Lung,
+        system: System,
+        tips: Float,
+        deployments: Deployments,
         target_lps: Float,
         errors: ErrorModel,
         procedure: Procedure,
         radius_mm: float,
     ) -> None:
-        self._lung, self._system = atlas.lung, atlas.system
-        found = atlas.deployments
-        self._tips = np.asarray(atlas.motions.tips)[found.site[entries]]
-        self._at, self._ahead = found.positions[entries], found.tangents[entries]
-        self._length, self._exit = found.inner_mm[entries], found.exit_mm[entries]
-        self._with_fissures, self._radius_mm, self._target = atlas.with_fissures, radius_mm, target_lps
-        height = share_of_motion(self._lung.height_share(target_lps))
-        scope = share_of_motion(self._lung.height_share(self._tips[0, :3])) if len(entries) else height
+        self._lung, self._system, self._tips = lung, system, tips
+        self._at, self._ahead = deployments.positions, deployments.tangents
+        self._length, self._exit = deployments.inner_mm, deployments.exit_mm
+        self._with_fissures = fissures_are_obstacles(lung, system)
+        self._radius_mm, self._target = radius_mm, target_lps
+        height = share_of_motion(lung.height_share(target_lps))
+        scope = share_of_motion(lung.height_share(tips[0, :3])) if len(tips) else height
         self._left = Residuals.of(errors, procedure, height - scope)
 
     @cached_property
     def chances(self) -> Float:
-        """The estimated chance of success of each candidate, `(N,)`."""
-        if not len(self._at):
-            return np.zeros(0)
-        needle, normal, kappa, lengths = self._needle_points()
-        tubes = self._tube_points()
-        moved_tubes = self._before(tubes, of_needle=False)
-        moved = [*self._before(needle, of_needle=True), *self._of_needle(needle, normal, kappa, lengths)]
-        beyond = self._margin(tubes, moved_tubes, self._system.tubes.inner.radius_mm, airway=False)
-        ahead = self._margin(needle, moved, self._needle_radius_mm, airway=True)
-        clear = _below(np.minimum(beyond, ahead))
-        return np.asarray(clear * self._hits([each[:, -1] for each in moved]))
+        """The estimated chance of success of each, `(N,)`: to end in the goal, and to stay clear.
+
+        What deviated tubes meet of the airway that they leave is not in it.
+        """
+        return np.asarray(self.goal_chances * self.clear_chances)
+
+    @cached_property
+    def goal_chances(self) -> Float:
+        """The chance of each to end within the goal's radius, `(N,)`."""
+        return self._hits([each[:, -1] for each in self._moved_needle])
+
+    @cached_property
+    def clear_chances(self) -> Float:
+        """The chance of each to stay clear where it is nearest to an obstacle, `(N,)`."""
+        tubes, inner = self._tube_points(), self._system.tubes.inner
+        of_tubes = self._margin(tubes, self._before(tubes, of_needle=False), inner.radius_mm, airway=False)
+        of_needle = self._margin(self._needle[0], self._moved_needle, self._needle_radius_mm, airway=True)
+        return _below(np.minimum(of_tubes, of_needle))
+
+    @cached_property
+    def _needle(self) -> tuple[Float, Float, Float, Float]:
+        return self._needle_points()
+
+    @cached_property
+    def _moved_needle(self) -> list[Float]:
+        """What one standard deviation of each error moves points of the needle by."""
+        points = self._needle[0]
+        return [*self._before(points, of_needle=True), *self._of_needle(*self._needle)]
 
     @property
     def _needle_radius_mm(self) -> float:
@@ -212,7 +235,7 @@ class Spread:
             away = np.linalg.norm(points - self._at[:, None], axis=2) > exempt
             clear = np.where(away, np.minimum(clear, near), clear)
         # Two of three directions lie across a device.
-        variance = sum((each**2).sum(axis=2) for each in moved) / 1.5
+        variance = np.sum([(each**2).sum(axis=2) for each in moved], axis=0) / 1.5
         margin = (clear - radius_mm) / np.sqrt(np.maximum(variance, 1e-12))
         return np.asarray(np.clip(margin, -CAP, CAP).min(axis=1))
 
@@ -225,8 +248,9 @@ class Spread:
         from scipy.special import gammainc
 
         left = self._left
-        end = sum(np.einsum("ni,nj->nij", each, each) for each in moved)
-        end = end + (left.target_mm**2) * np.eye(3)
+        end = np.tile((left.target_mm**2) * np.eye(3), (len(self._at), 1, 1))
+        for each in moved:
+            end += np.einsum("ni,nj->nij", each, each)
         end[:, 2, 2] += left.breathing_mm**2
         end = end + left.stop_mm**2 * np.einsum("ni,nj->nij", self._ahead, self._ahead)
         mean = np.trace(end, axis1=1, axis2=2)

@@ -260,7 +260,7 @@ def test_every_plan_of_the_page_has_its_chance(data: dict[str, Any]) -> None:
         headline = each["headline"]
         assert headline["geometry"] == "proved and checked"
         assert 0.0 <= headline["success"]["probability"] <= 1.0
-        assert headline["draws"] == 200 and headline["errors"]["name"] == "default"
+        assert headline["draws"] == 200 and headline["errors"]["name"] == "breath-hold"
 
 
 # Commands ---------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from itertools import count, islice
 
@@ -82,7 +82,7 @@ class SuccessSearch:
         self._model: Plan | None = None
 
     def steps(self) -> Iterator[tuple[Contender, int]]:
-        """Yield the best contender after each part of the search, and the number of variations tried.
+        """Yield the best contender so far, often, and the number of variations tried.
 
         Raises
         ------
@@ -92,10 +92,11 @@ class SuccessSearch:
         halving, ranked = self._estimator.halving, self._ranked(self._arcs.clear())
         pool = (made for made in map(self._contender, ranked.tolist()) if made)
         first = next(pool, None)
+        first = None if first is None else self._counted(first, halving.samples[0])
         if first is not None:
-            yield self._counted(first, halving.samples[0]), 0
+            yield first, 0
         started = [each for each in (first, *islice(pool, halving.pool - 1)) if each]
-        best = self._halved([*started, self._cheapest()])
+        best = yield from self._halved([*started, self._cheapest()], first)
         yield best, 0
         yield from self._challenged(best, pool)
 
@@ -170,11 +171,20 @@ class SuccessSearch:
         successes = self._estimator.successes(contender.plan, samples)
         return replace(contender, successes=successes, samples=samples)
 
-    def _halved(self, contenders: Sequence[Contender]) -> Contender:
-        """Return the best of several: in each round fewer of them have more draws."""
+    def _halved(
+        self, contenders: Sequence[Contender], first: Contender | None
+    ) -> Generator[tuple[Contender, int], None, Contender]:
+        """Return the best of several: in each round fewer of them have more draws.
+
+        Yield the first one again and again, for a caller whose time ends.
+        """
         halving = self._estimator.halving
         for samples, kept in zip(halving.samples, (*halving.kept, 1), strict=True):
-            counted = [self._counted(each, samples) for each in contenders]
+            counted = []
+            for each in contenders:
+                counted.append(self._counted(each, samples))
+                if first is not None:
+                    yield first, 0
             contenders = sorted(counted, key=lambda each: -each.successes)[:kept]
         return contenders[0]
 

@@ -37,7 +37,7 @@ class HalvingSettings:
 
 OPEN_LOOP = HalvingSettings(pool=150, of_a_tip=8, samples=(256, 1024, 4096), kept=(24, 6), fresh=16384)
 """The best is nearly always among 150 of first order; a share of one half is known to 1 % at the end."""
-MEASURED = HalvingSettings(pool=24, of_a_tip=1, samples=(8, 24, 72), kept=(8, 3), fresh=120)
+MEASURED = HalvingSettings(pool=24, of_a_tip=1, samples=(8, 24, 120), kept=(8, 3), fresh=120)
 """A procedure that plans again takes a thousand times as long as one that does not, and the deployment is
 chosen anew at the tip as measured: tips compete, with few draws."""
 

@@ -176,6 +176,7 @@ class SuccessSearch:
     ) -> Generator[tuple[Contender, int], None, Contender]:
         """Return the best of several: in each round fewer of them have more draws.
 
+        The plan of least cost is in all rounds: nothing that is worse may win by the luck of few draws.
         Yield the first one again and again, for a caller whose time ends.
         """
         halving = self._estimator.halving
@@ -185,7 +186,9 @@ class SuccessSearch:
                 counted.append(self._counted(each, samples))
                 if first is not None:
                     yield first, 0
-            contenders = sorted(counted, key=lambda each: -each.successes)[:kept]
+            contenders = sorted(counted, key=lambda each: -each.successes)
+            by_cost = [each for each in contenders[kept:] if each.candidate is None and kept > 1]
+            contenders = [*contenders[:kept], *by_cost]
         return contenders[0]
 
     def _challenged(self, best: Contender, others: Iterator[Contender]) -> Iterator[tuple[Contender, int]]:

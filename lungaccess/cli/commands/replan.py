@@ -27,6 +27,7 @@ from stages.needle import Objective
 if TYPE_CHECKING:
     from anatomy.typed import Float
     from lungaccess.one_stage import RestOfPlan
+    from lungaccess.plans.plan import Plan
 
 
 def replan(
@@ -61,8 +62,10 @@ def replan(
     from lungaccess.plans.no_plan import NoPlan
 
     stated, weighed, device = target.stated(), Objective.of(objective), system.load()
-    pose = _measured(scope, tube, frame)
+    pose, plan = _measured(scope, tube, frame)
     lung = output.load(patient)
+    if plan is not None:
+        plan.require_lung(lung)
     require_map(lung, weighed)
     aim, ask = stated.resolve(lung), replan_from_tube if scope is None else replan_from_scope
     try:
@@ -80,7 +83,8 @@ def replan(
     return ExitCode.OK
 
 
-def _measured(scope: str | None, tube: str | None, frame: Frame) -> Float:
+def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float, Plan | None]:
+    """Return the pose as measured, and the plan that it is of if it is one of a plan."""
     from anatomy.io.frames import read_pose
     from lungaccess.plans.plan import Plan
 
@@ -92,9 +96,9 @@ def _measured(scope: str | None, tube: str | None, frame: Frame) -> Float:
             remedy="`lungaccess template pose` prints a file to start from",
         )
     if not given.endswith(".json"):
-        return read_pose(given, frame)
+        return read_pose(given, frame), None
     plan = Plan.load(given)
-    return plan.tube.lps_from_tip if scope is None else plan.scope.lps_from_scope_tip
+    return (plan.tube.lps_from_tip if scope is None else plan.scope.lps_from_scope_tip), plan
 
 
 def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:

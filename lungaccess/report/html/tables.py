@@ -210,9 +210,10 @@ def sensitivity_bars(found: Sequence[Sensitivity]) -> str:
         "Share of the variance of success that goes with each kind of error: dark by itself, light together "
         "with others."
     )
+    height = 20 * len(found) + 4
     return (
-        f'<figure><svg xmlns="http://www.w3.org/2000/svg" width="400" height="{20 * len(found) + 4}" '
-        f'role="img" aria-label="{caption}" font-size="12" fill="currentColor">{"".join(rows)}</svg>'
+        f'<figure><svg xmlns="http://www.w3.org/2000/svg" width="400" viewBox="0 0 400 {height}" role="img" '
+        f'aria-label="{caption}" font-size="12" fill="currentColor">{"".join(rows)}</svg>'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 

@@ -177,11 +177,12 @@ def risk_section(report: RiskReport | None, start_words: str = "") -> str:
         (f"miss that {100.0 * share:.0f} % do not exceed", f"{miss:.2f} mm")
         for share, miss in report.miss_mm.items()
     ]
-    alone = [(name, _share(share)) for name, share in report.alone.items()]
+    alone = [(name.replace("_", " "), _share(share)) for name, share in report.alone.items()]
+    assumed = ", ".join(report.model.assumed).replace("_", " ") or "none"
     sizes = report.model.words(with_needle=report.with_needle)
     note = (
         f"{report.samples} deviated plans, seed {report.seed}, open loop, errors of '{report.model.label}': "
-        f"{sizes}; of which assumed: {', '.join(report.model.assumed) or 'none'}. Radius of the "
+        f"{sizes}; of which assumed: {assumed}. Radius of the "
         f"goal: {report.radius_origin}. The range is the 95 % interval."
     )
     return (

@@ -5,19 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tomllib
 from dataclasses import replace
-from importlib import resources
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
 from anatomy.errors import SettingsError
-from anatomy.io.files import read_toml
 from anatomy.margins import Margins
 from anatomy.settings import impossible, parse, settings, switch, text, to_mapping
-from anatomy.suggestion import did_you_mean
+from lungaccess.problem.preset_files import PresetFiles
 from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes
@@ -25,7 +21,11 @@ from stages.tube.device import ConcentricTubes
 _PRESETS = "presets"
 _NEEDLES = "presets/needles"
 _TUBES = "presets/tubes"
-_REMEDY = "`lungaccess presets --show lung-default` prints a complete file to start from"
+_FILES = PresetFiles(
+    what="system",
+    folders=(_PRESETS, _TUBES, _NEEDLES),
+    remedy="`lungaccess presets --show lung-default` prints a complete file to start from",
+)
 
 
 @settings
@@ -147,7 +147,7 @@ class System:
 
 def preset_names() -> tuple[str, ...]:
     """Return the names of the systems that ship with the package, sorted."""
-    return _names_in(_PRESETS)
+    return _FILES.names_in(_PRESETS)
 
 
 def needle_preset_names() -> tuple[str, ...]:
@@ -155,7 +155,7 @@ def needle_preset_names() -> tuple[str, ...]:
 
     They are published needles; scope and tubes are only as large as these need.
     """
-    return _names_in(_NEEDLES)
+    return _FILES.names_in(_NEEDLES)
 
 
 def tube_preset_names() -> tuple[str, ...]:
@@ -163,17 +163,12 @@ def tube_preset_names() -> tuple[str, ...]:
 
     They are not tried where the system is chosen among the presets: their atlas takes minutes.
     """
-    return _names_in(_TUBES)
+    return _FILES.names_in(_TUBES)
 
 
 def shipped_names() -> tuple[str, ...]:
     """Return the names of all systems that ship with the package."""
-    return (*preset_names(), *tube_preset_names(), *needle_preset_names())
-
-
-def _names_in(folder: str) -> tuple[str, ...]:
-    entries = (resources.files("lungaccess") / folder).iterdir()
-    return tuple(sorted(entry.name[:-5] for entry in entries if entry.name.endswith(".toml")))
+    return _FILES.names
 
 
 def preset_text(name: str) -> str:
@@ -184,19 +179,7 @@ def preset_text(name: str) -> str:
     SettingsError
         If there is no such preset.
     """
-    for folder in (_PRESETS, _TUBES, _NEEDLES):
-        if name in _names_in(folder):
-            return (resources.files("lungaccess") / folder / f"{name}.toml").read_text(encoding="utf-8")
-    raise _unknown(name)
-
-
-def _unknown(given: str) -> SettingsError:
-    known = shipped_names()
-    return SettingsError(
-        f"There is no system called {given!r}",
-        expected=f"a preset ({', '.join(known)}) or the path of a .toml file",
-        remedy=did_you_mean(given, known) or _REMEDY,
-    )
+    return _FILES.text(name)
 
 
 def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool | None = None) -> System:
@@ -226,13 +209,7 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     1.0
     """
     given = os.fspath(name_or_path)
-    if given in shipped_names():
-        mapping = tomllib.loads(preset_text(given))
-    elif isinstance(name_or_path, str) and not given.endswith(".toml"):
-        raise _unknown(given)
-    else:
-        mapping = read_toml(Path(name_or_path), remedy=_REMEDY)
-    loaded = parse(System, mapping, given, remedy=_REMEDY)
+    loaded = parse(System, _FILES.read(name_or_path), given, remedy=_FILES.remedy)
     if fissures_allowed is None or fissures_allowed == loaded.fissures_allowed:
         return loaded
     rule = "fissures may be crossed" if fissures_allowed else "fissures are obstacles"

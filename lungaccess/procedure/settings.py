@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-import tomllib
-from importlib import resources
 from typing import Annotated
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import read_toml
 from anatomy.settings import parse, quantity, settings, switch, text
-from anatomy.suggestion import did_you_mean
+from lungaccess.problem.preset_files import PresetFiles
 
 DEFAULT_PROCEDURE = "open-loop"
-_FOLDER = "presets/procedures"
-_REMEDY = "`lungaccess template procedure` prints a complete file to start from"
+_FILES = PresetFiles(
+    what="procedure",
+    folders=("presets/procedures",),
+    remedy="`lungaccess template procedure` prints a complete file to start from",
+    expected="tables such as [scope] with lines such as measured = true",
+)
 
 _Measured = Annotated[bool, switch("whether the tip is measured, and the rest planned again from there")]
 _Position = Annotated[
@@ -142,8 +142,7 @@ class Procedure:
 
 def procedure_names() -> tuple[str, ...]:
     """Return the names of the procedures that ship with the package, sorted."""
-    entries = (resources.files("lungaccess") / _FOLDER).iterdir()
-    return tuple(sorted(each.name[:-5] for each in entries if each.name.endswith(".toml")))
+    return _FILES.names
 
 
 def load_procedure(name_or_path: str | os.PathLike[str] = DEFAULT_PROCEDURE) -> Procedure:
@@ -162,17 +161,7 @@ def load_procedure(name_or_path: str | os.PathLike[str] = DEFAULT_PROCEDURE) -> 
         If the file cannot be read.
     """
     given = os.fspath(name_or_path)
-    if given in procedure_names():
-        written = (resources.files("lungaccess") / _FOLDER / f"{given}.toml").read_text(encoding="utf-8")
-        return parse(Procedure, tomllib.loads(written), given)
-    if isinstance(name_or_path, str) and not given.endswith(".toml"):
-        names = procedure_names()
-        raise SettingsError(
-            f"There is no procedure called {given!r}",
-            expected=f"a preset ({', '.join(names)}) or the path of a .toml file",
-            remedy=did_you_mean(given, names) or _REMEDY,
-        )
-    stated = read_toml(
-        given, expected="tables such as [scope] with lines such as measured = true", remedy=_REMEDY
-    )
-    return parse(Procedure, {"name": os.path.basename(given), **stated}, given, remedy=_REMEDY)
+    stated = _FILES.read(name_or_path)
+    if given in _FILES.names:
+        return parse(Procedure, stated, given)
+    return parse(Procedure, {"name": os.path.basename(given), **stated}, given, remedy=_FILES.remedy)

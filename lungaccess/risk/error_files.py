@@ -5,40 +5,33 @@ from __future__ import annotations
 import functools
 import os
 import tomllib
-from importlib import resources
 from typing import Any
 
 from anatomy.errors import SettingsError
-from anatomy.io.files import read_toml
 from anatomy.settings import parse, to_mapping
-from anatomy.suggestion import did_you_mean
+from lungaccess.problem.preset_files import PresetFiles
 from lungaccess.risk.errors import ErrorModel
 
 DEFAULT_ERRORS = "breath-hold"
 """Images for planning are taken in breath hold, and so is the procedure that repeats it."""
 LIKE = "like"
 """The key of a file that names the preset whose tables stand where the file has none."""
-_FOLDER = "presets/errors"
-_REMEDY = "`lungaccess template errors` prints a complete file to start from"
+_FILES = PresetFiles(
+    what="error model",
+    folders=("presets/errors",),
+    remedy="`lungaccess template errors` prints a complete file to start from",
+    expected="tables such as [scope_position] with lines such as attempt_mm = 1.0",
+)
 
 
 def error_preset_names() -> tuple[str, ...]:
     """Return the names of the error models that ship with the package, sorted."""
-    entries = (resources.files("lungaccess") / _FOLDER).iterdir()
-    return tuple(sorted(each.name[:-5] for each in entries if each.name.endswith(".toml")))
+    return _FILES.names
 
 
 @functools.cache
 def _preset(name: str) -> ErrorModel:
-    if name not in error_preset_names():
-        names = error_preset_names()
-        raise SettingsError(
-            f"There is no error model called {name!r}",
-            expected=f"a preset ({', '.join(names)}) or the path of a .toml file",
-            remedy=did_you_mean(name, names) or _REMEDY,
-        )
-    written = (resources.files("lungaccess") / _FOLDER / f"{name}.toml").read_text(encoding="utf-8")
-    return parse(ErrorModel, tomllib.loads(written), name)
+    return parse(ErrorModel, tomllib.loads(_FILES.text(name)), name)
 
 
 def load_errors(name_or_path: str | os.PathLike[str] = DEFAULT_ERRORS) -> ErrorModel:
@@ -65,14 +58,14 @@ def load_errors(name_or_path: str | os.PathLike[str] = DEFAULT_ERRORS) -> ErrorM
     1.3
     """
     given = os.fspath(name_or_path)
-    if isinstance(name_or_path, str) and not given.endswith(".toml"):
+    if given in _FILES.names:
         return _preset(given)
-    stated = read_toml(
-        given, expected="tables such as [scope_position] with lines such as attempt_mm = 1.0", remedy=_REMEDY
-    )
+    stated = _FILES.read(name_or_path)
     like = stated.pop(LIKE, DEFAULT_ERRORS)
     if not isinstance(like, str):
-        raise SettingsError(f"{given}: {LIKE} = {like!r}", expected="the name of a preset", remedy=_REMEDY)
+        raise SettingsError(
+            f"{given}: {LIKE} = {like!r}", expected="the name of a preset", remedy=_FILES.remedy
+        )
     base: dict[str, Any] = to_mapping(_preset(like))
     filled = {**base, "description": "", "name": os.path.basename(given), **stated}
-    return parse(ErrorModel, filled, given, remedy=_REMEDY)
+    return parse(ErrorModel, filled, given, remedy=_FILES.remedy)

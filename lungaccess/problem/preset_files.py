@@ -1,0 +1,77 @@
+"""Settings by the name of a preset that ships with the package, or by the path of a TOML file."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from importlib import resources
+from typing import Any
+
+from anatomy.errors import SettingsError
+from anatomy.io.files import read_toml
+from anatomy.records import frozen_value
+from anatomy.suggestion import did_you_mean
+
+
+@frozen_value
+class PresetFiles:
+    """The presets of one kind of settings, and files of one's own.
+
+    Parameters
+    ----------
+    what : str
+        What one of them is called in an error.
+    folders : tuple of str
+        Where the presets lie in the package.
+    expected, remedy : str
+        What a file holds, and what to do where it does not.
+    """
+
+    what: str
+    folders: tuple[str, ...]
+    remedy: str
+    expected: str = "UTF-8 text in TOML syntax"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the presets, sorted in each folder."""
+        return tuple(name for folder in self.folders for name in self.names_in(folder))
+
+    @staticmethod
+    def names_in(folder: str) -> tuple[str, ...]:
+        """Return the names of the presets in one of the folders, sorted."""
+        entries = (resources.files("lungaccess") / folder).iterdir()
+        return tuple(sorted(each.name[:-5] for each in entries if each.name.endswith(".toml")))
+
+    def text(self, name: str) -> str:
+        """Return the TOML text of a preset, with its comments.
+
+        Raises
+        ------
+        SettingsError
+            If there is no such preset.
+        """
+        for folder in self.folders:
+            if name in self.names_in(folder):
+                return (resources.files("lungaccess") / folder / f"{name}.toml").read_text(encoding="utf-8")
+        names = self.names
+        raise SettingsError(
+            f"There is no {self.what} called {name!r}",
+            expected=f"a preset ({', '.join(names)}) or the path of a .toml file",
+            remedy=did_you_mean(name, names) or self.remedy,
+        )
+
+    def read(self, name_or_path: str | os.PathLike[str]) -> dict[str, Any]:
+        """Return the values of a preset, or of a file whose name ends in ``.toml``.
+
+        Raises
+        ------
+        SettingsError
+            If there is no such preset, or the file is not TOML.
+        FileError
+            If the file cannot be read.
+        """
+        given = os.fspath(name_or_path)
+        if given in self.names or (isinstance(name_or_path, str) and not given.endswith(".toml")):
+            return tomllib.loads(self.text(given))
+        return read_toml(given, expected=self.expected, remedy=self.remedy)

@@ -13,6 +13,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
 from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
 from anatomy.grid import Grid, Volume
+from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.lung import Lung
 from anatomy.morphology import bounds, window
 from anatomy.patient import PatientImages
@@ -87,6 +88,8 @@ def build_lung(
 
     keep, tell = keep or _unchanged, progress or _silent
     warnings = list(images.warnings)
+    if images.fissures is None:
+        warnings.append(f"Fissures are not checked: {FISSURES_UNKNOWN}.")
     _require_tissue(images)
     tell("airway tree")
     tree = tree_from_mask(images.lumen)

@@ -6,6 +6,7 @@ import math
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.records import frozen_value
 from anatomy.words import plural
 from lungaccess.appraisal.grade import Grade, grade_of_chance
@@ -46,11 +47,14 @@ class Headline:
         Findings of the check that are not ok.
     risk : RiskReport or None
         The estimate of success; None if there is none, as for a refused plan.
+    fissures_unknown : bool
+        Whether fissures must not be crossed, and the patient has no mask of them.
     """
 
     geometry: Geometry
     refusals: int = 0
     risk: RiskReport | None = None
+    fissures_unknown: bool = False
 
     @classmethod
     def of(cls, report: CheckReport | None, risk: RiskReport | None) -> Headline:
@@ -58,7 +62,8 @@ class Headline:
         if report is None:
             return cls(geometry=Geometry.UNCHECKED, risk=risk)
         geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
-        return cls(geometry=geometry, refusals=len(report.refusals), risk=risk)
+        unknown = any(each.name == "patient.fissures" for each in report.unchecked)
+        return cls(geometry=geometry, refusals=len(report.refusals), risk=risk, fissures_unknown=unknown)
 
     @property
     def success(self) -> Share | None:
@@ -69,7 +74,7 @@ class Headline:
     def grade(self) -> Grade:
         """The worse of geometry and chance of success: accepted geometry alone is never good."""
         of_geometry = {
-            Geometry.PROVED: Grade.GOOD,
+            Geometry.PROVED: Grade.UNKNOWN if self.fissures_unknown else Grade.GOOD,
             Geometry.UNCHECKED: Grade.UNKNOWN,
             Geometry.REFUSED: Grade.POOR,
         }[self.geometry]
@@ -110,7 +115,13 @@ class Headline:
     def _geometry(self) -> str:
         if self.geometry == Geometry.REFUSED:
             return f"Refused by the independent check ({plural(self.refusals, 'finding')})."
-        return f"Geometry {self.geometry}."
+        return f"{self.geometry_words.capitalize()}."
+
+    @property
+    def geometry_words(self) -> str:
+        """What is known of the geometry, and that fissures are not checked where they are not known."""
+        missing = f", fissures not checked: {FISSURES_UNKNOWN}" if self.fissures_unknown else ""
+        return f"geometry {self.geometry}{missing}"
 
     def _chance(self) -> str:
         if self.risk is None:
@@ -162,6 +173,7 @@ class Headline:
             "grade": self.grade.key,
             "verdict": self.verdict,
             "geometry": str(self.geometry),
+            "fissures_unknown": self.fissures_unknown,
             "success": None if risk is None else _share(risk.succeeds),
             "most_frequent_failure": {"what": first[0][0], **_share(first[0][1])} if first else None,
             "failures": None if risk is None else {name: _share(share) for name, share in risk.failures},

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.typed import Float
 from lungaccess.checking.boxes import Boxes
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.shapes import STEP_MM
 from lungaccess.plans.plan import Plan
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+Case = TypeVar("Case", bound=tuple[Any, ...])
 
 CLEARANCE_TOLERANCE_MM = 1e-3
 """A planner may keep exactly the required clearance, so that the check may find a micrometre less."""
@@ -32,6 +41,15 @@ STATED_MM = 5.0
 
 REACH_MM = 20.0
 """Clearances are recomputed up to this distance; what lies farther counts as this far."""
+
+
+def structures_known(cases: Iterable[Case], stage: str, lung: Lung, found: Findings) -> Iterator[Case]:
+    """Yield the structures to keep clear of, and record that fissures are not checked if there is no mask."""
+    for case in cases:
+        if case[0] == "fissure" and not lung.has_fissures:
+            found.unchecked(f"{stage}.clearance.fissure", FISSURES_UNKNOWN)
+        else:
+            yield case
 
 
 def check_clear(

@@ -11,7 +11,7 @@ from anatomy import structures
 from anatomy.typed import Float, Labels
 from lungaccess.checking import shapes
 from lungaccess.checking.channel import check_channel, deployed_strain_factor
-from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
+from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance, structures_known
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import check_rigid, check_same_pose
@@ -179,7 +179,8 @@ def _check_clearance(
     contact = _first_contact(environment.lung, curve, way_out, plan)
     margin = plan.system.margins.total_mm + beside_mm
     needed = shapes.radius_at(plan, curve.arc_mm[:-1] + ROUNDING_MM) + margin + curve.sagitta_mm
-    for name, select, first in obstacles_of(way_out.branch, contact, way_out.frame):
+    cases = obstacles_of(way_out.branch, contact, way_out.frame)
+    for name, select, first in structures_known(cases, "tube", environment.lung, found):
         boxes = environment.boxes(select, REACH_MM)
         points = curve.points[first:]
         least = check_clear(

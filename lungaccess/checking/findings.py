@@ -21,6 +21,8 @@ class Finding:
     ----------
     name : str
         Stage and property, such as "needle.clearance.vessel".
+    ok : bool or None
+        None for what could not be checked.
     value, limit : float or None
         What was found and the bound it had to keep; None for what is not a number.
     side : str or None
@@ -32,7 +34,7 @@ class Finding:
     """
 
     name: str
-    ok: bool
+    ok: bool | None
     value: float | None = None
     limit: float | None = None
     side: Side | None = None
@@ -52,20 +54,24 @@ class Finding:
         """First word of the name: what it is about."""
         return self.name.split(".")[0]
 
+    @property
+    def verdict(self) -> str:
+        """What the check says in a word or two: "ok", "REFUSED" or "not checked"."""
+        return "not checked" if self.ok is None else "ok" if self.ok else "REFUSED"
+
     def __str__(self) -> str:
-        mark = "ok     " if self.ok else "REFUSED"
         unit = f" {self.unit}" if self.unit else ""
         number = "" if self.value is None else f" {self.value:.6g}{unit}"
         spare = f", tolerance {self.tolerance:.3g}" if self.tolerance else ""
         bound = f" ({self.side} {self.limit:.6g}, margin {self.margin:.3g}{spare})" if self.side else ""
         detail = f": {self.detail}" if self.detail else ""
-        return f"{mark} {self.name}{number}{bound}{detail}"
+        return f"{self.verdict:7} {self.name}{number}{bound}{detail}"
 
     def cells(self) -> tuple[str, ...]:
         """Return what a row of a table says: verdict, name, value, limit, margin and detail."""
         unit = f" {self.unit}" if self.unit else ""
         return (
-            "ok" if self.ok else "REFUSED",
+            self.verdict,
             self.name,
             "" if self.value is None else f"{self.value:.4g}{unit}",
             "" if self.side is None else f"{self.side} {self.limit:.4g}",
@@ -83,7 +89,7 @@ class Finding:
 
 @frozen_value
 class CheckReport:
-    """The verdict of the check: accepted only if every finding is ok."""
+    """The verdict of the check: accepted only if no finding is refused; what is not checked is listed."""
 
     accepted: bool
     findings: tuple[Finding, ...]
@@ -98,11 +104,18 @@ class CheckReport:
     @property
     def refusals(self) -> tuple[Finding, ...]:
         """The findings that are not ok."""
-        return tuple(finding for finding in self.findings if not finding.ok)
+        return tuple(finding for finding in self.findings if finding.ok is False)
+
+    @property
+    def unchecked(self) -> tuple[Finding, ...]:
+        """What could not be checked."""
+        return tuple(finding for finding in self.findings if finding.ok is None)
 
     def to_mapping(self) -> dict[str, object]:
         """Return the report as plain JSON values."""
-        return {"accepted": self.accepted, "findings": [each.to_mapping() for each in self.findings]}
+        findings = [each.to_mapping() for each in self.findings]
+        unchecked = [each.name for each in self.unchecked]
+        return {"accepted": self.accepted, "not_checked": unchecked, "findings": findings}
 
     def __str__(self) -> str:
         verdict = "accepted" if self.accepted else f"REFUSED ({len(self.refusals)} findings)"
@@ -119,6 +132,10 @@ class Findings:
         """Record a statement that must be true, and return it."""
         self._all.append(Finding(name=name, ok=bool(ok), detail=detail))
         return bool(ok)
+
+    def unchecked(self, name: str, detail: str) -> None:
+        """Record what could not be checked, and why."""
+        self._all.append(Finding(name=name, ok=None, detail=detail))
 
     def measured(self, name: str, value: float, unit: str, detail: str) -> None:
         """Record what was measured where nothing limits it."""
@@ -169,9 +186,9 @@ class Findings:
             detail=detail,
         )
         self._all.append(made)
-        return made.ok
+        return bool(ok)
 
     def report(self) -> CheckReport:
         """Return what was collected; nothing collected is not accepted."""
-        accepted = bool(self._all) and all(finding.ok for finding in self._all)
+        accepted = any(each.ok for each in self._all) and all(each.ok is not False for each in self._all)
         return CheckReport(accepted=accepted, findings=tuple(self._all))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from anatomy import structures
 from anatomy.typed import Bool, Float
-from lungaccess.checking.clearances import CLEARANCE_TOLERANCE_MM, REACH_MM, check_clear
+from lungaccess.checking.clearances import CLEARANCE_TOLERANCE_MM, REACH_MM, check_clear, structures_known
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import CheckReport, Findings
 from lungaccess.checking.poses import POSITION_TOLERANCE_MM, check_rigid
@@ -82,7 +82,7 @@ def _check_clear(
         ("fissure", structures.FISSURE, everywhere),
         ("airway", structures.AIRWAY, ~exempt),
     ]
-    for name, bits, where in cases:
+    for name, bits, where in structures_known(cases, "needle", environment.lung, found):
         first, last = run_of_frames(where)
         if last - first < 1:
             continue

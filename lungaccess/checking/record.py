@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy.errors import LungaccessError
+from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.settings import to_mapping
 from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
@@ -42,15 +43,22 @@ def check_record(
     _check_patient(plan, lung, found)
     _check_system(plan, found, system)
     _check_required(plan, found)
-    allowed = plan.system.fissures_allowed
-    found.true(
-        "patient.fissures",
-        plan.fissures_are_obstacles == (lung.has_fissures and not allowed),
-        f"obstacles: {plan.fissures_are_obstacles}; mask: {lung.has_fissures}; system allows: {allowed}",
-    )
+    _check_fissures(plan, lung, found)
     if target_lps is not None:
         found.agrees("target.given", plan.target_lps, target_lps, 1e-6, "mm")
     return _check_lengths(plan, found)
+
+
+def _check_fissures(plan: Plan, lung: Lung, found: Findings) -> None:
+    """The plan treats fissures as mask and system say; without a mask it states no distance from them."""
+    allowed, known = plan.system.fissures_allowed, lung.has_fissures
+    stated = any("fissure" in distances for distances in plan.clearance_mm.values())
+    right = plan.fissures_are_obstacles == (known and not allowed) and (known or not stated)
+    if right and not known and not allowed:
+        found.unchecked("patient.fissures", FISSURES_UNKNOWN)
+        return
+    detail = f"obstacles: {plan.fissures_are_obstacles}; mask: {known}; system allows: {allowed}"
+    found.true("patient.fissures", right, f"{detail}; distance stated: {stated}")
 
 
 def _sizes(value: object, where: str) -> Iterator[tuple[str, float]]:

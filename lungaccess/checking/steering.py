@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.typed import Float
-from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance
+from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance, structures_known
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.outcome import check_costs, check_target, forbidden_bits
@@ -143,7 +143,7 @@ def _check_clearance(
         ("fissure", has(structures.FISSURE), everywhere, required),
     ]
     nearest: dict[str, float] = {}
-    for name, select, where, needed in cases:
+    for name, select, where, needed in structures_known(cases, "needle", environment.lung, found):
         first, last = run_of_frames(where)
         if last - first < 1:
             continue

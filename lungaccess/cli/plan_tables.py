@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 
 GRADE_STYLES = {Grade.GOOD: "green", Grade.FAIR: "yellow", Grade.UNKNOWN: "yellow", Grade.POOR: "red"}
+MARKS = {True: "[green]ok[/]", False: "[bold red]refused[/]", None: "[yellow]not checked[/]"}
 
 
 def plan_record(
@@ -38,6 +39,7 @@ def plan_record(
         "found": True,
         **appraisal.to_mapping(),
         "refusals": [each.to_mapping() for each in appraisal.check.refusals],
+        "not_checked": [each.name for each in appraisal.check.unchecked],
         "folder": str(folder),
         "files": list(files),
         "digest": plan.digest,
@@ -141,7 +143,7 @@ def arcs_table(arcs: Iterable[Sequence[float]]) -> Table:
 def show_appraisal(appraisal: Appraisal) -> None:
     """Print the headline, then the limits, and what the check refuses, if anything."""
     show_headline(appraisal.headline)
-    for finding in appraisal.check.refusals:
+    for finding in (*appraisal.check.refusals, *appraisal.check.unchecked):
         terminal.say(f"{finding}")
     if appraisal.limits:
         terminal.show([limits_table(appraisal)])
@@ -187,7 +189,7 @@ def _findings_table(stage: str, findings: list[Finding]) -> Table:
         made.add_column(heading, justify="right")
     made.add_column("")
     for finding in findings:
-        mark = "[green]ok[/]" if finding.ok else "[bold red]refused[/]"
+        mark = MARKS[finding.ok]
         limit = "" if finding.side is None else f"{finding.side} {finding.limit:.4g}"
         unit = f" {finding.unit}" if finding.unit else ""
         made.add_row(

@@ -47,7 +47,7 @@ def _general_rows(plan: Plan) -> list[Row]:
 def _fissures(plan: Plan) -> str:
     if plan.fissures_are_obstacles:
         return "are obstacles"
-    return "may be crossed" if plan.system.fissures_allowed else "not known"
+    return "may be crossed" if plan.system.fissures_allowed else "not checked: no mask"
 
 
 def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:

@@ -35,7 +35,7 @@ def readme(plan: Plan, report: CheckReport, files: tuple[str, ...]) -> str:
         f"Plan {plan.digest[:16]}, anatomy {plan.lung_key[:16]}",
         "",
         f"The independent check {verdict} this plan.",
-        *(f"  {finding}" for finding in report.refusals),
+        *(f"  {finding}" for finding in (*report.refusals, *report.unchecked)),
         "It says nothing of the chance of success, which `lungaccess risk` estimates.",
         "",
         "Research software, not a medical device. Not for the treatment of patients.",

@@ -72,12 +72,16 @@ def _folded(summary: str, content: str) -> str:
 
 
 def _refusals(report: CheckReport) -> str:
+    """Return the verdict, what is refused, and what could not be checked."""
+    missing = words.bullets(report.unchecked)
+    missing = (
+        f"<p>{plural(len(report.unchecked), 'thing')} could not be checked:</p>{missing}" if missing else ""
+    )
     if report.accepted:
-        return (
-            f"<p>The independent check accepts the geometry: all {len(report.findings)} findings are ok.</p>"
-        )
-    items = "".join(f"<li>{words.text(finding)}</li>" for finding in report.refusals)
-    return f"<p>{words.verdict(False)}: do not use this plan.</p><ul>{items}</ul>"
+        number = len(report.findings) - len(report.unchecked)
+        return f"<p>The independent check accepts the geometry: {number} findings are ok.</p>{missing}"
+    refused = words.bullets(report.refusals)
+    return f"<p>{words.verdict(False)}: do not use this plan.</p>{refused}{missing}"
 
 
 def _limits(title: str, findings: Sequence[Finding]) -> str:
@@ -120,7 +124,7 @@ def plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> str
                 words.text(plan_name(number)),
                 words.grade(headline.grade, headline.chance_words),
                 words.text(headline.failures[0][0] if headline.failures else "–"),
-                words.text(f"geometry {headline.geometry}"),
+                words.text(headline.geometry_words),
                 words.text(tightest[0].words if tightest else "–"),
                 words.text(plan.tube.exit.branch),
                 words.text(plan.scope.generation),
@@ -240,7 +244,7 @@ def provenance_section(plan: Plan, lung: Lung) -> str:
         ("objective", plan.objective),
         *((f"seconds: {name}", f"{seconds:.2f}") for name, seconds in plan.timing.items()),
     ]
-    warnings = "".join(f"<li>{words.text(warning)}</li>" for warning in lung.warnings)
+    warnings = words.bullets(lung.warnings)
     files = words.pairs("SHA-256 of the image files", sorted(plan.sources.items()))
-    noted = f"<p>Warnings of the anatomy:</p><ul>{warnings}</ul>" if warnings else ""
+    noted = f"<p>Warnings of the anatomy:</p>{warnings}" if warnings else ""
     return words.pairs("Plan", rows) + noted + f"<details><summary>Image files</summary>{files}</details>"

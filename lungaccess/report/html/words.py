@@ -56,9 +56,17 @@ def steps(items: Iterable[str]) -> str:
     return "<ol>" + "".join(f"<li>{text(item)}</li>" for item in items) + "</ol>"
 
 
-def verdict(ok: bool, no: str = "REFUSED") -> str:
+def verdict(ok: bool | None, no: str = "REFUSED") -> str:
     """Return a word with a mark, so that it does not depend on its colour."""
+    if ok is None:
+        return "? not checked"
     return '<span class="good">✓ ok</span>' if ok else f'<span class="bad">✗ {text(no)}</span>'
+
+
+def bullets(items: Iterable[object]) -> str:
+    """Return a list; nothing for no items."""
+    listed = "".join(f"<li>{text(item)}</li>" for item in items)
+    return f"<ul>{listed}</ul>" if listed else ""
 
 
 def headline(said: Headline) -> str:

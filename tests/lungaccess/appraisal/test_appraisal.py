@@ -32,6 +32,7 @@ KEYS = {
     "grade",
     "verdict",
     "geometry",
+    "fissures_unknown",
     "success",
     "most_frequent_failure",
     "failures",
@@ -95,6 +96,17 @@ def test_what_was_not_looked_at_is_never_good() -> None:
     assert Headline.of(None, None).text == "Geometry not checked. Chance of success not estimated."
     for headline in (Headline.of(None, make_risk(2000)), Headline.of(make_check(True), None)):
         assert (headline.grade, headline.verdict) == (Grade.UNKNOWN, "not known to succeed")
+
+
+def test_without_a_fissure_mask_a_plan_is_never_good_news() -> None:
+    unknown = Finding(name="patient.fissures", ok=None, detail="no fissure mask")
+    check = make_check(True)
+    blind = replace(check, findings=(*check.findings, unknown))
+    headline = Headline.of(blind, make_risk(1980))
+    assert Headline.of(check, make_risk(1980)).grade == Grade.GOOD
+    assert (headline.grade, headline.verdict) == (Grade.UNKNOWN, "not known to succeed")
+    assert "fissures not checked: no fissure mask" in headline.text
+    assert headline.to_mapping()["fissures_unknown"] is True
 
 
 def test_the_model_is_named_and_its_sizes_are_stated(tmp_path: Path) -> None:

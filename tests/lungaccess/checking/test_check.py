@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,10 @@ from anatomy import structures
 from anatomy.settings import override
 from lungaccess.checking import Finding, check
 from lungaccess.checking.findings import Findings
+from lungaccess.cli.plan_tables import check_tables
 from lungaccess.plans.plan import Plan
+from lungaccess.report.html import tables
+from lungaccess.slicer.readme import readme
 
 LIMITS = {
     "tube.sweep.limit": "at most",
@@ -122,6 +126,29 @@ def test_fissures_that_may_be_crossed_are_measured_all_the_same(
         finding = found[f"{stage}.clearance.fissure"]
         assert finding.ok and finding.value is not None and finding.limit is None
         assert "may be crossed" in finding.detail
+
+
+def test_without_a_fissure_mask_fissures_are_not_checked_and_never_ok(
+    plan: Plan, lung: Any, system: Any, tools: Any
+) -> None:
+    blind = SimpleNamespace(**{**vars(lung), "has_fissures": False})
+    free = tools.changed(plan, fissures_are_obstacles=False)
+    stated = {stage: {k: v for k, v in d.items() if k != "fissure"} for stage, d in free.clearance_mm.items()}
+    report = check(tools.changed(free, clearance_mm=stated), blind)
+    names = ["needle.clearance.fissure", "patient.fissures", "tube.clearance.fissure"]
+    assert sorted(report.to_mapping()["not_checked"]) == names  # type: ignore[call-overload]
+    # The plan's cost counts its distance from the fissure; nothing else is wrong without the mask.
+    assert [each.name for each in report.refusals] == ["costs.inverse_clearance"]
+    for finding in report.unchecked:
+        assert finding.value is None and finding.cells()[0] == "not checked"
+        assert finding.to_mapping()["ok"] is None and str(finding).startswith("not checked")
+    shown = [row for table in check_tables(report) for row in table.columns[0].cells]
+    assert sum("not checked" in str(cell) for cell in shown) == len(names)
+    page = tables.check_section(report)
+    assert page.count("? not checked") == len(names) and "3 things could not be checked" in page
+    assert "not checked patient.fissures" in readme(plan, report, ("plan.json",))
+    # A distance from fissures that nobody knows is no statement of a plan.
+    assert "patient.fissures" in {each.name for each in check(free, blind).refusals}
 
 
 def test_report_as_json(plan: Plan, lung: Any, tools: Any) -> None:

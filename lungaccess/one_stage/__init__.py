@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.one_stage.from_scope import ScopeReplanner
     from lungaccess.one_stage.needle import (
         NeedleAnswer,
         NeedleQuestion,
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
         point_in_words,
         reason_in_words,
     )
-    from lungaccess.one_stage.replan import RestOfPlan, replan_from_scope, replan_from_tube
+    from lungaccess.one_stage.replan import replan_from_scope, replan_from_tube
+    from lungaccess.one_stage.rest import RestOfPlan
     from lungaccess.one_stage.route import RouteSource, open_source, read_drawing, route_record, widest_end
     from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, ScopeAdvice, advise_scope, save_advice
     from lungaccess.one_stage.scope_region import ScopeRegion, safe_scope_region

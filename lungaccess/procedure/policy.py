@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 
 import numpy as np
 
 from anatomy.errors import TargetError
 from anatomy.lung import Lung
 from anatomy.typed import Float
-from lungaccess.one_stage import RestOfPlan, replan_from_scope, replan_from_tube
+from lungaccess.one_stage import RestOfPlan, ScopeReplanner, replan_from_tube
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
+from lungaccess.problem.task import Task
 from lungaccess.procedure.settings import Procedure
 from lungaccess.procedure.spread import Spread
 from lungaccess.procedure.truth import (
@@ -33,6 +33,7 @@ from stages.needle import (
     ArcPath,
     Belief,
     Failure,
+    Objective,
     Query,
     Replan,
     Replanner,
@@ -107,13 +108,14 @@ class Policy:
     def __init__(
         self, plan: Plan, lung: Lung, errors: ErrorModel, procedure: Procedure, radius_mm: float
     ) -> None:
-        self._plan, self._lung, self._procedure = plan, lung, procedure
-        self._errors, self._radius_mm = errors, radius_mm
+        self._plan, self._lung, self.procedure = plan, lung, procedure
+        self.errors, self._radius_mm = errors, radius_mm
         self._aside_mm = ASIDE * radius_mm
         # Fissures are obstacles of the replan exactly where they are of the plan.
         whole = replace(plan.system, fissures_allowed=not plan.fissures_are_obstacles)
         share = procedure.least_margin_share
         self._systems = (whole,) if share == 1.0 else (whole, _with_margins(whole, share))
+        self._replanners: dict[System, ScopeReplanner] = {}
         self._environments = {
             system: needle_environment(
                 lung, system.needle, system.margins, with_fissures=plan.fissures_are_obstacles
@@ -134,7 +136,7 @@ class Policy:
             Of the errors of measuring.
         """
         history.placements += 1
-        placing, plan = self._procedure.scope, self._plan
+        placing, plan = self.procedure.scope, self._plan
         noise = rng.standard_normal((3, 5))
         if placing.measured:
             found = self._from_scope(history, self._scope_measured(attempt, noise[0]))
@@ -147,7 +149,7 @@ class Policy:
             history.complete = True
             return True
         n_tube = len(pieces) - len(plan.needle.arcs)
-        if self._procedure.tubes.measured or self._procedure.needle.closed_loop:
+        if self.procedure.tubes.measured or self.procedure.needle.closed_loop:
             after = self._from_tube(history, attempt, plan, pieces, noise[1:], rng)
             if after is None:
                 history.chains.append((attempt.start, pieces[:n_tube], n_tube))
@@ -159,7 +161,7 @@ class Policy:
 
     def _scope_measured(self, attempt: Attempt, noise: Float) -> Float:
         """Return the scope's tip as measured: in the lumen, where it is known to be."""
-        placing, true = self._procedure.scope, attempt.frame()
+        placing, true = self.procedure.scope, attempt.frame()
         measured = as_measured(true, placing.position_mm, placing.direction_deg, noise)
         shares = np.linspace(1.0, 0.0, SHARES)[:, None]
         points = true[:3, 3] + shares * (measured[:3, 3] - true[:3, 3])
@@ -172,8 +174,8 @@ class Policy:
         """Return how likely deployments from a scope tip `(1, 9)` as measured succeed, to first order."""
         plan, tips = self._plan, np.repeat(tip, deployments.count, axis=0)
         return Spread(
-            self._lung, plan.system, tips, deployments, np.asarray(plan.target_lps), self._errors,
-            self._procedure, self._radius_mm,
+            self._lung, plan.system, tips, deployments, np.asarray(plan.target_lps), self.errors,
+            self.procedure, self._radius_mm,
         ).chances  # fmt: skip
 
     def _from_scope(self, history: History, measured: Float) -> Plan | None:
@@ -181,10 +183,7 @@ class Policy:
         plan = self._plan
         target = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
         history.corrected_mm[SCOPE].append(self._miss_from(measured))
-        # The fastest answer: on two patients no more procedures succeeded with what local search and the
-        # needle's own search add, at two to four times the work.
-        replan = partial(replan_from_scope, tries=0, searches=0, rank=self._chances)
-        rest = self._rest(history, SCOPE, replan, measured, target)
+        rest = self._rest(history, SCOPE, self._from_scope_tip, measured, target)
         if rest is None:
             return None
         scope = replace(plan.scope, lps_from_scope_tip=rest.lps_from_measured)
@@ -192,16 +191,34 @@ class Policy:
         tube = plan.tube if rest.tube is None else rest.tube
         return replace(plan, scope=scope, tube=tube, needle=rest.needle, exemption=exemption)
 
+    def _from_scope_tip(self, system: System, measured: Float, target: Target) -> RestOfPlan:
+        """Plan tubes and needle again, by direct arcs: what else could be searched is left to the needle."""
+        if system not in self._replanners:
+            task = self._task(system, target)
+            self._replanners[system] = ScopeReplanner(task, searches=0, rank=self._chances)
+        return self._replanners[system].replan(measured)
+
+    def _from_tube_tip(self, system: System, measured: Float, target: Target) -> RestOfPlan:
+        return replan_from_tube(
+            self._lung, system, measured, target, objective=self._plan.objective, seed=self._plan.seed
+        )
+
+    def _task(self, system: System, target: Target) -> Task:
+        objective = Objective.of(self._plan.objective)
+        return Task(
+            lung=self._lung, system=system, target=target, objective=objective, method="replan",
+            seed=self._plan.seed,
+        )  # fmt: skip
+
     def _rest(
         self, history: History, stage: str, replan: Callable[..., RestOfPlan], measured: Float, target: Target
     ) -> RestOfPlan | None:
         """Return the rest from a measured pose: to the target, else beside it; with all margins or fewer."""
         aims = [target, *self._aside(measured, target)] if stage == TUBE else [target]
-        objective, seed = self._plan.objective, self._plan.seed
         for system in self._systems:
             for aim in aims:
                 try:
-                    rest = replan(self._lung, system, measured, aim, objective=objective, seed=seed)
+                    rest = replan(system, measured, aim)
                 except (NoPlan, TargetError):
                     continue
                 history.replans[stage].append(True)
@@ -236,7 +253,7 @@ class Policy:
         rng: np.random.Generator,
     ) -> Float | None:
         """Return the true arcs `(A, 4)` of the needle behind the tubes, None if no path was left."""
-        stage, needle = self._procedure.tubes, plan.needle
+        stage, needle = self.procedure.tubes, plan.needle
         if needle is None:
             return None
         n_tube = len(pieces) - len(needle.arcs)
@@ -250,11 +267,11 @@ class Policy:
             history.corrected_mm[TUBE].append(
                 _miss(ArcPath(lps_from_start=tip, arcs=path.arcs), target.lps_mm)
             )
-            rest = self._rest(history, TUBE, replan_from_tube, tip, target)
+            rest = self._rest(history, TUBE, self._from_tube_tip, tip, target)
             if rest is None or rest.needle is None:
                 return None
             path = path_of(rest.needle)
-        if self._procedure.needle.closed_loop:
+        if self.procedure.needle.closed_loop:
             arcs = self._steered(history, attempt, plan, path, true_tip, target, rng)
         else:
             arcs = carried_out(path, attempt)
@@ -265,7 +282,7 @@ class Policy:
 
     def _target(self, attempt: Attempt, noise: Float) -> Target:
         """Return the target as it is found in an image before the needle starts, or as planned."""
-        plan, imaging = self._plan, self._procedure.imaging
+        plan, imaging = self._plan, self.procedure.imaging
         planned = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
         if not imaging.measured:
             return planned
@@ -288,7 +305,7 @@ class Policy:
         rng: np.random.Generator,
     ) -> Float:
         """Return the arcs `(A, 3)` of a needle that is measured and planned again on its way."""
-        steering = self._procedure.needle
+        steering = self.procedure.needle
         start = np.asarray(path.lps_from_start)
         query = Query(lps_from_start=start, target=target.lps_mm, branch=plan.exemption.branch)
         truth = SteeredTruth(attempt, target.lps_mm, steering.position_mm, steering.direction_deg, rng)

@@ -82,40 +82,59 @@ def simulate_procedure(
     PlanFileError, SettingsError
         See `RiskAssessor`; also if there are no samples or processes.
     """
-    if processes < 1:
-        raise SettingsError(f"{processes} processes are asked for", expected="at least 1")
     model, followed = errors or load_errors(), procedure or load_procedure()
-    simulator = _Simulator(plan, lung, model, followed, samples, seed, radius_mm)
-    return _report(simulator, simulator.run(processes), model, followed, seed)
+    return Simulator(plan, lung, model, followed, radius_mm=radius_mm).report(samples, seed, processes)
 
 
-class _Simulator:
-    """All procedures of one plan."""
+class Simulator:
+    """Simulates procedures of one plan, see `simulate_procedure`; what it prepares serves all draws.
+
+    Attributes
+    ----------
+    assessor : RiskAssessor
+    errors : ErrorModel
+    procedure : Procedure
+    """
 
     def __init__(
         self,
         plan: Plan,
         lung: Lung,
-        model: ErrorModel,
+        errors: ErrorModel,
         procedure: Procedure,
-        samples: int,
-        seed: int,
-        radius_mm: float | None,
+        *,
+        radius_mm: float | None = None,
     ) -> None:
         self.assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
-        self.samples, self._seed, self._procedure = samples, seed, procedure
+        self.errors, self.procedure, self._lung = errors, procedure, lung
+        self._policy = Policy(plan, lung, errors, procedure, self.assessor.radius_mm)
+
+    def report(self, samples: int, seed: int, processes: int = 1) -> ProcedureReport:
+        """Return what comes of so many procedures."""
+        if processes < 1:
+            raise SettingsError(f"{processes} processes are asked for", expected="at least 1")
+        found = _Run(self.assessor, self._policy, self._lung, samples, seed).all(processes)
+        return _report(self, found, samples, seed)
+
+
+class _Run:
+    """Procedures of one plan with the draws of one seed."""
+
+    def __init__(self, assessor: RiskAssessor, policy: Policy, lung: Lung, samples: int, seed: int) -> None:
+        self.assessor, self._policy = assessor, policy
+        self.samples, self._seed = samples, seed
+        plan, procedure = assessor.plan, policy.procedure
         count = procedure.scope.placements if procedure.scope.measured or procedure.tubes.measured else 1
         n_arcs = ARCS if plan.needle is not None else 0
         self._attempts: list[Deviations] = [
-            self.assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs).deviations(model)
+            assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs).deviations(policy.errors)
             for number in range(count)
         ]
         self._starts = [deviated_starts(plan, lung, each) for each in self._attempts]
-        self._policy = Policy(plan, lung, model, procedure, self.assessor.radius_mm)
 
-    def run(self, processes: int) -> _Found:
+    def all(self, processes: int) -> _Found:
         """Return what comes of all procedures."""
-        if self._procedure.is_open_loop:
+        if self._policy.procedure.is_open_loop:
             return self._open_loop()
         parts = np.array_split(np.arange(self.samples), processes)
         if processes == 1 or "fork" not in multiprocessing.get_all_start_methods():
@@ -206,24 +225,22 @@ def _joined(parts: Iterable[_Found]) -> _Found:
     return _Found(touched, miss, stopped, tuple(history for each in found for history in each.histories))
 
 
-def _report(
-    simulator: _Simulator, found: _Found, model: ErrorModel, procedure: Procedure, seed: int
-) -> ProcedureReport:
-    assessor = simulator.assessor
+def _report(simulator: Simulator, found: _Found, samples: int, seed: int) -> ProcedureReport:
+    assessor, procedure = simulator.assessor, simulator.procedure
     reaches = found.miss_mm <= assessor.radius_mm
     touched = {name: (found.touched & flag) != 0 for name, flag in assessor.structures.items()}
     inserted = found.miss_mm[np.isfinite(found.miss_mm)]
     quantiles = {q: float(np.quantile(inserted, q)) for q in MISS_QUANTILES} if len(inserted) else {}
-    left = np.ones(simulator.samples, dtype=bool)
+    left = np.ones(samples, dtype=bool)
     ends = {}
     causes = [(name, touched[name]) for name in ORDER if name in assessor.forbidden]
     for name, mask in (*causes, (NO_PATH, found.stopped & ~reaches), (MISSES, ~reaches), (SUCCESS, left)):
         ends[name] = share_of(left & mask)
         left = left & ~mask
     return ProcedureReport(
-        model=model,
+        model=simulator.errors,
         procedure=procedure,
-        samples=simulator.samples,
+        samples=samples,
         seed=seed,
         radius_mm=assessor.radius_mm,
         radius_origin=assessor.radius_origin,

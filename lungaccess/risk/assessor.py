@@ -77,12 +77,6 @@ class RiskAssessor:
 
     def __init__(self, plan: Plan, lung: Lung, *, radius_mm: float | None = None) -> None:
         plan.require_lung(lung)
-        if radius_mm is not None and not 0.0 < radius_mm < math.inf:
-            raise SettingsError(
-                f"The radius of the goal is {radius_mm} mm",
-                expected="a finite length above 0",
-                remedy="Choose a radius in mm, such as 5",
-            )
         if plan.needle is not None and not plan.needle.arcs:
             raise SettingsError("The needle of the plan has no arc", expected="at least one arc")
         self.plan = plan
@@ -92,9 +86,7 @@ class RiskAssessor:
         tip = np.asarray(plan.scope.lps_from_scope_tip)[:3, 3]
         heights = (lung.height_share(np.asarray(plan.target_lps)), lung.height_share(tip))
         self.stretch = share_of_motion(heights[0]) - share_of_motion(heights[1])
-        self.radius_mm, self.radius_origin = (
-            goal_radius(lung, plan) if radius_mm is None else (float(radius_mm), "given")
-        )
+        self.radius_mm, self.radius_origin = goal_radius(lung, plan.target_lps, radius_mm)
         self._deviated, self._judging = DeviatedPlan(plan), judging(plan, lung)
         self.structures = {
             name: flag for name, flag in STRUCTURES.items() if flag != FISSURE or lung.has_fissures
@@ -172,12 +164,23 @@ def _in_threads(find: Callable[[slice], None], count: int) -> None:
         list(pool.map(find, map(slice, bounds[:-1], bounds[1:])))
 
 
-def goal_radius(lung: Lung, plan: Plan) -> tuple[float, str]:
-    """Return the radius in mm of the ball as large as the target's nodule, and its origin in words."""
+def goal_radius(lung: Lung, target_lps: Float, radius_mm: float | None = None) -> tuple[float, str]:
+    """Return the radius of the goal about a target in mm, and its origin in words.
+
+    It is the given one, or that of the ball as large as the target's nodule; see `RiskAssessor`.
+    """
+    if radius_mm is not None:
+        if not 0.0 < radius_mm < math.inf:
+            raise SettingsError(
+                f"The radius of the goal is {radius_mm} mm",
+                expected="a finite length above 0",
+                remedy="Choose a radius in mm, such as 5",
+            )
+        return float(radius_mm), "given"
     nodules = lung.nodules
-    inside = nodules is not None and bool(nodules.grid.contains(plan.target_lps))
+    inside = nodules is not None and bool(nodules.grid.contains(target_lps))
     if nodules is not None and inside:
-        ijk = np.floor(nodules.grid.ijk(plan.target_lps) + 0.5).astype(int)
+        ijk = np.floor(nodules.grid.ijk(target_lps) + 0.5).astype(int)
         if nodules.array[tuple(ijk)]:
             voxels, part = components(nodules.array)
             own = part[(voxels == ijk).all(axis=1)]

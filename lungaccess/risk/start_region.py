@@ -72,7 +72,7 @@ def safe_start_region(
             expected="a patient whose cost map is finite, or without one",
             remedy="Give the voxels that must not be entered as vessels",
         )
-    radius = goal_radius(lung, plan)[0] if radius_mm is None else float(radius_mm)
+    radius = goal_radius(lung, plan.target_lps)[0] if radius_mm is None else float(radius_mm)
     environment = needle_environment(
         lung, needle, plan.system.margins, with_fissures=plan.fissures_are_obstacles, goal_tolerance_mm=radius
     )

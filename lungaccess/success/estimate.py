@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
-from lungaccess.procedure import Procedure, simulate_procedure
-from lungaccess.risk import ErrorModel, RiskAssessor, Share
+from lungaccess.procedure import Procedure, Simulator
+from lungaccess.risk import ErrorModel, RiskAssessor, Share, goal_radius
 
 FRESH_SEED = 1 << 20
 """Added to a search's seed for the draws that it never sees."""
@@ -36,10 +38,15 @@ class HalvingSettings:
 
 
 OPEN_LOOP = HalvingSettings(pool=150, of_a_tip=8, samples=(256, 1024, 4096), kept=(24, 6), fresh=16384)
-"""The best is nearly always among 150 of first order; a share of one half is known to 1 % at the end."""
+"""The order of first order is rough, so the pool is several times what is kept; after 4,096 draws a share of
+one half is known to 1 %, as much as two good candidates differ by."""
 MEASURED = HalvingSettings(pool=24, of_a_tip=1, samples=(8, 24, 120), kept=(8, 3), fresh=120)
 """A procedure that plans again takes a thousand times as long as one that does not, and the deployment is
 chosen anew at the tip as measured: tips compete, with few draws."""
+
+
+Counter = Callable[[int, int], Share]
+"""Counts the successes of one plan: of so many draws, by a seed."""
 
 
 class ChanceEstimator:
@@ -50,32 +57,30 @@ class ChanceEstimator:
     errors : ErrorModel
     procedure : Procedure
     halving : HalvingSettings
+    radius_mm : float
+        Radius of the goal.
     """
 
     def __init__(
         self, task: Task, errors: ErrorModel, procedure: Procedure, *, radius_mm: float | None
     ) -> None:
         self.errors, self.procedure = errors, procedure
-        self._lung, self._seed, self._radius_mm = task.lung, task.seed, radius_mm
+        self._lung, self._seed = task.lung, task.seed
+        self.radius_mm = goal_radius(task.lung, task.target.lps_mm, radius_mm)[0]
         self.halving = OPEN_LOOP if procedure.is_open_loop else MEASURED
 
-    def successes(self, plan: Plan, samples: int) -> int:
+    def counter(self, plan: Plan) -> Counter:
+        """Return what counts the successes of a plan; what it prepares serves all draws."""
+        if self.procedure.is_open_loop:
+            assessor = RiskAssessor(plan, self._lung, radius_mm=self.radius_mm)
+            return lambda samples, seed: assessor.success(assessor.draws(samples, seed), self.errors)
+        simulator = Simulator(plan, self._lung, self.errors, self.procedure, radius_mm=self.radius_mm)
+        return lambda samples, seed: simulator.report(samples, seed).succeeds
+
+    def successes(self, counter: Counter, samples: int) -> int:
         """Return how many of `samples` procedures succeed; all plans have the same luck."""
-        return self._share(plan, samples, self._seed).count
+        return counter(samples, self._seed).count
 
     def fresh(self, plan: Plan, samples: int) -> Share:
         """Return the share of successes of draws that no search sees."""
-        return self._share(plan, samples, self._seed + FRESH_SEED)
-
-    def radius_mm(self, plan: Plan) -> float:
-        """Return the radius of the goal about the target of a plan."""
-        return RiskAssessor(plan, self._lung, radius_mm=self._radius_mm).radius_mm
-
-    def _share(self, plan: Plan, samples: int, seed: int) -> Share:
-        if self.procedure.is_open_loop:
-            assessor = RiskAssessor(plan, self._lung, radius_mm=self._radius_mm)
-            return assessor.success(assessor.draws(samples, seed), self.errors)
-        return simulate_procedure(
-            plan, self._lung, errors=self.errors, procedure=self.procedure, samples=samples, seed=seed,
-            radius_mm=self._radius_mm,
-        ).succeeds  # fmt: skip
+        return self.counter(plan)(samples, self._seed + FRESH_SEED)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import collections
 import math
-from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from itertools import count, islice
@@ -21,11 +21,11 @@ from lungaccess.plans.parts import Exemption
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
 from lungaccess.procedure.spread import Spread
-from lungaccess.success.estimate import ChanceEstimator
+from lungaccess.success.estimate import ChanceEstimator, Counter
 
 MANY = 10.0
-"""With so many clear deployments at a scope tip, one is left after measuring in two of three cases; it only
-ranks."""
+"""Clear deployments that a scope tip needs so that one is likely to be left after measuring: ten lie some
+millimetres or degrees apart, as far as the errors move the tip.  It only ranks."""
 BY_COST = 100
 """Iterations of the search by cost, whose best plan takes part."""
 TURN_RAD, SHIFT_MM = math.radians(10.0), 2.0
@@ -46,14 +46,17 @@ class Contender:
     plan : Plan
         Where there is a candidate, without what takes long to state: clearances, costs and the margin of
         the motion are those of another plan.
+    counter : Counter
+        Of the plan.
     successes, samples : int
         By the draws that all have in common.
     """
 
     candidate: Candidate | None
     plan: Plan
-    successes: int
-    samples: int
+    counter: Counter
+    successes: int = 0
+    samples: int = 1
 
     @property
     def share(self) -> float:
@@ -114,29 +117,20 @@ class SuccessSearch:
         site = chosen.site
         spread = Spread(
             self._task.lung, self._task.system, self._atlas.motions.tips[site], chosen, target,
-            estimator.errors, estimator.procedure, self._radius_mm(clear),
+            estimator.errors, estimator.procedure, estimator.radius_mm,
         )  # fmt: skip
         chances = spread.chances
         if estimator.procedure.scope.measured:
             _sites, which, counts = np.unique(site, return_inverse=True, return_counts=True)
             chances = chances * -np.expm1(-counts[which] / MANY)
         order = np.argsort(-chances, kind="stable")
-        taken: Counter[int] = Counter()
+        taken: collections.Counter[int] = collections.Counter()
         kept = []
         for entry, at in zip(clear[order].tolist(), site[order].tolist(), strict=True):
             taken[at] += 1
             if taken[at] <= estimator.halving.of_a_tip:
                 kept.append(entry)
         return np.array(kept, dtype=np.int64)
-
-    def _radius_mm(self, clear: Int) -> float:
-        """Return the radius of the goal."""
-        for entry in clear.tolist():
-            candidate = self._arcs.proved(entry)
-            if candidate is not None:
-                self._model = assemble(self._task, candidate, iteration=0, timing={})
-                return self._estimator.radius_mm(self._model)
-        return 1.0
 
     def _contender(self, entry: int) -> Contender | None:
         candidate = self._arcs.proved(entry)
@@ -155,7 +149,7 @@ class SuccessSearch:
         )
         scope = replace(model.scope, lps_from_scope_tip=frame)
         made = replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption)
-        return Contender(candidate=candidate, plan=made, successes=0, samples=1)
+        return Contender(candidate=candidate, plan=made, counter=self._estimator.counter(made))
 
     def _cheapest(self) -> Contender:
         """Return the plan of least cost."""
@@ -164,11 +158,12 @@ class SuccessSearch:
             task.lung, task.system, task.target, objective=task.objective, seed=task.seed,
             iterations=BY_COST, atlas=self._atlas, counterfactuals=self._counterfactuals,
         )  # fmt: skip
-        return Contender(candidate=None, plan=list(plans)[-1], successes=0, samples=1)
+        cheapest = list(plans)[-1]
+        return Contender(candidate=None, plan=cheapest, counter=self._estimator.counter(cheapest))
 
     def _counted(self, contender: Contender, samples: int) -> Contender:
         """Return a contender with its successes of so many draws."""
-        successes = self._estimator.successes(contender.plan, samples)
+        successes = self._estimator.successes(contender.counter, samples)
         return replace(contender, successes=successes, samples=samples)
 
     def _halved(

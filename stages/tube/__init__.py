@@ -13,9 +13,11 @@ if TYPE_CHECKING:
     from stages.tube.deployments import (
         DEFAULT_STOP_MM,
         Deployments,
+        Enumerator,
         enumerate_deployments,
         insertion_stops,
         join_deployments,
+        one_site_enumerator,
     )
     from stages.tube.design_shapes import coarser_shapes, shapes_digest, shapes_of
     from stages.tube.device import BentPiece, ConcentricTubes, Tube

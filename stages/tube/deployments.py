@@ -140,50 +140,19 @@ def enumerate_deployments(
         return _enumerate_shapes(
             lung, tubes, margins, tips, with_fissures, rotations, stop_spacing_mm, progress
         )
-    rotations = rotations if tubes.inner.bends else 1
-    coarse: Float = np.arange(rotations, dtype=np.float64) * (2 * math.pi / rotations)
-    angles = np.concatenate([coarse, coarse + math.pi / rotations])
-    stops = insertion_stops(tubes, stop_spacing_mm)
-    environment = tube_environment(lung, with_fissures=with_fissures)
-    constants = tube_constants(tubes, margins)
-    outer, inner, ends = _ends_at_stops(tubes, stop_spacing_mm)
-    every = np.zeros((len(angles), len(stops), len(stops)), dtype=np.bool_)
-    every[:, outer, inner] = True
+    enumerator = SiteEnumerator(
+        lung, tubes, margins, with_fissures=with_fissures, rotations=rotations,
+        stop_spacing_mm=stop_spacing_mm,
+    )  # fmt: skip
     done = 0
 
     def one_site(site: int) -> tuple[Float, Int, int]:
         nonlocal done
-        frame = frames.pose(tips[site, :3], tips[site, 3:6], tips[site, 6:])
-        normals = frames.bending_directions(frame, angles)
-        refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
-        work = np.zeros((2, kernels.N_TRACE))
-        wanted = every
-        if worthwhile:
-            wanted = np.zeros_like(every)
-            at, towards = _turned(ends, frame, normals)
-            wanted[:, outer, inner] = worthwhile(at, towards).reshape(len(angles), len(outer))
-
-        def rows_of(turns: Int) -> tuple[Float, int]:
-            chosen = wanted[turns]
-            most = int(np.count_nonzero(chosen))
-            rows = np.zeros((most, kernels.ENTRY_COLUMNS))
-            count = kernels.enumerate_site(
-                environment, constants, tips[site, :6], normals[turns], site, stops, chosen, rows, refused,
-                work,
-            )  # fmt: skip
-            found = rows[:count].copy()
-            found[:, 1] = turns[found[:, 1].astype(np.int64)]
-            return found, most
-
-        found, candidates = rows_of(np.arange(rotations))
-        between = np.arange(rotations) if worthwhile else _between_unlike(found, rotations, stops)
-        if len(between):
-            further, more = rows_of(rotations + between)
-            found, candidates = np.concatenate([found, further]), candidates + more
+        found = enumerator.rows(tips[site], site, worthwhile)
         done += 1
         if progress and done % 50 == 0:
             progress(done / len(tips))
-        return found, refused, candidates
+        return found
 
     with ThreadPoolExecutor(THREADS) as pool:
         parts = list(pool.map(one_site, range(len(tips))))
@@ -191,7 +160,94 @@ def enumerate_deployments(
     refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
     for _, counts, _ in parts:
         refused += counts
-    return _as_deployments(rows, angles, refused, sum(candidates for _, _, candidates in parts))
+    return _as_deployments(rows, enumerator.angles, refused, sum(candidates for *_, candidates in parts))
+
+
+Enumerator = Callable[[Float, Callable[[Float, Float], Bool]], Deployments]
+"""Returns the deployments from a scope tip `(9,)` that are of use; see `enumerate_deployments`."""
+
+
+def one_site_enumerator(
+    lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool
+) -> Enumerator:
+    """Return what enumerates the deployments from one scope tip after another, prepared once for all."""
+    if tubes.planar:
+        return SiteEnumerator(lung, tubes, margins, with_fissures=with_fissures).deployments
+    return lambda tip, worthwhile: enumerate_deployments(
+        lung, tubes, margins, tip[None], with_fissures=with_fissures, worthwhile=worthwhile
+    )
+
+
+class SiteEnumerator:
+    """Enumerates what planar tubes can do from one scope tip after another; see `enumerate_deployments`.
+
+    Attributes
+    ----------
+    angles : (T,) float64
+        Rotations, rad: the even ones, then those between them.
+    """
+
+    def __init__(
+        self,
+        lung: Lung,
+        tubes: ConcentricTubes,
+        margins: Margins,
+        *,
+        with_fissures: bool,
+        rotations: int = DEFAULT_ROTATIONS,
+        stop_spacing_mm: float = DEFAULT_STOP_MM,
+    ) -> None:
+        self._rotations = rotations if tubes.inner.bends else 1
+        coarse: Float = np.arange(self._rotations, dtype=np.float64) * (2 * math.pi / self._rotations)
+        self.angles = np.concatenate([coarse, coarse + math.pi / self._rotations])
+        self._stops = insertion_stops(tubes, stop_spacing_mm)
+        self._environment = tube_environment(lung, with_fissures=with_fissures)
+        self._constants = tube_constants(tubes, margins)
+        self._outer, self._inner, self._ends = _ends_at_stops(tubes, stop_spacing_mm)
+        self._every = np.zeros((len(self.angles), len(self._stops), len(self._stops)), dtype=np.bool_)
+        self._every[:, self._outer, self._inner] = True
+
+    def deployments(self, tip: Float, worthwhile: Callable[[Float, Float], Bool]) -> Deployments:
+        """Return the deployments from one scope tip `(9,)` that are of use."""
+        rows, refused, candidates = self.rows(tip, 0, worthwhile)
+        return _as_deployments(rows, self.angles, refused, candidates)
+
+    def rows(
+        self, tip: Float, site: int, worthwhile: Callable[[Float, Float], Bool] | None
+    ) -> tuple[Float, Int, int]:
+        """Return entries as the kernel writes them, counts of the refused, and how many were looked at."""
+        frame = frames.pose(tip[:3], tip[3:6], tip[6:])
+        normals = frames.bending_directions(frame, self.angles)
+        refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
+        work = np.zeros((2, kernels.N_TRACE))
+        wanted = self._every
+        if worthwhile:
+            wanted = np.zeros_like(self._every)
+            at, towards = np.zeros((2, len(self.angles) * len(self._outer), 3))
+            kernels.turned_ends(self._ends, frame, normals, at, towards)
+            wanted[:, self._outer, self._inner] = worthwhile(at, towards).reshape(len(self.angles), -1)
+
+        def rows_of(turns: Int) -> tuple[Float, int]:
+            chosen = wanted[turns]
+            most = int(np.count_nonzero(chosen))
+            rows = np.zeros((most, kernels.ENTRY_COLUMNS))
+            count = kernels.enumerate_site(
+                self._environment, self._constants, tip[:6], normals[turns], site, self._stops, chosen, rows,
+                refused, work,
+            )  # fmt: skip
+            found = rows[:count].copy()
+            found[:, 1] = turns[found[:, 1].astype(np.int64)]
+            return found, most
+
+        if worthwhile:
+            found, candidates = rows_of(np.arange(len(self.angles)))
+            return found, refused, candidates
+        found, candidates = rows_of(np.arange(self._rotations))
+        between = _between_unlike(found, self._rotations, self._stops)
+        if len(between):
+            further, more = rows_of(self._rotations + between)
+            found, candidates = np.concatenate([found, further]), candidates + more
+        return found, refused, candidates
 
 
 @lru_cache(maxsize=8)
@@ -212,16 +268,6 @@ def _ends_at_stops(tubes: ConcentricTubes, stop_spacing_mm: float) -> tuple[Int,
         for ends in zip(stops[outer].tolist(), stops[inner].tolist(), strict=True)
     ]
     return outer, inner, np.array(poses).reshape(-1, 6)[:, [0, 2, 3, 5]]
-
-
-def _turned(ends: Float, frame: Float, normals: Float) -> tuple[Float, Float]:
-    """Return positions and tangents `(T K, 3)`, LPS mm, of ends `(K, 4)` bent towards normals `(T, 3)`."""
-    aside, ahead = ends[:, 0::2], ends[:, 1::2]
-    at, towards = (
-        (normals[:, None] * aside[:, part, None] + frame[:3, 2] * ahead[:, part, None]).reshape(-1, 3)
-        for part in (0, 1)
-    )
-    return frame[:3, 3] + at, towards
 
 
 def _enumerate_shapes(

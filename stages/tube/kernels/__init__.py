@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         planar_points,
         tip_pose,
         tube_pieces,
+        turned_ends,
     )
     from stages.tube.kernels.shapes import ARC_COLUMNS, bend_towards, carried
     from stages.tube.kernels.wall_exit import (

@@ -99,3 +99,26 @@ def lateral_sweep(tubes, outer, inner):
     for m in range(1, SWEEP_SAMPLES + 1):
         worst = max(worst, _off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
     return worst
+
+
+@numba.njit(cache=True)
+def turned_ends(ends, frame, normals, at, towards):
+    """Turn ends of tubes in the plane of their bend to each of several directions.
+
+    Parameters
+    ----------
+    ends : (K, 4) float64
+        Position and tangent of the tip, each aside and ahead.
+    frame : (4, 4) float64
+        Of the scope tip.
+    normals : (T, 3) float64
+        Directions of the bend.
+    at, towards : (T K, 3) float64
+        Are filled: positions and tangents, LPS mm.
+    """
+    for t in range(normals.shape[0]):
+        for k in range(ends.shape[0]):
+            row = t * ends.shape[0] + k
+            for m in range(3):
+                at[row, m] = frame[m, 3] + (normals[t, m] * ends[k, 0] + frame[m, 2] * ends[k, 1])
+                towards[row, m] = normals[t, m] * ends[k, 2] + frame[m, 2] * ends[k, 3]

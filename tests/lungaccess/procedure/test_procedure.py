@@ -165,9 +165,9 @@ def test_a_scope_is_measured_in_the_lumen(plan: Plan, small_lung: Lung) -> None:
     procedure = Procedure(scope=ScopePlacing(measured=True, position_mm=5.0))
     from lungaccess.procedure import simulation
 
-    simulator = simulation._Simulator(plan, small_lung, ErrorModel(), procedure, 20, 0, None)
+    simulator = simulation.Simulator(plan, small_lung, ErrorModel(), procedure)
     simulator._policy = Recorded(plan, small_lung, ErrorModel(), procedure, 5.0)
-    simulator.run(1)
+    simulator.report(20, 0)
     tips = np.array([each[:3, 3] for each in seen])
     assert len(tips) == 20 and np.linalg.norm(tips - tips.mean(axis=0), axis=1).max() > 0.2
     assert (small_lung.lumen_depth.lower_bound_mm(tips) > 0.0).all()

@@ -37,7 +37,7 @@ def region(plan: Plan, small_lung: Lung) -> StartRegion:
 def test_every_pose_of_the_proved_part_has_a_path_by_the_rules_of_plans(
     plan: Plan, small_lung: Lung, exactly: bool
 ) -> None:
-    radius = 0.0 if exactly else goal_radius(small_lung, plan)[0]
+    radius = 0.0 if exactly else goal_radius(small_lung, plan.target_lps)[0]
     region = la.safe_start_region(plan, small_lung, radius_mm=radius, poses=25)
     needle = plan.system.require_needle("this test")
     environment = needle_environment(

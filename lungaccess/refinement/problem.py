@@ -95,13 +95,13 @@ class Problem:
         arcs = next(count for count in ARC_COUNTS if count >= len(rows))
         self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
         rows = split(rows, arcs, self._exempt_mm)
-        self.design, shape = design_arrays(self.task.system.tubes), deployment.shape
-        self.model = None if shape is None else ShapeModel(self.design, shape)
+        self.design = design = design_arrays(self.task.system.tubes)
+        self.model = self._model(deployment.shape)
         self.layout = Layout(
             arcs=arcs,
             with_map=weights[2] > 0.0,
-            tubes=len(self.design.lengths),
-            turned=int(self.design.turned.sum()),
+            tubes=0 if design is None else len(design.lengths),
+            turned=0 if design is None else int(design.turned.sum()),
         )
         self.axis = LocalAxis(evaluator.tip_rows, candidate.tip)
         tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
@@ -148,9 +148,14 @@ class Problem:
         for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall", "beside", "middle"):
             if name in rows:
                 least[rows[name]], most[rows[name]] = -np.inf, np.inf
-        model = None if shape is None else ShapeModel(self.design, shape, constant=True)
-        parameters = self._parameters(*one_tip(tip), model)
+        parameters = self._parameters(*one_tip(tip), self._model(shape, constant=True))
         return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
+
+    def _model(self, shape: TubeShape | None, *, constant: bool = False) -> ShapeModel | None:
+        """Return the model of tubes around a shape; None for planar tubes, which have a closed form."""
+        if shape is None or self.design is None:
+            return None
+        return ShapeModel(self.design, shape, constant=constant)
 
     @property
     def sideways(self) -> Float:

@@ -69,8 +69,9 @@ class Reconstruction:
             return None
         x[at["site"]] = 0.0
         x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm
-        if deployment.shape is not None:
-            x[self._problem.layout.joints] = joints_of(self._problem.design, deployment.shape)
+        design = self._problem.design
+        if deployment.shape is not None and design is not None:
+            x[self._problem.layout.joints] = joints_of(design, deployment.shape)
         x[at["exit"]] = deployment.exit_mm
         return Placement(share=share, x=x, tip=tip, deployment=deployment)
 

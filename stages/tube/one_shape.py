@@ -28,13 +28,13 @@ NO_SHAPES = ManyShapes(
 """Planar tubes have a closed form instead."""
 
 
-def design_arrays(tubes: ConcentricTubes) -> DesignArrays:
-    """Return a design and its limits for the kernels; empty for planar tubes, which have a closed form."""
+def design_arrays(tubes: ConcentricTubes) -> DesignArrays | None:
+    """Return a design and its limits for the kernels; None for planar tubes, which have a closed form.
+
+    A kernel that takes None is compiled without the mechanics that only other tubes need.
+    """
     if tubes.planar:
-        none = np.zeros(0)
-        return DesignArrays(
-            np.zeros((0, 2)), none, np.zeros((0, 5)), none, none, np.zeros(0, dtype=np.bool_), none
-        )
+        return None
     mechanics = TubeMechanics(tubes.nested)
     limits = np.zeros(kernel.N_LIMITS)
     limits[kernel.STEP], limits[kernel.STOP] = mechanics.step_rad, WAY_STEP_MM
@@ -57,10 +57,10 @@ def with_any_sweep(design: DesignArrays) -> DesignArrays:
     return design._replace(limits=limits)
 
 
-def shape_arrays(design: DesignArrays) -> ShapeArrays:
-    """Return arrays with room for any shape of a design."""
-    n = len(design.lengths)
-    room = columns.MOST_ARCS * (1 + n + 2 * len(design.bends)) if n else 0
+def shape_arrays(design: DesignArrays | None) -> ShapeArrays:
+    """Return arrays with room for any shape of a design; without room for planar tubes."""
+    n = 0 if design is None else len(design.lengths)
+    room = 0 if design is None else columns.MOST_ARCS * (1 + n + 2 * len(design.bends))
     return ShapeArrays(
         joints=np.zeros(2 * n),
         tips=np.zeros(n),

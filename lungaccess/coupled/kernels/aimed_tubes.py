@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
+from lungaccess.coupled.kernels.candidate import why_refused
 from stages.needle.kernels import cost_of_arc
 from stages.tube.kernels import (
     ACCEPTED,
@@ -22,11 +23,8 @@ from stages.tube.kernels import (
     aim_shape,
     bend_towards,
     carried,
-    required_beside,
     take_member,
     tube_pieces,
-    validate_arcs,
-    validate_deployment,
 )
 
 ROTATION, OUTER, INNER, COST, JOINTS = range(5)
@@ -81,6 +79,22 @@ def _pieces_of(constants, outer, inner, shape):
     return pieces
 
 
+@inner_kernel
+def _aimed(constants, design, near, shape, shapes, n, base, target, outer, inner, joints):
+    """Return ACCEPTED or why the tubes miss the target, rotation and insertions; fill `joints`."""
+    if design is None:
+        rotation, outer, inner, miss = aim(constants, base, target, outer, inner)
+        return ACCEPTED if miss <= CLOSE_MM else MISSES, rotation, outer, inner
+    take_member(near, shapes, n)
+    rotation, miss, kept = aim_shape(design, near, shape, base, target)
+    if not miss <= TIP_OFF_MM:
+        return MISSES, rotation, outer, inner
+    if not kept:
+        return SPOILT_WAY, rotation, outer, inner
+    joints[:] = shape.joints
+    return ACCEPTED, rotation, shape.joints[design.lengths.shape[0] - 1], shape.joints[0]
+
+
 @numba.njit(cache=True, nogil=True)
 def aim_tubes(
     tube,
@@ -124,7 +138,6 @@ def aim_tubes(
         Receives ACCEPTED, MISSES, SPOILT_WAY, NOT_TRIED, or the reason of `stages.tube.kernels`.
     """
     environment, constants, design, near, shape = tube
-    n_tubes = design.lengths.shape[0]
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
     for n in range(pose_of.shape[0]):
@@ -133,21 +146,11 @@ def aim_tubes(
         why[n] = NOT_TRIED
         if enough <= 0 or not allowed[pose_of[n]]:
             continue
-        why[n] = MISSES
-        if n_tubes == 0:
-            rotation, outer, inner, miss = aim(constants, base, target, outers[n], inners[n])
-            if not miss <= CLOSE_MM:
-                continue
-        else:
-            take_member(near, shapes, n)
-            rotation, miss, kept = aim_shape(design, near, shape, base, target)
-            if not miss <= TIP_OFF_MM:
-                continue
-            if not kept:
-                why[n] = SPOILT_WAY
-                continue
-            found[n, JOINTS:] = shape.joints
-            outer, inner = shape.joints[n_tubes - 1], shape.joints[0]
+        why[n], rotation, outer, inner = _aimed(
+            constants, design, near, shape, shapes, n, base, target, outers[n], inners[n], found[n, JOINTS:]
+        )
+        if why[n] != ACCEPTED:
+            continue
         c, s = math.cos(rotation), math.sin(rotation)
         normal = (
             c * base[6] + s * (base[4] * base[8] - base[5] * base[7]),
@@ -158,11 +161,9 @@ def aim_tubes(
         found[n, OUTER] = outer
         found[n, INNER] = inner
         towards = np.array(normal)
-        if n_tubes == 0:
-            reason = validate_deployment(environment, constants, base[:6], towards, outer, inner, trace, tip)
-        else:
-            beside, arcs = required_beside(shape), shape.arcs[: shape.number[0]]
-            reason = validate_arcs(environment, constants, base[:6], towards, arcs, beside, trace, tip)
+        reason = why_refused(
+            environment, constants, design, shape, base[:6], towards, outer, inner, trace, tip
+        )
         why[n] = reason
         if reason != ACCEPTED:
             continue

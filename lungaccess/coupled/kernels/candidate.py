@@ -1,8 +1,8 @@
 """Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
 `tube` is the tuple (environment, constants, design, near, shape): the first two are those of
-`stages.tube.kernels`.  The others count for tubes that are not planar: their `DesignArrays`, which are empty
-for planar tubes, a proved shape near that of the choice, and a shape that is filled with that of the choice.
+`stages.tube.kernels`.  The others count for tubes that are not planar: their `DesignArrays`, None for planar
+tubes, a proved shape near that of the choice, and a shape that is filled with that of the choice.
 `needle` is a `lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x` holds a row of
 `scope_poses`, the rotation in rad, and the insertions of the tubes in mm, the outermost first; then, of tubes
 that are not planar, how far the rear end of each is turned beside that rotation, in rad.  `vias` are points
@@ -118,6 +118,39 @@ def _shape_nearby(design, near, shape, x):
 
 
 @inner_kernel
+def _tip(constants, design, near, shape, base, normal, x):
+    """Return whether a choice has a tip, whether the way to it is that of the shape nearby, and its pose."""
+    if design is None:
+        outer, inner = x[OUTER], x[INNER]
+        possible = 0.0 <= outer <= inner <= constants[MAX_EXTENSION]
+        possible = possible and inner - outer <= constants[MAX_PROTRUSION]
+        return possible, True, tip_pose(constants, base, normal, outer, inner)
+    found, followed = _shape_nearby(design, near, shape, x)
+    return found, followed, tip_of_arcs(base, normal, shape.arcs[: shape.number[0]])
+
+
+@inner_kernel
+def _follow_way(design, shape):
+    """Fill a shape by its whole way; tell whether that keeps all limits, as the closed form always does."""
+    if design is None:
+        return True
+    return whole_way(design, shape)
+
+
+@inner_kernel
+def why_refused(environment, constants, design, shape, base, towards, outer, inner, trace, tip):
+    """Return ACCEPTED, or why tubes from a scope tip `base` (6,) are refused; fill `trace` and `tip`.
+
+    The others are those of `validate_deployment`; `shape` counts instead of the insertions where there is a
+    design.
+    """
+    if design is None:
+        return validate_deployment(environment, constants, base, towards, outer, inner, trace, tip)
+    beside, arcs = required_beside(shape), shape.arcs[: shape.number[0]]
+    return validate_arcs(environment, constants, base, towards, arcs, beside, trace, tip)
+
+
+@inner_kernel
 def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, cost_limit, trace, tip):
     """Return the cost of a choice if it is below `cost_limit` and all of it is proved; else infinity.
 
@@ -126,14 +159,8 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
     those of the needle, the whole way to it is followed.
     """
     environment, constants, design, near, shape = tube
-    planar = design.lengths.shape[0] == 0
     row = int(x[SCOPE_POSE])
     if row < 0 or row >= scope_poses.shape[0] or not allowed[row]:
-        return math.inf
-    outer, inner = x[OUTER], x[INNER]
-    if planar and (outer < 0.0 or outer > inner or inner > constants[MAX_EXTENSION]):
-        return math.inf
-    if planar and inner - outer > constants[MAX_PROTRUSION]:
         return math.inf
     base = scope_poses[row]
     c, s = math.cos(x[ROTATION]), math.sin(x[ROTATION])
@@ -142,28 +169,21 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
         c * base[7] + s * (base[5] * base[6] - base[3] * base[8]),
         c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
     )
-    proved = True
-    if planar:
-        pose = tip_pose(constants, base, normal, outer, inner)
-    else:
-        found, proved = _shape_nearby(design, near, shape, x)
-        if not found:
-            return math.inf
-        pose = tip_of_arcs(base, normal, shape.arcs[: shape.number[0]])
+    found, followed, pose = _tip(constants, design, near, shape, base, normal, x)
+    if not found:
+        return math.inf
     cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
     if cost == math.inf:
         return math.inf
     towards = np.array(normal)
-    if planar:
-        reason = validate_deployment(environment, constants, base[:6], towards, outer, inner, trace, tip)
-    else:
-        if not proved and not whole_way(design, shape):
-            return math.inf
-        beside, arcs = required_beside(shape), shape.arcs[: shape.number[0]]
-        reason = validate_arcs(environment, constants, base[:6], towards, arcs, beside, trace, tip)
+    if not followed and not _follow_way(design, shape):
+        return math.inf
+    reason = why_refused(
+        environment, constants, design, shape, base[:6], towards, x[OUTER], x[INNER], trace, tip
+    )
     if reason != ACCEPTED:
         return math.inf
-    if not proved:
+    if not followed:
         pose = (tip[0], tip[1], tip[2], tip[3], tip[4], tip[5])
         cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
         if cost == math.inf:

@@ -66,8 +66,7 @@ def _add_via(vias, count, start, target, spread, state):
 @inner_kernel
 def _vary_tubes(design, x, spread, state):
     """Change rotation and insertions, and of tubes that are not planar how they are turned beside it."""
-    n = design.lengths.shape[0]
-    insertions = n if n > 0 else 2
+    insertions = 2 if design is None else design.lengths.shape[0]
     if uniform(state) < EACH_SHARE:
         x[ROTATION] += ROTATION_SPREAD_RAD * spread * _normal(state)
     for m in range(OUTER, OUTER + insertions):
@@ -76,6 +75,15 @@ def _vary_tubes(design, x, spread, state):
     x[OUTER] = max(x[OUTER], 0.0)
     for m in range(OUTER + insertions - 2, OUTER - 1, -1):
         x[m] = min(x[m], x[m + 1])
+    _vary_relative_rotations(design, x, spread, state)
+
+
+@inner_kernel
+def _vary_relative_rotations(design, x, spread, state):
+    """Change how tubes that are not planar are turned one against the other."""
+    if design is None:
+        return
+    n = design.lengths.shape[0]
     for i in range(n):
         if design.turned[i] and uniform(state) < EACH_SHARE:
             x[OUTER + 2 * n - 1 - i] += RELATIVE_SPREAD_RAD * spread * _normal(state)
@@ -166,14 +174,15 @@ def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, s
 
 
 @inner_kernel
-def _draw(design, near, numbers, spreads, x, state):
+def _draw(design, near, shapes, row, numbers, spreads, x, state):
     """Draw a choice near a deployment with rotation and insertions `numbers`, and near its shape."""
-    n = design.lengths.shape[0]
     x[ROTATION] = numbers[0] + spreads[0] * (2.0 * uniform(state) - 1.0)
-    if n == 0:
+    if design is None:
         x[OUTER] = max(numbers[1] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
         x[INNER] = max(numbers[2] + spreads[1] * (2.0 * uniform(state) - 1.0), x[OUTER])
         return
+    n = design.lengths.shape[0]
+    take_member(near, shapes, row)
     for m in range(2 * n):
         x[OUTER + m] = near.joints[n - 1 - m if m < n else 3 * n - 1 - m]
     if uniform(state) >= OTHER_SHAPE:
@@ -242,9 +251,7 @@ def sample_deployments(
     for _ in range(tries):
         n = min(int(uniform(state) * pose_of.shape[0]), pose_of.shape[0] - 1)
         x[SCOPE_POSE] = pose_of[n]
-        if design.lengths.shape[0] > 0:
-            take_member(near, shapes, n)
-        _draw(design, near, numbers[n], spreads, x, state)
+        _draw(design, near, shapes, n, numbers[n], spreads, x, state)
         cost = validated_cost(
             tube, needle, scope_poses, allowed, x, vias, none, target, cost_limit, trace, tip
         )

@@ -85,9 +85,9 @@ class AimStarts(NamedTuple):
     @classmethod
     def around(cls, tubes: ConcentricTubes, found: Float, count: int) -> AimStarts | None:
         """Return `count` times what was found before; None if tubes that are not planar refuse it."""
-        shapes, ones = NO_SHAPES, np.ones(count)
-        if not tubes.planar:
-            design, n = design_arrays(tubes), len(tubes.nested)
+        shapes, ones, design = NO_SHAPES, np.ones(count), design_arrays(tubes)
+        if design is not None:
+            n = len(tubes.nested)
             made = deployed(design, found[JOINTS : JOINTS + n], found[JOINTS + n :])
             if made is None:
                 return None
@@ -141,9 +141,9 @@ class TubeAiming:
         why : (N,) int64
             0 for a deployment that ends at the point, MISSES, SPOILT_WAY, NOT_TRIED, or why tubes refuse it.
         """
-        found = np.zeros((len(row_of), JOINTS + 2 * len(self._design.lengths)))
-        why = np.zeros(len(row_of), dtype=np.int64)
         scratch = shape_arrays(self._design), shape_arrays(self._design)
+        found = np.zeros((len(row_of), JOINTS + len(scratch[0].joints)))
+        why = np.zeros(len(row_of), dtype=np.int64)
         tube = (self._environment, self._constants, self._design, *scratch)
         x, y, z = target.tolist()
         aim_tubes(
@@ -240,10 +240,10 @@ class AimedFromPose:
 def chosen_of(tubes: ConcentricTubes, found: Float) -> tuple[float, float, float, int | TubeShape]:
     """Return a row of what was found as `DeploymentValidator.choose` takes it."""
     rotation, outer, inner = (float(found[column]) for column in (ROTATION, OUTER, INNER))
-    if tubes.planar:
+    design, n = design_arrays(tubes), len(tubes.nested)
+    if design is None:
         return rotation, outer, inner, -1
-    n = len(tubes.nested)
-    made = deployed(design_arrays(tubes), found[JOINTS : JOINTS + n], found[JOINTS + n :])
+    made = deployed(design, found[JOINTS : JOINTS + n], found[JOINTS + n :])
     return rotation, outer, inner, -1 if made is None else shape_of_arrays(made)
 
 

@@ -29,7 +29,7 @@ from stages.tube import (
     tube_environment,
 )
 
-TubeArguments = tuple[TubeEnvironment, Float, DesignArrays, ShapeArrays, ShapeArrays]
+TubeArguments = tuple[TubeEnvironment, Float, DesignArrays | None, ShapeArrays, ShapeArrays]
 """Tubes for the kernels; see `lungaccess.coupled.kernels.candidate`."""
 
 SHIFTS_MM = evenly(0.25, 4.0)
@@ -59,17 +59,17 @@ class TubeChoice:
     shape: ShapeArrays
 
     @classmethod
-    def empty(cls, design: DesignArrays) -> TubeChoice:
+    def empty(cls, design: DesignArrays | None) -> TubeChoice:
         """Return one without a deployment."""
-        n = len(design.lengths)
-        return cls(x=np.zeros(OUTER + (2 * n or 2)), shape=shape_arrays(design))
+        shape = shape_arrays(design)
+        return cls(x=np.zeros(OUTER + (len(shape.joints) or 2)), shape=shape)
 
     @classmethod
-    def of(cls, design: DesignArrays, deployment: Deployment, row: float) -> TubeChoice | None:
+    def of(cls, design: DesignArrays | None, deployment: Deployment, row: float) -> TubeChoice | None:
         """Return that of a deployment; None if its way does not keep the limits when it is followed anew."""
         made, shape = deployment.shape, shape_arrays(design)
         joints = np.array([deployment.outer_mm, deployment.inner_mm])
-        if made is not None:
+        if made is not None and design is not None:
             again = deployed(design, made.insertions_mm, made.rotations_rad)
             if again is None:
                 return None
@@ -83,11 +83,12 @@ class TubeChoice:
         rotation = x[ROTATION] % (2.0 * math.pi)
         return rotation, x[OUTER], x[OUTER + (n or 2) - 1], shape_of_arrays(self.shape) if n else -1
 
-    def perturb(self, design: DesignArrays, rng: np.random.Generator) -> None:
+    def perturb(self, design: DesignArrays | None, rng: np.random.Generator) -> None:
         """Move it some distance away at random."""
-        n, x = len(design.lengths), self.x
+        n, x = len(self.shape.tips), self.x
         row, turn, insertion, relative = PERTURBATION
-        spreads = np.array([row, turn, *(insertion,) * (n or 2), *(relative * design.turned[::-1])])
+        turned = () if design is None else relative * design.turned[::-1]
+        spreads = np.array([row, turn, *(insertion,) * (n or 2), *turned])
         x[:] = x + rng.standard_normal(len(x)) * spreads
         x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(SHIFTS_MM) - 1)
         inserted = x[OUTER : OUTER + (n or 2)]
@@ -194,7 +195,7 @@ class LocalSearch:
 
 
 def tube_arguments(
-    evaluator: CandidateEvaluator, design: DesignArrays
+    evaluator: CandidateEvaluator, design: DesignArrays | None
 ) -> Callable[[TubeChoice], TubeArguments]:
     """Return what gives the tubes of a task, with the shape of a choice, as the kernels take them."""
     task, scratch = evaluator.task, shape_arrays(design)

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors, safe_start_region
     from lungaccess.slicer import export_slicer
     from lungaccess.study import read_study, run_study
-    from lungaccess.success import PlannedSuccess, plan_for_success
+    from lungaccess.success import PlannedSuccess, alternatives_for_success, plan_for_success
     from stages.needle import Objective
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

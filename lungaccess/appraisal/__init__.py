@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.appraisal.appraiser import DRAWS, SEED, Appraisal, Appraiser, appraise
+    from lungaccess.appraisal.appraiser import DRAWS, MEASURED_DRAWS, SEED, Appraisal, Appraiser, appraise
     from lungaccess.appraisal.grade import Grade, grade_of_chance
     from lungaccess.appraisal.headline import Geometry, Headline
     from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of

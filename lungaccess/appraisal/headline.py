@@ -1,4 +1,4 @@
-"""The headline of a plan: whether its geometry was accepted, and how likely it succeeds, always together."""
+"""The headline of a plan: how likely it succeeds, and whether its geometry was accepted, always together."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.records import frozen_value
 from anatomy.words import plural
 from lungaccess.appraisal.grade import Grade, grade_of_chance
+from lungaccess.plans.chance import Chance
+from lungaccess.procedure.report import NO_PATH
 from lungaccess.risk.assessment import MISSES
+from lungaccess.risk.statistics import Share
+from lungaccess.success.estimate import Estimate, chance_of
 
 if TYPE_CHECKING:
     from lungaccess.checking import CheckReport
-    from lungaccess.risk import RiskReport, Share
 
 FAILURES = {
     "vessel": "touches a vessel",
@@ -22,8 +25,9 @@ FAILURES = {
     "fissure": "touches a fissure",
     "airway": "touches an airway",
     "stays in the airway": "stays in the airway",
+    NO_PATH: "has no path left",
 }
-"""What a failed draw does, by the names of `lungaccess.risk.STRUCTURES`."""
+"""What a failed procedure does, by the names of `lungaccess.risk.STRUCTURES` and `NO_PATH`."""
 
 
 class Geometry(StrEnum):
@@ -45,30 +49,37 @@ class Headline:
     geometry : Geometry
     refusals : int
         Findings of the check that are not ok.
-    risk : RiskReport or None
-        The estimate of success; None if there is none, as for a refused plan.
+    estimate : RiskReport, ProcedureReport, Chance or None
+        The estimate of success, or what the plan states of one; None if there is none, as for a refused plan.
     fissures_unknown : bool
         Whether fissures must not be crossed, and the patient has no mask of them.
     """
 
     geometry: Geometry
     refusals: int = 0
-    risk: RiskReport | None = None
+    estimate: Estimate | None = None
     fissures_unknown: bool = False
 
     @classmethod
-    def of(cls, report: CheckReport | None, risk: RiskReport | None) -> Headline:
+    def of(cls, report: CheckReport | None, estimate: Estimate | None) -> Headline:
         """Return the headline of a check, or of none, and of an estimate, or of none."""
         if report is None:
-            return cls(geometry=Geometry.UNCHECKED, risk=risk)
+            return cls(geometry=Geometry.UNCHECKED, estimate=estimate)
         geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
         unknown = any(each.name == "patient.fissures" for each in report.unchecked)
-        return cls(geometry=geometry, refusals=len(report.refusals), risk=risk, fissures_unknown=unknown)
+        refusals = len(report.refusals)
+        return cls(geometry=geometry, refusals=refusals, estimate=estimate, fissures_unknown=unknown)
+
+    @property
+    def chance(self) -> Chance | None:
+        """What was counted; None where nothing was."""
+        return None if self.estimate is None else chance_of(self.estimate)
 
     @property
     def success(self) -> Share | None:
-        """The chance of success; None where it was not estimated."""
-        return None if self.risk is None else self.risk.succeeds
+        """The chance of success; None where it was not computed."""
+        chance = self.chance
+        return None if chance is None else Share(count=chance.successes, samples=chance.samples)
 
     @property
     def grade(self) -> Grade:
@@ -92,25 +103,37 @@ class Headline:
         ]
 
     @property
+    def all_failures(self) -> dict[str, Share]:
+        """Everything that made procedures fail, by its name, the most frequent first."""
+        chance = self.chance
+        if chance is None:
+            return {}
+        counts = sorted(chance.failures.items(), key=lambda item: (-item[1], item[0] != MISSES))
+        return {name: Share(count=count, samples=chance.samples) for name, count in counts}
+
+    @property
     def failures(self) -> tuple[tuple[str, Share], ...]:
         """The most frequent failure in words, and the most frequent touch if that is another one."""
-        if self.risk is None:
-            return ()
-        happened = [(name, share) for name, share in self.risk.failures if share.count]
+        happened = [(name, share) for name, share in self.all_failures.items() if share.count]
         touches = [each for each in happened if each[0] != MISSES]
         first = happened[:1]
         chosen = first + ([touches[0]] if touches and first[0][0] == MISSES else [])
         return tuple((self._failure(name), share) for name, share in chosen)
 
     def _failure(self, name: str) -> str:
-        if name == MISSES and self.risk is not None:
-            return f"ends more than {self.risk.radius_mm:.1f} mm from the target"
+        chance = self.chance
+        if name == MISSES and chance is not None:
+            return f"ends more than {chance.radius_mm:.1f} mm from the target"
         return FAILURES[name]
 
     @property
     def text(self) -> str:
-        """The headline in sentences: geometry first, then the chance of success and what fails most often."""
-        return f"{self._geometry()} {self._chance()}"
+        """The headline in sentences: how often it succeeds and why it fails, and its geometry.
+
+        A refusal stands first: such a plan has no chance.
+        """
+        parts = [self._chance(), self._geometry()]
+        return " ".join(reversed(parts) if self.geometry == Geometry.REFUSED else parts)
 
     def _geometry(self) -> str:
         if self.geometry == Geometry.REFUSED:
@@ -124,66 +147,84 @@ class Headline:
         return f"geometry {self.geometry}{missing}"
 
     def _chance(self) -> str:
-        if self.risk is None:
-            return "Chance of success not estimated."
-        low, high = self.risk.succeeds.interval
-        words = (
-            f"Estimated to succeed in {of_hundred(self.risk.succeeds.value)} of 100 (95 % interval "
-            f"{of_hundred(low)} to {of_hundred(high, up=True)}) under the errors of '{self.risk.model.label}'"
-        )
+        chance, success = self.chance, self.success
+        if chance is None or success is None:
+            return "Chance of success not computed."
+        low, high = success.interval
         failures = " and ".join(
             f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in self.failures
         )
-        return f"{words}; most often {failures}." if failures else f"{words}; no draw failed."
+        why = f"fails most because it {failures}" if failures else "none of them failed"
+        return (
+            f"Estimated to succeed in {of_hundred(success.value)} of 100 procedures (95 % interval "
+            f"{of_hundred(low)} to {of_hundred(high, up=True)}); {why}. "
+            f"Procedure '{chance.procedure}', errors of '{chance.errors}'."
+        )
 
     @property
     def chance_words(self) -> str:
         """The chance of success alone, for the cell of a table."""
-        if self.risk is None:
-            return "not estimated"
-        low, high = self.risk.succeeds.interval
+        if self.success is None:
+            return "not computed"
+        low, high = self.success.interval
         interval = f"{of_hundred(low)} to {of_hundred(high, up=True)}"
-        return f"{of_hundred(self.risk.succeeds.value)} of 100 ({interval})"
+        return f"{of_hundred(self.success.value)} of 100 ({interval})"
 
     @property
     def details(self) -> tuple[str, ...]:
         """What the estimate rests on, in sentences: draws, what counts as success, and the errors' sizes."""
-        if self.risk is None:
+        chance = self.chance
+        if chance is None:
             return ()
-        model, label = self.risk.model, self.risk.model.label
-        sizes = model.words(with_needle=self.risk.with_needle)
-        last = "needle ends" if self.risk.with_needle else "tubes end"
-        assumed = ", ".join(kind.replace("_", " ") for kind in model.assumed)
+        drawn = f"{plural(chance.samples, 'draw')}, seed {chance.seed}"
+        if self.is_stated:
+            drawn += " that its search never saw, as the plan states; not computed again"
+        last = "needle ends" if chance.with_needle else "tubes end"
+        assumed = ", ".join(kind.replace("_", " ") for kind in chance.assumed)
         return (
-            f"{plural(self.risk.samples, 'draw')}, seed {self.risk.seed}; the devices are not corrected on "
-            "their way.",
-            f"Success: the {last} within {self.risk.radius_mm:.1f} mm of the target "
-            f"({self.risk.radius_origin}) and nothing forbidden is touched.",
-            f"Errors of '{label}': {sizes}. Assumed, with no published source: {assumed or 'none'}.",
+            f"{drawn}. {chance.corrections}",
+            f"Success: the {last} within {chance.radius_mm:.1f} mm of the target "
+            f"({chance.radius_origin}) and nothing forbidden is touched.",
+            f"Errors of '{chance.errors}': {chance.sizes}. Assumed, with no published source: "
+            f"{assumed or 'none'}.",
         )
 
-    def to_mapping(self) -> dict[str, object]:
-        """Return the headline as plain JSON values; None where something was not estimated."""
-        from anatomy.settings import to_mapping
+    @property
+    def is_stated(self) -> bool:
+        """Whether the chance is that which the plan states."""
+        return isinstance(self.estimate, Chance)
 
-        risk = self.risk
-        first = self.failures[:1]
+    def to_mapping(self) -> dict[str, object]:
+        """Return the headline as plain JSON values; None where something was not computed."""
+        chance, first = self.chance, self.failures[:1]
+        counted = {name: _share(share) for name, share in self.all_failures.items()}
         return {
             "text": self.text,
             "grade": self.grade.key,
             "verdict": self.verdict,
             "geometry": str(self.geometry),
             "fissures_unknown": self.fissures_unknown,
-            "success": None if risk is None else _share(risk.succeeds),
+            "success": None if self.success is None else _share(self.success),
+            "stated_by_plan": self.is_stated,
             "most_frequent_failure": {"what": first[0][0], **_share(first[0][1])} if first else None,
-            "failures": None if risk is None else {name: _share(share) for name, share in risk.failures},
-            "draws": None if risk is None else risk.samples,
-            "seed": None if risk is None else risk.seed,
-            "goal_radius_mm": None if risk is None else risk.radius_mm,
-            "goal_radius_origin": None if risk is None else risk.radius_origin,
-            "errors": None if risk is None else {**to_mapping(risk.model), "name": risk.model.label},
-            "errors_assumed": None if risk is None else list(risk.model.assumed),
+            "failures": None if chance is None else counted,
+            "draws": None if chance is None else chance.samples,
+            "seed": None if chance is None else chance.seed,
+            "goal_radius_mm": None if chance is None else chance.radius_mm,
+            "goal_radius_origin": None if chance is None else chance.radius_origin,
+            "procedure": None if chance is None else chance.procedure,
+            "errors": None if chance is None else _errors(chance, self.estimate),
+            "errors_assumed": None if chance is None else list(chance.assumed),
         }
+
+
+def _errors(chance: Chance, estimate: Estimate | None) -> dict[str, object]:
+    """Return the error model by its keys, or of what a plan states its name and sizes."""
+    from anatomy.settings import to_mapping
+
+    if estimate is None or isinstance(estimate, Chance):
+        return {"name": chance.errors, "sizes": chance.sizes}
+    return {**to_mapping(estimate.model), "name": chance.errors}
 
 
 def _share(share: Share) -> dict[str, object]:

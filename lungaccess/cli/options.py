@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget
+    from lungaccess.procedure import Procedure
     from lungaccess.risk import ErrorModel
 
     ObjectiveText = str
@@ -41,13 +42,6 @@ PatientFolder = Annotated[
 ]
 PlanFile = Annotated[Path, Parameter(help="The plan.json.")]
 PatientOfPlan = Annotated[Path, Parameter(help="Folder of the patient it was made for.")]
-ProcedureName = Annotated[
-    str,
-    Parameter(
-        help="What is measured and planned again on the way: a preset (closed-loop, measured-scope, "
-        "measured-tip, open-loop) or a TOML file."
-    ),
-]
 SUCCESS = "success"
 """The objective that is no cost: the chance of success."""
 DEFAULT_SYSTEM = "lung-default"
@@ -182,21 +176,38 @@ class SystemOptions:
 @Parameter(name="*")
 @frozen_value
 class ErrorOptions:
-    """How large the errors of devices and target are assumed to be."""
+    """How large the errors of devices and target are assumed to be, and what a procedure measures of them."""
 
     errors: Annotated[
-        str,
+        str | None,
         Parameter(
             help="Error model: a preset (breath-hold, expiratory-free, gated-ct, inspiratory-ct, "
-            "vision-only) or a TOML file."
+            "vision-only) or a TOML file; breath-hold if not given."
         ),
-    ] = "breath-hold"
+    ] = None
+    procedure: Annotated[
+        str | None,
+        Parameter(
+            help="What is measured and planned again on the way: a preset (closed-loop, measured-scope, "
+            "measured-tip, open-loop) or a TOML file; open-loop if not given."
+        ),
+    ] = None
 
     def load(self) -> ErrorModel:
-        """Return the error model."""
+        """Return the error model, the default one if none is given."""
         from lungaccess.risk import load_errors
 
-        return load_errors(self.errors)
+        return load_errors() if self.errors is None else load_errors(self.errors)
+
+    def given(self) -> ErrorModel | None:
+        """Return the error model, None if none is given: then a plan's own chance of success is shown."""
+        return None if self.errors is None else self.load()
+
+    def given_procedure(self) -> Procedure | None:
+        """Return the procedure, None if none is given."""
+        from lungaccess.procedure import load_procedure
+
+        return None if self.procedure is None else load_procedure(self.procedure)
 
 
 @Parameter(name="*")

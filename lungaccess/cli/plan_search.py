@@ -96,7 +96,7 @@ class CostHistory:
 class PlanRequest:
     """What to plan and where to; of several systems the least invasive that reaches the target is chosen.
 
-    With a procedure the chance that it succeeds is made large, instead of a cost small.
+    For success the chance that the procedure succeeds is made large, instead of a cost small.
     """
 
     systems: tuple[System, ...]
@@ -107,6 +107,7 @@ class PlanRequest:
     output: PatientOptions
     pictures: bool = True
     procedure: Procedure | None = None
+    for_success: bool = False
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -166,7 +167,7 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
         "time_s": search.time_s,
         "on_progress": history.on_progress,
     }
-    if request.procedure is not None:
+    if request.for_success:
         for each in plan_for_success(
             lung, system, target, errors=request.errors, procedure=request.procedure,
             atlas=atlas_of(system), counterfactuals=False, **limits,
@@ -202,22 +203,19 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     found = best.plan
     from lungaccess.appraisal import appraise  # After the search: the first plan does not wait for it.
 
-    with progress("checking the plan and estimating its chance"):
+    with progress("checking the plan and its chance"):
         appraisal = appraise(
             found,
             lung,
-            errors=request.errors,
+            errors=None if found.chance else request.errors,
+            procedure=None if found.chance else request.procedure,
             system=system_of(found, request.systems),
             target_lps=target.lps_mm,
         )
     record = plan_tables.plan_record(found, lung, appraisal, request.out, request.files)
-    if best.success is not None:
-        record["success"] = plan_tables.success_record(best.success)
     write_text(request.out / SUMMARY_FILE, terminal.json_text(record))
     if not request.output.json:
         show_plan(found, lung, appraisal)
-        if best.success is not None:
-            terminal.say(plan_tables.success_words(best.success))
     write_history(best, history, lung, appraisal, request)
     if request.output.json:
         terminal.show_json(record)

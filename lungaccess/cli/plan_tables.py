@@ -12,7 +12,6 @@ from rich.table import Table
 
 from lungaccess.appraisal.grade import Grade
 from lungaccess.cli import terminal
-from lungaccess.cli.procedure_tables import plain_share
 from stages.needle import Objective
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from lungaccess.checking import CheckReport, Finding
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
-    from lungaccess.success import PlannedSuccess
 
 
 GRADE_STYLES = {Grade.GOOD: "green", Grade.FAIR: "yellow", Grade.UNKNOWN: "yellow", Grade.POOR: "red"}
@@ -53,20 +51,6 @@ def plan_record(
         "timing": dict(plan.timing),
         "scope_motion": motion_record(plan, lung.tree),
     }
-
-
-def success_record(found: PlannedSuccess) -> dict[str, Any]:
-    """Return the chance of success of a plan, under which errors and which procedure."""
-    return {"procedure": found.procedure, "errors": found.errors, **plain_share(found.succeeds)}
-
-
-def success_words(found: PlannedSuccess) -> str:
-    """Return the chance of success of a plan in a sentence."""
-    low, high = found.succeeds.interval
-    return (
-        f"Of {found.succeeds.samples} simulated procedures '{found.procedure}' with the errors "
-        f"'{found.errors}', {found.succeeds.value:.0%} succeed (95 % interval: {low:.0%} to {high:.0%})."
-    )
 
 
 def no_plan_record(failure: NoPlan) -> dict[str, Any]:

@@ -16,7 +16,15 @@ if TYPE_CHECKING:
         needle_changes,
         scope_changes,
     )
-    from lungaccess.coupled.diverse_plans import Alternative, alternatives, criteria, with_front
+    from lungaccess.coupled.diverse_plans import (
+        COUNT,
+        SEPARATION_MM,
+        Alternative,
+        alternatives,
+        criteria,
+        separated_plans,
+        with_front,
+    )
     from lungaccess.coupled.explanation import explain
     from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
     from lungaccess.coupled.planner import METHODS, ProgressEvent, atlas_event, plan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.explanation import explain
-from lungaccess.coupled.search.direct_candidates import direct_candidates
+from lungaccess.coupled.search.direct_candidates import DirectCandidates, direct_candidates
 from lungaccess.coupled.search.separated_arcs import separated_candidates
 from lungaccess.plans.assemble import assemble
+from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
@@ -25,8 +27,11 @@ SEPARATION_MM = 5.0
 """Fig. 6 of [Kuntz2015] shows as many plans; the separation is a free choice."""
 
 SMALL_IS_GOOD = ("inverse_clearance", "cost_map", "length_in_tissue_mm")
-LARGE_IS_GOOD = ("clearance_mm", "pleura_mm")
-"""The criteria of the Pareto front."""
+LARGE_IS_GOOD = ("success", "clearance_mm", "pleura_mm")
+"""Which way the criteria go."""
+GEOMETRIC = (*SMALL_IS_GOOD, "clearance_mm", "pleura_mm")
+TRADE_OFF = ("success", "length_in_tissue_mm", "clearance_mm")
+"""The criteria of the Pareto front: without chances of success, and with them."""
 
 
 @frozen_record
@@ -37,14 +42,19 @@ class Alternative:
     ----------
     criteria : dict of str to float
         "clearance_mm" and "pleura_mm", least distance of tube and needle from any obstacle and from the
-        pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" as the plan states them.
+        pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" as the plan states them; "success",
+        the share of procedures that succeed, where it is known.
     on_front : bool
-        Whether no other plan of the set is at least as good in all criteria and better in one.
+        Whether no other plan of the set is at least as good in all criteria of the front and better in one:
+        success, length and clearance where the chances of success are known, else all others.
+    chance : Chance or None
+        The chance of success, where it is known.
     """
 
     plan: Plan
     criteria: dict[str, float]
     on_front: bool
+    chance: Chance | None = None
 
 
 def alternatives(
@@ -85,29 +95,43 @@ def alternatives(
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
-    weighed = Objective.of(objective)
+    task = Task(
+        lung=lung, system=system, target=target, objective=Objective.of(objective), method="alternatives"
+    )
+    if atlas is not None:
+        require_same(atlas, lung, system)
+    direct = direct_candidates(task, atlas or build_atlas(lung, system))
+    return with_front(separated_plans(direct, count, separation_mm, counterfactuals=counterfactuals))
+
+
+def separated_plans(
+    direct: DirectCandidates, count: int, separation_mm: float, *, counterfactuals: bool
+) -> list[Plan]:
+    """Return the plans of a diverse plan set, chosen among direct candidates; see `alternatives`.
+
+    Raises
+    ------
+    NoPlan
+        If there is none.
+    SettingsError
+        If a number is not above 0.
+    """
     if count < 1 or not separation_mm > 0.0:
         raise SettingsError(
             f"{count} plans with a separation of {separation_mm:g} mm are asked for",
             expected="both above 0",
             remedy="State both, such as --count 15 --separation 5",
         )
-    task = Task(lung=lung, system=system, target=target, objective=weighed, method="alternatives")
-    if atlas is not None:
-        require_same(atlas, lung, system)
-    atlas = atlas or build_atlas(lung, system)
-    began = time.perf_counter()
-    direct = direct_candidates(task, atlas)
+    began, task, atlas = time.perf_counter(), direct.task, direct.atlas
     chosen = list(separated_candidates(direct, count, separation_mm))
     if not chosen:
         raise explain(task, atlas, direct.evaluator.blocked, 0, counterfactuals=counterfactuals)
     timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
-    plans = [assemble(task, each, iteration=0, timing=timing) for each in chosen]
-    return with_front(plans)
+    return [assemble(task, each, iteration=0, timing=timing) for each in chosen]
 
 
 def criteria(plan: Plan) -> dict[str, float]:
-    """Return what plans are compared by; see `Alternative`."""
+    """Return what plans are compared by, but for their chance of success; see `Alternative`."""
     clearances = list(plan.clearance_mm.values())
     obstacles = [name for name in clearances[0] if name != "fissure" or plan.fissures_are_obstacles]
     return {
@@ -119,14 +143,28 @@ def criteria(plan: Plan) -> dict[str, float]:
     }
 
 
-def with_front(plans: list[Plan]) -> tuple[Alternative, ...]:
-    """Return plans with their criteria, and which of them are on the Pareto front."""
-    values = [criteria(plan) for plan in plans]
-    signed = np.array(
-        [[v[name] for name in SMALL_IS_GOOD] + [-v[name] for name in LARGE_IS_GOOD] for v in values]
-    )
+def with_front(
+    plans: Sequence[Plan], chances: Sequence[Chance | None] | None = None
+) -> tuple[Alternative, ...]:
+    """Return plans with their criteria, and which of them are on the Pareto front.
+
+    Parameters
+    ----------
+    chances : sequence of Chance or None, optional
+        The chance of success of each plan.  A plan of which none is known is on no front.
+    """
+    names = GEOMETRIC if chances is None else TRADE_OFF
+    known = [None] * len(plans) if chances is None else list(chances)
+    values = [
+        criteria(plan) | ({} if chance is None else {"success": chance.share})
+        for plan, chance in zip(plans, known, strict=True)
+    ]
+    rated = [n for n, chance in enumerate(known) if chances is None or chance is not None]
+    signs = np.array([-1.0 if name in LARGE_IS_GOOD else 1.0 for name in names])
+    signed = np.array([[values[n][name] for name in names] for n in rated]).reshape(-1, len(names)) * signs
     beaten = [bool(((signed <= row).all(axis=1) & (signed < row).any(axis=1)).any()) for row in signed]
+    front = {n for n, worse in zip(rated, beaten, strict=True) if not worse}
     return tuple(
-        Alternative(plan=plan, criteria=value, on_front=not worse)
-        for plan, value, worse in zip(plans, values, beaten, strict=True)
+        Alternative(plan=plan, criteria=value, on_front=n in front, chance=chance)
+        for n, (plan, value, chance) in enumerate(zip(plans, values, known, strict=True))
     )

@@ -16,6 +16,7 @@ from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.typed import Float
 from anatomy.words import plural
 from lungaccess.plans import file as plan_file
+from lungaccess.plans.chance import Chance
 from lungaccess.plans.curves import (
     STEP_MM,
     DeviceCurves,
@@ -72,6 +73,9 @@ class Plan(Record):
         this one was chosen; see `lungaccess.coupled.presets`.  Empty otherwise.
     timing : mapping of str to float
         Seconds; the only values that differ between two equal runs.
+    chance : Chance or None
+        For a plan that was searched by its chance of success, that chance, counted on draws that the search
+        never saw; None for any other.
     """
 
     schema: str = plan_file.SCHEMA
@@ -99,6 +103,7 @@ class Plan(Record):
     timing: Mapping[str, float]
     needle_planner: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
     system_choice: tuple[str, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
+    chance: Chance | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""

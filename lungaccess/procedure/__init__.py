@@ -8,7 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.procedure.report import ProcedureReport, StageReport
-    from lungaccess.procedure.settings import Procedure, load_procedure, procedure_names
+    from lungaccess.procedure.settings import DEFAULT_PROCEDURE, Procedure, load_procedure, procedure_names
     from lungaccess.procedure.simulation import Simulator, simulate_procedure
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

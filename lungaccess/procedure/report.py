@@ -56,6 +56,8 @@ class ProcedureReport:
         Mean number of times that the bronchoscope was placed.
     stages : tuple of StageReport
         What was measured, in its order.
+    with_needle : bool
+        Whether the plan has a needle; its tubes end at the target where it has none.
     """
 
     model: ErrorModel
@@ -70,6 +72,7 @@ class ProcedureReport:
     miss_mm: Mapping[float, float]
     placements: float
     stages: tuple[StageReport, ...]
+    with_needle: bool = True
 
     @property
     def failures(self) -> tuple[tuple[str, Share], ...]:

@@ -250,6 +250,7 @@ def _report(simulator: Simulator, found: _Found, samples: int, seed: int) -> Pro
         miss_mm=MappingProxyType(quantiles),
         placements=float(np.mean([each.placements for each in found.histories])) if found.histories else 1.0,
         stages=tuple(_stage(stage, found.histories) for stage in STAGES if _used(procedure, stage)),
+        with_needle=assessor.plan.needle is not None,
     )
 
 

@@ -95,13 +95,14 @@ def export_slicer(
     report = check(plan, lung)
     devices = plan.curves(STEP_MM)
     items = _write_devices(plan, devices, target, refused=not report.accepted)
-    items += _write_start_region(plan, lung, target) if report.accepted else []
+    region, why_none = _write_start_region(plan, lung, target) if report.accepted else ([], "")
+    items += region
     items += _write_anatomy(lung, target, tell)
     write_text(target / SCENE_FILE, scene(items))
     write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
     plan.save(target / PLAN_FILE)
     files = (SCENE_FILE, *(item.file for item in items), ROUTE_FILE, PLAN_FILE, README_FILE)
-    write_text(target / README_FILE, readme(plan, report, files))
+    write_text(target / README_FILE, readme(plan, report, files, why_none))
     tell("done", 1.0)
     return Exported(files=files, report=report)
 
@@ -122,12 +123,12 @@ def _write_devices(plan: Plan, devices: DeviceCurves, folder: Path, *, refused: 
     return [*items, points]
 
 
-def _write_start_region(plan: Plan, lung: Lung, folder: Path) -> list[Item]:
-    """Write the bodies of the safe start region; none for a plan without a needle."""
+def _write_start_region(plan: Plan, lung: Lung, folder: Path) -> tuple[list[Item], str]:
+    """Write the bodies of the safe start region; say why where there is none."""
     try:
         region = safe_start_region(plan, lung)
-    except SettingsError:
-        return []
+    except SettingsError as reason:
+        return [], reason.found
     items = []
     for name, body, colour in (
         ("start_region_proved", proved_body(region), PROVED_COLOUR),
@@ -140,7 +141,7 @@ def _write_start_region(plan: Plan, lung: Lung, folder: Path) -> list[Item]:
                     kind="Model", name=name.replace("_", " "), file=f"{name}.ply", colour=colour, opacity=0.4
                 )
             )
-    return items
+    return items, "" if items else region.words
 
 
 def _named(markups: dict[str, Any], prefix: str) -> dict[str, Any]:

@@ -24,8 +24,11 @@ _MEANING = {
 }
 
 
-def readme(plan: Plan, report: CheckReport, files: tuple[str, ...]) -> str:
-    """Return what is in the folder, in which frame, and what the check says of the plan."""
+def readme(plan: Plan, report: CheckReport, files: tuple[str, ...], no_region: str = "") -> str:
+    """Return what is in the folder, in which frame, and what the check says of the plan.
+
+    `no_region` tells why there is no safe start region, if there is none.
+    """
     target = ", ".join(f"{c:.1f}" for c in plan.target_lps)
     ras = ", ".join(f"{c:.1f}" for c in (-plan.target_lps[0], -plan.target_lps[1], plan.target_lps[2]))
     verdict = "ACCEPTS" if report.accepted else "REFUSES"
@@ -37,6 +40,7 @@ def readme(plan: Plan, report: CheckReport, files: tuple[str, ...]) -> str:
         f"The independent check {verdict} this plan.",
         *(f"  {finding}" for finding in (*report.refusals, *report.unchecked)),
         "It says nothing of the chance of success, which `lungaccess risk` estimates.",
+        *([f"No safe start region: {no_region}."] if no_region else []),
         "",
         "Research software, not a medical device. Not for the treatment of patients.",
         "",

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.success.diverse_plans import alternatives_for_success
+    from lungaccess.success.estimate import ChanceEstimator, Estimate, chance_of, estimate_success
     from lungaccess.success.planner import PlannedSuccess, plan_for_success
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from anatomy.lung import Lung
 from anatomy.records import frozen_value
+from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
-from lungaccess.procedure import Procedure, Simulator
-from lungaccess.risk import ErrorModel, RiskAssessor, Share, goal_radius
+from lungaccess.procedure import (
+    DEFAULT_PROCEDURE,
+    Procedure,
+    ProcedureReport,
+    Simulator,
+    simulate_procedure,
+)
+from lungaccess.risk import ErrorModel, RiskAssessor, RiskReport, Share, assess, goal_radius
 
 FRESH_SEED = 1 << 20
 """Added to a search's seed for the draws that it never sees."""
@@ -48,6 +56,66 @@ chosen anew at the tip as measured: tips compete, with few draws."""
 Counter = Callable[[int, int], Share]
 """Counts the successes of one plan: of so many draws, by a seed."""
 
+Estimate = RiskReport | ProcedureReport | Chance
+"""What a chance of success is read from: an estimate with all its parts, or what a plan states of one."""
+
+
+UNCORRECTED = "The devices are not corrected on their way."
+
+
+def estimate_success(
+    plan: Plan,
+    lung: Lung,
+    *,
+    errors: ErrorModel,
+    procedure: Procedure,
+    samples: int,
+    seed: int,
+    radius_mm: float | None = None,
+    each_kind: bool = False,
+) -> RiskReport | ProcedureReport:
+    """Return how often a plan succeeds: deviated as it stands in open loop, else by simulated procedures.
+
+    Parameters
+    ----------
+    each_kind : bool
+        See `lungaccess.risk.assess`; of open loop alone.
+
+    Raises
+    ------
+    PlanFileError, SettingsError
+        See `lungaccess.risk.RiskAssessor`; also if there are no samples.
+    """
+    if procedure.is_open_loop:
+        return assess(
+            plan, lung, model=errors, samples=samples, seed=seed, radius_mm=radius_mm, each_kind=each_kind
+        )
+    return simulate_procedure(
+        plan, lung, errors=errors, procedure=procedure, samples=samples, seed=seed, radius_mm=radius_mm
+    )
+
+
+def chance_of(found: Estimate) -> Chance:
+    """Return the chance of success that an estimate counts."""
+    if isinstance(found, Chance):
+        return found
+    procedure = Procedure(name=DEFAULT_PROCEDURE, description=UNCORRECTED)
+    procedure = found.procedure if isinstance(found, ProcedureReport) else procedure
+    return Chance(
+        errors=found.model.label,
+        procedure=procedure.name,
+        corrections=procedure.description,
+        sizes=found.model.words(with_needle=found.with_needle),
+        assumed=found.model.assumed,
+        radius_mm=found.radius_mm,
+        radius_origin=found.radius_origin,
+        with_needle=found.with_needle,
+        samples=found.samples,
+        seed=found.seed,
+        successes=found.succeeds.count,
+        failures={name: share.count for name, share in found.failures},
+    )
+
 
 class ChanceEstimator:
     """Counts successes of the plans of one task.
@@ -65,7 +133,7 @@ class ChanceEstimator:
         self, task: Task, errors: ErrorModel, procedure: Procedure, *, radius_mm: float | None
     ) -> None:
         self.errors, self.procedure = errors, procedure
-        self._lung, self._seed = task.lung, task.seed
+        self._lung, self._seed, self._given_mm = task.lung, task.seed, radius_mm
         self.radius_mm = goal_radius(task.lung, task.target.lps_mm, radius_mm)[0]
         self.halving = OPEN_LOOP if procedure.is_open_loop else MEASURED
 
@@ -81,6 +149,9 @@ class ChanceEstimator:
         """Return how many of `samples` procedures succeed; all plans have the same luck."""
         return counter(samples, self._seed).count
 
-    def fresh(self, plan: Plan, samples: int) -> Share:
-        """Return the share of successes of draws that no search sees."""
-        return self.counter(plan)(samples, self._seed + FRESH_SEED)
+    def fresh(self, plan: Plan, samples: int) -> RiskReport | ProcedureReport:
+        """Return an estimate on draws that no search sees."""
+        return estimate_success(
+            plan, self._lung, errors=self.errors, procedure=self.procedure, samples=samples,
+            seed=self._seed + FRESH_SEED, radius_mm=self._given_mm,
+        )  # fmt: skip

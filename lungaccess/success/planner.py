@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
@@ -13,9 +14,9 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from lungaccess.procedure import Procedure, load_procedure
-from lungaccess.risk import ErrorModel, Share, load_errors
-from lungaccess.success.estimate import ChanceEstimator
+from lungaccess.procedure import Procedure, ProcedureReport, load_procedure
+from lungaccess.risk import ErrorModel, RiskReport, Share, load_errors
+from lungaccess.success.estimate import ChanceEstimator, chance_of
 from lungaccess.success.search import SuccessSearch
 from stages.needle import Objective
 
@@ -31,16 +32,18 @@ class PlannedSuccess:
     ----------
     plan : Plan
         Proved as every plan; its costs are those of the objective "inverse_clearance".
-    succeeds : Share
-        How many procedures succeed of draws that no search has seen; few draws of the first plan.
-    errors, procedure : str
-        What the error model and the procedure are called.
+    estimate : RiskReport or ProcedureReport
+        How many procedures succeed of draws that no search has seen, and what fails; few draws of the first
+        plan.  What is counted the plan states as its `chance`.
     """
 
     plan: Plan
-    succeeds: Share
-    errors: str
-    procedure: str
+    estimate: RiskReport | ProcedureReport
+
+    @property
+    def succeeds(self) -> Share:
+        """How many procedures succeed."""
+        return self.estimate.succeeds
 
 
 def plan_for_success(
@@ -123,12 +126,8 @@ def _run(
             samples = estimator.halving.samples[0] if best is None else estimator.halving.fresh
             best = contender
             whole = search.finished(contender, tried, clock.elapsed_s)
-            yield PlannedSuccess(
-                plan=whole,
-                succeeds=estimator.fresh(whole, samples),
-                errors=estimator.errors.label,
-                procedure=estimator.procedure.name,
-            )
+            found = estimator.fresh(whole, samples)
+            yield PlannedSuccess(plan=replace(whole, chance=chance_of(found)), estimate=found)
         if clock.elapsed_s > time_s:
             break
         if clock.due():

@@ -67,10 +67,10 @@ def appraise_as_told(monkeypatch: pytest.MonkeyPatch, seen: dict[str, Any]) -> N
         seen["judged_with"] = system
         return make_check(seen["accepted"])
 
-    def assess(*_: Any, model: ErrorModel | None = None, **options: Any) -> RiskReport:
-        seen["errors"] = model
+    def estimate(*_: Any, errors: ErrorModel | None = None, **options: Any) -> RiskReport:
+        seen["errors"] = errors
         return seen["risk"]
 
     monkeypatch.setattr("lungaccess.checking.checker.Checker.__init__", lambda *_: None)
     monkeypatch.setattr("lungaccess.checking.checker.Checker.check", judge)
-    monkeypatch.setattr("lungaccess.appraisal.appraiser.assess", assess)
+    monkeypatch.setattr("lungaccess.appraisal.appraiser.estimate_success", estimate)

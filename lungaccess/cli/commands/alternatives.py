@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -14,6 +14,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative
 from lungaccess.cli.options import (
+    SUCCESS,
     ErrorOptions,
     ObjectiveText,
     PatientFolder,
@@ -32,12 +33,13 @@ if TYPE_CHECKING:
     from lungaccess.coupled import Alternative
     from lungaccess.problem.system import System
 
-COLUMNS = ("plan", "succeeds", "branch", "gen.", "clear", "pleura", "tissue", "1/clear", "map", "best")
+PICTURE = "trade_off.svg"
+COLUMNS = ("plan", "succeeds", "branch", "gen.", "clear", "pleura", "tissue", "1/clear", "map", "front")
 NOTE = (
     "succeeds: of 100; gen.: generation of the scope's tip; clear, pleura: least distance of tubes and "
     "needle from any obstacle and from the pleura, mm, as the plan states it; tissue: way in tissue, mm; "
-    "1/clear: integral of 1/clearance; best: no other plan is better in one of the columns from clear on and "
-    "as good in the others"
+    "1/clear: integral of 1/clearance; front: no other plan is better in one of succeeds, clear and tissue "
+    "and as good in the others"
 )
 
 
@@ -52,19 +54,29 @@ def alternatives(
         Parameter(help="The needles of every two plans lie somewhere at least so many mm from each other."),
     ] = 5.0,
     objective: Annotated[
-        ObjectiveText, Parameter(help="By what the cheapest come first, as for `plan`.")
+        ObjectiveText,
+        Parameter(help="By what the best come first, as for `plan`; success: the likeliest to succeed."),
     ] = "inverse-clearance",
     errors: ErrorOptions = ErrorOptions(),
-    out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on.")] = Path(
+    out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on, and trade_off.svg.")] = Path(
         "lungaccess-alternatives"
     ),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Show plans to one target that differ, check each, and write them; those no other beats are marked."""
+    """Show plans to one target that differ, check each, and write them.
+
+    Those that no other beats in success, length and clearance together are marked: the Pareto front.
+    """
+    from anatomy.io.files import write_text
     from lungaccess.appraisal import Appraiser
     from lungaccess.coupled import alternatives as find_alternatives
+    from lungaccess.coupled import with_front
+    from lungaccess.report.html import trade_off_svg
+    from lungaccess.success import alternatives_for_success
 
-    stated, weighed, model = target.stated(), Objective.of(objective), errors.load()
+    for_success = objective == SUCCESS
+    stated, weighed = target.stated(), Objective.of("inverse-clearance" if for_success else objective)
+    model, procedure = errors.load(), errors.given_procedure()
     require_writable_folder(out)
     systems = system.candidates()
     lung = output.load(patient)
@@ -72,21 +84,30 @@ def alternatives(
     aim = stated.resolve(lung)
 
     def search(device: System) -> tuple[Alternative, ...]:
-        atlas = output.open_atlas(lung, device)
-        with progress("searching"):
-            return find_alternatives(
-                lung, device, aim, objective=weighed, count=count, separation_mm=separation, atlas=atlas,
-                counterfactuals=len(systems) == 1,
-            )  # fmt: skip
+        shared: dict[str, Any] = {
+            "atlas": output.open_atlas(lung, device),
+            "count": count,
+            "separation_mm": separation,
+            "counterfactuals": len(systems) == 1,
+        }
+        with progress("searching") as shown:
+            if for_success:
+                return alternatives_for_success(
+                    lung, device, aim, errors=model, procedure=procedure, progress=shown.share, **shared
+                )
+            return find_alternatives(lung, device, aim, objective=weighed, **shared)
 
     found = search(systems[0]) if len(systems) == 1 else _of_the_least_invasive(lung, systems, search)
     chosen = system_of(found[0].plan, systems)
-    appraiser, appraisals = Appraiser(lung, model), []
+    appraiser = Appraiser(lung) if for_success else Appraiser(lung, model, procedure=procedure)
+    appraisals = []
     with progress("checking") as shown:
         for number, each in enumerate(found, start=1):
             each.plan.save(out / f"plan-{number:02d}.json")
             appraisals.append(appraiser.appraise(each.plan, chosen, target_lps=aim.lps_mm))
             shown.share(number / len(found))
+    found = with_front([each.plan for each in found], [each.headline.chance for each in appraisals])
+    write_text(out / PICTURE, trade_off_svg(found))
     refused = sum(not each.accepted for each in appraisals)
     if output.json:
         terminal.show_json(_records(found, appraisals, out, lung.cost is not None))
@@ -157,7 +178,7 @@ def _records(
         {
             "plan": str(out / f"plan-{number:02d}.json"),
             **appraisal.to_mapping(),
-            "no_other_beats_it": bool(each.on_front),
+            "on_front": bool(each.on_front),
             "branch": int(each.plan.tube.exit.branch),
             "generation": int(each.plan.scope.generation),
             "criteria": known_costs(each.criteria, has_map=has_map),

@@ -32,9 +32,11 @@ def check(
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
 
-    stored, model = Plan.load(plan), errors.load()
+    stored, model = Plan.load(plan), errors.given()
     device = None if system is None else load_system(system)
-    appraisal = appraise(stored, output.load(patient, thick_slices=True), errors=model, system=device)
+    followed = errors.given_procedure()
+    lung = output.load(patient, thick_slices=True)
+    appraisal = appraise(stored, lung, errors=model, procedure=followed, system=device)
     if output.json:
         terminal.show_json({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
         return ExitCode.of(appraisal.accepted)

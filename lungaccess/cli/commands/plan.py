@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -19,7 +19,6 @@ from lungaccess.cli.options import (
     ErrorOptions,
     PatientFolder,
     PatientOptions,
-    ProcedureName,
     SearchOptions,
     SystemOptions,
     TargetOptions,
@@ -27,9 +26,6 @@ from lungaccess.cli.options import (
 )
 from lungaccess.cli.plan_search import PlanRequest, plan_and_report
 from stages.needle import Objective
-
-if TYPE_CHECKING:
-    from lungaccess.procedure import Procedure
 
 
 def plan(
@@ -39,13 +35,6 @@ def plan(
     system: SystemOptions = SystemOptions(),
     search: SearchOptions = SearchOptions(),
     errors: ErrorOptions = ErrorOptions(),
-    procedure: Annotated[
-        ProcedureName | None,
-        Parameter(
-            help="For --objective success, what is measured and planned again on the way: a preset "
-            "(closed-loop, measured-scope, measured-tip, open-loop) or a TOML file; open-loop if not given."
-        ),
-    ] = None,
     thick_slices: Annotated[
         bool,
         Parameter(help="Plan on masks from slices of more than 3 mm, which lack small airways and vessels."),
@@ -70,16 +59,19 @@ def plan(
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
 
-    followed = _procedure(search, system, procedure)
-    search = search if followed is None else replace(search, objective=SearchOptions().objective)
-    stated, objective, model = target.stated(), Objective.of(search.objective), errors.load()
+    for_success = search.objective == SUCCESS
+    if for_success:
+        _require_plain(search, system)
+        search = replace(search, objective=SearchOptions().objective)
+    stated, objective = target.stated(), Objective.of(search.objective)
+    model, procedure = errors.load(), errors.given_procedure()
     require_writable_folder(out)
     systems = system.candidates()
     lung = output.load(patient, thick_slices=thick_slices)
     require_map(lung, objective)
     request = PlanRequest(
         systems=systems, target=stated, search=search, errors=model, out=out, output=output,
-        pictures=pictures, procedure=followed,
+        pictures=pictures, procedure=procedure, for_success=for_success,
     )  # fmt: skip
     try:
         return plan_and_report(lung, request)
@@ -95,18 +87,8 @@ def plan(
         return ExitCode.NEGATIVE
 
 
-def _procedure(search: SearchOptions, system: SystemOptions, name: str | None) -> Procedure | None:
-    """Return the procedure that is to succeed, None where a cost is made small."""
-    from lungaccess.procedure import load_procedure
-
-    if search.objective != SUCCESS:
-        if name is not None:
-            raise SettingsError(
-                f"--procedure is {name} with --objective {search.objective}",
-                expected=f"--objective {SUCCESS}",
-                remedy="`lungaccess risk` simulates procedures of a plan that is there",
-            )
-        return None
+def _require_plain(search: SearchOptions, system: SystemOptions) -> None:
+    """Raise SettingsError unless the search is one that can be made for the chance of success."""
     plain = SearchOptions()
     if (search.method, search.needle_planner, search.processes) != (plain.method, None, plain.processes):
         raise SettingsError(
@@ -120,4 +102,3 @@ def _procedure(search: SearchOptions, system: SystemOptions, name: str | None) -
             expected="one system",
             remedy="Name a system; `lungaccess presets` lists them",
         )
-    return load_procedure(name or "open-loop")

@@ -43,15 +43,22 @@ def report(
     ] = None,
     errors: ErrorOptions = ErrorOptions(),
     samples: Annotated[
-        SamplesOrNone, Parameter(help="Deviated plans of the estimate of risk; 0 leaves it out.")
-    ] = 2000,
-    seed: Annotated[Seed, Parameter(help="Seed of that estimate.")] = 0,
+        SamplesOrNone | None,
+        Parameter(
+            help="Deviated plans of the estimate of success; 0 leaves it out; 2000 if not given, or 120 "
+            "procedures that measure."
+        ),
+    ] = None,
+    seed: Annotated[Seed | None, Parameter(help="Seed of that estimate; 0 if not given.")] = None,
     instructions: Annotated[
         bool, Parameter(help="Whether instructions for the scope are listed step by step.")
     ] = True,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Write one HTML file about a stored plan: it plays in 3-D, with slices, charts, limits and risk."""
+    """Write one HTML file about a stored plan: it plays in 3-D, with slices, charts, limits and risk.
+
+    A plan that states its chance of success shows that, unless errors, procedure, samples or seed are given.
+    """
     from lungaccess.plans.plan import Plan
     from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page
     from lungaccess.report.html.volumes import find_ct, read_ct
@@ -59,7 +66,7 @@ def report(
     page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)
-    stored, model = Plan.load(plan), errors.load()
+    stored, model, followed = Plan.load(plan), errors.given(), errors.given_procedure()
     lung = output.load(patient)
     stored.require_lung(lung)
     image = ct if ct is not None else find_ct(patient)
@@ -70,6 +77,7 @@ def report(
             ct_name="" if image is None else image.name,
             cost_over_time=plan.parent / HISTORY_FILE,
             errors=model,
+            procedure=followed,
             risk_samples=samples,
             risk_seed=seed,
             instructions=instructions,

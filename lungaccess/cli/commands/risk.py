@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Probability, Processes, Samples, Seed
-from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile, ProcedureName
+from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.procedure_tables import plain_share, procedure_record, procedure_tables, share_row
 from lungaccess.cli.progress import progress
 
@@ -24,7 +24,6 @@ def risk(
     patient: PatientOfPlan,
     *,
     errors: ErrorOptions = ErrorOptions(),
-    procedure: ProcedureName = "open-loop",
     samples: Annotated[
         Samples | None,
         Parameter(help="Number of deviated plans; 10000, or 1000 procedures that measure on their way."),
@@ -44,12 +43,12 @@ def risk(
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it."""
     from lungaccess.plans.plan import Plan
-    from lungaccess.procedure import load_procedure, simulate_procedure
+    from lungaccess.procedure import Procedure, simulate_procedure
     from lungaccess.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.risk import assess, find_tolerances
     from lungaccess.risk.assessment import DEFAULT_SAMPLES
 
-    model, followed = errors.load(), load_procedure(procedure)
+    model, followed = errors.load(), errors.given_procedure() or Procedure()
     stored = Plan.load(plan)
     lung = output.load(patient)
     if not followed.is_open_loop:

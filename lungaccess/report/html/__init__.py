@@ -11,5 +11,6 @@ if TYPE_CHECKING:
     from lungaccess.report.html.page_of_no_plan import no_plan_page
     from lungaccess.report.html.page_of_plan import PageOptions, plan_page
     from lungaccess.report.html.page_of_reach import reach_page
+    from lungaccess.report.html.trade_off import trade_off_svg
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

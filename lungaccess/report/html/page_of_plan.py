@@ -13,22 +13,30 @@ import numpy as np
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_record
 from anatomy.words import plural
-from lungaccess.appraisal import DRAWS, SEED, Appraiser
+from lungaccess.appraisal import Appraiser
+from lungaccess.coupled import with_front
+from lungaccess.plans.chance import Chance
+from lungaccess.procedure import load_procedure, procedure_names
 from lungaccess.report.html import tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
 from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, write_page
 from lungaccess.report.html.meshes import start_meshes, structure_meshes
+from lungaccess.report.html.risk import risk_section
+from lungaccess.report.html.trade_off import CAPTION, trade_off_svg
 from lungaccess.report.html.volumes import page_image
+from lungaccess.risk import error_preset_names, load_errors
 
 if TYPE_CHECKING:
     from anatomy.grid import Volume
     from anatomy.lung import Lung
     from lungaccess.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
+    from lungaccess.procedure import Procedure
     from lungaccess.risk import ErrorModel
     from stages.needle import StartRegion
 
 MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
+NO_REGION = "No safe start region"
 THICKER = "; seen from afar, devices are drawn thicker than they are"
 
 
@@ -46,10 +54,9 @@ class PageOptions:
         What the CT is, for people.
     cost_over_time : path or None
         CSV that `lungaccess plan` wrote beside the plan.
-    errors : ErrorModel or None
-        The errors under which the chance of success is estimated; the default ones if None.
-    risk_samples, risk_seed : int
-        Draws of that estimate and their seed, see `lungaccess.appraisal.Appraiser`; 0 samples for none.
+    errors, procedure, risk_samples, risk_seed
+        Of the estimate of success, see `lungaccess.appraisal.Appraiser`: 0 samples for none.  If all are
+        None, a plan that states its chance shows that, and its alternatives are estimated as it was.
     instructions : bool
         Whether the steps that bring the scope to its place are listed.
     """
@@ -59,8 +66,9 @@ class PageOptions:
     ct_name: str = ""
     cost_over_time: Path | None = None
     errors: ErrorModel | None = None
-    risk_samples: int = DRAWS
-    risk_seed: int = SEED
+    procedure: Procedure | None = None
+    risk_samples: int | None = None
+    risk_seed: int | None = None
     instructions: bool = True
 
 
@@ -89,10 +97,10 @@ def plan_page(
     """
     chosen = options or PageOptions()
     plans = (plan, *chosen.alternatives)
-    appraiser = Appraiser(lung, chosen.errors, draws=chosen.risk_samples, seed=chosen.risk_seed)
-    appraisals = [appraiser.appraise(each, each_kind=each is plan) for each in plans]
+    appraisals = _appraised(plans, lung, chosen)
     first = appraisals[0]
-    region = start_region_of(plan, lung) if first.accepted else None
+    region = start_region_of(plan, lung) if first.accepted else "Not computed for a refused plan"
+    drawn, told = (None, region) if isinstance(region, str) else (region, region.words)
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
         "headline": words.headline(first.headline),
@@ -100,26 +108,57 @@ def plan_page(
         "summary": _summary(plan),
         "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),
         "image_source": words.text(image_source(lung, chosen.ct_name if chosen.ct is not None else "")),
-        "plans": tables.plans_section(plans, appraisals),
+        "plans": _plans_section(plans, appraisals),
         "key_numbers": tables.key_section(plan, lung),
         "findings": tables.check_section(first.check),
         "instructions": tables.instructions_section(plan, lung)
         if chosen.instructions
         else "<p>Left out.</p>",
-        "risk": tables.risk_section(first.risk, "" if region is None else region.words),
+        "risk": risk_section(first.risk, told),
         "provenance": tables.provenance_section(plan, lung),
     }
-    return write_page(path, "plan.html", MODULES, page_data(plans, appraisals, lung, chosen, region), parts)
+    return write_page(path, "plan.html", MODULES, page_data(plans, appraisals, lung, chosen, drawn), parts)
 
 
-def start_region_of(plan: Plan, lung: Lung) -> StartRegion | None:
-    """Return the safe start region of a plan; None where the plan has no needle or the region is refused."""
+def _plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> str:
+    """Return a table that compares plans, and for several of them a drawing of what they trade."""
+    rated = with_front(plans, [each.headline.chance for each in appraisals])
+    if len(plans) == 1:
+        return tables.plans_section(rated, appraisals)
+    drawing = trade_off_svg(rated, first=0)
+    figure = f"<figure>{drawing}<figcaption>{CAPTION}</figcaption></figure>" if drawing else ""
+    return tables.plans_section(rated, appraisals) + figure
+
+
+def _appraised(plans: Sequence[Plan], lung: Lung, options: PageOptions) -> list[Appraisal]:
+    """Return the appraisals of a plan and its alternatives, whose chances are all of the same luck."""
+    given = (options.errors, options.procedure, options.risk_samples, options.risk_seed)
+    appraiser = Appraiser(lung, given[0], procedure=given[1], draws=given[2], seed=given[3])
+    first = appraiser.appraise(plans[0], each_kind=True)
+    if isinstance(first.risk, Chance) and len(plans) > 1:
+        appraiser = _appraiser_like(first.risk, lung)
+    return [first, *(appraiser.appraise(each) for each in plans[1:])]
+
+
+def _appraiser_like(chance: Chance, lung: Lung) -> Appraiser:
+    """Return what estimates other plans as a stated chance was; no estimate where that was by a file."""
+    known = chance.errors in error_preset_names() and chance.procedure in procedure_names()
+    if not known:
+        return Appraiser(lung, draws=0)
+    return Appraiser(
+        lung, load_errors(chance.errors), procedure=load_procedure(chance.procedure), draws=chance.samples,
+        seed=chance.seed,
+    )  # fmt: skip
+
+
+def start_region_of(plan: Plan, lung: Lung) -> StartRegion | str:
+    """Return the safe start region of a plan, or in words why there is none."""
     from lungaccess.risk import safe_start_region
 
     try:
         return safe_start_region(plan, lung)
-    except SettingsError:
-        return None
+    except SettingsError as reason:
+        return f"{NO_REGION}: {reason.found}"
 
 
 def page_data(

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from lungaccess.appraisal import Appraisal, Limit
     from lungaccess.checking import CheckReport
     from lungaccess.checking.findings import Finding
+    from lungaccess.coupled import Alternative
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk import RiskReport, Sensitivity, Share
 
 AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
@@ -114,16 +114,19 @@ def _value(finding: Finding) -> str:
     return f"{words.number(finding.value)} {words.text(finding.unit)}" if finding.value is not None else "–"
 
 
-def plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> str:
-    """Return a table that compares plans, each with its chance of success."""
+def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal]) -> str:
+    """Return a table that compares plans, each with its chance of success; those on the front are marked."""
     rows = []
-    for number, (plan, appraisal) in enumerate(zip(plans, appraisals, strict=True)):
-        headline, tightest = appraisal.headline, appraisal.limits[:1]
+    for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True)):
+        headline, tightest, plan = appraisal.headline, appraisal.limits[:1], each.plan
         rows.append(
             (
                 words.text(plan_name(number)),
                 words.grade(headline.grade, headline.chance_words),
                 words.text(headline.failures[0][0] if headline.failures else "–"),
+                words.number(each.criteria["length_in_tissue_mm"]),
+                words.number(each.criteria["clearance_mm"]),
+                "yes" if each.on_front and len(found) > 1 else "",
                 words.text(headline.geometry_words),
                 words.text(tightest[0].words if tightest else "–"),
                 words.text(plan.tube.exit.branch),
@@ -132,8 +135,9 @@ def plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> str
             )
         )
     headings = (
-        "plan", "succeeds", "fails most often because it", "check", "nearest limit", "branch pierced",
-        "generation of the scope's tip", "integral of 1/clearance",
+        "plan", "succeeds", "fails most often because it", "tissue, mm", "clearance, mm", "on the front",
+        "check", "nearest limit", "branch pierced", "generation of the scope's tip",
+        "integral of 1/clearance",
     )  # fmt: skip
     return words.table("Plans to this target", headings, rows)
 
@@ -161,71 +165,6 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     )
     texts = [*(one.text for one in steps), handle_words(plan)]
     return f"{words.steps(texts)}<p class='note'>{words.text(note)}</p>"
-
-
-def risk_section(report: RiskReport | None, start_words: str = "") -> str:
-    """Return how likely the plan succeeds if the devices deviate from it, or that it was not estimated.
-
-    `start_words` tell its safe start region.
-    """
-    of_start = f"<p>{words.text(start_words)}.</p>" if start_words else ""
-    if report is None:
-        return f"{of_start}<p>Not estimated.</p>"
-    rows = [("reaches the goal and touches nothing forbidden", _share(report.succeeds))]
-    rows.append((f"ends within {report.radius_mm:.1f} mm of the target", _share(report.reaches)))
-    rows += [
-        (f"touches: {name}" if name != "stays in the airway" else name, _share(share))
-        for name, share in report.touches.items()
-    ]
-    rows += [
-        (f"miss that {100.0 * share:.0f} % do not exceed", f"{miss:.2f} mm")
-        for share, miss in report.miss_mm.items()
-    ]
-    alone = [(name.replace("_", " "), _share(share)) for name, share in report.alone.items()]
-    assumed = ", ".join(report.model.assumed).replace("_", " ") or "none"
-    sizes = report.model.words(with_needle=report.with_needle)
-    note = (
-        f"{report.samples} deviated plans, seed {report.seed}, open loop, errors of '{report.model.label}': "
-        f"{sizes}; of which assumed: {assumed}. Radius of the "
-        f"goal: {report.radius_origin}. The range is the 95 % interval."
-    )
-    return (
-        f"{of_start}<p class='note'>{words.text(note)}</p>"
-        + words.pairs("If the devices deviate", rows)
-        + words.pairs("Success with errors of one kind only", alone)
-        + sensitivity_bars(report.sensitivity)
-    )
-
-
-def sensitivity_bars(found: Sequence[Sensitivity]) -> str:
-    """Return a drawing of what each kind of error has to do with success, "" without any."""
-    if not found or not found[0].total:
-        return ""
-    most = max(1.0, found[0].total)
-    rows = []
-    for number, each in enumerate(found):
-        top, total, first = 20 * number, 220.0 * each.total / most, 220.0 * max(each.first_order, 0.0) / most
-        rows.append(
-            f'<text x="0" y="{top + 13}">{words.text(each.kind.replace("_", " "))}</text>'
-            f'<rect x="130" y="{top + 3}" width="{total:.1f}" height="13" fill="#9ecae1"/>'
-            f'<rect x="130" y="{top + 3}" width="{min(first, total):.1f}" height="13" fill="#2171b5"/>'
-            f'<text x="{136 + total:.1f}" y="{top + 13}">{each.total:.2f}</text>'
-        )
-    caption = (
-        "Share of the variance of success that goes with each kind of error: dark by itself, light together "
-        "with others."
-    )
-    height = 20 * len(found) + 4
-    return (
-        f'<figure><svg xmlns="http://www.w3.org/2000/svg" width="400" viewBox="0 0 400 {height}" role="img" '
-        f'aria-label="{caption}" font-size="12" fill="currentColor">{"".join(rows)}</svg>'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _share(share: Share) -> str:
-    low, high = share.interval
-    return f"{100.0 * share.value:.1f} % ({100.0 * low:.1f} to {100.0 * high:.1f})"
 
 
 def provenance_section(plan: Plan, lung: Lung) -> str:

@@ -34,12 +34,14 @@ KEYS = {
     "geometry",
     "fissures_unknown",
     "success",
+    "stated_by_plan",
     "most_frequent_failure",
     "failures",
     "draws",
     "seed",
     "goal_radius_mm",
     "goal_radius_origin",
+    "procedure",
     "errors",
     "errors_assumed",
 }
@@ -68,32 +70,32 @@ def test_a_good_plan_is_good_news() -> None:
     headline = Headline.of(make_check(True), make_risk(2000))
     assert (headline.grade, headline.verdict) == (Grade.GOOD, "likely to succeed")
     assert headline.text == (
-        "Geometry proved and checked. Estimated to succeed in 100 of 100 (95 % interval 99.8 to 100) under "
-        "the errors of 'breath-hold'; no draw failed."
+        "Estimated to succeed in 100 of 100 procedures (95 % interval 99.8 to 100); none of them failed. "
+        "Procedure 'open-loop', errors of 'breath-hold'. Geometry proved and checked."
     )
 
 
 def test_a_risky_plan_says_what_fails_before_its_geometry_reassures() -> None:
     headline = Headline.of(make_check(True), make_risk(60, reaches=700, vessel=1220, airway=300))
     assert (headline.grade, headline.verdict) == (Grade.POOR, "likely to fail")
-    assert "succeed in 3 of 100 (95 % interval 2.3 to 3.9)" in headline.text
-    assert headline.text.endswith(
-        "most often ends more than 2.5 mm from the target (65 of 100) and touches a vessel (61 of 100)."
+    assert headline.text.startswith(
+        "Estimated to succeed in 3 of 100 procedures (95 % interval 2.3 to 3.9); fails most because it ends "
+        "more than 2.5 mm from the target (65 of 100) and touches a vessel (61 of 100)."
     )
     touched = Headline.of(make_check(True), make_risk(1200, reaches=1900, vessel=700))
     assert (touched.grade, touched.verdict) == (Grade.FAIR, "may fail")
-    assert touched.text.endswith("most often touches a vessel (35 of 100).")
+    assert "; fails most because it touches a vessel (35 of 100). " in touched.text
 
 
 def test_a_refused_plan_has_no_chance() -> None:
     headline = Headline.of(make_check(False), None)
     assert (headline.grade, headline.verdict) == (Grade.POOR, "refused: do not use")
-    assert headline.text == ("Refused by the independent check (1 finding). Chance of success not estimated.")
+    assert headline.text == ("Refused by the independent check (1 finding). Chance of success not computed.")
     assert headline.to_mapping()["success"] is None
 
 
 def test_what_was_not_looked_at_is_never_good() -> None:
-    assert Headline.of(None, None).text == "Geometry not checked. Chance of success not estimated."
+    assert Headline.of(None, None).text == "Chance of success not computed. Geometry not checked."
     for headline in (Headline.of(None, make_risk(2000)), Headline.of(make_check(True), None)):
         assert (headline.grade, headline.verdict) == (Grade.UNKNOWN, "not known to succeed")
 

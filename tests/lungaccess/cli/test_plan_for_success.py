@@ -15,7 +15,6 @@ from lungaccess.plans.plan import Plan
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--objective", "length", "--procedure", "open-loop"], "--objective success"),
         (["--objective", "success", "--method", "kuntz2015"], "neither --method"),
         (["--objective", "success", "--processes", "2"], "neither --method"),
         (["--objective", "success", "--system", "auto"], "one system"),
@@ -38,9 +37,18 @@ def test_a_plan_and_its_chance(patient: Path, tmp_path: Path, capsys: pytest.Cap
     where = ["--errors", "gated-ct", "--out", str(tmp_path), "--cache", str(patient.parent / "cache")]
     assert cli.main(["plan", str(patient), *words, *budget, *where]) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)
-    success = said["success"]
-    assert (success["errors"], success["procedure"]) == ("gated-ct", "open-loop")
-    low, high = success["interval_95"]
-    assert 0.0 <= low <= success["probability"] <= high <= 1.0
-    assert Plan.load(tmp_path / "plan.json").digest == said["digest"]
-    assert json.loads((tmp_path / "summary.json").read_text())["success"] == success
+    headline = said["headline"]
+    assert (headline["errors"]["name"], headline["procedure"]) == ("gated-ct", "open-loop")
+    assert headline["stated_by_plan"] and headline["draws"] == 16384
+    low, high = headline["success"]["interval_95"]
+    assert 0.0 <= low <= headline["success"]["probability"] <= high <= 1.0
+    plan = Plan.load(tmp_path / "plan.json")
+    assert plan.digest == said["digest"]
+    assert plan.chance is not None and plan.chance.share == headline["success"]["probability"]
+    assert json.loads((tmp_path / "summary.json").read_text())["headline"] == headline
+    check = ["check", str(tmp_path / "plan.json"), str(patient), "--json", *where[4:]]
+    assert cli.main(check) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["headline"] == headline
+    assert cli.main([*check, "--errors", "gated-ct"]) == ExitCode.OK
+    computed = json.loads(capsys.readouterr().out)["headline"]
+    assert not computed["stated_by_plan"] and computed["draws"] == 2000

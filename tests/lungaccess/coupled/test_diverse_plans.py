@@ -156,5 +156,5 @@ def test_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]
     assert cli.main([*words, "--out", str(tmp_path / "plans"), "--cache", str(tmp_path)]) == 0
     saved = sorted(path.name for path in (tmp_path / "plans").iterdir())
-    assert saved == ["plan-01.json", "plan-02.json"]
+    assert saved == ["plan-01.json", "plan-02.json", "trade_off.svg"]
     assert la.check(la.Plan.load(tmp_path / "plans" / "plan-01.json"), small_lung).accepted

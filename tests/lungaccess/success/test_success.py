@@ -79,7 +79,9 @@ def test_it_succeeds_more_often_than_the_plan_of_least_cost(
         assert low - 0.01 < chance(best.plan, small_lung, 100) < high + 0.01
         report = la.check(best.plan, small_lung, SYSTEM)
         assert report.accepted, [str(each) for each in report.refusals]
-        assert (best.errors, best.procedure) == ("gated-ct", "open-loop")
+        stated = best.plan.chance
+        assert stated is not None and stated.successes == best.succeeds.count
+        assert (stated.errors, stated.procedure) == ("gated-ct", "open-loop")
     assert len(gains) == 2 and min(gains) > -0.01 and max(gains) > 0.05
 
 

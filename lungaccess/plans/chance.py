@@ -1,0 +1,68 @@
+"""The chance of success of a plan as it is stated: counts of simulated procedures, and what they rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from anatomy.errors import PlanFileError
+from anatomy.records import frozen_record
+from lungaccess.plans.record import Record
+
+
+@frozen_record
+class Chance(Record):
+    """How many simulated procedures of a plan succeed.
+
+    Parameters
+    ----------
+    errors, procedure : str
+        What the error model and the procedure are called.
+    corrections : str
+        What is measured and corrected on the way, in a sentence.
+    sizes : str
+        The sizes of the errors in words.
+    assumed : tuple of str
+        Kinds of error whose size nobody has published.
+    radius_mm, radius_origin : float, str
+        Radius of the goal about the target, and where it came from.
+    with_needle : bool
+        Whether it is the needle that ends at the target; the tubes do so without one.
+    samples, seed : int
+        Simulated procedures, and the seed of their random numbers.
+    successes : int
+    failures : mapping of str to int
+        What made procedures fail, and how many; in open loop one procedure may fail for several reasons.
+
+    Raises
+    ------
+    PlanFileError
+        If a count is negative or exceeds the samples.
+    """
+
+    errors: str
+    procedure: str
+    corrections: str
+    sizes: str
+    assumed: tuple[str, ...]
+    radius_mm: float
+    radius_origin: str
+    with_needle: bool
+    samples: int
+    seed: int
+    successes: int
+    failures: Mapping[str, int]
+
+    @property
+    def share(self) -> float:
+        """The share of successes."""
+        return self.successes / self.samples
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        counts = (self.successes, *self.failures.values())
+        if self.samples < 1 or not all(0 <= count <= self.samples for count in counts):
+            raise PlanFileError(
+                f"The chance of a plan counts {self.successes} successes of {self.samples} procedures",
+                expected="counts from 0 to the number of procedures",
+                remedy="Run `lungaccess plan` again",
+            )

@@ -13,6 +13,7 @@ import time
 import numpy as np
 
 import lungaccess as la
+from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.peripheral import peripheral_targets
@@ -25,11 +26,9 @@ SIZES = {"quick": (2, 20), "full": (8, 100)}
 ITERATIONS = 100
 
 
-def plans_of(patient: str, system: la.System, count: int, seed: int) -> list[la.Plan]:
+def plans_of(lung: Lung, atlas: la.Atlas, count: int, seed: int) -> list[la.Plan]:
     """Return the plans of least cost to the first `count` random targets that are reached."""
-    lung = anatomy(patient)
-    atlas = la.build_atlas(lung, system)
-    plans: list[la.Plan] = []
+    system, plans = atlas.system, list[la.Plan]()
     for point in peripheral_targets(lung, 4 * count, seed):
         if len(plans) == count:
             break
@@ -61,7 +60,7 @@ def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
     parser.add_argument("--patient", default=default_anatomies()[-1], metavar="NAME")
-    parser.add_argument("--system", default="ultrathin", metavar="NAME")
+    parser.add_argument("--system", default="tight-inner", metavar="NAME")
     options = parser.parse_args()
     n_targets, samples = SIZES[setting_of(options)]
     result = Result(
@@ -70,9 +69,9 @@ def main() -> None:
     )  # fmt: skip
     system = la.load_system(options.system, fissures_allowed=True)
     lung = anatomy(options.patient)
-    plans = plans_of(options.patient, system, n_targets, options.seed)
+    plans = plans_of(lung, la.open_atlas(lung, system), n_targets, options.seed)
     result.conditions = {
-        "anatomy": f"{lung.name}, system {system.name}",
+        "anatomy": f"{lung.name}, system {system.name}, fissures may be crossed",
         "targets": f"{len(plans)} peripheral ones, the plan of least cost after {ITERATIONS} iterations",
         "procedures": f"{samples} for each; a success ends within 5 mm of the target and touches nothing "
         "forbidden",

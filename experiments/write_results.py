@@ -33,6 +33,8 @@ OUR_OWN = (
     "needle_planners",
     "tube_speed",
     "closed_loop",
+    "procedures",
+    "success_planning",
     "growth",
 )
 SETTINGS = ("full", "quick")

@@ -74,8 +74,8 @@ class Plan(Record):
     timing : mapping of str to float
         Seconds; the only values that differ between two equal runs.
     chance : Chance or None
-        For a plan that was searched by its chance of success, that chance, counted on draws that the search
-        never saw; None for any other.
+        Of success, counted on draws that no search saw: for a plan that was searched by it, and of studies
+        that count it; None for any other.
     """
 
     schema: str = plan_file.SCHEMA

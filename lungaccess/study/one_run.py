@@ -10,10 +10,11 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -25,14 +26,18 @@ from lungaccess.checking import Checker
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.atlas_store import open_atlas
 from lungaccess.coupled.planner import plan
+from lungaccess.plans.chance import Chance
 from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
-from lungaccess.problem.target import point_target
+from lungaccess.problem.target import Target, point_target
 from lungaccess.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PLAN, TIMEOUT, UNKNOWN, Answer, Improvement
 from lungaccess.study.needle_run import needle_answer
 from lungaccess.study.patients import Patient, open_patient
 from lungaccess.study.runs import Problem, Run
-from lungaccess.study.settings import StudyError
+from lungaccess.study.settings import SUCCESS, StudyError
+from lungaccess.success import plan_for_success
+from lungaccess.success.estimate import FRESH_SEED, MEASURED, OPEN_LOOP, chance_of, estimate_success
 
 KEPT_PATIENTS = 2
 """Runs come case by case, so that a worker needs the last patient and sometimes the next."""
@@ -111,25 +116,15 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     problem, best = run.problem, None
     improvements = []
     target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
-    for best in plan(
-        opened.lung,
-        problem.system,
-        target,
-        objective=problem.objective,
-        method=run.planner.method,
-        needle_planner=run.planner.needle_planner,
-        seed=run.seed,
-        iterations=run.iterations,
-        time_s=problem.time_s,
-        atlas=atlas,
-    ):
+    for best, cost in _plans(run, opened.lung, target, atlas):
         improvements.append(
-            Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=best.cost)
+            Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=cost)
         )
         if problem.first_plan:
             break
     if best is None:
         raise NoPlan("The search ended without a plan", reasons={})
+    best = replace(best, chance=_chance(run, best, opened.lung))
     report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
     return Answer(
         key=run.key,
@@ -142,6 +137,42 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
         findings=tuple(each.to_mapping() for each in report.findings),
         plan=best.to_json(),
         digest=best.digest,
+    )
+
+
+def _plans(run: Run, lung: Lung, target: Target, atlas: Atlas) -> Iterator[tuple[Plan, float]]:
+    """Yield better and better plans, each with what is made small: its cost, or its chance of failure."""
+    problem = run.problem
+    limits: dict[str, Any] = {
+        "seed": run.seed,
+        "iterations": run.iterations,
+        "time_s": problem.time_s,
+        "atlas": atlas,
+    }
+    if run.planner.method == SUCCESS:
+        for each in plan_for_success(
+            lung, problem.system, target, errors=problem.errors, procedure=problem.procedure, **limits
+        ):
+            yield each.plan, 1.0 - each.succeeds.value
+        return
+    for found in plan(
+        lung, problem.system, target, objective=problem.objective, method=run.planner.method,
+        needle_planner=run.planner.needle_planner, **limits,
+    ):  # fmt: skip
+        yield found, found.cost
+
+
+def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:
+    """Return the chance of success of a plan on draws that no search saw, the same for all planners."""
+    errors, procedure = run.problem.errors, run.problem.procedure
+    if errors is None:
+        return None
+    samples = (OPEN_LOOP if procedure.is_open_loop else MEASURED).fresh
+    if found.chance is not None and found.chance.samples == samples:
+        return found.chance
+    seed = run.seed + FRESH_SEED
+    return chance_of(
+        estimate_success(found, lung, errors=errors, procedure=procedure, samples=samples, seed=seed)
     )
 
 

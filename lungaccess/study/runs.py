@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,14 @@ from lungaccess.plans.assemble import software_version
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
+from lungaccess.procedure import Procedure, load_procedure
+from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.study.patients import Patient, open_patient, patient_of
 from lungaccess.study.settings import Case, PlannerChoice, Study
 from stages.needle import Objective
 
+OF_THEIR_OWN_CLASS = ("patient", "system", "errors", "procedure")
+"""The fields of a problem that are not plain values."""
 RUN_FORMAT = 1
 """Raise it when what a run does changes: stored runs of another format are run anew."""
 
@@ -47,6 +51,10 @@ class Problem:
         The budget.
     first_plan : bool
         Whether a run ends with its first plan.
+    errors : ErrorModel or None
+        Under which the chance of success of a plan is counted; None for not at all.
+    procedure : Procedure
+        By which it is counted.
     """
 
     case: str
@@ -63,6 +71,8 @@ class Problem:
     iterations: int | None
     time_s: float | None
     first_plan: bool = False
+    errors: ErrorModel | None = None
+    procedure: Procedure = Procedure()
 
     @property
     def patient_name(self) -> str:
@@ -78,11 +88,18 @@ class Problem:
             "system": system_fingerprint(self.system),
             "version": software_version(),
             "format": RUN_FORMAT,
+            **self.counted(),
         }
+
+    def counted(self) -> dict[str, Any]:
+        """Return errors and procedure as plain JSON types; nothing where no chance is counted."""
+        if self.errors is None:
+            return {}
+        return {"errors": to_mapping(self.errors), "procedure": to_mapping(self.procedure)}
 
     def plain(self) -> dict[str, Any]:
         """Return the fields that are plain values."""
-        names = (item.name for item in fields(self) if item.name not in ("patient", "system"))
+        names = (item.name for item in fields(self) if item.name not in OF_THEIR_OWN_CLASS)
         return {name: getattr(self, name) for name in names}
 
     @cached_property
@@ -116,6 +133,7 @@ class Run:
         values = self.problem.plain() | {
             "patient": asdict(self.problem.patient),
             "system": to_mapping(self.problem.system),
+            **self.problem.counted(),
         }
         return json.dumps({"problem": values, "planner": to_mapping(self.planner), "seed": self.seed})
 
@@ -132,6 +150,9 @@ class Run:
             "patient": Patient(**patient | {"sources": tuple(map(tuple, patient["sources"]))}),
             "system": parse(System, problem["system"], "run"),
         }
+        for name, cls in (("errors", ErrorModel), ("procedure", Procedure)):
+            if name in problem:
+                problem[name] = parse(cls, problem[name], "run")
         planner = parse(PlannerChoice, values["planner"], "run")
         return Run(problem=Problem(**problem), planner=planner, seed=values["seed"])
 
@@ -151,25 +172,18 @@ def runs_of(
         (progress or (lambda _words: None))(f"targets of {case.name}")
         folder = Path(study.folder)
         patient = patient_of(case, folder, cache)
-        name = str(folder / case.system) if case.system.endswith(".toml") else case.system
-        system = load_system(name, fissures_allowed=case.fissures_allowed)
+        system = load_system(_beside(case.system, folder), fissures_allowed=case.fissures_allowed)
+        counted: dict[str, Any] = {}
+        if case.errors:
+            counted = {
+                "errors": load_errors(_beside(case.errors, folder)),
+                "procedure": load_procedure(_beside(case.procedure, folder)),
+            }
         for planner in study.planner:
             if planner.needs_a_needle:
                 system.require_needle(f"The planner {planner.name!r} of the study")
         targets = _targets(case, open_patient(patient, cache))
         for number, (point, origin) in enumerate(targets, start=1):
-            yield from _runs_to(study, case, patient, system, number, point, origin)
-
-
-Point = tuple[float, float, float]
-
-
-def _runs_to(
-    study: Study, case: Case, patient: Patient, system: System, number: int, point: Point, origin: str
-) -> Iterator[Run]:
-    """Yield the runs of a case to one target."""
-    for planner in study.planner:
-        for start in case.starts if planner.kind == "needle" else (0,):
             problem = Problem(
                 case=case.name,
                 patient=patient,
@@ -178,16 +192,32 @@ def _runs_to(
                 target=number,
                 target_lps=point,
                 origin=origin,
-                start=start,
+                start=0,
                 rotations=study.atlas.rotations,
                 stop_spacing_mm=study.atlas.stop_spacing_mm,
                 site_spacing_mm=study.atlas.site_spacing_mm,
                 iterations=study.budget.iterations,
                 time_s=study.budget.time_s,
                 first_plan=study.budget.first_plan,
+                **counted,
             )
+            yield from _runs_to(study, case, problem)
+
+
+Point = tuple[float, float, float]
+
+
+def _beside(name: str, folder: Path) -> str:
+    """Return the name of a preset as it is, and that of a file as it lies beside the study's."""
+    return str(folder / name) if name.endswith(".toml") else name
+
+
+def _runs_to(study: Study, case: Case, problem: Problem) -> Iterator[Run]:
+    """Yield the runs of a problem with every planner, start and seed."""
+    for planner in study.planner:
+        for start in case.starts if planner.kind == "needle" else (0,):
             for seed in study.seeds:
-                yield Run(problem=problem, planner=planner, seed=seed)
+                yield Run(problem=replace(problem, start=start), planner=planner, seed=seed)
 
 
 def _targets(case: Case, lung: Lung) -> list[tuple[Point, str]]:

@@ -17,6 +17,8 @@ from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
 PHANTOM = "phantom"
+SUCCESS = "success"
+"""The method that makes the chance of success large."""
 _REMEDY = "`lungaccess template study` prints a complete file to start from"
 Seed = Annotated[int, Field(strict=True, ge=0)]
 Iterations = Annotated[int, Field(strict=True, ge=0, description="iterations beyond the direct arcs")]
@@ -59,6 +61,9 @@ class Case:
         Whether fissures may be crossed; None for what the system says.
     objective : str
         What is minimised; see `stages.needle.objective.Objective.of`.
+    errors, procedure : str
+        Error model and procedure under which the chance of success of each plan is counted: presets, or TOML
+        files relative to the study's file.  Without errors no chance is counted.
     targets : tuple of str
         "ras:x,y,z", "lps:x,y,z", "nodule" or "nodule N".
     peripheral : Peripheral
@@ -73,6 +78,8 @@ class Case:
     system: Annotated[str, text("preset or TOML file")] = "lung-default"
     fissures_allowed: Annotated[bool | None, switch("whether a fissure may be crossed")] = None
     objective: Annotated[str, text("what is minimised")] = "inverse_clearance"
+    errors: Annotated[str, text("error model: preset or TOML file", may_be_empty=True)] = ""
+    procedure: Annotated[str, text("procedure: preset or TOML file")] = "open-loop"
     targets: Annotated[tuple[str, ...], Field(description="points with their frame, or nodules")] = ()
     peripheral: Peripheral = Peripheral()
     starts: Annotated[tuple[Seed, ...], Field(description="start poses of the needle, from 1")] = ()
@@ -95,7 +102,8 @@ class PlannerChoice:
     kind : str
         "plan" for all three stages, "needle" for the needle alone from the case's start poses.
     method : str
-        One of `lungaccess.coupled.planner.METHODS`; for the needle, of `stages.needle.NEEDLE_PLANNERS`.
+        One of `lungaccess.coupled.planner.METHODS`, or "success", see `lungaccess.success.plan_for_success`;
+        for the needle, one of `stages.needle.NEEDLE_PLANNERS`.
     needle_planner : str
         For "plan", one of the latter instead of the method's own.
     iterations : int or None
@@ -115,6 +123,8 @@ class PlannerChoice:
         known = methods(self.kind)
         if self.method not in known:
             raise impossible("method", self.method, f"one of {', '.join(known)}")
+        if self.needle_planner and self.method == SUCCESS:
+            raise impossible("needle_planner", self.needle_planner, "none, for the method success")
         if self.needle_planner and (self.kind == "needle" or self.needle_planner not in NEEDLE_PLANNERS):
             expected = f"one of {', '.join(NEEDLE_PLANNERS)}, for a planner of the kind plan"
             raise impossible("needle_planner", self.needle_planner, expected)
@@ -129,7 +139,8 @@ class PlannerChoice:
         """Whether it plans for no system that has none."""
         from lungaccess.coupled.planner import NEED_A_NEEDLE
 
-        return self.kind == "needle" or bool(self.needle_planner) or self.method in NEED_A_NEEDLE
+        need = (*NEED_A_NEEDLE, SUCCESS)
+        return self.kind == "needle" or bool(self.needle_planner) or self.method in need
 
 
 @settings
@@ -188,6 +199,10 @@ class Study:
         of_ompl = [each for each in self.planner if each.kind == "needle" and each.is_of_ompl]
         if self.budget.time_s is None and of_ompl:
             raise impossible("budget", "no time_s", "time_s, which planners of OMPL end by")
+        if any(each.method == SUCCESS for each in self.planner) and not all(c.errors for c in self.case):
+            raise impossible(
+                "case", 'errors = ""', "errors in every case, for planners of the method success"
+            )
         if any(each.kind == "needle" for each in self.planner) and not all(c.starts for c in self.case):
             raise impossible("case", "starts = []", "start poses in every case, for planners of the needle")
 
@@ -198,7 +213,7 @@ def methods(kind: str) -> tuple[str, ...]:
         return NEEDLE_PLANNERS
     from lungaccess.coupled.planner import METHODS
 
-    return tuple(METHODS)
+    return (*METHODS, SUCCESS)
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:

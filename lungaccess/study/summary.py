@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 from anatomy.records import frozen_value
 from lungaccess.study.results import ResultsFile
 
 _QUERY = """
 SELECT p.case_name, p.objective, c.name,
-       o.failed, r.solved, r.correct_solution, r.first_solution_time, r.time, r.cost
+       o.failed, r.solved, r.correct_solution, r.first_solution_time, r.time, r.cost,
+       1.0 * json_extract(l.plan, '$.chance.successes') / json_extract(l.plan, '$.chance.samples')
 FROM runs r JOIN outcomes o ON o.runid = r.id JOIN plannerConfigs c ON c.id = r.plannerid
-     JOIN problems p ON p.experimentid = r.experimentid
+     JOIN problems p ON p.experimentid = r.experimentid LEFT JOIN plans l ON l.runid = r.id
 ORDER BY p.case_name, p.objective, c.name, r.key"""
 
 
@@ -34,6 +36,8 @@ class Group:
         Median time of a run.
     cost : float or None
         Median cost of the best plans.
+    success : float or None
+        Median chance of success of the best plans; None where the study counts none.
     """
 
     case: str
@@ -46,6 +50,7 @@ class Group:
     first_plan_s: tuple[float, float] | None
     run_s: float
     cost: float | None
+    success: float | None = None
 
 
 def summarise(path: Path) -> list[Group]:
@@ -56,17 +61,18 @@ def summarise(path: Path) -> list[Group]:
     FileError
         If the file cannot be read.
     """
-    groups: dict[tuple[str, str, str], list[tuple[float, ...]]] = {}
+    groups: dict[tuple[str, str, str], list[tuple[Any, ...]]] = {}
     with ResultsFile(path) as results:
         for case, objective, planner, *values in results.rows(_QUERY):
             groups.setdefault((case, objective, planner), []).append(tuple(values))
     return [_group(*names, rows) for names, rows in groups.items()]
 
 
-def _group(case: str, objective: str, planner: str, rows: list[tuple[float, ...]]) -> Group:
+def _group(case: str, objective: str, planner: str, rows: list[tuple[Any, ...]]) -> Group:
     made = [row[1:] for row in rows if not row[0]]
     solved = [row for row in made if row[0]]
     first = [row[2] for row in solved]
+    chances = [row[5] for row in solved if row[5] is not None]
     return Group(
         case=case,
         objective=objective,
@@ -78,4 +84,5 @@ def _group(case: str, objective: str, planner: str, rows: list[tuple[float, ...]
         first_plan_s=(median(first), max(first)) if first else None,
         run_s=median(row[3] for row in made) if made else 0.0,
         cost=median(row[4] for row in solved) if solved else None,
+        success=median(chances) if chances else None,
     )

@@ -16,9 +16,14 @@ SELECT r.key, p.case_name AS "case", p.patient, p.lung, p.system, p.fissures_all
        p.time_s AS time_allowed_s, e.version, c.name AS planner, c.settings AS planner_settings, r.seed,
        o.outcome, o.failed, o.message, o.advice, r.solved, r.correct_solution, r.status, r.iterations,
        r.solutions, r.cost, r.inverse_clearance, r.cost_map, r.voxel_sum, r.solution_length,
+       json_extract(l.plan, '$.chance.errors') AS errors,
+       json_extract(l.plan, '$.chance.procedure') AS procedure,
+       json_extract(l.plan, '$.chance.samples') AS success_samples,
+       json_extract(l.plan, '$.chance.successes') AS successes,
        r.time, r.cpu_time, r.first_solution_time, r.memory
 FROM runs r JOIN outcomes o ON o.runid = r.id JOIN plannerConfigs c ON c.id = r.plannerid
      JOIN experiments e ON e.id = r.experimentid JOIN problems p ON p.experimentid = e.id
+     LEFT JOIN plans l ON l.runid = r.id
 ORDER BY p.case_name, p.target, p.start, c.name, r.seed, r.key"""
 
 QUERIES = {
@@ -37,14 +42,17 @@ SELECT r.key, t.digest, t.plan FROM plans t JOIN runs r ON r.id = t.runid ORDER 
 """What is exported and compared, by the name of the table."""
 
 INTEGERS = frozenset(
-    {"target", "start", "iterations_allowed", "seed", "status", "iterations", "solutions", "number", "count"}
-)
+    {
+        "target", "start", "iterations_allowed", "seed", "status", "iterations", "solutions", "number",
+        "count", "success_samples", "successes",
+    }
+)  # fmt: skip
 TRUTHS = frozenset({"fissures_allowed", "failed", "solved", "correct_solution", "ok"})
 TEXTS = frozenset(
     {
         "key", "case", "patient", "lung", "system", "objective", "origin", "version", "planner",
         "planner_settings", "outcome", "message", "advice", "name", "side", "unit", "detail", "reason",
-        "digest", "plan",
+        "digest", "plan", "errors", "procedure",
     }
 )  # fmt: skip
 """Kinds of columns; every other one holds real numbers."""

@@ -163,8 +163,12 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
 
 
 def _table(title: str, groups: list[Group]) -> Table:
-    headings = ("case", "planner", "runs", "failed", "solved, %", "accepted, %", "first, s", "run, s", "cost")
-    return terminal.table(title, headings, [_row(group) for group in groups])
+    headings = (
+        "case", "planner", "runs", "failed", "solved, %", "accepted, %", "first, s", "run, s", "cost",
+        "succeeds, %",
+    )  # fmt: skip
+    columns = len(headings) - all(group.success is None for group in groups)
+    return terminal.table(title, headings[:columns], [_row(group)[:columns] for group in groups])
 
 
 def _row(group: Group) -> tuple[str, ...]:
@@ -178,4 +182,5 @@ def _row(group: Group) -> tuple[str, ...]:
         "" if group.first_plan_s is None else f"{group.first_plan_s[0]:.3f}",
         f"{group.run_s:.2f}",
         "" if group.cost is None else f"{group.cost:.4g}",
+        "" if group.success is None else f"{100.0 * group.success:.1f}",
     )

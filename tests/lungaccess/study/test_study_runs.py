@@ -16,14 +16,17 @@ from anatomy.errors import FileError, SettingsError, TargetError
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import peripheral
 from lungaccess.problem.system import load_system
-from lungaccess.study import one_run
+from lungaccess.procedure import load_procedure
+from lungaccess.risk import load_errors
+from lungaccess.study import one_run, summarise
 from lungaccess.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
 from lungaccess.study.needle_run import needle_answer
 from lungaccess.study.one_run import answer
 from lungaccess.study.patients import open_patient
+from lungaccess.study.results import ResultsFile
 from lungaccess.study.runs import Run, runs_of
 from lungaccess.study.settings import PlannerChoice, study_of
-from tests.lungaccess.study.toys import content
+from tests.lungaccess.study.toys import NEAR, content
 
 
 def test_every_target_with_every_seed(runs: list[Run]) -> None:
@@ -46,6 +49,8 @@ def test_every_target_with_every_seed(runs: list[Run]) -> None:
         {"site_spacing_mm": 3.0},
         {"system": load_system("lung-default")},
         {"case": "other"},
+        {"errors": load_errors("gated-ct")},
+        {"errors": load_errors(), "procedure": load_procedure("measured-tip")},
         {"start": 1},
     ],
 )
@@ -66,7 +71,8 @@ def test_the_key_depends_on_planner_seed_and_patient_but_not_on_where_it_lies(ru
 
 
 def test_a_run_survives_json(runs: list[Run]) -> None:
-    for run in runs:
+    counted = {"errors": load_errors("gated-ct"), "procedure": load_procedure("measured-tip")}
+    for run in [*runs, replace(runs[0], problem=replace(runs[0].problem, **counted))]:
         again = Run.from_json(run.to_json())
         assert again == run
         assert again.key == run.key
@@ -93,6 +99,26 @@ def test_a_plan_is_checked_and_a_bad_target_is_an_answer(runs: list[Run], cache:
     assert (bad.outcome, bad.status, bad.solved, bad.failed) == ("TargetError", INVALID_GOAL, False, False)
     assert "outside the images" in bad.message
     assert answer(runs[0], cache).digest == good.digest
+
+
+def test_success_against_least_cost_with_the_same_luck(cache: Path, tmp_path: Path) -> None:
+    """Each plan states its chance on the same draws; it is that of the results file, too."""
+    planners = [{"name": "cost"}, {"name": "safe", "method": "success", "iterations": 1}]
+    asked = content(planner=planners, seeds=[0], case={"errors": "gated-ct", "targets": [NEAR]})
+    with ResultsFile(tmp_path / "results.db", create=True) as results:
+        chances = []
+        for run in runs_of(study_of(asked), cache=cache):
+            made = answer(run, cache)
+            assert made.accepted and results.add(run, made)
+            chance = Plan.from_json(made.plan).chance
+            assert chance is not None and (chance.errors, chance.procedure) == ("gated-ct", "open-loop")
+            chances.append(chance)
+            again = answer(run, cache)
+            assert again.digest == made.digest
+    assert len({(each.samples, each.seed) for each in chances}) == 1
+    assert chances[1].share >= chances[0].share - 0.02
+    groups = {each.planner: each.success for each in summarise(tmp_path / "results.db")}
+    assert groups == {"cost": chances[0].share, "safe": chances[1].share}
 
 
 def test_an_unknown_nodule_and_words_that_are_no_target(cache: Path) -> None:

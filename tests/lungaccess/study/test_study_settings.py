@@ -56,6 +56,8 @@ def test_a_file_is_read_with_its_folder(tmp_path: Path) -> None:
         ({"case": {"sistem": "x"}}, "did you mean system"),
         ({"case": {"targets": []}}, "at least one target"),
         ({"case": {"objective": "price"}}, "objective"),
+        ({"planner": [{"name": "safe", "method": "success"}]}, "errors in every case"),
+        ({"planner": [{"name": "a", "method": "success", "needle_planner": "rrt"}]}, "needle_planner"),
         ({"case": {"objective": "length=-1"}}, "weights of 0 or more"),
         ({"case": {"peripheral": {"per_lung": -1}}}, "at least 0"),
         ({"planner": [{"name": "a", "method": "atlass"}]}, "kuntz2015"),

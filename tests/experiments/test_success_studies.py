@@ -18,7 +18,7 @@ COUNTS = {"a": 20, "b": 60, "c": 90}
 
 
 def report(plan: str, errors: ErrorModel, procedure: Procedure, samples: int) -> ProcedureReport:
-    """Return that so many of 100 procedures succeed as the name of a plan says, and all others touch a vessel."""
+    """Return that as many of 100 procedures succeed as `COUNTS` says; all others touch a vessel."""
     count = COUNTS[plan]
     return ProcedureReport(
         model=errors, procedure=procedure, samples=100, seed=0, radius_mm=5.0, radius_origin="given",

@@ -16,7 +16,7 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.procedure import Procedure, load_procedure
 from lungaccess.procedure.spread import Spread
-from lungaccess.risk import ErrorModel, goal_radius, load_errors
+from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.success.estimate import ChanceEstimator, chance_of
 from stages.needle import Objective
 
@@ -27,9 +27,9 @@ METHOD = "success, alternatives"
 class LikelyArcs(DirectArcs):
     """Direct arcs whose cost is their chance of failure to first order."""
 
-    def __init__(self, task: Task, atlas: Atlas, estimator: ChanceEstimator, radius_mm: float) -> None:
+    def __init__(self, task: Task, atlas: Atlas, estimator: ChanceEstimator) -> None:
         super().__init__(task, atlas)
-        self._estimator, self._radius_mm = estimator, radius_mm
+        self._estimator = estimator
 
     def evaluate(self, chosen: Int, slack: float, best: float = math.inf) -> tuple[Int, Float, float]:
         """Return what blocks the arcs from deployments, and how likely each fails; see `DirectArcs`."""
@@ -38,7 +38,8 @@ class LikelyArcs(DirectArcs):
         deployments = self.atlas.deployments.only(clear)
         spread = Spread(
             self.task.lung, self.task.system, self.atlas.motions.tips[deployments.site], deployments,
-            self.task.target.lps_mm, self._estimator.errors, self._estimator.procedure, self._radius_mm,
+            self.task.target.lps_mm, self._estimator.errors, self._estimator.procedure,
+            self._estimator.radius_mm,
         )  # fmt: skip
         costs[blockers == 0] = 1.0 - spread.chances
         return blockers, costs, float(costs.min(initial=best))
@@ -91,8 +92,7 @@ def alternatives_for_success(
     estimator = ChanceEstimator(
         task, errors or load_errors(), procedure or load_procedure(), radius_mm=radius_mm
     )
-    goal_mm = goal_radius(lung, target.lps_mm)[0] if radius_mm is None else radius_mm
-    arcs = LikelyArcs(task, atlas or build_atlas(lung, system), estimator, goal_mm)
+    arcs = LikelyArcs(task, atlas or build_atlas(lung, system), estimator)
     plans, stated = separated_plans(arcs, count, separation_mm, counterfactuals=counterfactuals), []
     for number, plan in enumerate(plans, start=1):
         found = estimator.fresh(plan, estimator.halving.fresh)

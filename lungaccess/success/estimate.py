@@ -9,13 +9,7 @@ from anatomy.records import frozen_value
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
-from lungaccess.procedure import (
-    DEFAULT_PROCEDURE,
-    Procedure,
-    ProcedureReport,
-    Simulator,
-    simulate_procedure,
-)
+from lungaccess.procedure import DEFAULT_PROCEDURE, Procedure, ProcedureReport, Simulator, simulate_procedure
 from lungaccess.risk import ErrorModel, RiskAssessor, RiskReport, Share, assess, goal_radius
 
 FRESH_SEED = 1 << 20

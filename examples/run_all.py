@@ -23,6 +23,7 @@ NAMES = (
     "diverse_plans",
     "planner",
     "risk",
+    "success",
     "device",
     "study",
 )

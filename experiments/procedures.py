@@ -71,7 +71,7 @@ def main() -> None:
     lung = anatomy(options.patient)
     plans = plans_of(lung, la.open_atlas(lung, system), n_targets, options.seed)
     result.conditions = {
-        "anatomy": f"{lung.name}, system {system.name}, fissures may be crossed",
+        "anatomy": f"{lung.name}, system {system.name}",
         "targets": f"{len(plans)} peripheral ones, the plan of least cost after {ITERATIONS} iterations",
         "procedures": f"{samples} for each; a success ends within 5 mm of the target and touches nothing "
         "forbidden",

@@ -131,7 +131,7 @@ def main() -> None:
     plans = plans_of(lung, atlas, max(TARGETS[setting]), options.seed)
     targets, draws = (" and ".join(map(str, sizes[setting])) for sizes in (TARGETS, DRAWS))
     result.conditions = {
-        "anatomy": f"{lung.name}, system {system.name}, fissures may be crossed",
+        "anatomy": f"{lung.name}, system {system.name}",
         "targets": f"peripheral ones; {targets} for {' and '.join(PROCEDURES)}",
         "least cost": f"{ITERATIONS} iterations",
         "counted": f"both plans on the same draws, {draws} of them; a success ends within 5 mm of the target "

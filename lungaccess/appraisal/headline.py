@@ -178,7 +178,7 @@ class Headline:
             return ()
         drawn = f"{plural(chance.samples, 'draw')}, seed {chance.seed}"
         if self.is_stated:
-            drawn += " that its search never saw, as the plan states; not computed again"
+            drawn += ", which its search never saw; as the plan states, not computed again"
         last = "needle ends" if chance.with_needle else "tubes end"
         assumed = ", ".join(kind.replace("_", " ") for kind in chance.assumed)
         return (

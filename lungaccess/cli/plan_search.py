@@ -31,6 +31,8 @@ PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
 """The plan, saved as soon as there is one and again when there is a better one; how its cost fell."""
 SUMMARY_FILE = "summary.json"
 """What `--json` prints: headline, limits, costs.  The plan's own file states only the plan."""
+FAILURE = "chance of failure"
+"""What a search for success makes small."""
 PICTURES = ("overview.png", "tree.png", "cost_over_time.png")
 """Pictures of a found plan, unless the user wants none."""
 
@@ -199,7 +201,8 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
         If no plan was found.
     """
     target, search = request.target.resolve(lung), request.search
-    best, history = run_search(lung, target, request, SearchDisplay(search.time_s, search.iterations))
+    display = SearchDisplay(search.time_s, search.iterations, FAILURE if request.for_success else "cost")
+    best, history = run_search(lung, target, request, display)
     found = best.plan
     from lungaccess.appraisal import appraise  # After the search: the first plan does not wait for it.
 
@@ -254,7 +257,7 @@ def draw_plan(found: Found, history: list[CostPoint], lung: Lung, appraisal: App
     """Write the pictures of a plan and of its search into a folder."""
     from lungaccess.report import cost_over_time_png, overview_png, tree_png
 
-    words = "chance of failure" if found.success else Objective.of(found.plan.objective).words
+    words = FAILURE if found.success else Objective.of(found.plan.objective).words
     overview_png(found.plan, lung, out / "overview.png", appraisal)
     tree_png(lung, out / "tree.png")
     cost_over_time_png(history, out / "cost_over_time.png", words)

@@ -129,10 +129,10 @@ def progress(description: str) -> StepDisplay:
 
 
 class SearchDisplay(_Shown):
-    """Shows a search while it runs: what it does, how much of the budget is used, the best cost."""
+    """Shows a search while it runs: what it does, how much of the budget is used, the best cost, or what is made small instead."""
 
-    def __init__(self, time_s: float | None, iterations: int | None) -> None:
-        self._time_s, self._iterations = time_s, iterations
+    def __init__(self, time_s: float | None, iterations: int | None, what: str = "cost") -> None:
+        self._time_s, self._iterations, self._what = time_s, iterations, what
         self._progress = _bar(TextColumn("{task.fields[best]}"))
         total = float(iterations) if iterations is not None else time_s
         self._task = self._progress.add_task("searching", total=total, best="no plan yet")
@@ -140,12 +140,12 @@ class SearchDisplay(_Shown):
     def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
         """Show the state of the search."""
         done = float(iteration) if self._iterations is not None else elapsed_s
-        best = "no plan yet" if best_cost is None else f"best cost {best_cost:.4g}"
+        best = "no plan yet" if best_cost is None else f"best {self._what} {best_cost:.4g}"
         self._progress.update(self._task, description=description, completed=done, best=best)
 
     def better(self, elapsed_s: float, cost: float) -> None:
         """Leave a line about a better plan above the bar."""
-        self._progress.console.print(f"  {elapsed_s:8.2f} s   cost {cost:.5g}", highlight=False)
+        self._progress.console.print(f"  {elapsed_s:8.2f} s   {self._what} {cost:.5g}", highlight=False)
 
     def interrupted(self) -> None:
         """Leave a line that says that the user ended the search."""

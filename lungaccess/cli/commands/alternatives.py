@@ -107,7 +107,8 @@ def alternatives(
             appraisals.append(appraiser.appraise(each.plan, chosen, target_lps=aim.lps_mm))
             shown.share(number / len(found))
     found = with_front([each.plan for each in found], [each.headline.chance for each in appraisals])
-    write_text(out / PICTURE, trade_off_svg(found))
+    if drawing := trade_off_svg(found):
+        write_text(out / PICTURE, drawing)
     refused = sum(not each.accepted for each in appraisals)
     if output.json:
         terminal.show_json(_records(found, appraisals, out, lung.cost is not None))

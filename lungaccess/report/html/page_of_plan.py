@@ -108,6 +108,7 @@ def plan_page(
         "summary": _summary(plan),
         "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),
         "image_source": words.text(image_source(lung, chosen.ct_name if chosen.ct is not None else "")),
+        "made_small": words.text(made_small(plan).capitalize()),
         "plans": _plans_section(plans, appraisals),
         "key_numbers": tables.key_section(plan, lung),
         "findings": tables.check_section(first.check),
@@ -126,7 +127,7 @@ def _plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> st
     if len(plans) == 1:
         return tables.plans_section(rated, appraisals)
     drawing = trade_off_svg(rated, first=0)
-    figure = f"<figure>{drawing}<figcaption>{CAPTION}</figcaption></figure>" if drawing else ""
+    figure = f"<figure>{drawing}<figcaption>{CAPTION} 0 is the plan.</figcaption></figure>" if drawing else ""
     return tables.plans_section(rated, appraisals) + figure
 
 
@@ -180,7 +181,13 @@ def page_data(
         ],
         **page_image(lung, near, options.ct),
         "cost_over_time": cost_history(options.cost_over_time),
+        "made_small": made_small(plans[0]),
     }
+
+
+def made_small(plan: Plan) -> str:
+    """Say what a search made small over its time."""
+    return "best cost" if plan.chance is None else "chance of failure"
 
 
 def image_source(lung: Lung, ct_name: str) -> str:

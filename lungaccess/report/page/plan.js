@@ -221,7 +221,7 @@ class PlanPage extends AnatomyPage {
     if (history.length < 2) return;
     const ys = history.map(([, value]) => value);
     lineChart(byId("chart-history"), {
-      x: { name: "planning time, s" }, y: { name: "best cost", from: Math.min(...ys) * 0.98 }, top: Math.max(...ys) * 1.02,
+      x: { name: "planning time, s" }, y: { name: this.data.made_small, from: Math.min(...ys) * 0.98 }, top: Math.max(...ys) * 1.02,
       series: [{ name: "best plan so far", colour: "#0072B2", xs: history.map(([s]) => s), ys, stairs: true }],
     });
   }

@@ -85,6 +85,29 @@ def test_it_succeeds_more_often_than_the_plan_of_least_cost(
     assert len(gains) == 2 and min(gains) > -0.01 and max(gains) > 0.05
 
 
+def test_a_diverse_set_trades_success_for_length_and_clearance(
+    small_lung: Lung, atlas: la.Atlas, targets: list[Target]
+) -> None:
+    several = la.alternatives_for_success(
+        small_lung, SYSTEM, targets[0], errors=ERRORS, radius_mm=RADIUS_MM, atlas=atlas, count=4
+    )
+    assert len(several) > 1 and any(each.on_front for each in several)
+    best = max(several, key=lambda each: each.criteria["success"])
+    assert best.on_front
+    for each in several:
+        assert la.check(each.plan, small_lung, SYSTEM).accepted
+        stated = each.plan.chance
+        assert stated is not None and stated.share == each.criteria["success"]
+        assert stated.share == chance(each.plan, small_lung, stated.seed, stated.samples)
+        better = [
+            other.criteria["success"] > stated.share
+            and other.criteria["length_in_tissue_mm"] < each.criteria["length_in_tissue_mm"]
+            and other.criteria["clearance_mm"] > each.criteria["clearance_mm"]
+            for other in several
+        ]
+        assert not (each.on_front and any(better))
+
+
 def test_the_same_seed_gives_the_same_plans(small_lung: Lung, atlas: la.Atlas, targets: list[Target]) -> None:
     target = targets[0]
     one, other = (

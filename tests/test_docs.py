@@ -30,6 +30,7 @@ READERS = {
     "errors.toml": load_errors,
     "my-device.toml": load_system,
     "study.toml": read_study,
+    "success.toml": read_study,
     "tubes.toml": load_tubes,
 }
 SHELL = {

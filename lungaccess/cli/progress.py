@@ -129,7 +129,7 @@ def progress(description: str) -> StepDisplay:
 
 
 class SearchDisplay(_Shown):
-    """Shows a search while it runs: what it does, how much of the budget is used, the best cost, or what is made small instead."""
+    """Shows a search while it runs: what it does, how much of the budget is used, how small `what` is."""
 
     def __init__(self, time_s: float | None, iterations: int | None, what: str = "cost") -> None:
         self._time_s, self._iterations, self._what = time_s, iterations, what

@@ -62,6 +62,9 @@ class PatientFile:
     thick_slices_mm: Annotated[
         float, quantity("Distance of slices too thick to show small airways and vessels", at_least=0.0)
     ] = 0.0
+    accepted: Annotated[
+        tuple[str, ...], _key("Checks of the segmentation that failed and were overruled by --accept")
+    ] = ()
 
 
 def load_own_masks(description: Path) -> PatientImages:
@@ -96,7 +99,7 @@ def load_own_masks(description: Path) -> PatientImages:
         targets_lps=targets,
         breath_hold=keys.breath_hold or None,
         sources=hashes,
-        warnings=_thick_slices(keys.thick_slices_mm),
+        warnings=(*_thick_slices(keys.thick_slices_mm), *_accepted(keys.accepted)),
     )
 
 
@@ -121,6 +124,16 @@ def _thick_slices(distance_mm: float) -> tuple[str, ...]:
     return (
         f"The masks were made from slices {distance_mm:.1f} mm apart: small airways and vessels are missing, "
         "so a path that looks free may not be.",
+    )
+
+
+def _accepted(names: tuple[str, ...]) -> tuple[str, ...]:
+    if not names:
+        return ()
+    return (
+        f"The segmentation failed its check of {', '.join(names)}, and a person accepted that: look at "
+        "the masks "
+        "before planning.",
     )
 
 

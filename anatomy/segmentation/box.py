@@ -52,6 +52,7 @@ class Box:
             trachea_seed_ijk=lungs.trachea_seed_ijk - self.low,
             central_airway=self.cut(lungs.central_airway),
             threshold_hu=lungs.threshold_hu,
+            offset_hu=lungs.offset_hu,
             warnings=lungs.warnings,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,8 @@ FROM_MIDLINE_MM = 50.0
 """A trachea that is pushed aside stays within this distance of the middle of the image."""
 SHORTEST_COLUMN_MM = 20.0
 """Bowel and emphysema hold shorter columns of air as wide as a trachea."""
+MOST_COLUMNS = 4
+"""Trachea, throat, stomach and bowel: so many columns are tried until one leads into lungs."""
 SEED_SHARE = 0.3
 """How far down the column the seed lies."""
 
@@ -55,7 +58,20 @@ class CentralAirway:
 
 
 def find_central_airway(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) -> CentralAirway:
-    """Find trachea and main bronchi.
+    """Find trachea and main bronchi: the first of `central_airways`.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no column of air like a trachea, or the point does not lie in air.
+    """
+    return next(central_airways(ct, outside, seed_lps))
+
+
+def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) -> Iterator[CentralAirway]:
+    """Find what may be trachea and main bronchi, the largest column of air first.
+
+    An image with much noise is smoothed if nothing else helps.
 
     Parameters
     ----------
@@ -70,13 +86,24 @@ def find_central_airway(ct: CoarseCt, outside: Mask, seed_lps: Float | None = No
     AnatomyError
         If there is no column of air like a trachea, or the point does not lie in air.
     """
-    try:
-        return _find(ct, outside, seed_lps)
-    except AnatomyError as error:
+    found, first = False, None
+    for image in (ct, None):
+        image = image or _smoothed(ct)
         try:
-            return _find(_smoothed(ct), outside, seed_lps)
-        except AnatomyError:
-            raise error from None
+            seeds = [seed_lps] if seed_lps is not None else _trachea_seeds(image, outside)
+        except AnatomyError as error:
+            first = first or error
+            continue
+        for seed in seeds:
+            try:
+                airway = _long_enough(image, grow_from(image, outside, seed))
+            except AnatomyError as error:
+                first = first or error
+                continue
+            found = True
+            yield airway
+    if not found and first is not None:
+        raise first
 
 
 def _smoothed(ct: CoarseCt) -> CoarseCt:
@@ -86,10 +113,7 @@ def _smoothed(ct: CoarseCt) -> CoarseCt:
     return replace(ct, hu=np.asfortranarray(gaussian_filter(ct.hu, SMOOTHING_VOXELS, mode="nearest")))
 
 
-def _find(ct: CoarseCt, outside: Mask, seed_lps: Float | None) -> CentralAirway:
-    if seed_lps is None:
-        seed_lps = ct.grid.lps(_trachea_seed(ct, outside))
-    found = grow_from(ct, outside, seed_lps)
+def _long_enough(ct: CoarseCt, found: CentralAirway) -> CentralAirway:
     low, high = bounds(found.grown)
     length_mm = float((high - low)[2] * ct.spacing_mm[2])
     if length_mm < SHORTEST_COLUMN_MM:
@@ -127,31 +151,30 @@ def _given_seed(ct: CoarseCt, seed_lps: Float) -> Int:
     return np.array(block, dtype=np.int64)
 
 
-def _trachea_seed(ct: CoarseCt, outside: Mask) -> Int:
-    """Return the middle of the column of air that is most like a trachea."""
+def _trachea_seeds(ct: CoarseCt, outside: Mask) -> list[Float]:
+    """Return the middles `(3,)` LPS mm of columns of air that may be a trachea, the largest first."""
     from scipy import ndimage
 
     columns = _column_cross_sections(ct, outside)
     pieces, count = ndimage.label(columns)
-    best, most = 0, 0
     boxes = ndimage.find_objects(pieces)
-    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
-    for piece, box in enumerate(boxes, start=1):
-        height_mm = (box[2].stop - box[2].start) * ct.spacing_mm[2]
-        if height_mm >= SHORTEST_COLUMN_MM and sizes[piece] > most:
-            best, most = piece, int(sizes[piece])
-    if not best:
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
+    tall = np.array([(box[2].stop - box[2].start) * ct.spacing_mm[2] for box in boxes]) >= SHORTEST_COLUMN_MM
+    if not tall.any():
         raise AnatomyError(
             "No trachea was found: no column of air near the middle is "
             f"{SHORTEST_COLUMN_MM:g} mm long and as wide as a trachea",
             expected="a CT of the chest that shows the trachea down to the carina",
             remedy="Give a point in the trachea with --seed, if the image shows it",
         )
-    levels = boxes[best - 1][2]
-    level = levels.stop - 1 - int(SEED_SHARE * (levels.stop - 1 - levels.start))
-    inside = ndimage.distance_transform_edt(pieces[:, :, level] == best, sampling=ct.spacing_mm[:2])
-    i, j = np.unravel_index(int(np.argmax(inside)), inside.shape)
-    return np.array([i, j, level], dtype=np.int64)
+    seeds = []
+    for piece in np.argsort(-(sizes * tall), kind="stable")[: min(MOST_COLUMNS, int(tall.sum()))]:
+        levels = boxes[piece][2]
+        level = levels.stop - 1 - int(SEED_SHARE * (levels.stop - 1 - levels.start))
+        inside = ndimage.distance_transform_edt(pieces[:, :, level] == piece + 1, sampling=ct.spacing_mm[:2])
+        i, j = np.unravel_index(int(np.argmax(inside)), inside.shape)
+        seeds.append(ct.grid.lps((i, j, level)))
+    return seeds
 
 
 def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:

@@ -9,12 +9,14 @@ import numpy as np
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds
 from anatomy.records import frozen_record
+from anatomy.segmentation.canonical import towards_lps, turned_grid
 from anatomy.typed import Array, Float, Float32, Int, Mask
 
 COARSE_MM = 1.5
 """Blocks of voxels come as near to this size as whole numbers of voxels allow."""
-LEAST_HU = -1024
-"""Scanners write lower values where they measured nothing."""
+LEAST_HU = -1100
+"""Air that is shifted by 60 HU with its noise is above; scanners write lower values where they measured
+nothing."""
 
 
 @frozen_record
@@ -24,7 +26,7 @@ class CoarseCt:
     Parameters
     ----------
     hu : (Ni, Nj, Nk) float32
-        Hounsfield units, not below -1024; contiguous along axis 0.
+        Hounsfield units, not below -1100; contiguous along axis 0.
     grid : Grid
         The grid of `hu`.
     fine_shape : (3,) int
@@ -49,10 +51,10 @@ class CoarseCt:
         """Average the blocks of a CT; blocks at the end may hold fewer voxels."""
         step = tuple(max(1, round(COARSE_MM / float(s))) for s in ct.grid.spacing_mm)
         blocks = _block_means(ct.array, step)
-        order, flipped = _towards_lps(ct.grid.lps_from_ijk[:3, :3])
+        order, flipped = towards_lps(ct.grid.lps_from_ijk[:3, :3])
         made = cls(
             hu=blocks,
-            grid=_turned_grid(_block_grid(ct.grid, blocks.shape, step), order, flipped),
+            grid=turned_grid(_block_grid(ct.grid, blocks.shape, step), order, flipped),
             fine_shape=ct.grid.shape,
             step=(step[0], step[1], step[2]),
             order=order,
@@ -133,29 +135,4 @@ def _block_grid(grid: Grid, shape: tuple[int, ...], step: tuple[int, ...]) -> Gr
     matrix = grid.lps_from_ijk.copy()
     matrix[:3, :3] = matrix[:3, :3] * step
     matrix[:3, 3] = grid.lps((np.asarray(step) - 1) / 2)
-    return Grid(shape=(shape[0], shape[1], shape[2]), lps_from_ijk=matrix)
-
-
-def _towards_lps(axes: Float) -> tuple[tuple[int, int, int], tuple[bool, bool, bool]]:
-    """Return which axis runs most nearly along x, y and z, and whether against it."""
-    from scipy.optimize import linear_sum_assignment
-
-    cosines = axes / np.linalg.norm(axes, axis=0)
-    _, columns = linear_sum_assignment(-np.abs(cosines))
-    x, y, z = (int(c) for c in columns)
-    against = [bool(cosines[row, column] < 0) for row, column in enumerate((x, y, z))]
-    return (x, y, z), (against[0], against[1], against[2])
-
-
-def _turned_grid(grid: Grid, order: tuple[int, int, int], flipped: tuple[bool, bool, bool]) -> Grid:
-    """Return the grid after its axes were put into another order and some of them turned around."""
-    matrix = grid.lps_from_ijk.copy()
-    shape = [grid.shape[axis] for axis in order]
-    columns = grid.lps_from_ijk[:3, list(order)]
-    last = np.zeros(3)
-    for axis in range(3):
-        if flipped[axis]:
-            last[order[axis]] = shape[axis] - 1
-    matrix[:3, :3] = columns * np.where(flipped, -1.0, 1.0)
-    matrix[:3, 3] = grid.lps(last)
     return Grid(shape=(shape[0], shape[1], shape[2]), lps_from_ijk=matrix)

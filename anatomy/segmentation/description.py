@@ -41,11 +41,17 @@ class Description:
         return False
 
 
-def description_text(name: str, has_nodule: bool, target_lps: Float | None, thick_slices_mm: float) -> str:
+def description_text(
+    name: str,
+    has_nodule: bool,
+    target_lps: Float | None,
+    thick_slices_mm: float,
+    accepted: tuple[str, ...] = (),
+) -> str:
     """Return the `patient.toml` of a segmentation.
 
     An empty name is left out; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that
-    were accepted although they are thick, else 0.
+    were accepted although they are thick, else 0; `accepted` are checks that failed and were overruled.
     """
     lines = [f"name = {json.dumps(name, ensure_ascii=False)}"] if name else []
     lines += [
@@ -61,4 +67,6 @@ def description_text(name: str, has_nodule: bool, target_lps: Float | None, thic
         lines.append('targets = ["lps:{:.3f},{:.3f},{:.3f}"]'.format(*target_lps))
     if thick_slices_mm:
         lines.append(f"thick_slices_mm = {thick_slices_mm:.3f}")
+    if accepted:
+        lines.append(f"accepted = {json.dumps(list(accepted))}")
     return "\n".join(lines) + "\n"

@@ -15,6 +15,7 @@ from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Grid, Volume
 from anatomy.io.files import atomic_write, read_text, require_writable_folder, sha256, write_text
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
+from anatomy.segmentation.canonical import canonical
 from anatomy.typed import Array
 
 STATE = "segmentation.json"
@@ -181,11 +182,14 @@ def key_of(step: str, **parts: Any) -> str:
 def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
     """Place an image whose voxels coincide with those of `grid`, but which may cover another box.
 
+    Its voxels may be stored in another order; those of `grid` are in that of `canonical`.
+
     Raises
     ------
     GridMismatchError
         If the voxels do not coincide.
     """
+    volume = canonical(volume)
     if volume.grid.is_close(grid):
         return Volume(grid=grid, array=volume.array)
     start = grid.ijk(volume.grid.lps((0, 0, 0)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,14 +12,16 @@ from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, freeze_arrays
 from anatomy.morphology import bounds, grown_by_one, window
 from anatomy.records import frozen_record
-from anatomy.segmentation.central_airway import CentralAirway, find_central_airway
+from anatomy.segmentation.central_airway import CentralAirway, central_airways, find_central_airway
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
+from anatomy.segmentation.hounsfield import AIR_HU, air_offset_hu, offset_warning, without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right
+from anatomy.segmentation.lung_pieces import gas_pockets, lung_pieces
 from anatomy.segmentation.outside_air import outside_air
 from anatomy.segmentation.pleural_nodules import notches
 from anatomy.segmentation.truncation import truncation
-from anatomy.typed import Float32, Int, Int32, Mask
+from anatomy.typed import Float, Float32, Int, Int32, Mask
 
 Progress = Callable[[str], None]
 
@@ -33,13 +36,6 @@ CLOSING_MM = 5.0
 """Ball of the closing: vessels, bronchi and notches of up to 10 mm across become lung."""
 WALL_MM = 2.0
 """What is this close to the lumen of trachea and main bronchi is their wall, not lung."""
-
-SMALLEST_LUNG_ML = 150.0
-"""The smallest lung of a child after breathing out is about this large; bowel gas is less."""
-SMALLER_SHARE = 0.1
-"""A lung has at least this share of the other's volume; a smaller piece of air is something else."""
-GAS_HU, GAS_PERCENTILE = -975.0, 25.0
-"""A piece is gas in the bowel, not lung, if this share of it lies below."""
 
 
 @frozen_record
@@ -57,6 +53,8 @@ class Lungs:
         Lumen of trachea and main bronchi, roughly.
     threshold_hu : float
         What was taken for lung lies below.
+    offset_hu : float
+        How much must be taken from the values of the CT so that air measures -1000 HU.
     """
 
     left: Mask
@@ -64,6 +62,7 @@ class Lungs:
     trachea_seed_ijk: Int
     central_airway: Mask
     threshold_hu: float
+    offset_hu: float = 0.0
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -101,6 +100,7 @@ def segment_lungs(
     coarse = CoarseCt.of(ct)
     seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
     added: tuple[Mask | None, Mask | None]
+    offset = 0.0
     if ex_vivo:
         from anatomy.segmentation.ex_vivo import coarse_lung_ex_vivo
 
@@ -108,11 +108,14 @@ def segment_lungs(
         added = (None, None)
     else:
         tell("lungs: trachea")
-        outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
-        airway = find_central_airway(coarse, outside, seed)
+        coarse, outside, offset = in_hounsfield(coarse, seed)
+        ct = without_offset(ct, offset)
         tell("lungs: left and right")
         threshold = lung_threshold(coarse.hu, outside)
-        sides, warnings = _coarse_sides(coarse, outside, airway, threshold)
+        airway, tissue = _airway_and_lung(coarse, outside, seed, threshold)
+        gas = gas_pockets(coarse, tissue, AIR_HU)
+        sides, warnings = _coarse_sides(coarse, tissue & ~gas, airway)
+        warnings = (*offset_warning(offset), *warnings, *_gas_warning(coarse, gas))
         tell("lungs: nodules on the pleura")
         added = notches(coarse, sides == RIGHT, sides == LEFT, CLOSING_MM)
     tell("lungs: boundary")
@@ -129,6 +132,7 @@ def segment_lungs(
         trachea_seed_ijk=coarse.ct_voxel(airway.seed),
         central_airway=central,
         threshold_hu=threshold,
+        offset_hu=offset,
         warnings=(*airway.warnings, *warnings, *truncation(left | right, ct.grid)),
     )
 
@@ -141,9 +145,10 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
     AnatomyError
         If there is no trachea.
     """
-    coarse = CoarseCt.of(ct)
-    outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
-    airway = find_central_airway(coarse, outside, None if seed_lps is None else np.asarray(seed_lps, float))
+    seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
+    coarse, outside, offset = in_hounsfield(CoarseCt.of(ct), seed)
+    ct = without_offset(ct, offset)
+    airway = find_central_airway(coarse, outside, seed)
     main = _on_ct(coarse, _with_wall(coarse, airway.main))
     sides = [_filled(side, ct.grid) & ~main for side in (left, right)]
     _part(sides[1], sides[0])
@@ -153,7 +158,8 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
         trachea_seed_ijk=coarse.ct_voxel(airway.seed),
         central_airway=_on_ct(coarse, airway.main) & (ct.array < FIRST_THRESHOLD_HU),
         threshold_hu=FIRST_THRESHOLD_HU,
-        warnings=(*airway.warnings, *truncation(sides[0] | sides[1], ct.grid)),
+        offset_hu=offset,
+        warnings=(*offset_warning(offset), *airway.warnings, *truncation(sides[0] | sides[1], ct.grid)),
     )
 
 
@@ -179,37 +185,66 @@ def lung_threshold(hu: Float32, outside: Mask) -> float:
     lung = hu[(hu < FIRST_THRESHOLD_HU) & ~outside]
     tissue = hu[(hu > TISSUE_HU[0]) & (hu < TISSUE_HU[1])]
     if not lung.size or not tissue.size:
-        raise _no_lung("holds no air inside a body")
+        raise AnatomyError(
+            "The image holds no air inside a body",
+            expected="a CT of the chest with both lungs",
+            remedy="Choose the series of the chest; for an inflated lung outside a body use --ex-vivo",
+        )
     middle = 0.5 * (float(np.median(lung)) + float(np.median(tissue)))
     return float(np.clip(middle, *THRESHOLD_RANGE_HU))
 
 
-def _coarse_sides(
-    coarse: CoarseCt, outside: Mask, airway: CentralAirway, threshold: float
-) -> tuple[Int32, tuple[str, ...]]:
+def in_hounsfield(coarse: CoarseCt, seed: Float | None) -> tuple[CoarseCt, Mask, float]:
+    """Return the coarse CT with air at -1000 HU, the air around the patient, and the offset that was taken.
+
+    Raises
+    ------
+    AnatomyError
+        If there is no trachea.
+    """
+    outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
+    offset = air_offset_hu(coarse, find_central_airway(coarse, outside, seed).grown)
+    if offset:
+        coarse = replace(coarse, hu=np.asfortranarray(coarse.hu - np.float32(offset)))
+        outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
+    return coarse, outside, offset
+
+
+def _airway_and_lung(
+    coarse: CoarseCt, outside: Mask, seed: Float | None, threshold: float
+) -> tuple[CentralAirway, Mask]:
+    """Return the first central airway that divides and has lungs at it, else the first with lungs."""
+    found: list[tuple[CentralAirway, Mask]] = []
+    failed: AnatomyError | None = None
+    for airway in central_airways(coarse, outside, seed):
+        air = (coarse.hu < threshold) & ~outside & ~grown_by_one(airway.grown)
+        try:
+            found.append((airway, lung_pieces(coarse, air, airway.grown)))
+        except AnatomyError as error:
+            failed = failed or error
+            continue
+        if not airway.warnings:
+            return found[-1]
+    if not found and failed is not None:
+        raise failed
+    return found[0]
+
+
+def _coarse_sides(coarse: CoarseCt, tissue: Mask, airway: CentralAirway) -> tuple[Int32, tuple[str, ...]]:
     """Label the right lung 1 and the left lung 2 on coarse voxels."""
-    walls = grown_by_one(airway.grown)
-    air = (coarse.hu < threshold) & ~outside & ~walls
-    tissue = _lung_pieces(coarse, air)
     sides = sides_from_right(tissue, coarse)
     return (sides, ()) if sides is not None else _one_side(coarse, tissue, airway)
 
 
-def _lung_pieces(coarse: CoarseCt, air: Mask) -> Mask:
-    """Keep the pieces of air that are as large as a lung and hold tissue."""
-    from scipy import ndimage
-
-    pieces, _ = ndimage.label(air)
-    volumes_ml = np.bincount(pieces.ravel()) * coarse.voxel_ml
-    volumes_ml[0] = 0.0
-    lung = np.zeros(len(volumes_ml), dtype=np.bool_)
-    for piece in np.flatnonzero(volumes_ml >= SMALLEST_LUNG_ML):
-        lung[piece] = np.percentile(coarse.hu[pieces == piece], GAS_PERCENTILE) > GAS_HU
-    if not lung.any():
-        raise _no_lung(f"holds no lung: the largest piece of air inside has {volumes_ml.max():.0f} ml")
-    lung &= volumes_ml >= SMALLER_SHARE * volumes_ml[lung].max()
-    chosen: Mask = np.asfortranarray(lung[pieces])
-    return chosen
+def _gas_warning(coarse: CoarseCt, gas: Mask) -> tuple[str, ...]:
+    if not gas.any():
+        return ()
+    place = ", ".join(f"{x:.0f}" for x in coarse.grid.lps(np.argwhere(gas).mean(axis=0)))
+    return (
+        f"{np.count_nonzero(gas) * coarse.voxel_ml:.0f} ml of gas without tissue lie in the lungs, about LPS "
+        f"({place}) mm: a pneumothorax or a bulla. Where it borders on the chest wall it is taken out; no "
+        "needle can be steered in what is left of it.",
+    )
 
 
 def _one_side(coarse: CoarseCt, tissue: Mask, airway: CentralAirway) -> tuple[Int32, tuple[str, ...]]:
@@ -263,11 +298,3 @@ def _part(right: Mask, left: Mask) -> None:
     both = right & left
     right &= ~both
     left &= ~both
-
-
-def _no_lung(what: str) -> AnatomyError:
-    return AnatomyError(
-        f"The image {what}",
-        expected="a CT of the chest with both lungs",
-        remedy="Choose the series of the chest; for an inflated lung outside a body use --ex-vivo",
-    )

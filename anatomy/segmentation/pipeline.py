@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.records import frozen_record
+from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.description import Description, description_text
 from anatomy.segmentation.folder import SegmentationFolder, digest_of, grid_digest, key_of
+from anatomy.segmentation.gate import require_known_checks
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
 from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.request import SegmentationRequest
@@ -29,7 +32,7 @@ BYTES_PER_VOXEL = 40
 
 @frozen_record
 class Segmentation:
-    """What a segmentation wrote; all images lie on the grid of the CT.
+    """What a segmentation wrote; all images lie on the voxels of the CT, in the order of `canonical`.
 
     Steps not in `recomputed` were up to date; `corrected` images are a person's; `kept_description` tells
     whether an edited `patient.toml` was kept.
@@ -64,7 +67,8 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     Raises
     ------
     AnatomyError
-        If the CT cannot be segmented, or the folder holds corrections of another CT.
+        If the CT cannot be segmented, what was found cannot be a patient's lungs and airways, or the folder
+        holds corrections of another CT.
     GridMismatchError
         If a given mask does not fit the CT.
     FileError
@@ -72,6 +76,8 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     """
     tell = progress or (lambda _step: None)
     tell("checking the CT")
+    require_known_checks(request.accept)
+    request = replace(request, ct=canonical(request.ct))
     warnings = list(require_chest_ct(request.ct, thick_slices=request.thick_slices))
     grid = request.ct.grid
     stated = request.given.target
@@ -86,7 +92,7 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
     folder.save(provenance=_provenance(request, steps, warnings))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
-    text = description_text(request.name, bool(parts.nodule.any()), target, thick_mm)
+    text = description_text(request.name, bool(parts.nodule.any()), target, thick_mm, steps.accepted)
     return Segmentation(
         folder=folder.path,
         grid=grid,
@@ -129,6 +135,7 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
         "given_files": request.given.hashes(),
         "ex_vivo": request.ex_vivo,
         "thick_slices": request.thick_slices,
+        "accepted": list(steps.accepted),
         "seed_lps": None if request.seed_lps is None else request.seed_lps.tolist(),
         "corrected": steps.corrected,
         "warnings": warnings,
@@ -136,7 +143,7 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
 
 
 def read_ct(path: str | Path, series_uid: str | None = None) -> tuple[Volume, dict[str, str]]:
-    """Read a CT from an image file or a folder of DICOM files.
+    """Read a CT from an image file or a folder of DICOM files, in the order of voxels of `canonical`.
 
     Returns
     -------
@@ -159,11 +166,11 @@ def read_ct(path: str | Path, series_uid: str | None = None) -> tuple[Volume, di
         volume = read_dicom(path, series_uid)
         chosen = [s for s in list_series(path) if series_uid in (None, s.uid)]
         files = sorted(file for series in chosen for file in series.paths)
-        return volume, {file.relative_to(path).as_posix(): sha256(file) for file in files}
+        return canonical(volume), {file.relative_to(path).as_posix(): sha256(file) for file in files}
     if path.is_file() and image_suffix(path) is None:
         raise FileError(
             f"{path} is no image of a known kind",
             expected="a folder of DICOM files, or a NIfTI, NRRD or MetaImage file",
             remedy="Give the folder that holds the DICOM series",
         )
-    return read_volume(path), {path.name: sha256(path)}
+    return canonical(read_volume(path)), {path.name: sha256(path)}

@@ -119,6 +119,8 @@ class SegmentationRequest:
         The image shows an inflated lung in air.
     thick_slices : bool
         Accept slices of more than 3 mm; the folder is marked, and planning on it must be allowed too.
+    accept : tuple of str
+        Checks of `anatomy.segmentation.gate.CHECKS` whose failure a person accepts; it is recorded.
     seed_lps : (3,) float64, optional
         A point in the trachea, LPS mm.
     given : Given
@@ -130,5 +132,6 @@ class SegmentationRequest:
     sources: Mapping[str, str] = field(default_factory=dict)
     ex_vivo: bool = False
     thick_slices: bool = False
+    accept: tuple[str, ...] = ()
     seed_lps: Float | None = None
     given: Given = field(default_factory=Given)

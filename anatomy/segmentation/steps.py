@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
 from anatomy.io.files import sha256
 from anatomy.records import frozen_record
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.description import Description
 from anatomy.segmentation.folder import IMAGES, SegmentationFolder, digest_of, grid_digest, key_of
+from anatomy.segmentation.gate import judge, require_plausible
+from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.larynx import without_larynx
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
@@ -29,7 +32,7 @@ Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
 Progress = Callable[[str], None]
 
-VERSION = 1
+VERSION = 2
 """Raise it when a step makes other images from the same input."""
 _NOT_MASKS = ("lungs", "vesselness", "cost")
 
@@ -53,6 +56,31 @@ class Parts:
     all_vessels: Mask
     cost: Float32
 
+    @classmethod
+    def begun(cls, lungs: Lungs, lumen: Mask, wall: Mask) -> Parts:
+        """Return the images of a segmentation that ended with the airway."""
+        none = np.zeros(lumen.shape, dtype=np.bool_, order="F")
+        return cls(
+            left=lungs.left,
+            right=lungs.right,
+            central_airway=lungs.central_airway,
+            lumen=lumen,
+            wall=wall,
+            nodule=none,
+            vesselness=none.astype(np.float32),
+            large_vessels=none,
+            all_vessels=none,
+            cost=none.astype(np.float32),
+        )
+
+
+class RefusedError(AnatomyError):
+    """What was segmented cannot be the lungs and airways of a patient; `parts` show why."""
+
+    def __init__(self, error: AnatomyError, parts: Parts) -> None:
+        super().__init__(error.found, expected=error.expected, remedy=error.remedy)
+        self.parts = parts
+
 
 class Steps:
     """Runs lungs, airway, nodule, vessels and cost map in this order; tells each step as it begins."""
@@ -66,11 +94,12 @@ class Steps:
         progress: Progress,
     ) -> None:
         self._request, self._folder, self._description = request, folder, description
-        self._ct_digest, self._tell = ct_digest, progress
+        self._ct_digest, self._tell, self._ct = ct_digest, progress, request.ct
         self._digests: dict[str, str] = {}
         self.recomputed: list[str] = []
         self.corrected: list[str] = []
         self.warnings: list[str] = []
+        self.accepted: tuple[str, ...] = ()
         self._sources = request.given.images(folder.grid)
         for name in IMAGES:
             path = folder.correction(name)
@@ -81,7 +110,9 @@ class Steps:
     def run(self) -> Parts:
         """Bring every step up to date and return all images."""
         lungs = self._lungs()
+        self._ct = without_offset(self._ct, lungs.offset_hu)
         airway = self._airway(lungs)
+        self._require_plausible(lungs, airway)
         nodule = self._nodule()
         vessels = self._vessels(lungs, airway, nodule)
         cost = self._cost(lungs, airway, nodule, vessels)
@@ -111,7 +142,12 @@ class Steps:
                 lungs = segment_lungs(request.ct, ex_vivo=request.ex_vivo, seed_lps=seed, progress=self._tell)
             images = {"lungs": lung_labels(lungs.left, lungs.right), "central_airway": lungs.central_airway}
             seed_ijk = [int(n) for n in lungs.trachea_seed_ijk]
-            facts = {"seed": seed_ijk, "threshold_hu": lungs.threshold_hu, "warnings": list(lungs.warnings)}
+            facts = {
+                "seed": seed_ijk,
+                "threshold_hu": lungs.threshold_hu,
+                "offset_hu": lungs.offset_hu,
+                "warnings": list(lungs.warnings),
+            }
             return images, facts
 
         images, facts = self._bring_up_to_date("lungs", ("lungs", "central_airway"), key, compute)
@@ -121,6 +157,7 @@ class Steps:
             trachea_seed_ijk=np.array(facts["seed"], dtype=np.int64),
             central_airway=images["central_airway"],
             threshold_hu=float(facts["threshold_hu"]),
+            offset_hu=float(facts["offset_hu"]),
             warnings=tuple(facts["warnings"]),
         )
 
@@ -137,7 +174,7 @@ class Steps:
             warnings: tuple[str, ...] = ()
             if lumen is None:
                 box = Box.around(lungs, self._folder.grid)
-                found = segment_airway(box.volume(self._request.ct), box.lungs(lungs), progress=self._tell)
+                found = segment_airway(box.volume(self._ct), box.lungs(lungs), progress=self._tell)
                 trachea, cut_mm = without_larynx(found.lumen, lungs.trachea_seed_ijk - box.low, box.inner)
                 lumen, warnings = box.whole(trachea), found.warnings
                 # The wall of what was cut off stays: it is an obstacle.
@@ -154,6 +191,19 @@ class Steps:
             return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": list(warnings)}
 
         return self._bring_up_to_date("airway", ("airway", "airway_wall"), key, compute)[0]
+
+    def _require_plausible(self, lungs: Lungs, airway: Images) -> None:
+        """Refuse lungs and airway that cannot be those of a patient, unless that is accepted by name."""
+        if self._request.ex_vivo:
+            return
+        self._tell("checking lungs and airway")
+        failed, warnings = judge(self._ct, lungs, airway["airway"])
+        self.warnings += warnings
+        try:
+            self.accepted = require_plausible(failed, self._request.accept)
+        except AnatomyError as error:
+            self._description.set_aside()
+            raise RefusedError(error, Parts.begun(lungs, airway["airway"], airway["airway_wall"])) from None
 
     def _nodule(self) -> Mask:
         given, grid = self._request.given, self._folder.grid
@@ -183,9 +233,7 @@ class Steps:
 
             box = Box.around(lungs, self._folder.grid)
             inside = box.lungs(lungs).mask
-            found = segment_vessels(
-                box.volume(self._request.ct), inside, _airways(box, airway), progress=self._tell
-            )
+            found = segment_vessels(box.volume(self._ct), inside, _airways(box, airway), progress=self._tell)
             target = box.cut(nodule)
             masks = {"vessels": found.large, "all_vessels": found.mask}
             for name, mask in masks.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,15 @@ PLANES = (("sagittal", 0, (1, 2)), ("coronal", 1, (0, 2)), ("axial", 2, (0, 1)))
 """Name, normal, and the axes across and up, as LPS axes."""
 
 
-def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> Path:
+def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[str]) -> Path:
     """Draw the masks over the CT: five sagittal, coronal and axial slices through the lungs.
 
     Axial slices are seen from the feet, coronal ones from the front: the patient's right is on the left.
 
     Parameters
     ----------
-    parts : Parts
-        On the grid of the CT.
+    parts : Parts or None
+        On the grid of the CT; None draws the whole CT alone.
 
     Raises
     ------
@@ -42,7 +43,8 @@ def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> 
         If the file cannot be written.
     """
     pad = np.ceil(MARGIN_MM / ct.grid.spacing_mm).astype(np.int64)
-    low, high = bounds(parts.left | parts.right | parts.lumen, pad)
+    shown = ct.array < np.inf if parts is None else parts.left | parts.right | parts.lumen
+    low, high = bounds(shown, pad)
     axis_of = [int(np.argmax(np.abs(ct.grid.lps_from_ijk[row, :3]))) for row in range(3)]
     figure = style.new_figure(SLICES * PANEL_IN, 3 * PANEL_IN + 0.7)
     panels = figure.subplots(3, SLICES, squeeze=False)
@@ -55,7 +57,8 @@ def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> 
             _panel(axes, ct, parts, (low, high), through, level, (axis_of[across], axis_of[up]), up == 1)
             place = ct.grid.lps(np.where(np.arange(3) == through, level, low))[normal]
             axes.set_title(f"{name}, LPS {'xyz'[normal]} = {place:.0f} mm", fontsize=8, color=style.INK)
-    figure.legend(handles=_legend(), loc="lower center", ncol=8, fontsize=9, frameon=False)
+    if parts is not None:
+        figure.legend(handles=_legend(), loc="lower center", ncol=8, fontsize=9, frameon=False)
     figure.subplots_adjust(left=0.005, right=0.995, top=0.975, bottom=0.045, wspace=0.02, hspace=0.09)
     return style.save_png(figure, path)
 
@@ -63,7 +66,7 @@ def segmentation_png(ct: Volume, parts: Parts, path: str | os.PathLike[str]) -> 
 def _panel(
     axes: Axes,
     ct: Volume,
-    parts: Parts,
+    parts: Parts | None,
     box: tuple[Int, Int],
     through: int,
     level: int,
@@ -83,6 +86,15 @@ def _panel(
         cut(ct.array), cmap="gray", vmin=WINDOW_HU[0], vmax=WINDOW_HU[1], extent=extent, origin="lower",
         interpolation="nearest",
     )  # fmt: skip
+    if parts is not None:
+        _draw_parts(axes, parts, cut, extent)
+    if downwards:
+        axes.invert_yaxis()
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def _draw_parts(axes: Axes, parts: Parts, cut: Callable[[Array], Array], extent: Any) -> None:
     for mask, colour, alpha in (
         (parts.all_vessels, SMALL_VESSEL, 0.55),
         (parts.large_vessels, LARGE_VESSEL, 0.75),
@@ -96,10 +108,6 @@ def _panel(
         plane = cut(mask)
         if plane.any():
             axes.contour(plane, [0.5], colors=colour, linewidths=0.8, extent=extent, origin="lower")
-    if downwards:
-        axes.invert_yaxis()
-    axes.set_aspect("equal")
-    axes.set_axis_off()
 
 
 def _extent(grid: Grid, box: tuple[Int, Int], shown: tuple[int, int]) -> tuple[float, float, float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from anatomy.errors import AnatomyError
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import parse_point
@@ -16,6 +17,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from anatomy.grid import Volume
     from anatomy.segmentation.pipeline import Segmentation
     from anatomy.segmentation.quality import Quality
 
@@ -40,6 +42,7 @@ def segment(
     series: str | None = None,
     ex_vivo: bool = False,
     thick_slices: bool = False,
+    accept: tuple[str, ...] = (),
     seed: str | None = None,
     lungs: Path | None = None,
     airway: Path | None = None,
@@ -73,6 +76,10 @@ def segment(
         The image shows an inflated lung in air, not a patient.
     thick_slices : bool
         Accept slices of more than 3 mm; planning on the result must then be allowed as well.
+    accept : tuple[str, ...]
+        A check that failed and is overruled, by the name in its message: axes, sides, airway, bronchi,
+        one-lung,
+        volume or density. It is recorded in patient.toml.
     seed : str
         A point in the trachea, ras:x,y,z or lps:x,y,z, if it is not found by itself.
     lungs : Path
@@ -117,6 +124,7 @@ def segment(
             sources=sources,
             ex_vivo=ex_vivo,
             thick_slices=thick_slices,
+            accept=accept,
             seed_lps=None if seed is None else parse_point(seed),
             given=Given(
                 lungs=lungs,
@@ -129,7 +137,13 @@ def segment(
                 target=target,
             ),
         )
-        result = run(request, lambda step: shown.step(step, STEP_SHARES.get(step)))
+        try:
+            result = run(request, lambda step: shown.step(step, STEP_SHARES.get(step)))
+        except AnatomyError as error:
+            if pictures:
+                _show_refused(volume, error, out / "refused.png")
+            raise
+        (out / "refused.png").unlink(missing_ok=True)
         shown.step("airway tree", STEP_SHARES["airway tree"])
         quality = quality_of(result.parts, result.grid)
         if pictures:
@@ -147,6 +161,15 @@ def segment(
     terminal.show_warnings(warnings)
     terminal.say(_written(result))
     return ExitCode.OK
+
+
+def _show_refused(ct: Volume, error: AnatomyError, path: Path) -> None:
+    """Draw the CT with what was found in it until it was refused."""
+    from anatomy.segmentation.steps import RefusedError
+    from lungaccess.report.segmentation import segmentation_png
+
+    segmentation_png(ct, error.parts if isinstance(error, RefusedError) else None, path)
+    terminal.progress_console.print(f"{path} shows what was found", highlight=False)
 
 
 def _tables(result: Segmentation, quality: Quality) -> list[Table]:

@@ -1,0 +1,48 @@
+"""Images in one order of voxels: what a segmentation makes does not depend on how a file stores its image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.grid import Grid, Volume
+from anatomy.typed import Float
+
+
+def canonical(volume: Volume) -> Volume:
+    """Return an image with its voxels in the order right to left, front to back, feet to head.
+
+    Only the order of the voxels changes: every voxel keeps its place in the patient.  An image in this order
+    is
+    returned as it is.
+    """
+    order, flipped = towards_lps(volume.grid.lps_from_ijk[:3, :3])
+    if order == (0, 1, 2) and not any(flipped):
+        return volume
+    reversed_axes = tuple(axis for axis in range(3) if flipped[axis])
+    array = np.flip(np.transpose(volume.array, order), axis=reversed_axes)
+    return Volume(grid=turned_grid(volume.grid, order, flipped), array=np.asfortranarray(array))
+
+
+def towards_lps(axes: Float) -> tuple[tuple[int, int, int], tuple[bool, bool, bool]]:
+    """Return which axis runs most nearly along x, y and z, and whether against it."""
+    from scipy.optimize import linear_sum_assignment
+
+    cosines = axes / np.linalg.norm(axes, axis=0)
+    _, columns = linear_sum_assignment(-np.abs(cosines))
+    x, y, z = (int(c) for c in columns)
+    against = [bool(cosines[row, column] < 0) for row, column in enumerate((x, y, z))]
+    return (x, y, z), (against[0], against[1], against[2])
+
+
+def turned_grid(grid: Grid, order: tuple[int, int, int], flipped: tuple[bool, bool, bool]) -> Grid:
+    """Return the grid after its axes were put into another order and some of them turned around."""
+    matrix = grid.lps_from_ijk.copy()
+    shape = [grid.shape[axis] for axis in order]
+    columns = grid.lps_from_ijk[:3, list(order)]
+    last = np.zeros(3)
+    for axis in range(3):
+        if flipped[axis]:
+            last[order[axis]] = shape[axis] - 1
+    matrix[:3, :3] = columns * np.where(flipped, -1.0, 1.0)
+    matrix[:3, 3] = grid.lps(last)
+    return Grid(shape=(shape[0], shape[1], shape[2]), lps_from_ijk=matrix)

@@ -45,8 +45,8 @@ class Implausible:
     remedy: str
 
 
-def judge(ct: Volume, lungs: Lungs, lumen: Mask) -> tuple[tuple[Implausible, ...], tuple[str, ...]]:
-    """Judge lungs and airway by anatomy.
+def plausibility(ct: Volume, lungs: Lungs, lumen: Mask) -> tuple[tuple[Implausible, ...], tuple[str, ...]]:
+    """Check lungs and airway by anatomy.
 
     Parameters
     ----------

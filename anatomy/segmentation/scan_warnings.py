@@ -18,7 +18,7 @@ QUIET_SHARE = 0.2
 """Of the cubes: the others hold the edge of something."""
 LEAST_PATCHES = 20
 """From fewer no noise is told."""
-LOUD_HU = 35.0
+LOUD_HU = 30.0
 """Diagnostic CT of the chest has 10 to 30 HU."""
 LOSS_PER_HU = 0.004
 """Share of the airway tree that each HU of noise above 20 costs in phantoms: 8 % at 40 HU, 20 % at 70 HU."""
@@ -33,7 +33,7 @@ def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
     if noise > LOUD_HU:
         loss = 100.0 * LOSS_PER_HU * (noise - 20.0)
         warnings.append(
-            f"The noise is {noise:.0f} HU: about {loss:.0f} % of the airways, the thin ones, are not "
+            f"The noise is {noise:.0f} HU: {loss:.0f} % of the airways or more, the thin ones, are not "
             "found, and "
             "reach is understated by what they lead to. A reconstruction with a smoother kernel or "
             "thicker slices "

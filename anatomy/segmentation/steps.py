@@ -15,7 +15,7 @@ from anatomy.records import frozen_record
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.description import Description
 from anatomy.segmentation.folder import IMAGES, SegmentationFolder, digest_of, grid_digest, key_of
-from anatomy.segmentation.gate import judge, require_plausible
+from anatomy.segmentation.gate import plausibility, require_plausible
 from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.larynx import without_larynx
@@ -197,7 +197,7 @@ class Steps:
         if self._request.ex_vivo:
             return
         self._tell("checking lungs and airway")
-        failed, warnings = judge(self._ct, lungs, airway["airway"])
+        failed, warnings = plausibility(self._ct, lungs, airway["airway"])
         self.warnings += warnings
         try:
             self.accepted = require_plausible(failed, self._request.accept)

@@ -14,7 +14,7 @@ from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIG
 from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.gate import judge, require_plausible
+from anatomy.segmentation.gate import plausibility, require_plausible
 from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.input import require_chest_ct
 from anatomy.segmentation.lungs import Lungs, segment_lungs
@@ -59,7 +59,7 @@ class Outcome:
 
 
 def run(case: HardCase, image: HardImage, plain_tree: float = 1.0) -> Outcome:
-    """Segment the image of a case up to the airways and judge the result by the truth."""
+    """Segment the image of a case up to the airways and plausibility the result by the truth."""
     made = case.make(image)
     try:
         lungs, lumen, warnings = segmented(made.ct, thick=case.thick, accepted=case.accepted)
@@ -91,7 +91,7 @@ def segmented(
     lungs = segment_lungs(ct)
     ct = without_offset(ct, lungs.offset_hu)
     airways = segment_airway(ct, lungs)
-    failed, further = judge(ct, lungs, airways.lumen)
+    failed, further = plausibility(ct, lungs, airways.lumen)
     accepted_names = require_plausible(failed, accepted)
     said = (*warnings, *lungs.warnings, *airways.warnings, *further, *accepted_names)
     return lungs, airways.lumen, said

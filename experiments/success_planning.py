@@ -58,18 +58,20 @@ def compare(
     size: tuple[int, int],
     seed: int,
 ) -> Pair:
-    """Plan for success to the target of a plan of least cost, and count both.
+    """Plan for success to the target of a plan of least cost, with its seed, and count both.
 
     Parameters
     ----------
     size : tuple of int
         Variations of the search, and draws of the comparison.
+    seed : int
+        Of the comparison.
     """
     variations, draws = size
     target, began = la.point_target(lung, plan.target_lps), time.process_time()
     *_, best = la.plan_for_success(
-        lung, plan.system, target, errors=errors, procedure=procedure, seed=seed, iterations=variations,
-        atlas=atlas,
+        lung, plan.system, target, errors=errors, procedure=procedure, seed=plan.seed,
+        iterations=variations, atlas=atlas,
     )  # fmt: skip
     cpu_s = time.process_time() - began
     cost, success = (
@@ -107,7 +109,7 @@ def drawn(found: dict[tuple[str, str], list[Pair]]) -> Figure:
             x, y = ([100.0 * getattr(each, field) for each in pairs] for field in ("cost", "success"))
             axes.scatter(x, y, s=26, color=colour, alpha=0.8, label=errors)
         axes.set(
-            xlim=(0, 100), ylim=(0, 100), aspect="equal", title=procedure,
+            xlim=(-2, 102), ylim=(-2, 102), aspect="equal", title=procedure,
             xlabel="plan of least cost succeeds, %", ylabel="plan for success succeeds, %",
         )  # fmt: skip
     axes.legend(loc="lower right")

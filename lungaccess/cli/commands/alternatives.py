@@ -39,7 +39,8 @@ NOTE = (
     "succeeds: of 100; gen.: generation of the scope's tip; clear, pleura: least distance of tubes and "
     "needle from any obstacle and from the pleura, mm, as the plan states it; tissue: way in tissue, mm; "
     "1/clear: integral of 1/clearance; front: no other plan is better in one of succeeds, clear and tissue "
-    "and as good in the others"
+    "and as good in the others.  The plan that succeeds most often of several owes part of it to luck, which "
+    "its interval does not count"
 )
 
 

@@ -88,14 +88,14 @@ def test_a_comparison_has_one_luck(monkeypatch: pytest.MonkeyPatch) -> None:
         return report(plan, errors, procedure, samples)
 
     def search(_lung: Any, system: str, target: str, **options: Any) -> list[Any]:
-        assert (system, target, options["iterations"], options["seed"]) == ("s", "t", 5, 7)
+        assert (system, target, options["iterations"], options["seed"]) == ("s", "t", 5, 4)
         return [SimpleNamespace(plan="a"), SimpleNamespace(plan="c")]
 
     monkeypatch.setattr(success_planning, "estimate_success", estimate)
     monkeypatch.setattr("lungaccess.plan_for_success", search, raising=False)
     monkeypatch.setattr("lungaccess.point_target", lambda _lung, point: point, raising=False)
-    COUNTS_OF = SimpleNamespace(target_lps="t", system="s")
-    plan: Any = type("Named", (str,), vars(COUNTS_OF))("b")
+    stated = {"target_lps": "t", "system": "s", "seed": 4}
+    plan: Any = type("Named", (str,), stated)("b")
     pair = success_planning.compare(
         plan,
         None,

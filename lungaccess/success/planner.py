@@ -17,7 +17,7 @@ from lungaccess.problem.task import Task
 from lungaccess.procedure import Procedure, ProcedureReport, load_procedure
 from lungaccess.risk import ErrorModel, RiskReport, Share, load_errors
 from lungaccess.success.estimate import ChanceEstimator, chance_of
-from lungaccess.success.search import SuccessSearch
+from lungaccess.success.search import Contender, SuccessSearch
 from stages.needle import Objective
 
 METHOD = "success"
@@ -33,8 +33,9 @@ class PlannedSuccess:
     plan : Plan
         Proved as every plan; its costs are those of the objective "inverse_clearance".
     estimate : RiskReport or ProcedureReport
-        How many procedures succeed of draws that no search has seen, and what fails; few draws of the first
-        plan.  What is counted the plan states as its `chance`.
+        How many procedures succeed of draws that no search has seen, and what fails; few draws of a plan
+        that may soon be surpassed, and which comes again with all draws if it is not.  What is counted the
+        plan states as its `chance`.
     """
 
     plan: Plan
@@ -117,17 +118,20 @@ def _run(
     time_s: float,
     tell: Callable[[ProgressEvent], None],
 ) -> Iterator[PlannedSuccess]:
-    """Drive a search within its budget."""
-    clock, best = Clock(), None
+    """Drive a search within its budget; what it ends with is estimated with all draws, even after it."""
+    clock, best, few = Clock(), None, False
+
+    def planned(contender: Contender, tried: int, samples: int) -> PlannedSuccess:
+        whole = search.finished(contender, tried, clock.elapsed_s)
+        found = estimator.fresh(whole, samples)
+        return PlannedSuccess(plan=replace(whole, chance=chance_of(found)), estimate=found)
+
     for contender, tried in search.steps():
         if iterations is not None and tried > iterations:
             break
         if best is None or contender.plan is not best.plan:
-            samples = estimator.halving.samples[0] if best is None else estimator.halving.fresh
-            best = contender
-            whole = search.finished(contender, tried, clock.elapsed_s)
-            found = estimator.fresh(whole, samples)
-            yield PlannedSuccess(plan=replace(whole, chance=chance_of(found)), estimate=found)
+            few, best = contender.samples < estimator.halving.samples[-1], contender
+            yield planned(contender, tried, estimator.halving.samples[0] if few else estimator.halving.fresh)
         if clock.elapsed_s > time_s:
             break
         if clock.due():
@@ -137,3 +141,5 @@ def _run(
                     message=f"succeeds in {contender.share:.0%} of the draws",
                 )
             )  # fmt: skip
+    if best is not None and few:
+        yield planned(best, 0, estimator.halving.fresh)

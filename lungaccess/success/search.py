@@ -172,18 +172,20 @@ class SuccessSearch:
         """Return the best of several: in each round fewer of them have more draws.
 
         The plan of least cost is in all rounds: nothing that is worse may win by the luck of few draws.
-        Yield the first one again and again, for a caller whose time ends.
+        Yield the best of the last whole round again and again, at first `first`, for a caller whose time
+        ends.
         """
-        halving = self._estimator.halving
+        halving, leader = self._estimator.halving, first
         for samples, kept in zip(halving.samples, (*halving.kept, 1), strict=True):
             counted = []
             for each in contenders:
                 counted.append(self._counted(each, samples))
-                if first is not None:
-                    yield first, 0
+                if leader is not None:
+                    yield leader, 0
             contenders = sorted(counted, key=lambda each: -each.successes)
             by_cost = [each for each in contenders[kept:] if each.candidate is None and kept > 1]
             contenders = [*contenders[:kept], *by_cost]
+            leader = contenders[0]
         return contenders[0]
 
     def _challenged(self, best: Contender, others: Iterator[Contender]) -> Iterator[tuple[Contender, int]]:

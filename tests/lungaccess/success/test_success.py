@@ -19,6 +19,7 @@ from lungaccess.problem.task import Task
 from lungaccess.procedure import load_procedure
 from lungaccess.procedure.spread import Spread
 from lungaccess.risk import ErrorModel, RiskAssessor, load_errors
+from lungaccess.success.estimate import OPEN_LOOP
 from stages.needle import Objective
 
 SYSTEM = la.load_system("tight-inner", fissures_allowed=True)
@@ -83,6 +84,16 @@ def test_it_succeeds_more_often_than_the_plan_of_least_cost(
         assert stated is not None and stated.successes == best.succeeds.count
         assert (stated.errors, stated.procedure) == ("gated-ct", "open-loop")
     assert len(gains) == 2 and min(gains) > -0.01 and max(gains) > 0.05
+
+
+def test_a_search_without_time_estimates_its_plan_with_all_draws(
+    small_lung: Lung, atlas: la.Atlas, targets: list[Target]
+) -> None:
+    first, last = la.plan_for_success(
+        small_lung, SYSTEM, targets[0], errors=ERRORS, radius_mm=RADIUS_MM, atlas=atlas, time_s=0.0
+    )
+    assert first.plan.tube.rotation_rad == last.plan.tube.rotation_rad
+    assert (first.succeeds.samples, last.succeeds.samples) == (OPEN_LOOP.samples[0], OPEN_LOOP.fresh)
 
 
 def test_a_diverse_set_trades_success_for_length_and_clearance(

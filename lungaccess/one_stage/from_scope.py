@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
@@ -26,8 +26,20 @@ SEARCH_ITERATIONS = 300
 TRIES = 400
 """Variations of rotation, insertions and needle that improve the first answer: some milliseconds."""
 
-DeploymentRank = Callable[[Float, Deployments], Float]
-"""Tells from the row `(1, 9)` of a scope tip and N deployments how good `(N,)` each is."""
+RANKED = 256
+"""So many deployments are ranked first, spread over all of them: those between are much like them."""
+FORESEEN = 12
+"""So many with a clear arc, the likeliest, are looked at closely; further ones are alike or worse."""
+
+
+class DeploymentRank(Protocol):
+    """Tells how good deployments from a scope tip are, which is a row `(1, 9)`."""
+
+    def likely(self, tip: Float, deployments: Deployments) -> Float:
+        """Return it roughly for N of them whose arcs are not tested, `(N,)`."""
+
+    def foreseen(self, tip: Float, deployments: Deployments) -> Float:
+        """Return it exactly for a few whose arcs are clear, `(N,)`."""
 
 
 class ScopeReplanner:
@@ -36,8 +48,10 @@ class ScopeReplanner:
     Parameters
     ----------
     task : Task
-    tries, searches, rank
+    tries, searches : int
         As those of `replan_from_scope`.
+    rank : DeploymentRank, optional
+        The best by it is taken, instead of the cheapest, and not varied.
     """
 
     def __init__(
@@ -107,35 +121,61 @@ class _FromScope:
 
     def best(self) -> tuple[Deployment, ArcPath] | None:
         """Return the cheapest deployment and path found, None if there is none."""
-        first = self._direct() or self._searched()
+        first = (self._direct() if self._rank is None else self._ranked(self._rank)) or self._searched()
         return None if first is None else self._improved(*first)
 
     def _direct(self) -> tuple[Deployment, ArcPath] | None:
         """Return the proved direct arc of least estimated cost, those of the least bounds looked at first."""
-        near, entries, needle = self._near, self.entries, self._evaluator.needle_arrays
-        x, y, z = self._target.tolist()
+        near, (x, y, z) = self._near, self._target.tolist()
         bounds = np.zeros(len(near))
-        cost_bounds(needle, entries.positions[near], self._near_mm, (x, y, z), bounds)
+        cost_bounds(
+            self._evaluator.needle_arrays, self.entries.positions[near], self._near_mm, (x, y, z), bounds
+        )
         near = near[np.argsort(bounds, kind="stable")]
-        blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
         # An arc that costs more than a clear one is of use only where the cheaper ones are not proved.
-        for slack in (1.0, math.inf) if self._rank is None else (math.inf,):
-            evaluate_arcs(
-                needle, entries.positions[near], entries.tangents[near], entries.branch[near], (x, y, z),
-                slack, math.inf, blockers, costs,
-            )  # fmt: skip
+        for slack in (1.0, math.inf):
+            blockers, costs = self._arcs(near, slack)
             clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
-            worst = costs[clear]
-            if self._rank is not None:
-                worst = -self._rank(self._row, entries.only(near[clear]))
-            for n in clear[np.argsort(worst, kind="stable")].tolist():
-                deployment = self._deployment(int(near[n]))
-                path = path_through(deployment, np.zeros((0, 3)), self._target)
-                if self._evaluator.proves(deployment, path):
-                    return deployment, path
-            if not len(clear):
+            found = self._first_proved(near[clear[np.argsort(costs[clear], kind="stable")]])
+            if found is not None or not len(clear):
                 break
         self._evaluator.count_blockers(blockers)
+        return found
+
+    def _ranked(self, rank: DeploymentRank) -> tuple[Deployment, ArcPath] | None:
+        """Return the best proved direct arc: of some deployments, or of the others if they have none."""
+        some = np.arange(len(self._near)) % -(-len(self._near) // RANKED or 1) == 0
+        for near in (self._near[some], self._near[~some]):
+            near = near[np.argsort(-rank.likely(self._row, self.entries.only(near)), kind="stable")]
+            clear = np.zeros(0, dtype=np.int64)
+            while len(near) and len(clear) < FORESEEN:
+                part, near = near[: 2 * FORESEEN], near[2 * FORESEEN :]
+                blockers, costs = self._arcs(part, math.inf)
+                self._evaluator.count_blockers(blockers)
+                clear = np.concatenate([clear, part[(blockers == 0) & np.isfinite(costs)]])
+            clear = clear[:FORESEEN]
+            good = rank.foreseen(self._row, self.entries.only(clear))
+            found = self._first_proved(clear[np.argsort(-good, kind="stable")])
+            if found is not None:
+                return found
+        return None
+
+    def _arcs(self, entries: Int, slack: float) -> tuple[Int, Float]:
+        """Return what blocks the direct arcs of some deployments, and what they cost; see `evaluate_arcs`."""
+        every, (x, y, z) = self.entries, self._target.tolist()
+        blockers, costs = np.zeros(len(entries), dtype=np.int64), np.zeros(len(entries))
+        evaluate_arcs(
+            self._evaluator.needle_arrays, every.positions[entries], every.tangents[entries],
+            every.branch[entries], (x, y, z), slack, math.inf, blockers, costs,
+        )  # fmt: skip
+        return blockers, costs
+
+    def _first_proved(self, entries: Int) -> tuple[Deployment, ArcPath] | None:
+        for entry in entries.tolist():
+            deployment = self._deployment(entry)
+            path = path_through(deployment, np.zeros((0, 3)), self._target)
+            if self._evaluator.proves(deployment, path):
+                return deployment, path
         return None
 
     def _searched(self) -> tuple[Deployment, ArcPath] | None:

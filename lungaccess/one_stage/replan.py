@@ -11,7 +11,7 @@ from anatomy import poses
 from anatomy.errors import FrameError, TargetError
 from anatomy.lung import Lung
 from anatomy.typed import Float
-from lungaccess.one_stage.from_scope import SEARCHED, TRIES, DeploymentRank, ScopeReplanner
+from lungaccess.one_stage.from_scope import SEARCHED, TRIES, ScopeReplanner
 from lungaccess.one_stage.needle import needle_question
 from lungaccess.one_stage.obstruction import reason_in_words
 from lungaccess.one_stage.rest import RestOfPlan
@@ -44,7 +44,6 @@ def replan_from_scope(
     seed: int = 0,
     tries: int = TRIES,
     searches: int = SEARCHED,
-    rank: DeploymentRank | None = None,
 ) -> RestOfPlan:
     """Plan tubes and needle from where the tip of the scope really is.
 
@@ -61,9 +60,6 @@ def replan_from_scope(
         Variations of rotation, insertions and needle that improve the first answer; 0 for a faster one.
     searches : int
         Deployments from which the needle's own search starts where no direct arc is clear.
-    rank : callable, optional
-        Tells from the row `(1, 9)` of the scope tip and N deployments with a clear direct arc how good each
-        is; the best is taken, instead of the cheapest, and not varied.
 
     Raises
     ------
@@ -76,7 +72,7 @@ def replan_from_scope(
     """
     frame = _rigid(lung, lps_from_scope_tip, "scope")
     task = _task(lung, system, target, objective, seed)
-    return ScopeReplanner(task, tries=tries, searches=searches, rank=rank).replan(frame)
+    return ScopeReplanner(task, tries=tries, searches=searches).replan(frame)
 
 
 def replan_from_tube(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+import math
+from dataclasses import fields, replace
+from functools import cached_property
+from itertools import product
 
 import numpy as np
 
+from anatomy import poses
 from anatomy.errors import TargetError
 from anatomy.lung import Lung
 from anatomy.typed import Float
@@ -16,8 +19,12 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
 from lungaccess.problem.task import Task
+from lungaccess.procedure.foresight import Foresight
+from lungaccess.procedure.fusion import fused, fused_share, scope_moves, tip_moves
+from lungaccess.procedure.history import NEEDLE, SCOPE, TUBE, History
+from lungaccess.procedure.residuals import Residuals
 from lungaccess.procedure.settings import Procedure
-from lungaccess.procedure.spread import Spread
+from lungaccess.procedure.spread import ASIDE, bend_per_mm
 from lungaccess.procedure.truth import (
     Attempt,
     SteeredTruth,
@@ -28,11 +35,14 @@ from lungaccess.procedure.truth import (
     path_of,
     with_stop,
 )
-from lungaccess.risk import ErrorModel
+from lungaccess.risk import ErrorModel, RiskAssessor
+from lungaccess.risk.deviations import deviated_starts
+from lungaccess.risk.errors import BREATHING
 from stages.needle import (
     ArcPath,
     Belief,
     Failure,
+    NeedleEnvironment,
     Objective,
     Query,
     Replan,
@@ -43,52 +53,20 @@ from stages.needle import (
     needle_environment,
     steer,
 )
-from stages.tube import Deployments
 
-SCOPE, TUBE, NEEDLE = "scope", "tube", "needle"
-STAGES = (SCOPE, TUBE, NEEDLE)
-ASIDE = 0.6
-"""Points beside the target are aimed at so far out, as a share of the goal's radius: what is left of it is
-there for the errors that come after."""
 SIDES = np.concatenate([np.eye(3), -np.eye(3)])
 ASIDES = 2
 """So many points beside the target are tried, the two that the needle has to bend least for."""
 SHARES = 9
 """Shares of an error of measuring that are tried until a scope's tip lies in the lumen."""
+AIMING_ITERATIONS = 100
+"""Iterations from a tip of the tubes as measured: most targets are reached by one arc, which they improve."""
 SEARCH_ITERATIONS = 1500
-"""Iterations of a replan on the way, where the plan that is left cannot be aimed again."""
-
-
-@dataclass
-class History:
-    """What happened in one procedure.
-
-    Attributes
-    ----------
-    chains : list of (Float, Float, int)
-        Of each attempt the true scope tip `(9,)`, the true arcs `(P, 4)` of what was inserted, and how many
-        of them are the tubes'.
-    complete : bool
-        Whether the last chain has all its devices; otherwise no path was left.
-    stopped : bool
-        Whether the needle stopped on its way because no path was left.
-    placements : int
-        How often the scope was placed.
-    system : System or None
-        The system with the margins that the last replan kept; None before any.
-    replans : dict of str to list of bool
-        Of each stage, whether each of its replans found a path.
-    corrected_mm : dict of str to list of float
-        Of each stage, how far from the target the plan so far would have ended.
-    """
-
-    chains: list[tuple[Float, Float, int]] = field(default_factory=list)
-    complete: bool = False
-    stopped: bool = False
-    placements: int = 0
-    system: System | None = None
-    replans: dict[str, list[bool]] = field(default_factory=lambda: {stage: [] for stage in STAGES})
-    corrected_mm: dict[str, list[float]] = field(default_factory=lambda: {stage: [] for stage in STAGES})
+"""Iterations where that finds no path, or the plan that is left cannot be aimed again on the way."""
+IMAGINED = 16
+"""Placements of the scope that are imagined beforehand: their mean chance is then known to some percent."""
+_SEED = 2
+"""Of their draws, which have nothing to do with those of a simulated procedure."""
 
 
 class Policy:
@@ -96,33 +74,31 @@ class Policy:
 
     Parameters
     ----------
-    plan, lung
-        The plan, and the patient that it is for.
+    assessor : RiskAssessor
+        Of the plan.
+    lung : Lung
+        The patient that it is for.
     errors : ErrorModel
-        By which a deployment is chosen from a scope's tip as measured.
+        By which measurements are weighed against what was expected, and deployments chosen.
     procedure : Procedure
-    radius_mm : float
-        Radius of the goal: where its centre cannot be reached, other points in it are aimed at.
     """
 
-    def __init__(
-        self, plan: Plan, lung: Lung, errors: ErrorModel, procedure: Procedure, radius_mm: float
-    ) -> None:
-        self._plan, self._lung, self.procedure = plan, lung, procedure
-        self.errors, self._radius_mm = errors, radius_mm
-        self._aside_mm = ASIDE * radius_mm
+    def __init__(self, assessor: RiskAssessor, lung: Lung, errors: ErrorModel, procedure: Procedure) -> None:
+        self._plan = plan = assessor.plan
+        self._assessor, self._lung, self.errors, self.procedure = assessor, lung, errors, procedure
+        # Where the centre of the goal cannot be reached, other points in it are aimed at.
+        self._aside_mm = ASIDE * assessor.radius_mm
+        self._foresight = Foresight(assessor, lung, errors, procedure)
+        self._left = Residuals.of(errors, procedure, assessor.stretch)
         # Fissures are obstacles of the replan exactly where they are of the plan.
         whole = replace(plan.system, fissures_allowed=not plan.fissures_are_obstacles)
         share = procedure.least_margin_share
         self._systems = (whole,) if share == 1.0 else (whole, _with_margins(whole, share))
-        self._replanners: dict[System, ScopeReplanner] = {}
-        self._environments = {
-            system: needle_environment(
-                lung, system.needle, system.margins, with_fissures=plan.fissures_are_obstacles
-            )
+        self._environments = [
+            needle_environment(lung, system.needle, system.margins, with_fissures=plan.fissures_are_obstacles)
             for system in self._systems
             if system.needle is not None
-        }
+        ]
 
     def attempt(self, history: History, attempt: Attempt, rng: np.random.Generator) -> bool:
         """Place the scope once and go on from there; tell whether the procedure is over.
@@ -139,8 +115,9 @@ class Policy:
         placing, plan = self.procedure.scope, self._plan
         noise = rng.standard_normal((3, 5))
         if placing.measured:
-            found = self._from_scope(history, self._scope_measured(attempt, noise[0]))
-            if found is None:
+            found = self._from_scope(history, self._scope_measured(attempt.frame(), noise[0]))
+            left = placing.placements - history.placements
+            if found is None or self._foresight.best < self.worth[left]:
                 return False
             plan = found
         pieces = attempt.pieces(plan)
@@ -159,72 +136,95 @@ class Policy:
         history.complete = True
         return True
 
-    def _scope_measured(self, attempt: Attempt, noise: Float) -> Float:
-        """Return the scope's tip as measured: in the lumen, where it is known to be."""
-        placing, true = self.procedure.scope, attempt.frame()
+    @cached_property
+    def worth(self) -> tuple[float, ...]:
+        """The chance of success that so many more placements of the scope promise, from 0 on.
+
+        A placement is worth going on from if its own chance is not less: then stopping is optimal, as far as
+        placements are alike and chances are those foreseen.
+        """
+        worth, scope = [0.0], self.procedure.scope
+        if scope.measured and scope.placements > 1:
+            drawn = self._assessor.draws(IMAGINED, _SEED).deviations(self.errors)
+            starts = deviated_starts(self._plan, self._lung, drawn)
+            rng = np.random.default_rng(_SEED)
+            chances = [self._chance_from(poses.pose(*np.split(each, 3)), rng) for each in starts]
+            for _ in range(scope.placements - 1):
+                worth.append(float(np.maximum(chances, worth[-1]).mean()))
+        return (*worth, *[0.0] * (scope.placements - len(worth)))
+
+    def _chance_from(self, true: Float, rng: np.random.Generator) -> float:
+        """Return the chance that is foreseen where the scope's tip truly stands at a pose."""
+        found = self._from_scope(History(), self._scope_measured(true, rng.standard_normal(5)))
+        return 0.0 if found is None else self._foresight.best
+
+    def _scope_measured(self, true: Float, noise: Float) -> Float:
+        """Return where the scope's tip most likely is: in the lumen, where it is known to be."""
+        placing, plan = self.procedure.scope, self._plan
         measured = as_measured(true, placing.position_mm, placing.direction_deg, noise)
-        shares = np.linspace(1.0, 0.0, SHARES)[:, None]
-        points = true[:3, 3] + shares * (measured[:3, 3] - true[:3, 3])
+        measured[:3, 3] = self._in_lumen(measured[:3, 3], true[:3, 3])
+        expected, errors = np.asarray(plan.scope.lps_from_scope_tip), self.errors
+        sizes = errors.term("scope_position").size, math.radians(errors.term("scope_direction").size)
+        moves = scope_moves(expected, *sizes)
+        likely = fused(expected, moves, measured, placing.position_mm, math.radians(placing.direction_deg))
+        likely[:3, 3] = self._in_lumen(likely[:3, 3], measured[:3, 3])
+        return likely
+
+    def _in_lumen(self, point: Float, inside: Float) -> Float:
+        """Return the first point on the way inside where the lumen is as deep as the scope, or as inside."""
+        points = inside + np.linspace(1.0, 0.0, SHARES)[:, None] * (point - inside)
         depths = self._lung.lumen_depth.lower_bound_mm(points)
         enough = min(self._plan.system.scope.radius_mm, float(depths[-1]))
-        measured[:3, 3] = points[np.argmax(depths >= enough)]
-        return measured
-
-    def _chances(self, tip: Float, deployments: Deployments) -> Float:
-        """Return how likely deployments from a scope tip `(1, 9)` as measured succeed, to first order."""
-        plan, tips = self._plan, np.repeat(tip, deployments.count, axis=0)
-        return Spread(
-            self._lung, plan.system, tips, deployments, np.asarray(plan.target_lps), self.errors,
-            self.procedure, self._radius_mm,
-        ).chances  # fmt: skip
+        return np.asarray(points[np.argmax(depths >= enough)])
 
     def _from_scope(self, history: History, measured: Float) -> Plan | None:
         """Return the plan with tubes and needle from the scope's tip as measured, None if there is none."""
         plan = self._plan
-        target = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
         history.corrected_mm[SCOPE].append(self._miss_from(measured))
-        rest = self._rest(history, SCOPE, self._from_scope_tip, measured, target)
-        if rest is None:
+        try:
+            rest = self._replanner.replan(measured)
+        except NoPlan:
+            history.replans[SCOPE].append(False)
             return None
+        history.replans[SCOPE].append(True)
         scope = replace(plan.scope, lps_from_scope_tip=rest.lps_from_measured)
         exemption = replace(plan.exemption, branch=rest.branch)
         tube = plan.tube if rest.tube is None else rest.tube
         return replace(plan, scope=scope, tube=tube, needle=rest.needle, exemption=exemption)
 
-    def _from_scope_tip(self, system: System, measured: Float, target: Target) -> RestOfPlan:
-        """Plan tubes and needle again, by direct arcs: what else could be searched is left to the needle."""
-        if system not in self._replanners:
-            task = self._task(system, target)
-            self._replanners[system] = ScopeReplanner(task, searches=0, rank=self._chances)
-        return self._replanners[system].replan(measured)
+    @cached_property
+    def _replanner(self) -> ScopeReplanner:
+        """Plans tubes and needle again, by direct arcs: what else could be searched is left to the needle.
 
-    def _from_tube_tip(self, system: System, measured: Float, target: Target) -> RestOfPlan:
-        return replan_from_tube(
-            self._lung, system, measured, target, objective=self._plan.objective, seed=self._plan.seed
+        The chance of a deployment weighs clearance by itself, so that the least margins suffice.
+        """
+        plan = self._plan
+        task = Task(
+            lung=self._lung,
+            system=self._systems[-1],
+            target=Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin),
+            objective=Objective.of(plan.objective),
+            method="replan",
+            seed=plan.seed,
         )
+        return ScopeReplanner(task, searches=0, rank=self._foresight)
 
-    def _task(self, system: System, target: Target) -> Task:
-        objective = Objective.of(self._plan.objective)
-        return Task(
-            lung=self._lung, system=system, target=target, objective=objective, method="replan",
-            seed=self._plan.seed,
-        )  # fmt: skip
-
-    def _rest(
-        self, history: History, stage: str, replan: Callable[..., RestOfPlan], measured: Float, target: Target
-    ) -> RestOfPlan | None:
-        """Return the rest from a measured pose: to the target, else beside it; with all margins or fewer."""
-        aims = [target, *self._aside(measured, target)] if stage == TUBE else [target]
-        for system in self._systems:
-            for aim in aims:
+    def _from_tip(self, history: History, measured: Float, target: Target) -> RestOfPlan | None:
+        """Return the needle from a tip as measured: to the target or beside it, with all margins or fewer."""
+        aims = [target, *self._aside(measured, target)]
+        first, last = (AIMING_ITERATIONS, self._systems), (SEARCH_ITERATIONS, self._systems[-1:])
+        for iterations, systems in (first, last):
+            for system, aim in product(systems, aims):
                 try:
-                    rest = replan(system, measured, aim)
+                    rest = replan_from_tube(
+                        self._lung, system, measured, aim, objective=self._plan.objective,
+                        seed=self._plan.seed, iterations=iterations,
+                    )  # fmt: skip
                 except (NoPlan, TargetError):
                     continue
-                history.replans[stage].append(True)
-                history.system = system
+                history.replans[TUBE].append(True)
                 return rest
-        history.replans[stage].append(False)
+        history.replans[TUBE].append(False)
         return None
 
     def _aside(self, frame: Float, target: Target) -> list[Target]:
@@ -263,11 +263,15 @@ class Policy:
         path, tip = path_of(needle), np.asarray(needle.lps_from_start)
         target = self._target(attempt, noise[1])
         if stage.measured:
-            tip = as_measured(true_tip, stage.position_mm, stage.direction_deg, noise[0])
+            measured = as_measured(true_tip, stage.position_mm, stage.direction_deg, noise[0])
+            moves = tip_moves(
+                np.asarray(plan.scope.lps_from_scope_tip), tip, self._left, bend_per_mm(plan.system)
+            )
+            tip = fused(tip, moves, measured, stage.position_mm, math.radians(stage.direction_deg))
             history.corrected_mm[TUBE].append(
                 _miss(ArcPath(lps_from_start=tip, arcs=path.arcs), target.lps_mm)
             )
-            rest = self._rest(history, TUBE, self._from_tube_tip, tip, target)
+            rest = self._from_tip(history, tip, target)
             if rest is None or rest.needle is None:
                 return None
             path = path_of(rest.needle)
@@ -286,7 +290,11 @@ class Policy:
         planned = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
         if not imaging.measured:
             return planned
-        found = attempt.target_lps + imaging.position_mm * noise[:3]
+        errors, breath = self.errors.term("target_position").size, self.errors.term(BREATHING).size
+        expected = np.array([errors, errors, math.hypot(errors, self._assessor.stretch * breath)])
+        shares = np.array([fused_share(each, imaging.position_mm) for each in expected.tolist()])
+        measured = attempt.target_lps + imaging.position_mm * noise[:3]
+        found = planned.lps_mm + shares * (measured - planned.lps_mm)
         try:
             require_free(self._lung, found)
         except TargetError:
@@ -309,11 +317,10 @@ class Policy:
         start = np.asarray(path.lps_from_start)
         query = Query(lps_from_start=start, target=target.lps_mm, branch=plan.exemption.branch)
         truth = SteeredTruth(attempt, target.lps_mm, steering.position_mm, steering.direction_deg, rng)
-        environment = self._environments[history.system or self._systems[0]]
+        preferred, environment = self._environments[0], self._environments[-1]
         needle, belief = TrueNeedle(truth, true_tip, 0.0), Belief(query, steering.gain)
-        replanner = _FrugalReplanner(
-            environment, query, path, settings=ReplanSettings(largest_miss_mm=min(self._aside_mm, 10.0))
-        )
+        allowed = ReplanSettings(largest_miss_mm=min(self._aside_mm, 10.0))
+        replanner = _FrugalReplanner(preferred, environment, query, path, allowed)
         replans, stopped = steer(
             environment,
             truth,
@@ -332,7 +339,27 @@ class Policy:
 
 
 class _FrugalReplanner(Replanner):
-    """Aims the plan that is left again, and searches only where that finds no path."""
+    """Aims the plan that is left again, and searches only where that finds no path.
+
+    Parameters
+    ----------
+    preferred : NeedleEnvironment
+        The one with all margins, in which a path is looked for first.
+    environment, query, plan, settings
+        As those of `Replanner`.
+    """
+
+    def __init__(
+        self,
+        preferred: NeedleEnvironment,
+        environment: NeedleEnvironment,
+        query: Query,
+        plan: ArcPath,
+        settings: ReplanSettings,
+    ) -> None:
+        super().__init__(environment, query, plan, settings=settings)
+        if preferred is not environment:
+            self._variants.insert(0, preferred)
 
     def replan(
         self, lps_from_tip: Float, target: Float, inserted_mm: float, *, turned_rad: float | None = None

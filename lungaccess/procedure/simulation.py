@@ -16,7 +16,8 @@ from anatomy.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
-from lungaccess.procedure.policy import STAGES, History, Policy
+from lungaccess.procedure.history import STAGES, History
+from lungaccess.procedure.policy import Policy
 from lungaccess.procedure.report import NO_PATH, ProcedureReport, StageReport
 from lungaccess.procedure.settings import Procedure, load_procedure
 from lungaccess.procedure.truth import ARCS, Attempt
@@ -107,7 +108,7 @@ class Simulator:
     ) -> None:
         self.assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
         self.errors, self.procedure, self._lung = errors, procedure, lung
-        self._policy = Policy(plan, lung, errors, procedure, self.assessor.radius_mm)
+        self._policy = Policy(self.assessor, lung, errors, procedure)
 
     def report(self, samples: int, seed: int, processes: int = 1) -> ProcedureReport:
         """Return what comes of so many procedures."""

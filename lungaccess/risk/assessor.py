@@ -21,6 +21,7 @@ from lungaccess.risk.deviations import DeviatedPlan, Deviations, judging, no_dev
 from lungaccess.risk.draws import Draws
 from lungaccess.risk.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.risk.kernels import deviation as kernel
+from lungaccess.risk.kernels.chain import Devices
 from lungaccess.risk.kernels.outcomes import find_outcomes, find_successes, follow_chains
 from lungaccess.risk.statistics import Share, share_of
 from stages.needle import Obstacles
@@ -150,6 +151,25 @@ class RiskAssessor:
             find_successes(*inputs, self.radius_mm, self._forbidden_flags, part.start, done[part])
 
         _in_threads(find, deviations.count)
+        return done
+
+    def clear(self, devices: Devices, errors: Float, least_depth_mm: float) -> Bool:
+        """Tell which `(N,)` of deviated devices touch nothing forbidden, wherever they end.
+
+        Parameters
+        ----------
+        devices : Devices
+            In place of those of the plan.
+        errors : (N, E) float64
+            See `in_rows`.
+        least_depth_mm : float
+            See `Judging`.
+        """
+        done, which = np.zeros(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
+        judged = self._judging._replace(least_depth_mm=least_depth_mm)
+        find_successes(
+            devices, errors, which, self._obstacles, judged, math.inf, self._forbidden_flags, 0, done
+        )
         return done
 
     def success(self, draws: Draws, model: ErrorModel) -> Share:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Float, Int
+from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.kernels.chain import TUBE_PIECES, Devices
 from lungaccess.risk.kernels.outcomes import N_START, Judging, find_pieces, find_starts
 from lungaccess.risk.twisted import twisted_shapes
+from stages.tube import ConcentricTubes
 
 ROUNDING_MM = 1e-9
 """The planned tip itself stands in the lumen, however its depth is rounded."""
@@ -153,7 +157,8 @@ class DeviatedPlan:
         self._needle[:, 1] = np.cumsum([arc.roll_rad for arc in arcs])
         self._needle[:, 2] = [arc.curvature_per_mm for arc in arcs]
         self._needle[:, 3] = plan.system.track_radius_mm
-        self._tubes = np.zeros(0) if plan.tube.shape is not None else _tube_values(plan)
+        twisted, tubes = plan.tube.shape is not None, plan.system.tubes
+        self._tubes = np.zeros(0) if twisted else _tube_values(tubes, plan.tube)
 
     def kernel_inputs(self, deviations: Deviations) -> tuple[Devices, Float, Int]:
         """Return the devices, the errors in rows, and the number of each draw's shape; see `Devices`."""
@@ -167,12 +172,43 @@ class DeviatedPlan:
         needle = self.plan.system.needle
         longest = 0.0 if needle is None else needle.max_length_mm
         devices = Devices(self._frame, self._tubes, self._needle, shapes, rolled, n_tube, longest)
-        return devices, np.column_stack([getattr(deviations, name) for name in COLUMNS]), which
+        return devices, in_rows(deviations), which
 
 
-def _tube_values(plan: Plan) -> Float:
+def in_rows(deviations: Deviations) -> Float:
+    """Return deviations as the kernels take them, `(N, E)`."""
+    return np.column_stack([getattr(deviations, name) for name in COLUMNS])
+
+
+def tubes_alone(
+    tubes: ConcentricTubes, lps_from_scope_tip: Float, choice: tuple[float, float, float]
+) -> Devices:
+    """Return planar tubes without a needle as kernels take them.
+
+    Parameters
+    ----------
+    choice : (float, float, float)
+        Rotation in rad and insertions of outer and inner tube in mm; nothing is swept sideways.
+    """
+    turned, outer, inner = choice
+    tube = Deployed(turned, 0.0 if tubes.outer is None else outer, inner, 0.0)
+    empty = np.zeros((0, kernel.N_PIECE))
+    return Devices(
+        lps_from_scope_tip, _tube_values(tubes, tube), empty, empty[None][:0], np.zeros(0), TUBE_PIECES, 0.0
+    )
+
+
+class Deployed(NamedTuple):
+    """Rotation, insertions and sideways sweep of planar tubes, as those of a `TubeDeployment`."""
+
+    rotation_rad: float
+    outer_insertion_mm: float
+    inner_insertion_mm: float
+    lateral_sweep_mm: float
+
+
+def _tube_values(tubes: ConcentricTubes, tube: TubeDeployment | Deployed) -> Float:
     """Return what a kernel has to know of planar tubes `(11,)`, see `chain.Devices`."""
-    tube, tubes = plan.tube, plan.system.tubes
     longest = tubes.max_extension_mm
     outer_longest = longest if tubes.outer is None else min(longest, tubes.outer.length_mm)
     return np.array(

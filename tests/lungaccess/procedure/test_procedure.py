@@ -163,10 +163,11 @@ def test_a_scope_is_measured_in_the_lumen(plan: Plan, small_lung: Lung) -> None:
 
     seen: list[np.ndarray] = []
     procedure = Procedure(scope=ScopePlacing(measured=True, position_mm=5.0))
+    model = ErrorModel(scope_position=PositionError(attempt_mm=5.0))
     from lungaccess.procedure import simulation
 
-    simulator = simulation.Simulator(plan, small_lung, ErrorModel(), procedure)
-    simulator._policy = Recorded(plan, small_lung, ErrorModel(), procedure, 5.0)
+    simulator = simulation.Simulator(plan, small_lung, model, procedure)
+    simulator._policy = Recorded(simulator.assessor, small_lung, model, procedure)
     simulator.report(20, 0)
     tips = np.array([each[:3, 3] for each in seen])
     assert len(tips) == 20 and np.linalg.norm(tips - tips.mean(axis=0), axis=1).max() > 0.2

@@ -2,9 +2,10 @@
 
     python -m experiments.hard_inputs [--only PATTERN] [--record FILE] [--page FILE]
 
-Every case of `experiments.support.segmentation.hard_cases` is made from the CT of the small phantom, segmented up
+Each case of `experiments.support.segmentation.hard_cases` is made of the CT of the small phantom, segmented
+up
 to the airways, and compared with the truth.  Cases in the record are not run again, so that a study that was
-stopped goes on.  The page gets the table between its two marks.
+stopped goes on.  The page gets the table between its marks.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def outcomes(record: Path, pattern: str) -> dict[str, Outcome]:
 
 def table(found: dict[str, Outcome]) -> str:
     """Return the outcomes as a table of a page."""
-    counts = {verdict: 0 for verdict in ("right", "warned", "refused")}
+    counts = dict.fromkeys(("right", "warned", "refused"), 0)
     for outcome in found.values():
         counts[outcome.verdict] = counts.get(outcome.verdict, 0) + 1
     total = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())

@@ -264,7 +264,10 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
         tree = tree_from_mask(Volume(grid=grid, array=wide))
     except AnatomyError as error:
         main[box] = wide
-        return main, (f"The main bronchi could not be told from the lobar ones: {error.found}",)
+        return main, (
+            f"The main bronchi could not be told from the lobar ones: {error.found}. The image may be "
+            "blurred by breathing or noise: airways are missing, and reach is understated.",
+        )
     voxels = np.argwhere(wide)
     _, nearest = tree.nearest_point_index.query(grid.lps(voxels))
     first = tree.generation[tree.branch_of_point[nearest]] <= 1

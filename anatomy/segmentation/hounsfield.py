@@ -14,14 +14,33 @@ AIR_HU = -1000.0
 CORE_SHARE = 0.6
 """Of the greatest depth in the airway: so far from its wall nothing but air is measured."""
 GREATEST_OFFSET_HU = 25.0
-"""Scanners keep air within 10 HU, and scatter in the chest adds as much; more is another scale."""
+"""Scanners keep air around the patient within 10 HU; more is another scale."""
+GREATEST_SCATTER_HU = 45.0
+"""Scatter and contrast medium raise the air in the trachea by up to 40 HU, so it tells less where it is
+alone."""
+AROUND_HU = (-1099.0, -880.0)
+"""Air around the patient, shifted or not: lower values are padding, higher ones table and clothes."""
+LEAST_AROUND_SHARE = 0.01
+"""Of the sides of the image; less air at the sides may be lung that the image cuts off."""
 
 
 def air_offset_hu(coarse: CoarseCt, airway: Mask) -> float:
-    """Return by how much air in the airway differs from -1000 HU; 0 if it is as usual."""
+    """Return by how much air, in the airway and around the patient, differs from -1000 HU; 0 if as usual."""
     depth = distance_mm(np.asfortranarray(airway), coarse.spacing_mm)
-    offset = float(np.median(coarse.hu[depth >= CORE_SHARE * depth.max()])) - AIR_HU
-    return offset if abs(offset) > GREATEST_OFFSET_HU else 0.0
+    inside = float(np.median(coarse.hu[depth >= CORE_SHARE * depth.max()])) - AIR_HU
+    around = offset_around_hu(coarse)
+    if around is None:
+        return inside if abs(inside) > GREATEST_SCATTER_HU else 0.0
+    smaller = inside if abs(inside) < abs(around) else around
+    return smaller if inside * around > 0.0 and abs(smaller) > GREATEST_OFFSET_HU else 0.0
+
+
+def offset_around_hu(coarse: CoarseCt) -> float | None:
+    """Return by how much air at the sides of the image differs from -1000 HU; None if there is hardly any."""
+    hu = coarse.hu
+    sides = np.concatenate([side.ravel() for side in (hu[0], hu[-1], hu[:, 0], hu[:, -1])])
+    air = sides[(sides > AROUND_HU[0]) & (sides < AROUND_HU[1])]
+    return float(np.median(air)) - AIR_HU if air.size >= LEAST_AROUND_SHARE * sides.size else None
 
 
 def without_offset(ct: Volume, offset_hu: float) -> Volume:
@@ -37,7 +56,7 @@ def offset_warning(offset_hu: float) -> tuple[str, ...]:
     if not offset_hu:
         return ()
     return (
-        f"Air measures {AIR_HU + offset_hu:.0f} HU in the trachea instead of {AIR_HU:.0f}: "
+        f"Air measures {AIR_HU + offset_hu:.0f} HU instead of {AIR_HU:.0f}: "
         f"{-offset_hu:+.0f} HU "
         "were added to every voxel. Vessels are told apart by their HU: if the scale is wrong in other ways, "
         "too many or too few of them are obstacles.",

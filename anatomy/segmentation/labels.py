@@ -28,7 +28,8 @@ def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
     """Return the left and the right lung of a label map or mask.
 
     The values may be 1 right, 2 left (lungmask, and our own files); 1 to 5 for the lobes (lungmask
-    LTRCLobes); or one value for both lungs, which are then told apart by their shape.
+    LTRCLobes); or one value for both lungs, which are then told apart by their shape.  One lung alone is the
+    left one if its value is 2, else the right one.
 
     Raises
     ------
@@ -47,7 +48,8 @@ def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
     if values <= {1, 2, 3, 4, 5} and len(values) > 2:
         return np.isin(volume.array, _LOBES_LEFT), np.isin(volume.array, _LOBES_RIGHT)
     if len(values) == 1:
-        return split_sides(np.asfortranarray(volume.array != 0), volume.grid)
+        left, right = split_sides(np.asfortranarray(volume.array != 0), volume.grid)
+        return (right, left) if values == {LEFT} and not left.any() else (left, right)
     raise AnatomyError(
         f"{name} holds the values {sorted(values)[:9]}",
         expected="1 right and 2 left lung, lobes 1 to 5, or one value for both lungs",

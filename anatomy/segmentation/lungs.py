@@ -15,7 +15,14 @@ from anatomy.records import frozen_record
 from anatomy.segmentation.central_airway import CentralAirway, central_airways, find_central_airway
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
-from anatomy.segmentation.hounsfield import AIR_HU, air_offset_hu, offset_warning, without_offset
+from anatomy.segmentation.hounsfield import (
+    AIR_HU,
+    GREATEST_OFFSET_HU,
+    air_offset_hu,
+    offset_around_hu,
+    offset_warning,
+    without_offset,
+)
 from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right
 from anatomy.segmentation.lung_pieces import gas_pockets, lung_pieces
 from anatomy.segmentation.outside_air import outside_air
@@ -203,7 +210,13 @@ def in_hounsfield(coarse: CoarseCt, seed: Float | None) -> tuple[CoarseCt, Mask,
         If there is no trachea.
     """
     outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
-    offset = air_offset_hu(coarse, find_central_airway(coarse, outside, seed).grown)
+    try:
+        offset = air_offset_hu(coarse, find_central_airway(coarse, outside, seed).grown)
+    except AnatomyError:
+        # A shift can hide the trachea from the thresholds it is searched with.
+        offset = offset_around_hu(coarse) or 0.0
+        if abs(offset) <= GREATEST_OFFSET_HU:
+            raise
     if offset:
         coarse = replace(coarse, hu=np.asfortranarray(coarse.hu - np.float32(offset)))
         outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)

@@ -266,7 +266,12 @@ def _cases() -> list[HardCase]:
             thick=mm > 3,
         )
     add("cut", "sides of the lungs", lambda i: cropped(i, (-75, -INF, -INF), (75, INF, INF)), "cut off")
-    add("cut", "sides, front and back", lambda i: cropped(i, (-75, -45, -INF), (75, 45, INF)), "cut off")
+    add(
+        "cut",
+        "sides, front and back",
+        lambda i: cropped(i, (-75, -45, -INF), (75, 45, INF)),
+        "cut off|100 mm",
+    )
     add("cut", "upper half of the trachea", lambda i: cropped(i, (-INF, -INF, -INF), (INF, INF, 30)), "cut")
     add(
         "cut",
@@ -380,7 +385,7 @@ def _cases() -> list[HardCase]:
     add("scan", "contrast medium", _contrast)
     add("scan", "metal with streaks", _streaks, "metal|noise")
     add("scan", "rings of 40 HU", lambda i: _rings(i, 40.0), "noise|rings")
-    add("scan", "breathing while scanned", _moved, "moved|ends|stops|noise")
+    add("scan", "breathing while scanned", _moved, "blurred by breathing")
     return found
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.errors import AnatomyError, FileError, GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume
@@ -21,6 +22,7 @@ from anatomy.segmentation.labels import sides_of
 from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
 from anatomy.segmentation.quality import quality_of
 from anatomy.segmentation.request import Given, SegmentationRequest
+from anatomy.segmentation.steps import RefusedError
 
 ALL = ("lungs", "airway", "nodule", "vessels", "cost map")
 IMAGES = ("lungs", "central_airway", "airway", "airway_wall", "nodule", "vesselness", "vessels", "cost")
@@ -309,3 +311,38 @@ def test_a_file_that_is_no_image_is_refused(tmp_path: Path) -> None:
         read_ct(tmp_path / "slice.dcm")
     with pytest.raises(FileError):
         read_ct(tmp_path / "missing.nii.gz")
+
+
+def test_what_cannot_be_a_patient_leaves_none_and_is_accepted_by_name(
+    patient: Phantom, made: Segmentation, copy: Path
+) -> None:
+    alone = made.parts.left * np.uint8(2)
+    write_volume(copy / "lungs.nii.gz", Volume(grid=made.grid, array=alone))
+    request = _request(patient, copy, nodule_mask=made.folder.parent / "given-nodule.nii.gz")
+    with pytest.raises(RefusedError, match="no right lung.*--accept one-lung") as refused:
+        segment(request)
+    assert not (copy / "patient.toml").exists()
+    assert refused.value.parts.left.any() and not refused.value.parts.right.any()
+    segment(replace(request, accept=("one-lung",)))
+    assert 'accepted = ["one-lung"]' in (copy / "patient.toml").read_text()
+    assert any("one-lung" in warning for warning in load_patient(copy).warnings)
+    with pytest.raises(RefusedError):
+        segment(request)
+    assert not (copy / "patient.toml").exists()
+    with pytest.raises(SettingsError, match="one-lungs.*no check"):
+        segment(replace(request, accept=("one-lungs",)))
+
+
+@pytest.mark.slow
+def test_the_order_of_the_voxels_does_not_matter(
+    patient: Phantom, made: Segmentation, tmp_path: Path
+) -> None:
+    grid = patient.ct.grid
+    matrix = grid.lps_from_ijk.copy()
+    matrix[:3, 3] = grid.lps((grid.shape[0] - 1, grid.shape[1] - 1, 0))
+    matrix[:3, :2] *= -1
+    turned = Volume(grid=Grid(shape=grid.shape, lps_from_ijk=matrix), array=patient.ct.array[::-1, ::-1])
+    nodule = made.folder.parent / "given-nodule.nii.gz"
+    again = segment(SegmentationRequest(ct=turned, out=tmp_path, given=Given(nodule_mask=nodule)))
+    assert _voxels(again.folder) == _voxels(made.folder)
+    assert again.grid.is_close(made.grid)

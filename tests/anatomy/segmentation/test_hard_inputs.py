@@ -1,0 +1,113 @@
+"""Wrong and hard inputs: none is silently wrong. The truth of every case is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Volume
+from anatomy.phantom import Phantom
+from anatomy.segmentation.canonical import canonical
+from anatomy.segmentation.gate import CHECKS, Implausible, require_known_checks, require_plausible
+from anatomy.segmentation.hounsfield import without_offset
+from experiments.support.segmentation.hard_cases import CASES
+from experiments.support.segmentation.hard_images import HardImage, phantom_image, turned
+from experiments.support.segmentation.hard_runs import run
+
+PLAIN = "axes: as it is"
+FAST = {name for name, case in CASES.items() if case.group == "scale" and case.refuse} | {
+    "part: neck and tops of the lungs",
+    "header: slices taken for coronal ones",
+    "cut: all above the carina",
+    "cut: sides, front and back",
+    "cut: a lesion alone",
+}
+"""Each is refused in less than a second."""
+
+
+@pytest.fixture(scope="module")
+def image(patient: Phantom) -> HardImage:
+    return phantom_image(patient)
+
+
+@pytest.fixture(scope="module")
+def plain_tree(image: HardImage) -> float:
+    found = run(CASES[PLAIN], image)
+    assert found.verdict == "right", found
+    return found.tree
+
+
+def test_the_suite_is_as_large_as_it_claims() -> None:
+    assert len(CASES) >= 85
+    assert len({case.group for case in CASES.values()}) >= 10
+    assert len(FAST) >= 11
+
+
+@pytest.mark.parametrize("name", sorted(FAST))
+def test_what_is_no_chest_is_refused_in_its_own_words(name: str, image: HardImage) -> None:
+    found = run(CASES[name], image)
+    assert found.verdict == "refused", found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(CASES) - FAST - {PLAIN}))
+def test_no_hard_input_is_silently_wrong(name: str, image: HardImage, plain_tree: float) -> None:
+    found = run(CASES[name], image, plain_tree)
+    case = CASES[name]
+    expected = {"refused"} if case.refuse else {"warned"} if case.warn else {"right", "warned", "refused"}
+    assert found.verdict in expected, found
+    if not case.words:
+        assert found.verdict == "right", found
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (0, 2, 1), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
+@pytest.mark.parametrize("flips", [(), (0,), (1, 2), (0, 1), (0, 1, 2)])
+def test_voxels_come_into_one_order_whatever_the_file_has(
+    order: tuple[int, ...], flips: tuple[int, ...]
+) -> None:
+    rng = np.random.default_rng(0)
+    image = _small(rng)
+    if _handed(order, flips) < 0:
+        return
+    stored = turned(image, order, flips, header=True)
+    again = canonical(stored.ct)
+    assert again.grid.is_close(image.grid)
+    assert (again.array == image.ct.array).all()
+    assert canonical(again) is again
+
+
+def _small(rng: np.random.Generator) -> HardImage:
+    from anatomy.grid import Grid
+
+    hu = rng.integers(-1000, 100, (4, 5, 6)).astype(np.float32)
+    grid = Grid.from_spacing(hu.shape, (0.7, 0.8, 1.5), (-3.0, 8.0, 40.0))
+    none = np.zeros(hu.shape, dtype=np.uint8)
+    return HardImage(hu=hu, lobes=none, lumen=none > 0, grid=grid, tree_lps=np.zeros((1, 3)))
+
+
+def _handed(order: tuple[int, ...], flips: tuple[int, ...]) -> float:
+    return float(np.linalg.det(np.eye(3)[list(order)])) * (-1.0) ** len(flips)
+
+
+def test_a_failed_check_is_refused_until_it_is_accepted_by_name() -> None:
+    failed = (
+        Implausible(name="sides", found="It is mirrored", remedy="Look at it"),
+        Implausible(name="one-lung", found="One lung", remedy="Look again"),
+    )
+    with pytest.raises(AnatomyError, match=r"mirrored; One lung.*--accept sides --accept one-lung"):
+        require_plausible(failed, ())
+    with pytest.raises(AnatomyError, match=r"^One lung.*add --accept one-lung\.$"):
+        require_plausible(failed, ("sides",))
+    assert require_plausible(failed, ("sides", "one-lung", "volume")) == ("sides", "one-lung")
+    assert require_plausible((), ("sides",)) == ()
+    require_known_checks(tuple(CHECKS))
+    with pytest.raises(Exception, match="sidse.*no check"):
+        require_known_checks(("sidse",))
+
+
+def test_an_offset_is_taken_from_every_voxel(image: HardImage) -> None:
+    ct = image.ct
+    assert without_offset(ct, 0.0) is ct
+    shifted = Volume(grid=ct.grid, array=ct.array + np.int16(57))
+    assert (without_offset(shifted, 57.0).array == ct.array).all()

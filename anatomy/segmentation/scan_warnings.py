@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.grid import Volume
+from anatomy.morphology import bounds, window
 from anatomy.segmentation.input import slice_mm
 from anatomy.typed import Array, Mask
 
@@ -24,11 +25,20 @@ LOSS_PER_HU = 0.004
 """Share of the airway tree that each HU of noise above 20 costs in phantoms: 8 % at 40 HU, 20 % at 70 HU."""
 COARSE_SLICES_MM = 1.5
 """Thinner slices show segmental bronchi nearly as wide as they are."""
+METAL_HU, LEAST_METAL_ML = 2500.0, 0.1
+"""Compact bone ends at 2000 HU; a screw has more than the volume."""
 
 
 def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
-    """Return warnings of noise in and about the lungs `near`, `(ni, nj, nk)` bool, and of the slices."""
+    """Warn of noise and metal in the box of the lungs `near`, `(ni, nj, nk)` bool, and of thick slices."""
     warnings = []
+    metal = np.count_nonzero(ct.array[window(*bounds(near))] > METAL_HU) * ct.grid.voxel_volume_mm3 / 1000.0
+    if metal >= LEAST_METAL_ML:
+        warnings.append(
+            f"{metal:.1f} ml of metal lie between or beside the lungs: its streaks hide airways and "
+            "vessels in "
+            "the slices around it, so a path that looks free there may not be."
+        )
     noise = noise_hu(ct, near)
     if noise > LOUD_HU:
         loss = 100.0 * LOSS_PER_HU * (noise - 20.0)
@@ -51,8 +61,6 @@ def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
 
 def noise_hu(ct: Volume, near: Mask) -> float:
     """Return the standard deviation of the noise in soft tissue of the box around the lungs; 0 if unknown."""
-    from anatomy.morphology import bounds, window
-
     box = window(*bounds(near))
     side = np.maximum(2, np.rint(PATCH_MM / ct.grid.spacing_mm)).astype(np.int64)
     patches = _cubes(ct.array[box], side)

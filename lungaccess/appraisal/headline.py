@@ -132,7 +132,7 @@ class Headline:
 
         A refusal stands first: such a plan has no chance.
         """
-        parts = [self._chance(), self._geometry()]
+        parts = [self.chance_text, self._geometry()]
         return " ".join(reversed(parts) if self.geometry == Geometry.REFUSED else parts)
 
     def _geometry(self) -> str:
@@ -146,7 +146,9 @@ class Headline:
         missing = f", fissures not checked: {FISSURES_UNKNOWN}" if self.fissures_unknown else ""
         return f"geometry {self.geometry}{missing}"
 
-    def _chance(self) -> str:
+    @property
+    def chance_text(self) -> str:
+        """How often the plan succeeds, why it fails, and under what, in sentences."""
         chance, success = self.chance, self.success
         if chance is None or success is None:
             return "Chance of success not computed."

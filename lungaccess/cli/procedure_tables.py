@@ -54,13 +54,7 @@ def procedure_record(report: ProcedureReport) -> dict[str, object]:
 
 
 def procedure_tables(report: ProcedureReport) -> list[Table]:
-    """Return how procedures ended, in a sentence and in numbers, and what each stage corrected."""
-    from lungaccess.appraisal.headline import of_hundred
-
-    worst = "".join(
-        f"; fails most by '{name}' ({of_hundred(share.value, up=True)} of 100)"
-        for name, share in report.failures[:1]
-    )
+    """Return how procedures ended, and what each stage corrected."""
     rows = [share_row("success", report.succeeds)]
     rows += [share_row(name, share) for name, share in report.failures]
     rows += [
@@ -68,7 +62,6 @@ def procedure_tables(report: ProcedureReport) -> list[Table]:
         for share, miss in report.miss_mm.items()
     ]
     title = (
-        f"Succeeds in {of_hundred(report.succeeds.value)} of 100{worst}.\n"
         f"{report.samples} procedures '{report.procedure.name}', errors of '{report.model.label}'; goal "
         f"{report.radius_mm:.2f} mm: {report.radius_origin}"
     )

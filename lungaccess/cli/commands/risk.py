@@ -42,6 +42,7 @@ def risk(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it."""
+    from lungaccess.appraisal import Headline
     from lungaccess.plans.plan import Plan
     from lungaccess.procedure import Procedure, simulate_procedure
     from lungaccess.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
@@ -66,6 +67,7 @@ def risk(
         if output.json:
             terminal.show_json(procedure_record(found))
         else:
+            terminal.say(Headline.of(None, found).chance_text)
             terminal.show(procedure_tables(found))
         return ExitCode.OK
     samples = samples or DEFAULT_SAMPLES
@@ -78,6 +80,7 @@ def risk(
     if output.json:
         terminal.show_json(record(report, kept))
     else:
+        terminal.say(Headline.of(None, report).chance_text)
         terminal.show([_outcome_table(report), _sensitivity_table(report), _tolerance_table(kept)])
     return ExitCode.OK
 

@@ -25,6 +25,7 @@ PAPERS = {
     "Kuntz et al. 2015": ("kuntz2015_reachability", "kuntz2015_quality"),
     "Li et al. 2021": ("li2021_route",),
     "Pan et al. 2025": ("pan2025_tour",),
+    "Alterovitz et al. 2008": ("alterovitz2008",),
 }
 OUR_OWN = (
     "reachability_by_device",
@@ -35,6 +36,7 @@ OUR_OWN = (
     "closed_loop",
     "procedures",
     "success_planning",
+    "rare_events",
     "growth",
 )
 SETTINGS = ("full", "quick")

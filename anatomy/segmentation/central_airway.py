@@ -11,6 +11,7 @@ from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
 from anatomy.morphology import bounds, window
 from anatomy.records import frozen_record
+from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.typed import Float, Int, Mask
 
@@ -136,7 +137,17 @@ def grow_from(ct: CoarseCt, outside: Mask, seed_lps: Float) -> CentralAirway:
     seed = _given_seed(ct, seed_lps)
     grown = grow(ct, seed, outside)
     main, warnings = _main_part(ct, grown)
+    if not main[tuple(seed)]:  # the column was a lobar bronchus
+        seed = _middle_of_upper_half(ct, main)
     return CentralAirway(grown=grown, main=main, seed=seed, warnings=warnings)
+
+
+def _middle_of_upper_half(ct: CoarseCt, main: Mask) -> Int:
+    """Return the voxel in the upper half of the main airways that is farthest from their wall."""
+    low, high = bounds(main)
+    depth = distance_mm(main, ct.spacing_mm)
+    depth[:, :, : (low[2] + high[2]) // 2] = 0.0
+    return np.array(np.unravel_index(int(np.argmax(depth)), depth.shape), dtype=np.int64)
 
 
 def _given_seed(ct: CoarseCt, seed_lps: Float) -> Int:

@@ -26,7 +26,8 @@ LOSS_PER_HU = 0.004
 COARSE_SLICES_MM = 1.5
 """Thinner slices show segmental bronchi nearly as wide as they are."""
 METAL_HU, LEAST_METAL_ML = 2500.0, 0.1
-"""Compact bone ends at 2000 HU; a screw has more than the volume."""
+"""Compact bone ends at 2000 HU; a screw has more than the volume, as has a vein while contrast medium
+enters."""
 
 
 def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.io import read_volume
 from anatomy.phantom import LABELS, Phantom
+from anatomy.segmentation.central_airway import find_central_airway
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.lungs import CLOSING_MM, Lungs, lungs_given, segment_lungs
@@ -200,6 +201,18 @@ def test_a_given_seed_must_lie_in_air(patient: Phantom, lungs: Lungs) -> None:
         segment_lungs(patient.ct, seed_lps=inside + (0.0, 30.0, 0.0))
     with pytest.raises(AnatomyError, match="outside the image"):
         segment_lungs(patient.ct, seed_lps=inside + (0.0, 900.0, 0.0))
+
+
+def test_a_seed_in_a_lobar_bronchus_leads_to_the_trachea(patient: Phantom) -> None:
+    coarse = CoarseCt.of(patient.ct)
+    airway = patient.centerlines["airway"]
+    lobar = np.flatnonzero(airway.generation == 2)
+    start, end = (airway.branch_start[lobar[0] + n] for n in (0, 1))
+    outside = np.zeros(coarse.hu.shape, dtype=bool, order="F")
+    found = find_central_airway(coarse, outside, airway.points_lps[(start + end) // 2])
+    assert found.main[tuple(found.seed)]
+    assert coarse.grid.lps(found.seed)[2] > 10.0  # above the carina, which is the origin
+    assert abs(coarse.grid.lps(found.seed)[0]) < 5.0
 
 
 def test_an_inflated_lung_outside_a_body(patient: Phantom) -> None:

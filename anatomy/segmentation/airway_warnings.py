@@ -32,15 +32,24 @@ def airway_warnings(lumen: Volume, left: Mask, right: Mask) -> tuple[str, ...]:
     warnings = []
     trachea = tree.distance_from_root_mm[tree.branch_start[1] - 1]
     if trachea < LEAST_TRACHEA_MM:
-        warnings.append(f"The trachea is cut: only {trachea:.0f} mm of it are in the airway.")
+        warnings.append(
+            f"The trachea is cut: only {trachea:.0f} mm of it are in the airway. How "
+            "a scope lies above it is not known."
+        )
     ends = np.setdiff1d(np.arange(len(tree.branch_parent)), tree.branch_parent)
     tips = tree.points_lps[tree.branch_start[ends + 1] - 1]
     at = tuple(np.clip(np.rint(lumen.grid.ijk(tips)).astype(np.int64), 0, np.array(left.shape) - 1).T)
     counts = {"left": int(left[at].sum()), "right": int(right[at].sum())}
     for side, count in counts.items():
         if count < max(LEAST_ENDS, LEAST_SHARE * max(counts.values())):
-            warnings.append(f"The airway stops early in the {side} lung: it has {count} ends there.")
+            warnings.append(
+                f"The airway stops early in the {side} lung: it has {count} ends there. Reach in that lung is "
+                "understated."
+            )
     loops = len(tree.report.loops_opened)
     if loops > max(GREATEST_LOOPS_SHARE * len(ends), 2):
-        warnings.append(f"Leak suspected: the airway has {loops} rings.")
+        warnings.append(
+            f"Leak suspected: the airway has {loops} rings. A branch may be lung that no scope can "
+            "enter: look at the branches of a plan."
+        )
     return tuple(warnings)

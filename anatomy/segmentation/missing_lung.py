@@ -14,8 +14,8 @@ from anatomy.typed import Float, Mask
 
 SAMPLE_MM = 4.0
 """The shape of the chest is looked at on voxels of this size."""
-LEAST_FILLED = 0.7
-"""Of a zone: lung fills 0.92 and more of it in healthy phantoms, and 0.2 and less if the lobe is solid."""
+LEAST_FILLED = 0.6
+"""Of a zone: half-way between healthy phantoms, 0.92 and more, and those with a solid lobe, 0.2 and less."""
 FROM_MIDDLE_SHARE = 0.4
 """Of the half width: nearer to the middle lie heart, spine and large vessels."""
 TOP_SHARE, BASE_SHARE = 0.1, 0.3

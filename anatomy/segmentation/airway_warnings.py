@@ -43,8 +43,8 @@ def airway_warnings(lumen: Volume, left: Mask, right: Mask) -> tuple[str, ...]:
     for side, count in counts.items():
         if count < max(LEAST_ENDS, LEAST_SHARE * max(counts.values())):
             warnings.append(
-                f"The airway stops early in the {side} lung: it has {count} ends there. Reach in that lung is "
-                "understated."
+                f"The airway stops early in the {side} lung: it has {count} ends there. Reach in that lung "
+                "is understated."
             )
     loops = len(tree.report.loops_opened)
     if loops > max(GREATEST_LOOPS_SHARE * len(ends), 2):

@@ -26,10 +26,15 @@ SEARCH_ITERATIONS = 300
 TRIES = 400
 """Variations of rotation, insertions and needle that improve the first answer: some milliseconds."""
 
-RANKED = 256
+RANKED = 128
 """So many deployments are ranked first, spread over all of them: those between are much like them."""
-FORESEEN = 12
+FORESEEN = 8
 """So many with a clear arc, the likeliest, are looked at closely; further ones are alike or worse."""
+
+
+ENOUGH = 1024
+"""So many deployments towards the target are looked at where they are ranked: several times what is ranked,
+since most are refused."""
 
 
 class DeploymentRank(Protocol):
@@ -62,8 +67,9 @@ class ScopeReplanner:
         self._enumerate: Enumerator | None = None
         if task.system.needle is not None:
             self._enumerate = one_site_enumerator(
-                task.lung, task.system.tubes, task.system.margins, with_fissures=task.with_fissures
-            )
+                task.lung, task.system.tubes, task.system.margins, with_fissures=task.with_fissures,
+                enough=None if rank is None else ENOUGH,
+            )  # fmt: skip
 
     def replan(self, lps_from_scope_tip: Float) -> RestOfPlan:
         """Return the rest from a rigid pose `(4, 4)`; NoPlan if there is none."""

@@ -14,7 +14,7 @@ from lungaccess.risk import Deviations, ErrorModel, RiskAssessor
 from lungaccess.risk.deviations import ROUNDING_MM, in_rows, no_deviations, tubes_alone
 from stages.tube import Deployments
 
-KEPT, DRAWS = 4, (8, 32)
+KEPT, DRAWS = 3, (8, 32)
 """All deployments are tried with the first few draws and the best of them with all: what is likely to fail
 shows soon, and the chances of two tips are compared to some percent."""
 _SEED = 1

@@ -168,11 +168,14 @@ Enumerator = Callable[[Float, Callable[[Float, Float], Bool]], Deployments]
 
 
 def one_site_enumerator(
-    lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool
+    lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool, enough: int | None = None
 ) -> Enumerator:
-    """Return what enumerates the deployments from one scope tip after another, prepared once for all."""
+    """Return what enumerates the deployments from one scope tip after another, prepared once for all.
+
+    Where more than `enough` are of use, fewer rotations of planar tubes are looked at.
+    """
     if tubes.planar:
-        return SiteEnumerator(lung, tubes, margins, with_fissures=with_fissures).deployments
+        return SiteEnumerator(lung, tubes, margins, with_fissures=with_fissures, enough=enough).deployments
     return lambda tip, worthwhile: enumerate_deployments(
         lung, tubes, margins, tip[None], with_fissures=with_fissures, worthwhile=worthwhile
     )
@@ -196,7 +199,9 @@ class SiteEnumerator:
         with_fissures: bool,
         rotations: int = DEFAULT_ROTATIONS,
         stop_spacing_mm: float = DEFAULT_STOP_MM,
+        enough: int | None = None,
     ) -> None:
+        self._enough = enough
         self._rotations = rotations if tubes.inner.bends else 1
         coarse: Float = np.arange(self._rotations, dtype=np.float64) * (2 * math.pi / self._rotations)
         self.angles = np.concatenate([coarse, coarse + math.pi / self._rotations])
@@ -226,6 +231,8 @@ class SiteEnumerator:
             at, towards = np.zeros((2, len(self.angles) * len(self._outer), 3))
             kernels.turned_ends(self._ends, frame, normals, at, towards)
             wanted[:, self._outer, self._inner] = worthwhile(at, towards).reshape(len(self.angles), -1)
+            if self._enough is not None:
+                self._thin(wanted, self._enough)
 
         def rows_of(turns: Int) -> tuple[Float, int]:
             chosen = wanted[turns]
@@ -248,6 +255,15 @@ class SiteEnumerator:
             further, more = rows_of(self._rotations + between)
             found, candidates = np.concatenate([found, further]), candidates + more
         return found, refused, candidates
+
+    def _thin(self, wanted: Bool, enough: int) -> None:
+        """Drop rotations evenly until no more than enough deployments are left: those between come last."""
+        counts = np.count_nonzero(wanted, axis=(1, 2))
+        turn = np.arange(len(self.angles)).reshape(-1, 2).T.ravel()
+        step = 1
+        while counts[turn % step == 0].sum() > enough and step < self._rotations:
+            step *= 2
+        wanted[turn % step != 0] = False
 
 
 @lru_cache(maxsize=8)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import lungaccess as la
 from anatomy.errors import FileError, SettingsError
 from anatomy.lung import Lung
 from anatomy.poses import pose
@@ -27,17 +26,10 @@ from lungaccess.procedure.truth import end_of, with_stop
 from lungaccess.risk import MISSES, AngleError, CurvatureError, ErrorModel, PositionError, assess, load_errors
 from lungaccess.risk.deviations import deviated_starts
 
-SYSTEM = la.load_system("ultrathin")
 SCOPE_ONLY = ErrorModel(
     scope_position=PositionError(attempt_mm=0.4), scope_direction=AngleError(attempt_deg=1.0)
 )
 SEEN_EXACTLY = Procedure(scope=ScopePlacing(measured=True), tubes=TubesOut(measured=True))
-
-
-@pytest.fixture(scope="module")
-def plan(small_lung: Lung) -> Plan:
-    *_, best = la.plan(small_lung, SYSTEM, la.resolve_target(small_lung), iterations=100)
-    return best
 
 
 # Open loop ---------------------------------------------------------------------------------------

@@ -1,0 +1,57 @@
+"""Chances of success: deviated plans and simulated procedures of one plan, and the first plan for success."""
+
+from __future__ import annotations
+
+import time
+
+import lungaccess as la
+from anatomy.build import build_lung
+from anatomy.phantom import make_phantom
+from lungaccess.procedure import Simulator
+from lungaccess.risk import RiskAssessor
+
+DEVIATED = 1_000_000
+PROCEDURES = 50
+RADIUS_MM = 5.0
+
+
+class Chances:
+    """A plan to a peripheral point of a synthetic lung, under the errors of `gated-ct`; CPU time."""
+
+    timeout = 600
+    number = 1
+    repeat = (2, 5, 20.0)
+    warmup_time = 0.0
+    timer = time.process_time
+
+    def setup(self) -> None:
+        """Make the plan, and compile the kernels."""
+        self.lung = build_lung(make_phantom(seed=3, size="small").images)
+        self.system = la.load_system("ultrathin")
+        self.target = la.point_target(self.lung, la.peripheral_targets(self.lung, 1, 0)[0])
+        self.errors = la.load_errors("gated-ct")
+        self.atlas = la.build_atlas(self.lung, self.system)
+        plan = next(la.plan(self.lung, self.system, self.target, atlas=self.atlas))
+        self.assessor = RiskAssessor(plan, self.lung, radius_mm=RADIUS_MM)
+        procedure = la.load_procedure("measured-tip")
+        self.simulator = Simulator(plan, self.lung, self.errors, procedure, radius_mm=RADIUS_MM)
+        self.simulator.report(2, 1)
+        self.time_first_plan_for_success()
+
+    def time_deviated_plans(self) -> None:
+        """A million deviated plans, carried out blindly."""
+        self.assessor.success(self.assessor.draws(DEVIATED, 0), self.errors)
+
+    def time_procedures(self) -> None:
+        """Fifty procedures that measure scope and tubes and plan the rest again."""
+        self.simulator.report(PROCEDURES, 0)
+
+    def time_first_plan_for_success(self) -> None:
+        """The first plan for success with such procedures, from the atlas."""
+        procedure = la.load_procedure("measured-tip")
+        next(
+            la.plan_for_success(
+                self.lung, self.system, self.target, errors=self.errors, procedure=procedure,
+                radius_mm=RADIUS_MM, atlas=self.atlas, counterfactuals=False,
+            )
+        )  # fmt: skip

@@ -16,7 +16,7 @@ RADIUS_MM = 5.0
 
 
 class Chances:
-    """A plan to a peripheral point of a synthetic lung, under the errors of `gated-ct`; CPU time."""
+    """A plan to the nodule of a synthetic lung, under the errors of `gated-ct`; CPU time."""
 
     timeout = 600
     number = 1
@@ -28,7 +28,7 @@ class Chances:
         """Make the plan, and compile the kernels."""
         self.lung = build_lung(make_phantom(seed=3, size="small").images)
         self.system = la.load_system("ultrathin")
-        self.target = la.point_target(self.lung, la.peripheral_targets(self.lung, 1, 0)[0])
+        self.target = la.resolve_target(self.lung, nodule=1)
         self.errors = la.load_errors("gated-ct")
         self.atlas = la.build_atlas(self.lung, self.system)
         plan = next(la.plan(self.lung, self.system, self.target, atlas=self.atlas))

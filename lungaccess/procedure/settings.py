@@ -38,7 +38,7 @@ class ScopePlacing:
         Errors of measuring: of the position along each axis, of the direction about each of two axes.
     placements : int
         How often the scope may be placed.  It is moved away and placed again, at the same tip, where no path
-        is left from the pose as measured; every placement has errors of its own.
+        is left from the pose as measured, or a further placement promises more; each has errors of its own.
     source : str
         Where the errors of measuring come from.
     """

@@ -108,6 +108,6 @@ def _require_cost(cost: Volume, grid: Grid) -> None:
         n_wrong, first = np.count_nonzero(~allowed), values[~allowed][0]
         raise AnatomyError(
             f"The cost map holds {n_wrong} voxels that are not allowed, such as {first:g}",
-            expected="costs in [0, 1], or infinity where passing is forbidden",
+            expected="costs in [0, 1], and 1000 or infinity where passing is forbidden",
             remedy="Scale the cost map to [0, 1]",
         )

@@ -37,6 +37,7 @@ OUR_OWN = (
     "procedures",
     "success_planning",
     "rare_events",
+    "lobes",
     "growth",
 )
 SETTINGS = ("full", "quick")

@@ -10,6 +10,7 @@ import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
+from anatomy.io.cost_maps import from_stored
 from anatomy.io.lungs import with_lobes
 from anatomy.io.masks import MaskSet
 from anatomy.io.placement import place
@@ -102,7 +103,7 @@ def _empty(role: str, masks: MaskSet) -> str:
 
 def require_cost(volume: Volume, grid: Grid) -> Volume:
     """Return a cost map as float32 on the grid of the masks; forbidden where it does not reach."""
-    array = volume.array.astype(np.float32)
+    array = from_stored(volume.array)
     if not grid.is_close(volume.grid):
         array = place(array, volume.grid, grid, fill=np.inf).array
     return Volume(grid=grid, array=array)

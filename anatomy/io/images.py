@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 NIFTI, NRRD, METAIMAGE = (".nii.gz", ".nii", ".gz"), (".seg.nrrd", ".nrrd"), (".mha", ".mhd")
 T = TypeVar("T")
 
+MOST_NOTE = 79
+"""Letters that the description in a NIfTI header has room for."""
 SUFFIXES = NIFTI + NRRD + METAIMAGE
 
 
@@ -127,7 +129,9 @@ def read_labels(path: str | Path) -> Mapping[int, str]:
     return nrrd_labels(read_nrrd_header(path)) if suffix in NRRD else {}
 
 
-def write_volume(path: str | Path, volume: Volume, *, header: Mapping[str, str] | None = None) -> None:
+def write_volume(
+    path: str | Path, volume: Volume, *, header: Mapping[str, str] | None = None, note: str = ""
+) -> None:
     """Write a volume as .nii, .nii.gz, .nrrd or .seg.nrrd, with its frame stated; masks become 0 and 1.
 
     The file appears complete or not at all.
@@ -138,6 +142,9 @@ def write_volume(path: str | Path, volume: Volume, *, header: Mapping[str, str] 
     volume : Volume
     header : mapping of str to str, optional
         `key:=value` lines of a .nrrd file, such as those that name the segments of .seg.nrrd.
+
+    note : str
+        What the header of a NIfTI file says of its voxels, at most 79 letters.
 
     Raises
     ------
@@ -159,6 +166,8 @@ def write_volume(path: str | Path, volume: Volume, *, header: Mapping[str, str] 
     image.SetSpacing(spacing.tolist())
     image.SetOrigin(volume.grid.lps_from_ijk[:3, 3].tolist())
     image.SetDirection((volume.grid.lps_from_ijk[:3, :3] / spacing).ravel().tolist())
+    if note:
+        image.SetMetaData("ITK_FileNotes", note[:MOST_NOTE])
     for key, value in (header or {}).items():
         image.SetMetaData(key, value)
     with atomic_write(path) as temporary:

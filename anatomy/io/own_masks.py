@@ -59,6 +59,7 @@ class PatientFile:
         Literal["", "inspiration", "expiration", "free-breathing"], _key("State of breathing")
     ] = ""
     targets: Annotated[tuple[str, ...], _key("Points with their frame")] = ()
+    warnings: Annotated[tuple[str, ...], _key("What every command says again about these masks")] = ()
     thick_slices_mm: Annotated[
         float, quantity("Distance of slices too thick to show small airways and vessels", at_least=0.0)
     ] = 0.0
@@ -99,7 +100,7 @@ def load_own_masks(description: Path) -> PatientImages:
         targets_lps=targets,
         breath_hold=keys.breath_hold or None,
         sources=hashes,
-        warnings=(*_thick_slices(keys.thick_slices_mm), *_accepted(keys.accepted)),
+        warnings=(*_thick_slices(keys.thick_slices_mm), *_accepted(keys.accepted), *keys.warnings),
     )
 
 

@@ -7,6 +7,7 @@ import json
 import os
 
 from anatomy.io.files import sha256, write_text
+from anatomy.lobes import LOBES
 from anatomy.segmentation.folder import SegmentationFolder
 from anatomy.typed import Float
 
@@ -44,14 +45,16 @@ class Description:
 def description_text(
     name: str,
     has_nodule: bool,
+    fissure_warnings: tuple[str, ...] | None,
     target_lps: Float | None,
     thick_slices_mm: float,
     accepted: tuple[str, ...] = (),
 ) -> str:
     """Return the `patient.toml` of a segmentation.
 
-    An empty name is left out; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that
-    were accepted although they are thick, else 0; `accepted` are checks that failed and were overruled.
+    An empty name is left out; `fissure_warnings` is what to say of the fissures, or None where they are not
+    known; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that were accepted
+    although they are thick, else 0; `accepted` are checks that failed and were overruled.
     """
     lines = [f"name = {json.dumps(name, ensure_ascii=False)}"] if name else []
     lines += [
@@ -61,6 +64,11 @@ def description_text(
         'lung = "lungs.nii.gz"',
         'cost = "cost.nii.gz"',
     ]
+    if fissure_warnings is not None:
+        lobes = (f'"{name}" = "lobes.nii.gz#{number}"' for number, name in LOBES.items())
+        lines += ['fissures = "fissures.nii.gz"', f"lobes = {{ {', '.join(lobes)} }}"]
+    if fissure_warnings:
+        lines.append(f"warnings = {json.dumps(list(fissure_warnings))}")
     if has_nodule:
         lines.append('nodule = "nodule.nii.gz"')
     if target_lps is not None:

@@ -13,8 +13,10 @@ import numpy as np
 
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Grid, Volume
+from anatomy.io import cost_maps
 from anatomy.io.files import atomic_write, read_text, require_writable_folder, sha256, write_text
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
+from anatomy.lobes import LOBES
 from anatomy.segmentation.canonical import canonical
 from anatomy.typed import Array
 
@@ -22,8 +24,14 @@ STATE = "segmentation.json"
 FORMAT = 1
 _MADE_SUFFIX = ".nii.gz"
 CORRECTIONS = "corrections"
-IMAGES = ("lungs", "airway", "airway_wall", "nodule", "vessels", "all_vessels")
+IMAGES = ("lungs", "airway", "airway_wall", "nodule", "vessels", "all_vessels", "lobes", "fissures")
 """What a person may correct."""
+NOTES = {
+    "cost": cost_maps.NOTE,
+    "lobes": ", ".join(f"{number} {name}" for number, name in LOBES.items()).replace(" lobe", ""),
+    "fissures": "1 border of lobes without a fissure to be seen, 2 fissure seen",
+}
+"""What the headers of images say that are no masks."""
 _SHIFT_TOLERANCE = 0.05
 """Largest deviation from a whole number of voxels, in voxels."""
 
@@ -105,7 +113,7 @@ class SegmentationFolder:
         digest = digest_of(array)
         path = self.path_of(name)
         with atomic_write(path) as temporary:
-            write_volume(temporary, Volume(grid=self.grid, array=array))
+            write_volume(temporary, Volume(grid=self.grid, array=array), note=NOTES.get(name, ""))
             file = sha256(temporary)
             known = [*self._entry(name).get("written", ())][-1:]
             entry = {"key": key, "file": file, "voxels": digest, "written": [*known, file]}

@@ -92,7 +92,10 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
     folder.save(provenance=_provenance(request, steps, warnings))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
-    text = description_text(request.name, bool(parts.nodule.any()), target, thick_mm, steps.accepted)
+    sides = [side for side in (parts.left, parts.right) if side.any()]
+    known = all(parts.lobes[side].any() for side in sides)
+    said = tuple(folder.facts("lobes").get("warnings", ())) if known else None
+    text = description_text(request.name, bool(parts.nodule.any()), said, target, thick_mm, steps.accepted)
     return Segmentation(
         folder=folder.path,
         grid=grid,

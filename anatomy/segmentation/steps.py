@@ -10,6 +10,7 @@ import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
+from anatomy.io.cost_maps import OBSTACLE_COST, as_stored, from_stored
 from anatomy.io.files import sha256
 from anatomy.records import frozen_record
 from anatomy.segmentation.box import Box
@@ -23,7 +24,7 @@ from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.segmentation.wall import wall_around
-from anatomy.typed import Array, Float32, Mask
+from anatomy.typed import Array, Float32, Mask, UInt8
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
@@ -34,15 +35,16 @@ Progress = Callable[[str], None]
 
 VERSION = 2
 """Raise it when a step makes other images from the same input."""
-_NOT_MASKS = ("lungs", "vesselness", "cost")
+_NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 
 
 @frozen_record
 class Parts:
     """The images of a segmentation on the grid of the CT, `(ni, nj, nk)`.
 
-    The nodule is empty if none was given; vesselness is in [0, 1], cost too, or infinite in obstacles,
-    which the large vessels are.
+    The nodule is empty if none was given.  Lobes have numbers of `anatomy.lobes.LOBES`; fissures are 1 where
+    they are inferred and 2 where they are seen; both are 0 where nothing is known.  Vesselness is in [0, 1],
+    cost too, or infinite in obstacles, which the large vessels are.
     """
 
     left: Mask
@@ -54,6 +56,8 @@ class Parts:
     vesselness: Float32
     large_vessels: Mask
     all_vessels: Mask
+    lobes: UInt8
+    fissures: UInt8
     cost: Float32
 
     @classmethod
@@ -70,6 +74,8 @@ class Parts:
             vesselness=none.astype(np.float32),
             large_vessels=none,
             all_vessels=none,
+            lobes=none.astype(np.uint8),
+            fissures=none.astype(np.uint8),
             cost=none.astype(np.float32),
         )
 
@@ -83,7 +89,7 @@ class RefusedError(AnatomyError):
 
 
 class Steps:
-    """Runs lungs, airway, nodule, vessels and cost map in this order; tells each step as it begins."""
+    """Runs lungs, airway, nodule, vessels, lobes and cost map in this order; tells each step as it begins."""
 
     def __init__(
         self,
@@ -115,6 +121,7 @@ class Steps:
         self._require_plausible(lungs, airway)
         nodule = self._nodule()
         vessels = self._vessels(lungs, airway, nodule)
+        lobes = self._lobes(lungs, airway, vessels)
         cost = self._cost(lungs, airway, nodule, vessels)
         return Parts(
             left=lungs.left,
@@ -126,6 +133,8 @@ class Steps:
             vesselness=vessels["vesselness"],
             large_vessels=vessels["vessels"],
             all_vessels=vessels["all_vessels"],
+            lobes=lobes["lobes"],
+            fissures=lobes["fissures"],
             cost=cost,
         )
 
@@ -249,9 +258,32 @@ class Steps:
 
         return self._bring_up_to_date("vessels", names, key, compute)[0]
 
+    def _lobes(self, lungs: Lungs, airway: Images, vessels: Images) -> Images:
+        names = ("lobes", "fissures")
+        key = self._key(
+            "lobes", sources=names, of=("lungs", "airway", "airway_wall", "all_vessels"), ct=self._ct_digest
+        )
+
+        def compute() -> tuple[Images, dict[str, Any]]:
+            from anatomy.segmentation.lobes import lobes_given, segment_lobes
+
+            given = {
+                name: self._sources[name].array.astype(np.uint8) for name in names if name in self._sources
+            }
+            if "lobes" in given:
+                return lobes_given(given["lobes"], given.get("fissures")), {}
+            box = Box.around(lungs, self._folder.grid)
+            self._tell("lobes and fissures")
+            ct, vessel = box.volume(self._ct), box.cut(vessels["all_vessels"])
+            found = segment_lobes(ct, box.lungs(lungs), _airways(box, airway), vessel)
+            images = {"lobes": box.whole(found.lobes), "fissures": box.whole(found.fissures), **given}
+            return images, {"seen": dict(found.seen), "warnings": list(found.warnings)}
+
+        return self._bring_up_to_date("lobes", names, key, compute)[0]
+
     def _cost(self, lungs: Lungs, airway: Images, nodule: Mask, vessels: Images) -> Float32:
         made_of = ("lungs", "airway", "airway_wall", "nodule", "vesselness", "vessels", "all_vessels")
-        key = self._key("cost map", of=made_of)
+        key = self._key("cost map", of=made_of, obstacles=OBSTACLE_COST)
 
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.cost_map import cost_map
@@ -267,10 +299,10 @@ class Steps:
             )
             inside = box.lungs(lungs).mask | box.cut(nodule)
             cost = cost_map(found, _airways(box, airway), inside, box.inner)
-            return {"cost": box.whole(cost.array, fill=np.inf)}, {}
+            return {"cost": as_stored(box.whole(cost.array, fill=np.inf))}, {}
 
         self._tell("cost map")
-        return self._bring_up_to_date("cost map", ("cost",), key, compute)[0]["cost"]
+        return from_stored(self._bring_up_to_date("cost map", ("cost",), key, compute)[0]["cost"])
 
     def _key(
         self, step: str, *, sources: tuple[str, ...] = (), of: tuple[str, ...] = (), **others: Any

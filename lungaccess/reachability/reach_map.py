@@ -78,7 +78,7 @@ class ReachMap:
         Estimated integral of 1 / clearance of the best path found, and the clearance that it keeps
         beyond the exempt length of the needle; 0 where there is none.
     regions : Regions
-        The side of each voxel, on the same grid.
+        Side and lobe of each voxel, on the same grid.
     entries : int
         Deployments of the atlas.
     resumed_layers : int
@@ -100,11 +100,8 @@ class ReachMap:
     atlas_s: float
 
     def by_region(self) -> tuple[RegionReach, ...]:
-        """Return what is reached of each region, and of all of them last."""
-        regions = [
-            self._reach(name, self.regions.volume.array == code) for code, name in self.regions.names.items()
-        ]
-        return *regions, self.total
+        """Return what is reached of each lung, of each lobe if they are known, and of all of them last."""
+        return *(self._reach(name, where) for name, where in self.regions.parts()), self.total
 
     @property
     def total(self) -> RegionReach:

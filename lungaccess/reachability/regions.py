@@ -1,17 +1,18 @@
-"""Left and right lung of a patient, for figures by side."""
+"""Lungs and lobes of a patient, for figures by region."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
 import numpy as np
 
 from anatomy.grid import Grid, Volume
+from anatomy.lobes import LOBES
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.structures import OBSTACLES
-from anatomy.typed import Float, Mask
+from anatomy.typed import Float, Mask, UInt8
 
 RIGHT, LEFT = 1, 2
 NAMES: Mapping[int, str] = MappingProxyType({RIGHT: "right lung", LEFT: "left lung"})
@@ -24,20 +25,28 @@ class Regions:
     """The region of each voxel of a grid: a key of `names`, or 0, in a volume of uint8.
 
     If `lungs_are_separate`, the two are parts of the mask without a bridge; else the plane through the carina
-    divides them.
+    divides them.  `lobes` has the numbers of `anatomy.lobes.LOBES`; None if the patient came without lobes.
     """
 
     volume: Volume
     names: Mapping[int, str]
     lungs_are_separate: bool
+    lobes: Volume | None = None
+
+    def parts(self) -> Iterator[tuple[str, Mask]]:
+        """Yield the name and the voxels of each lung, then of each lobe."""
+        for code, name in self.names.items():
+            yield name, self.volume.array == code
+        if self.lobes is not None:
+            for code, name in LOBES.items():
+                yield name, self.lobes.array == code
 
 
 def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     """Return the side of the voxels of a grid, any in the same place, that are true in `where`; 0 of others.
 
     The lungs are the two largest parts of the free tissue between which no face is shared; smaller parts
-    belong to the side of the carina on which they lie.  The anatomy keeps no lobes: fissures are open
-    here and there, so that lobes are not separate parts.
+    belong to the side of the carina on which they lie.
     """
     from scipy import ndimage
 
@@ -50,16 +59,25 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     points = grid.lps(ijk)
     # LPS: the patient's left is +x.
     codes = np.where(points[:, 0] > lung.tree.carina_lps[0], LEFT, RIGHT).astype(np.uint8)
+    voxels = tuple(np.clip(np.floor(lung.grid.ijk(points) + 0.5).astype(int), 0, np.array(parts.shape) - 1).T)
     if lungs_are_separate:
-        voxels = np.clip(np.floor(lung.grid.ijk(points) + 0.5).astype(int), 0, np.array(parts.shape) - 1)
-        here = parts[tuple(voxels.T)]
+        here = parts[voxels]
         first, second = here == two[0], here == two[1]
         first_is_left = _mean_x(points[first]) > _mean_x(points[second])
         codes[first] = LEFT if first_is_left else RIGHT
         codes[second] = RIGHT if first_is_left else LEFT
-    array = np.zeros(grid.shape, dtype=np.uint8, order="F")
-    array[tuple(ijk.T)] = codes
-    return Regions(volume=Volume(grid=grid, array=array), names=NAMES, lungs_are_separate=lungs_are_separate)
+
+    def on_grid(values: UInt8) -> Volume:
+        array = np.zeros(grid.shape, dtype=np.uint8, order="F")
+        array[tuple(ijk.T)] = values
+        return Volume(grid=grid, array=array)
+
+    return Regions(
+        volume=on_grid(codes),
+        names=NAMES,
+        lungs_are_separate=lungs_are_separate,
+        lobes=None if lung.lobes is None else on_grid(lung.lobes.array[voxels]),
+    )
 
 
 def _mean_x(points: Float) -> float:

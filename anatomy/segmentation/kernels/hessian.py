@@ -12,7 +12,7 @@ ZERO, ONE, HALF, QUARTER, TWO = (np.float64(x) for x in (0.0, 1.0, 0.5, 0.25, 2.
 
 
 @inner_kernel
-def _second_differences(image, k, j, i, factors):
+def second_differences(image, k, j, i, factors):
     """Return the entries ii, jj, kk, ij, ik, jk of the scaled Hessian by central differences, float64."""
     nk, nj, ni = image.shape
     k0, k1 = max(k - 1, 0), min(k + 1, nk - 1)
@@ -69,7 +69,7 @@ def add_vesselness(image, first, last, n_scales, scale, factors, settings, best)
             for i in range(image.shape[2]):
                 if n_scales[k, j, i] <= scale:
                     continue
-                ii, jj, kk, ij, ik, jk = _second_differences(image, k, j, i, factors)
+                ii, jj, kk, ij, ik, jk = second_differences(image, k, j, i, factors)
                 # The last two eigenvalues outweigh the first: both negative makes the trace negative.
                 if ii + jj + kk >= ZERO:
                     continue
@@ -97,7 +97,7 @@ def add_large_response(
             for i in range(image.shape[2]):
                 if n_scales[k, j, i] <= scale:
                     continue
-                ii, jj, kk, ij, ik, jk = _second_differences(image, k, j, i, factors)
+                ii, jj, kk, ij, ik, jk = second_differences(image, k, j, i, factors)
                 if ii + jj + kk >= ZERO:
                     continue
                 weight = ONE / (reference - min(np.float64(hu[k, j, i]), brightest))

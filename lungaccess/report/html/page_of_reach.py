@@ -123,7 +123,7 @@ def volumes_section(maps: Sequence[ReachMap]) -> str:
             for row in each.by_region()
         ]
         tables.append(words.table(each.system.name, headings, rows))
-    note = "The anatomy has no lobes: fissure masks have gaps, so that lobes are not separate."
+    note = "The patient came without lobes." if any(each.regions.lobes is None for each in maps) else ""
     return "".join(tables) + f"<p class='note'>{note}</p>"
 
 

@@ -11,21 +11,35 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from anatomy.errors import AnatomyError, FileError, GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume
+from anatomy.lobes import LOBES
 from anatomy.phantom import LABELS, Phantom
 from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, digest_of, onto_grid
 from anatomy.segmentation.labels import sides_of
+from anatomy.segmentation.lobes import SEEN
 from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
 from anatomy.segmentation.quality import quality_of
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.segmentation.steps import RefusedError
 
-ALL = ("lungs", "airway", "nodule", "vessels", "cost map")
-IMAGES = ("lungs", "central_airway", "airway", "airway_wall", "nodule", "vesselness", "vessels", "cost")
+ALL = ("lungs", "airway", "nodule", "vessels", "lobes", "cost map")
+IMAGES = (
+    "lungs",
+    "central_airway",
+    "airway",
+    "airway_wall",
+    "nodule",
+    "vesselness",
+    "vessels",
+    "lobes",
+    "fissures",
+    "cost",
+)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +83,31 @@ def test_the_folder_is_a_patient(patient: Phantom, made: Segmentation) -> None:
     assert np.count_nonzero(free) > 0.8 * np.count_nonzero(images.lung.array)
     assert made.recomputed == ALL
     assert made.corrected == ()
+
+
+def test_lobes_and_fissures_are_those_of_the_patient(patient: Phantom, made: Segmentation) -> None:
+    images = load_patient(made.folder)
+    assert images.lobes is not None and images.fissures is not None
+    truth = patient.lobes.array * (made.parts.left | made.parts.right)
+    for number, name in LOBES.items():
+        both = np.count_nonzero((images.lobes.array == number) & (truth == number))
+        sizes = np.count_nonzero(images.lobes.array == number) + np.count_nonzero(truth == number)
+        assert 2 * both / sizes > 0.92, name  # the middle lobe; the others are above 0.97
+    far = ndimage.distance_transform_edt(~patient.mask("fissure"), sampling=patient.grid.spacing_mm)
+    assert np.median(far[made.parts.fissures == SEEN]) <= 1.5
+    assert np.mean(made.parts.fissures[made.parts.fissures > 0] == SEEN) > 0.8
+    assert not [said for said in images.warnings if "fissure" in said]
+
+
+def test_lobes_that_are_not_known_are_not_claimed(patient: Phantom, made: Segmentation, copy: Path) -> None:
+    """Without lobes of one lung there are no fissures to be trusted: the check must say so."""
+    half = made.parts.lobes * made.parts.left
+    (copy / "lobes.nii.gz").unlink()
+    write_volume(copy / "lobes.seg.nrrd", Volume(grid=made.grid, array=half))
+    again = _again(patient, made, copy)
+    assert again.corrected == ("lobes",) and again.recomputed == ("lobes",)
+    images = load_patient(copy)
+    assert images.fissures is None and images.lobes is None
 
 
 def test_the_nodule_is_the_target_and_no_vessel(patient: Phantom, made: Segmentation) -> None:
@@ -116,7 +155,7 @@ def test_a_corrected_mask_is_kept_and_only_what_follows_is_done_again(
     write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=cut))
     again = _again(patient, made, copy)
     assert again.corrected == ("airway",)
-    assert again.recomputed == ("airway", "vessels", "cost map")
+    assert again.recomputed == ("airway", "vessels", "lobes", "cost map")
     assert (again.parts.lumen == cut).all()
     assert (load_patient(copy).lumen.array == cut).all()
     assert np.isfinite(again.parts.cost[made.parts.lumen & ~cut & made.parts.left]).any()
@@ -147,7 +186,7 @@ def test_a_segmentation_of_slicer_over_a_part_of_the_image_is_taken(
     write_volume(copy / "lungs.seg.nrrd", part)
     again = _again(patient, made, copy)
     assert again.corrected == ("lungs",)
-    assert again.recomputed == ("lungs", "airway", "vessels", "cost map")
+    assert again.recomputed == ("lungs", "airway", "vessels", "lobes", "cost map")
     assert not (copy / "lungs.seg.nrrd").exists()
     assert not (again.parts.left | again.parts.right)[:, :, -50:].any()
 

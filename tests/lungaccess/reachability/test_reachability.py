@@ -228,6 +228,19 @@ def test_one_lung_is_divided_at_the_carina() -> None:
     assert left[:, 0].min() > lung.tree.carina_lps[0] >= right[:, 0].max()
 
 
+def test_lobes_are_regions_if_the_patient_has_them() -> None:
+    canvas = Canvas.empty([-20, -10, -10], [20, 10, 10], 1.0)
+    bare = canvas.lung()
+    where = (bare.labels & (OUTSIDE | AIRWAY)) == 0
+    upper = np.indices(bare.grid.shape)[2] >= 10
+    array = np.asfortranarray(np.where(upper, 4, 5).astype(np.uint8))
+    lung = canvas.lung(lobes=Volume(grid=bare.grid, array=array))
+    parts = dict(lung_regions(lung, lung.grid, where).parts())
+    assert (parts["left upper lobe"] == (where & upper)).all()
+    assert (parts["left lower lobe"] == (where & ~upper)).all() and not parts["right upper lobe"].any()
+    assert "left upper lobe" not in dict(lung_regions(bare, bare.grid, where).parts())
+
+
 def test_neighbours_come_before() -> None:
     counted = np.random.default_rng(1).uniform(size=(9, 7)) < 0.6
     places = np.argwhere(counted)

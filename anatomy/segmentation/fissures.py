@@ -1,0 +1,129 @@
+"""Fissures in a CT: thin bright sheets between the lobes, told apart from all other plates by their size.
+
+What is plate-like by the eigenvalues of its Hessian [Wiemker2005, Lassen2013] is noise, the edge of a vessel
+or a fissure.  Only a fissure goes on in its plane: around it normals agree, and hundreds of voxels hang
+together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.records import frozen_record
+from anatomy.typed import Array, Float32, Mask
+
+SIGMA_MM = 1.0
+"""A fissure is thinner than the blur of a CT: about as wide as this in the image."""
+BRIGHTEST_HU = 350.0
+"""Above the lung's median; a fissure is below, and vessels are cut to this so that their edges are small."""
+AGREEMENT_MM = 3.0
+"""Sigma of the neighbourhood in which normals are compared: wider than a vessel, narrower than folds."""
+SURFACE_VOXELS = 3
+"""So near to the surface of the lung a plate may be the pleura."""
+BLOCK = 2
+"""Normals are compared over blocks of so many voxels."""
+NOISE_PERCENTILE = 90.0
+"""Fissures fill about 2 % of a lung: below this percentile there is noise alone."""
+LEAST_NOISE = 0.1
+"""An image without noise has rounding errors of about this."""
+SHEET_NOISES = 2.0
+"""A sheet goes on where the response is so many times the noise: 2 % of a lung's voxels are by chance."""
+SHEET_COSINE = 0.9
+"""Neighbours in a sheet turn by at most 26 degrees: 20 mm of radius at 1 mm voxels would turn by 3."""
+LEAST_SHEET_VOXELS = 500
+"""About 200 mm^2 of a sheet of 2 to 3 voxels: what hangs together by chance is smaller."""
+EVEN_NOISES = 3.0
+"""Likelihood is one half at so many times the noise."""
+
+
+@frozen_record
+class Fissureness:
+    """How likely each cubic voxel is of a fissure, `(nk, nj, ni)`.
+
+    Parameters
+    ----------
+    likelihood : float32
+        In [0, 1); 0 where no sheet is.
+    looked : bool
+        Where a fissure could be seen: in the lung, away from vessels, airways and the pleura.
+    noise : float
+        The response that noise gives.
+    """
+
+    likelihood: Float32
+    looked: Mask
+    noise: float
+
+    @property
+    def seen(self) -> Mask:
+        """The voxels of the sheets."""
+        return np.asarray(self.likelihood > 0)
+
+
+def fissureness(hu: Float32, lung: Mask, barred: Mask) -> Fissureness:
+    """Return where sheets like fissures are, on cubic voxels of 1 mm.
+
+    Parameters
+    ----------
+    hu : (nk, nj, ni) float32
+    lung : (nk, nj, ni) bool
+        Both lungs, filled.
+    barred : (nk, nj, ni) bool
+        Vessels and airways, whose walls look like plates.
+    """
+    from scipy import ndimage
+
+    from anatomy.segmentation.kernels.plates import grow_sheets, plate_responses
+
+    inner = ndimage.binary_erosion(lung)
+    typical = np.median(hu[inner]) if inner.any() else 0.0
+    filled = np.where(inner, np.minimum(hu, typical + BRIGHTEST_HU), typical).astype(np.float32)
+    smooth = ndimage.gaussian_filter(filled, SIGMA_MM, truncate=3.0)
+    where = ndimage.binary_erosion(lung, iterations=SURFACE_VOXELS) & ~ndimage.binary_dilation(barred)
+    strength = np.zeros(hu.shape, dtype=np.float32)
+    normal = np.zeros((3, *hu.shape), dtype=np.float32)
+    plate_responses(smooth, where, strength, normal)
+    response = _in_agreement(strength, normal)
+    noise = max(float(np.percentile(response[where], NOISE_PERCENTILE)) if where.any() else 0.0, LEAST_NOISE)
+    sheet, least = np.zeros(hu.shape, dtype=np.int32), SHEET_NOISES * noise
+    stack = np.zeros(np.count_nonzero(response >= least) + 1, dtype=np.int64)
+    sizes = grow_sheets(response, normal, least, SHEET_COSINE, sheet, stack)
+    large = (sizes >= LEAST_SHEET_VOXELS)[sheet]
+    likelihood = np.where(large, response / (response + EVEN_NOISES * noise), np.float32(0.0))
+    return Fissureness(likelihood=likelihood.astype(np.float32), looked=where, noise=noise)
+
+
+def _in_agreement(strength: Float32, normal: Float32) -> Float32:
+    """Return the geometric mean of each plate's strength and of how much of those around lies in its plane.
+
+    The sum of `s n n^T` around a voxel has along `n` what agrees, and across it what does not.
+    """
+    from scipy import ndimage
+
+    at = np.nonzero(strength)
+    place = tuple(
+        np.minimum(axis // BLOCK, n // BLOCK - 1) for axis, n in zip(at, strength.shape, strict=True)
+    )
+    along = np.zeros(len(at[0]), dtype=np.float32)
+    total = np.zeros(len(at[0]), dtype=np.float32)
+    for a in range(3):
+        for b in range(a, 3):
+            summed = _block_mean(strength * normal[a] * normal[b])
+            around = ndimage.gaussian_filter(summed, AGREEMENT_MM / BLOCK, truncate=2.5)[place]
+            along += np.float32(1 if a == b else 2) * normal[a][at] * normal[b][at] * around
+            if a == b:
+                total += around
+    response = np.zeros(strength.shape, dtype=np.float32)
+    response[at] = np.sqrt(strength[at] * np.maximum(along - np.float32(0.5) * (total - along), 0))
+    return response
+
+
+def blocks_of(image: Array) -> Array:
+    """Return an image as blocks of 2 x 2 x 2 voxels, along the axes 1, 3 and 5; a rest is cut off."""
+    nk, nj, ni = (n // BLOCK for n in image.shape)
+    cut = image[: nk * BLOCK, : nj * BLOCK, : ni * BLOCK]
+    return cut.reshape(nk, BLOCK, nj, BLOCK, ni, BLOCK)
+
+
+def _block_mean(image: Float32) -> Float32:
+    return np.asarray(blocks_of(image).mean(axis=(1, 3, 5), dtype=np.float32))

@@ -1,0 +1,316 @@
+"""Lobes of a CT: bronchi say where each one is, fissures and the lack of vessels where it ends.
+
+As in [Lassen2013] and [Ukil2009] seeds come from the bronchi and borders from fissures and from where there
+are no vessels.  Lobes are shared out by diffusion, which passes a gap in a fissure by no more than its width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.errors import AnatomyError
+from anatomy.grid import Volume
+from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER, fissures_between
+from anatomy.morphology import bounds, window
+from anatomy.records import frozen_record
+from anatomy.segmentation.airway import Airways
+from anatomy.segmentation.closing import closed, largest_piece
+from anatomy.segmentation.cubic import EDGE_MM, Cubic
+from anatomy.segmentation.fissures import BLOCK, Fissureness, blocks_of, fissureness
+from anatomy.segmentation.lobar_bronchi import TRUNK_SHARE, Regions, lobes_of_branches
+from anatomy.segmentation.lungs import Lungs
+from anatomy.typed import Bool, Float32, Int, Int32, Mask, UInt8
+
+OF_LUNG = {"right": (RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER), "left": (LEFT_UPPER, LEFT_LOWER)}
+FISSURES = {
+    "right horizontal fissure": ((RIGHT_UPPER,), (RIGHT_MIDDLE,)),
+    "right oblique fissure": ((RIGHT_UPPER, RIGHT_MIDDLE), (RIGHT_LOWER,)),
+    "left oblique fissure": ((LEFT_UPPER,), (LEFT_LOWER,)),
+}
+"""The lobes on both sides of each fissure."""
+BORDER, SEEN = 1, 2
+"""Values of a mask of fissures: a border between lobes where no fissure is seen, and where one is."""
+SEEN_WITHIN_VOXELS = 3
+"""A sheet so near to a border is the border's fissure: about twice the error of either."""
+FISSURE_COST = 100.0
+"""Crossing a fissure costs as much as going round it through 100 mm of lung."""
+FISSURE_RESISTANCE = 200.0
+"""Times that of lung: a fissure then outweighs the whole way from a bronchus to it."""
+HOLE_MM, HOLE_LIKELIHOOD = 6.0, np.float32(0.5)
+"""Vessels, their blur and the pleura hide so much of a fissure to each side, which is likely there."""
+VESSEL_REACH_MM = 6.0
+"""Vessels are so far apart within a lobe; farther from them, where fissures run, lung resists more."""
+ROUNDS, RELAXATION = 120, np.float32(1.8)
+"""Diffusion starts near to its end, and then changes less than one voxel in a thousand."""
+BAND_BLOCKS = 5
+"""In blocks, 10 mm: so far from the border of the diffusion the fissure itself is looked for."""
+LEAST_SEEN = 0.5
+"""Below this share a fissure's course is mostly a guess, and an oblique one says nothing of the lobes."""
+OUTER_VOXELS = 2
+"""Lobes are made so far beyond the lung, so that none of its voxels is left without one."""
+
+
+@frozen_record
+class Lobes:
+    """Lobes of both lungs on the grid of the CT.
+
+    Parameters
+    ----------
+    lobes : (ni, nj, nk) uint8
+        Numbers of `anatomy.lobes.LOBES`, 0 outside the lungs; 0 everywhere if lobes could not be told apart.
+    fissures : (ni, nj, nk) uint8
+        Both sides of the borders between lobes: `SEEN` where a fissure is seen, else `BORDER`.
+    seen : mapping of str to float
+        Share of each border at which a fissure is seen.
+    warnings : tuple of str
+    """
+
+    lobes: UInt8
+    fissures: UInt8
+    seen: Mapping[str, float]
+    warnings: tuple[str, ...]
+
+
+def segment_lobes(ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask) -> Lobes:
+    """Return the lobes and fissures of a CT.
+
+    Parameters
+    ----------
+    ct : Volume
+        Hounsfield units.
+    lungs, airways
+        On the grid of the CT.
+    vessels : (ni, nj, nk) bool
+        All vessels.
+
+    References
+    ----------
+    [Lassen2013], [Ukil2009], [Wiemker2005]
+    """
+    from anatomy.tree import tree_from_mask
+
+    try:
+        tree = tree_from_mask(Volume(grid=ct.grid, array=airways.lumen))
+    except AnatomyError as error:
+        nothing = np.zeros(ct.grid.shape, dtype=np.uint8, order="F")
+        said = f"Lobes and fissures are not known, because the airway gives no tree: {error.found}"
+        return Lobes(lobes=nothing, fissures=nothing, seen={}, warnings=(said,))
+    cubic = Cubic.over(ct.grid)
+    masks = {"right": cubic.sampled(lungs.right), "left": cubic.sampled(lungs.left)}
+    barred = cubic.sampled(vessels | airways.lumen | airways.wall)
+    sheets = fissureness(cubic.mean(ct.array), masks["right"] | masks["left"], barred)
+    found, vessel, warnings = np.zeros(cubic.shape, dtype=np.uint8), cubic.sampled(vessels), []
+    for side, mask in masks.items():
+        if not mask.any():
+            continue
+        low, high = bounds(mask, OUTER_VOXELS)
+        box = window(low, high)
+        made = _LungParts(mask[box], vessel[box], sheets.likelihood[box], cubic, low, tree).lobes(side)
+        if not made.any():
+            warnings.append(f"The lobes of the {side} lung are not known: too few of its bronchi are found.")
+        found[box][made > 0] = made[made > 0]
+    seen = _seen_shares(found, sheets)
+    for side in masks:
+        share = seen.get(f"{side} oblique fissure", 0.0)
+        if share < LEAST_SEEN and np.isin(found, OF_LUNG[side]).any():
+            found[np.isin(found, OF_LUNG[side])] = 0
+            seen = {name: value for name, value in seen.items() if not name.startswith(side)}
+            warnings.append(
+                f"The lobes of the {side} lung are not known: its oblique fissure is seen on {share:.0%} of "
+                "what would be its course."
+            )
+    lobes = cubic.back(found) * (lungs.right | lungs.left)
+    for name, share in seen.items():
+        if share < LEAST_SEEN:
+            warnings.append(
+                f"The {name} is seen on {share:.0%} of the border between its lobes; the rest is inferred."
+            )
+    near = cubic.back(_grown(sheets.seen, SEEN_WITHIN_VOXELS))
+    fissures = np.where(near, np.uint8(SEEN), np.uint8(BORDER)) * fissures_between(lobes)
+    return Lobes(lobes=lobes, fissures=fissures, seen=seen, warnings=tuple(warnings))
+
+
+def lobes_given(lobes: UInt8, fissures: UInt8 | None) -> dict[str, UInt8]:
+    """Return lobes that a person corrected, and the fissures between them if there are no others."""
+    borders = (SEEN * fissures_between(lobes)).astype(np.uint8) if fissures is None else fissures
+    return {"lobes": lobes, "fissures": borders}
+
+
+class _LungParts:
+    """One lung in blocks of 2 mm, and what its bronchi and fissures part it into."""
+
+    def __init__(
+        self, mask: Mask, vessels: Mask, likelihood: Float32, cubic: Cubic, low: Int, tree: AirwayTree
+    ) -> None:
+        self._fine, self._likelihood, self._cubic, self._tree = mask, likelihood, cubic, tree
+        self._low = low
+        self._mask = blocks_of(mask).mean(axis=(1, 3, 5), dtype=np.float32) >= np.float32(0.5)
+        self._coarse = blocks_of(likelihood).max(axis=(1, 3, 5))
+        self._vessels = blocks_of(vessels).any(axis=(1, 3, 5))
+        place = (cubic.index(tree.points_lps) - low) // BLOCK
+        self._inside = ((place >= 0) & (place < self._mask.shape)).all(axis=1)
+        self._place = tuple(np.clip(place, 0, np.array(self._mask.shape) - 1).T)
+        self._inside &= self._mask[self._place]
+
+    def lobes(self, side: str) -> UInt8:
+        """Return the lobes on the cubic voxels; all 0 if there are too few bronchi."""
+        regions = self._regions()
+        lobe_of_branch = lobes_of_branches(regions, OF_LUNG[side])
+        nothing = np.zeros(self._fine.shape, dtype=np.uint8)
+        if set(OF_LUNG[side]) - set(lobe_of_branch.tolist()):
+            return nothing
+        return self._refined(self._shared_out(lobe_of_branch, OF_LUNG[side]))
+
+    def _seeded(self, number_of_branch: Int) -> Int32:
+        """Return the blocks on the centreline of each branch, with its number; -1 outside the lung."""
+        seeds = np.where(self._mask, 0, -1).astype(np.int32)
+        numbers = number_of_branch[self._tree.branch_of_point]
+        there = (numbers > 0) & self._inside
+        seeds[tuple(axis[there] for axis in self._place)] = numbers[there]
+        return seeds
+
+    def _flooded(self, seeds: Int32, likelihood: Float32) -> Int32:
+        """Return the number of the seeds from which the way to each block costs least."""
+        from anatomy.segmentation.kernels.flooding import flood
+
+        labels = seeds.copy()
+        flood(labels, 1.0 + np.float32(FISSURE_COST / BLOCK) * likelihood)
+        return np.maximum(labels, 0)
+
+    def _regions(self) -> Regions:
+        """Return what lies nearest to each branch of this lung that is no main bronchus."""
+        tree, count = self._tree, self._tree.n_branches
+        below = np.eye(count, dtype=np.bool_)
+        for branch in range(count - 1, 0, -1):
+            below[tree.branch_parent[branch]] |= below[branch]
+        here = np.bincount(tree.branch_of_point, weights=self._inside, minlength=count)
+        behind = below @ here
+        used = (here > 0) & (behind < TRUNK_SHARE * here.sum())
+        seeds = self._seeded(np.where(used, np.arange(1, count + 1), 0))
+        labels = self._flooded(seeds, self._coarse)
+        used &= np.bincount(labels.ravel(), minlength=count + 1)[1:] > 0
+        return _regions_of(labels, self._coarse, below, used, self._cubic, self._low)
+
+    def _shared_out(self, lobe_of_branch: Int, lobes: tuple[int, ...]) -> Int32:
+        """Return the lobe of every block of the lung by diffusion from the bronchi."""
+        from scipy import ndimage
+
+        from anatomy.segmentation.kernels.flooding import diffuse
+
+        seeds = self._seeded(lobe_of_branch)
+        likelihood = _without_holes(self._coarse, self._mask)
+        start = np.pad(self._flooded(seeds, likelihood), 1)
+        far = ndimage.distance_transform_edt(~self._vessels, sampling=BLOCK * EDGE_MM) / VESSEL_REACH_MM
+        resistance = (1.0 + far**2) * (1.0 + FISSURE_RESISTANCE * likelihood)
+        along = _conductance(
+            np.pad(resistance.astype(np.float32), 1, constant_values=1.0), np.pad(self._mask, 1)
+        )
+        free = np.flatnonzero(np.pad(seeds == 0, 1))
+        shares = []
+        for lobe in lobes[:-1]:
+            share = (start == lobe).astype(np.float32)
+            diffuse(share, free, *along, ROUNDS, RELAXATION)
+            shares.append(share[1:-1, 1:-1, 1:-1])
+        shares.append(1.0 - np.sum(shares, axis=0, dtype=np.float32))
+        return np.where(self._mask, np.array(lobes)[np.argmax(shares, axis=0)], 0).astype(np.int32)
+
+    def _refined(self, coarse: Int32) -> UInt8:
+        """Return lobes on the cubic voxels: near the borders of the coarse ones they meet on the fissure."""
+        from scipy import ndimage
+
+        from anatomy.segmentation.kernels.flooding import flood
+
+        nearest = ndimage.distance_transform_edt(coarse == 0, return_distances=False, return_indices=True)
+        whole = coarse[tuple(nearest)]
+        band = _grown(_borders(whole), BAND_BLOCKS)
+        labels = self._on_cubic(np.where(band, 0, whole))
+        labels[~_grown(self._fine, OUTER_VOXELS)] = -1
+        cost = 1.0 + np.float32(FISSURE_COST) * self._likelihood
+        flood(labels, cost)
+        for lobe in np.unique(coarse[coarse > 0]):
+            labels[(labels == lobe) & ~largest_piece(labels == lobe)] = 0
+        flood(labels, cost)
+        return np.maximum(labels, 0).astype(np.uint8)
+
+    def _on_cubic(self, blocks: Int32) -> Int32:
+        places = [
+            np.minimum(np.arange(n) // BLOCK, m - 1)
+            for n, m in zip(self._fine.shape, blocks.shape, strict=True)
+        ]
+        return np.ascontiguousarray(blocks[np.ix_(*places)])
+
+
+def _without_holes(likelihood: Float32, mask: Mask) -> Float32:
+    """Return likelihoods with the holes of sheets closed, and the gaps between sheets and the pleura."""
+    solid = np.asfortranarray((likelihood > 0) | ~mask)
+    hidden = closed(solid, HOLE_MM, (BLOCK * EDGE_MM,) * 3) & mask
+    return np.where(hidden, np.maximum(likelihood, HOLE_LIKELIHOOD), likelihood)
+
+
+def _regions_of(
+    labels: Int32, likelihood: Float32, below: Bool, used: Bool, cubic: Cubic, low: Int
+) -> Regions:
+    count = len(used)
+    sums, faces = (np.zeros((count + 1) ** 2) for _ in range(2))
+    for axis in range(3):
+        one, other = np.moveaxis(labels, axis, 0)[:-1], np.moveaxis(labels, axis, 0)[1:]
+        value = np.moveaxis(likelihood, axis, 0)
+        meet = (one != other) & (one > 0) & (other > 0)
+        pair = one[meet].astype(np.int64) * (count + 1) + other[meet]
+        sums += np.bincount(pair, np.maximum(value[:-1], value[1:])[meet], minlength=sums.size)
+        faces += np.bincount(pair, minlength=sums.size)
+    square = [each.reshape(count + 1, count + 1)[1:, 1:] for each in (sums, faces)]
+    at = np.argwhere(labels > 0)
+    owner = labels[tuple(at.T)]
+    middle = ((at + 0.5) * BLOCK + low)[:, ::-1] * EDGE_MM / cubic.grid.spacing_mm - 0.5
+    places = cubic.grid.lps(middle)
+    return Regions(
+        volume=np.bincount(owner, minlength=count + 1)[1:].astype(np.float64),
+        moment=np.stack([np.bincount(owner, p, minlength=count + 1)[1:] for p in places.T], axis=1),
+        likelihood=square[0] + square[0].T,
+        faces=square[1] + square[1].T,
+        below=below,
+        used=used,
+    )
+
+
+def _conductance(resistance: Float32, mask: Mask) -> list[Float32]:
+    """Return the conductance from each voxel to the next along i, j, k; 0 unless both lie in the lung."""
+    found = []
+    for axis in (2, 1, 0):
+        made = np.zeros(mask.shape, dtype=np.float32)
+        first, inside, of = (np.moveaxis(each, axis, 0) for each in (made, mask, resistance))
+        first[:-1] = np.where(inside[:-1], inside[1:], False) / (of[:-1] + of[1:])
+        found.append(made)
+    return found
+
+
+def _borders(labels: Int32) -> Mask:
+    """Return the voxels on both sides of every face between two labels."""
+    found = np.zeros(labels.shape, dtype=np.bool_)
+    for axis in range(3):
+        at, mark = np.moveaxis(labels, axis, 0), np.moveaxis(found, axis, 0)
+        meet = at[:-1] != at[1:]
+        mark[:-1] |= meet
+        mark[1:] |= meet
+    return found
+
+
+def _grown(mask: Mask, voxels: int) -> Mask:
+    from scipy import ndimage
+
+    return np.asarray(ndimage.binary_dilation(mask, iterations=voxels))
+
+
+def _seen_shares(lobes: UInt8, sheets: Fissureness) -> dict[str, float]:
+    """Return at which share of each border a fissure is seen, of where one could be."""
+    near, shares = _grown(sheets.seen, SEEN_WITHIN_VOXELS), {}
+    for name, sides in FISSURES.items():
+        one, other = (np.isin(lobes, side) for side in sides)
+        border = (_grown(one, 1) & other | _grown(other, 1) & one) & sheets.looked
+        if border.any():
+            shares[name] = float(near[border].mean())
+    return shares

@@ -1,0 +1,134 @@
+"""Fissures are sheets, not noise or tubes; bronchi and fissures together say where each lobe is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from anatomy.grid import Grid
+from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
+from anatomy.segmentation.cubic import Cubic
+from anatomy.segmentation.fissures import fissureness
+from anatomy.segmentation.kernels.flooding import diffuse, flood
+from anatomy.segmentation.lobar_bronchi import Regions, lobes_of_branches
+from anatomy.segmentation.lobes import SEEN, lobes_given
+
+SHAPE = (40, 50, 60)
+
+
+@pytest.mark.parametrize("spacing", [(0.7, 0.8, 1.0), (0.5, 1.5, 2.5)])
+def test_cubic_voxels_keep_a_gradient_and_find_the_same_place_again(spacing: tuple[float, ...]) -> None:
+    grid = Grid.from_spacing((41, 33, 20), spacing, (5.0, -3.0, 9.0))
+    cubic = Cubic.over(grid)
+    places = np.moveaxis(np.indices(grid.shape), 0, -1)
+    height = grid.lps(places.reshape(-1, 3))[:, 2].reshape(grid.shape).astype(np.float32)
+    made = cubic.mean(height)
+    assert made.shape == cubic.shape
+    assert np.abs(cubic.back(made) - height)[:, :, 2:-2].max() <= 0.5 * max(spacing[2], 1.0) + 1e-3
+    voxel = (20, 10, 12)
+    marked = np.zeros(grid.shape, dtype=bool)
+    marked[voxel[0] - 1 : voxel[0] + 2, voxel[1] - 1 : voxel[1] + 2, voxel[2]] = True
+    k, j, i = cubic.index(grid.lps(np.array([voxel])))[0]
+    assert cubic.sampled(marked)[k, j, i]
+
+
+@pytest.fixture(scope="module")
+def noisy_lung() -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return (-860.0 + 20.0 * rng.standard_normal(SHAPE)).astype(np.float32)
+
+
+def test_a_sheet_is_seen_and_noise_and_tubes_are_not(noisy_lung: np.ndarray) -> None:
+    """A tilted sheet of 100 HU, as a fissure has at 1 mm, and a tube of 200 HU."""
+    k, j, i = np.indices(SHAPE)
+    offset = (k - 20 - 0.4 * (j - 25)) / np.hypot(1.0, 0.4)
+    hu = noisy_lung + 100.0 * np.exp(-0.5 * offset**2)
+    hu += 200.0 * np.exp(-0.5 * ((k - 33) ** 2 + (i - 30) ** 2) / 1.5**2)
+    lung = np.zeros(SHAPE, dtype=bool)
+    lung[2:-2, 2:-2, 2:-2] = True
+    found = fissureness(hu.astype(np.float32), lung, np.zeros(SHAPE, dtype=bool))
+    sheet = found.looked & (np.abs(offset) < 0.5)
+    assert found.seen[sheet].mean() > 0.95
+    assert not found.seen[np.abs(offset) > 4].any()
+    assert not fissureness(noisy_lung, lung, ~lung).seen.any()
+
+
+def test_a_flood_goes_round_a_wall_if_that_costs_less() -> None:
+    labels, cost = np.zeros((1, 3, 9), dtype=np.int32), np.ones((1, 3, 9), dtype=np.float32)
+    labels[0, 0, 0], labels[0, 0, 8], cost[0, :, 2] = 1, 2, 50.0
+    flood(labels, cost)
+    assert (labels[0, :, :2] == 1).all() and (labels[0, :, 3:] == 2).all()
+    labels = np.full((1, 3, 9), -1, dtype=np.int32)
+    labels[0, 0] = 0
+    labels[0, 0, 0] = 7
+    flood(labels, cost)
+    assert (labels[0, 0] == 7).all() and (labels[0, 1] == -1).all()
+
+
+def test_shares_fall_evenly_between_two_fixed_ends() -> None:
+    share = np.zeros((3, 3, 13), dtype=np.float32)
+    share[1, 1, 1] = 1.0
+    along = np.zeros(share.shape, dtype=np.float32)
+    along[1, 1, 1:11] = 1.0
+    nothing = np.zeros_like(along)
+    free = np.ravel_multi_index((1, 1, np.arange(2, 11)), share.shape)
+    diffuse(share, free, along, nothing, nothing, 200, np.float32(1.5))
+    assert share[1, 1, 1:12] == pytest.approx(np.linspace(1.0, 0.0, 11), abs=1e-4)
+
+
+def regions(volume: list[float], places: list[list[float]], fissures: list[tuple[int, int]]) -> Regions:
+    """Regions of a main bronchus 0 that divides into 1 and 2; 3 and 4 are branches of 1, 5 and 6 of 2."""
+    parent = [-1, 0, 0, 1, 1, 2, 2]
+    below = np.eye(7, dtype=bool)
+    for branch in range(6, 0, -1):
+        below[parent[branch]] |= below[branch]
+    faces, likelihood = np.zeros((2, 7, 7))
+    for one, other in ((3, 4), (5, 6), (4, 5)):
+        faces[one, other] = faces[other, one] = 200.0
+    for one, other in fissures:
+        likelihood[one, other] = likelihood[other, one] = 160.0
+    size = np.array(volume)
+    used = size > 0
+    return Regions(
+        volume=size, moment=size[:, None] * np.array(places), likelihood=likelihood, faces=faces,
+        below=below,
+        used=used,
+    )  # fmt: skip
+
+
+PLACES = [[0.0, 0, 0], [0, 0, 50], [0, 0, -50], [0, 0, 90], [0, 0, 50], [0, -40, -20], [0, 40, -60]]
+VOLUME = [0.0, 10, 10, 300, 200, 300, 300]
+
+
+def test_the_parting_is_where_the_fissure_is() -> None:
+    lobes = (LEFT_UPPER, LEFT_LOWER)
+    between = lobes_of_branches(regions(VOLUME, PLACES, [(4, 5)]), lobes)
+    assert between[3:].tolist() == [LEFT_UPPER, LEFT_UPPER, LEFT_LOWER, LEFT_LOWER]
+    inside = lobes_of_branches(regions(VOLUME, PLACES, [(5, 6)]), lobes)
+    assert inside[3:].tolist() == [LEFT_UPPER, LEFT_UPPER, LEFT_UPPER, LEFT_LOWER]
+
+
+def test_the_middle_lobe_lies_in_front_and_leading_branches_have_no_lobe() -> None:
+    lobes = (RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER)
+    found = lobes_of_branches(regions(VOLUME, PLACES, [(4, 5), (5, 6)]), lobes)
+    assert found[[0, 2]].tolist() == [0, 0]
+    assert found[3:].tolist() == [RIGHT_UPPER, RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER]
+
+
+def test_without_fissures_usual_shares_decide() -> None:
+    found = lobes_of_branches(regions(VOLUME, PLACES, []), (LEFT_UPPER, LEFT_LOWER))
+    assert found[3:].tolist() == [LEFT_UPPER, LEFT_UPPER, LEFT_LOWER, LEFT_LOWER]
+
+
+def test_too_few_bronchi_give_no_lobes() -> None:
+    one = regions([0.0, 0, 0, 300, 0, 0, 0], PLACES, [])
+    assert not lobes_of_branches(one, (LEFT_UPPER, LEFT_LOWER)).any()
+
+
+def test_corrected_lobes_have_fissures_between_them() -> None:
+    lobes = np.zeros((4, 4, 4), dtype=np.uint8)
+    lobes[:2], lobes[2:] = LEFT_UPPER, LEFT_LOWER
+    made = lobes_given(lobes, None)
+    assert (made["fissures"][1:3] == SEEN).all() and not made["fissures"][[0, 3]].any()
+    own = np.ones_like(lobes)
+    assert lobes_given(lobes, own)["fissures"] is own

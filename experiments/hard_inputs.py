@@ -28,9 +28,8 @@ from anatomy.segmentation.pipeline import read_ct
 from anatomy.tree import tree_from_mask
 from experiments.support.segmentation.hard_cases import CASES
 from experiments.support.segmentation.hard_images import HardImage, phantom_image
-from experiments.support.segmentation.hard_runs import Outcome, run, segmented
+from experiments.support.segmentation.hard_runs import Outcome, plain_tree, run, segmented
 
-PLAIN = "axes: as it is"
 SEED = 3
 ANYWHERE = ("axes", "header", "scale", "shift", "noise", "slices")
 """Groups of cases that need not know where the organs lie."""
@@ -58,12 +57,11 @@ def outcomes(record: Path, pattern: str, ct: Path | None) -> dict[str, Outcome]:
     if record.is_file():
         known = {name: Outcome(**row) for name, row in json.loads(record.read_text()).items()}
     image = phantom_image(make_phantom(seed=SEED, size="small")) if ct is None else ct_image(ct)
-    if PLAIN not in known:
-        known[PLAIN] = run(CASES[PLAIN], image)
+    plain = plain_tree(image)
     for name, case in CASES.items():
         anywhere = ct is None or case.group in ANYWHERE
         if name not in known and anywhere and re.search(pattern, name):
-            known[name] = run(case, image, known[PLAIN].tree)
+            known[name] = run(case, image, plain)
             print(f"{known[name].verdict:16} {name}", flush=True)
             record.parent.mkdir(parents=True, exist_ok=True)
             record.write_text(json.dumps({n: asdict(o) for n, o in known.items()}, indent=1) + "\n")
@@ -83,9 +81,8 @@ def table(found: dict[str, Outcome]) -> str:
         "|---|---|---|---|---|",
     ]
     for name, o in found.items():
-        plain = o.tree if name != PLAIN else 1.0
         figures = (
-            ("", "") if o.verdict.startswith("refused") else (f"{o.right:.3f}, {o.left:.3f}", f"{plain:.2f}")
+            ("", "") if o.verdict.startswith("refused") else (f"{o.right:.3f}, {o.left:.3f}", f"{o.tree:.2f}")
         )
         first = o.said.split(". ")[0].split(": about")[0].rstrip(".").replace("|", "/")
         rows.append(f"| {name} | {o.verdict} | {figures[0]} | {figures[1]} | {first[:110]} |")

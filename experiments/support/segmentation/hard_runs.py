@@ -58,8 +58,16 @@ class Outcome:
     said: str = ""
 
 
-def run(case: HardCase, image: HardImage, plain_tree: float = 1.0) -> Outcome:
-    """Segment the image of a case up to the airways and plausibility the result by the truth."""
+def plain_tree(image: HardImage) -> float:
+    """Return the share of the tree that is found in an image that nothing makes hard."""
+    return tree_share(upright(image), segmented(image.ct)[1])
+
+
+def run(case: HardCase, image: HardImage, plain: float) -> Outcome:
+    """Segment the image of a case up to the airways and judge the result by the truth.
+
+    `plain` is the share of the tree that is found without what makes the case hard.
+    """
     made = case.make(image)
     try:
         lungs, lumen, warnings = segmented(made.ct, thick=case.thick, accepted=case.accepted)
@@ -74,7 +82,7 @@ def run(case: HardCase, image: HardImage, plain_tree: float = 1.0) -> Outcome:
         dice(found, of_lobes(made, lobes)) if of_lobes(made, lobes).any() else float(not found.any())
         for found, lobes in ((lungs.right, RIGHT_LUNG), (lungs.left, LEFT_LUNG))
     )
-    tree = tree_share(made, lumen) / plain_tree
+    tree = tree_share(made, lumen) / plain
     good = min(right, left) >= LEAST_DICE and tree >= LEAST_TREE and not (case.refuse or case.warn)
     warned = bool(case.words) and re.search(case.words, said) is not None and not case.refuse
     verdict = "right" if good else "warned" if warned else "SILENTLY WRONG"

@@ -63,6 +63,14 @@ class Contender:
         """Share of successes."""
         return self.successes / self.samples
 
+    def clearly_beats(self, other: Contender) -> bool:
+        """Tell whether it succeeds more often by more than the standard error of the difference.
+
+        The error is that of draws of their own, which is more than that of common random numbers.
+        """
+        variance = sum(max(each.share * (1.0 - each.share), 0.01) / each.samples for each in (self, other))
+        return self.share - other.share > math.sqrt(variance)
+
 
 class SuccessSearch:
     """Finds plans to one target that succeed more and more often.
@@ -83,6 +91,7 @@ class SuccessSearch:
         self._counterfactuals = counterfactuals
         self._arcs = DirectArcs(task, atlas)
         self._model: Plan | None = None
+        self._by_cost: Contender | None = None
 
     def steps(self) -> Iterator[tuple[Contender, int]]:
         """Yield the best contender so far, often, and the number of variations tried.
@@ -100,8 +109,9 @@ class SuccessSearch:
             yield first, 0
         started = [each for each in (first, *islice(pool, halving.pool - 1)) if each]
         best = yield from self._halved([*started, self._cheapest()], first)
-        yield best, 0
-        yield from self._challenged(best, pool)
+        yield self._sure(best), 0
+        for challenged, tried in self._challenged(best, pool):
+            yield self._sure(challenged), tried
 
     def finished(self, contender: Contender, iteration: int, elapsed_s: float) -> Plan:
         """Return the whole plan of a contender."""
@@ -182,11 +192,20 @@ class SuccessSearch:
                 counted.append(self._counted(each, samples))
                 if leader is not None:
                     yield leader, 0
+            self._by_cost = next(each for each in counted if each.candidate is None)
             contenders = sorted(counted, key=lambda each: -each.successes)
             by_cost = [each for each in contenders[kept:] if each.candidate is None and kept > 1]
             contenders = [*contenders[:kept], *by_cost]
-            leader = contenders[0]
+            leader = self._sure(contenders[0])
         return contenders[0]
+
+    def _sure(self, best: Contender) -> Contender:
+        """Return the best contender, or the plan of least cost if it does not clearly beat that.
+
+        So no plan is worse than that of least cost by the luck of few draws.
+        """
+        cheapest = self._by_cost
+        return best if cheapest is None or best.clearly_beats(cheapest) else cheapest
 
     def _challenged(self, best: Contender, others: Iterator[Contender]) -> Iterator[tuple[Contender, int]]:
         """Let variations of the best contender challenge it, and every other time one of the pool's rest.

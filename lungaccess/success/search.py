@@ -115,9 +115,9 @@ class SuccessSearch:
 
     def finished(self, contender: Contender, iteration: int, elapsed_s: float) -> Plan:
         """Return the whole plan of a contender."""
-        if contender.candidate is None:
-            return contender.plan
         timing = {"planning_s": elapsed_s, "atlas_s": self._atlas.build_s}
+        if contender.candidate is None:
+            return replace(contender.plan, timing=timing)
         return assemble(self._task, contender.candidate, iteration=iteration, timing=timing)
 
     def _ranked(self, clear: Int) -> Int:

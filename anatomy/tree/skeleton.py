@@ -15,6 +15,9 @@ from anatomy.typed import Bool, Float, Int
 LOOP_EDGES = 12
 """A ring of fewer skeleton voxels is roughness of the mask, not two airways that touch."""
 
+RING_APART_MM = 3.0
+"""Rings that begin nearer to each other are one: a wide contact of two airways closes many."""
+
 CONTACT_COST = 100.0
 """A step across a mere contact counts as this many steps in the lumen: it is taken only where nothing else
 joins."""
@@ -150,6 +153,7 @@ def _rings(tree: SkeletonTree, left_out: list[tuple[int, int]]) -> list[tuple[in
         return []
     parent, level = _hang(tree.neighbours, left_out[0][0])
     rings: list[tuple[int, int, float]] = []
+    begins = np.zeros((len(left_out), 3))
     for p, q in left_out:
         around, a, b = [p], p, q
         back = [q]
@@ -161,8 +165,11 @@ def _rings(tree: SkeletonTree, left_out: list[tuple[int, int]]) -> list[tuple[in
                 b = parent[b]
                 back.append(b)
         nodes = around + back[::-1]
-        near = any(np.linalg.norm(tree.mm[p] - tree.mm[r[0]]) < 3.0 for r in rings)
-        if len(nodes) >= LOOP_EDGES and not near:
+        if len(nodes) < LOOP_EDGES:
+            continue
+        others = begins[: len(rings)]
+        if not (np.linalg.norm(others - tree.mm[p], axis=1) < RING_APART_MM).any():
+            begins[len(rings)] = tree.mm[p]
             rings.append((p, q, tree.length_mm([*nodes, p])))
     return rings
 

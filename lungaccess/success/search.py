@@ -26,8 +26,8 @@ from lungaccess.success.estimate import ChanceEstimator, Counter
 MANY = 10.0
 """Clear deployments that a scope tip needs so that one is likely to be left after measuring: ten lie some
 millimetres or degrees apart, as far as the errors move the tip.  It only ranks."""
-BY_COST = 100
-"""Iterations of the search by cost, whose best plan takes part."""
+BY_COST = 300
+"""Iterations of the search by cost, whose best plan takes part: more make it only a little cheaper."""
 TURN_RAD, SHIFT_MM = math.radians(10.0), 2.0
 """Standard deviations of the first variations: less than the spacing of the atlas."""
 SHRINK = 0.98

@@ -132,9 +132,8 @@ def _accepted(names: tuple[str, ...]) -> tuple[str, ...]:
     if not names:
         return ()
     return (
-        f"The segmentation failed its check of {', '.join(names)}, and a person accepted that: look at "
-        "the masks "
-        "before planning.",
+        f"The segmentation failed its check of {', '.join(names)}, and a person accepted that: look at the "
+        "masks before planning.",
     )
 
 

@@ -12,8 +12,7 @@ def canonical(volume: Volume) -> Volume:
     """Return an image with its voxels in the order right to left, front to back, feet to head.
 
     Only the order of the voxels changes: every voxel keeps its place in the patient.  An image in this order
-    is
-    returned as it is.
+    is returned as it is.
     """
     order, flipped = towards_lps(volume.grid.lps_from_ijk[:3, :3])
     if order == (0, 1, 2) and not any(flipped):

@@ -156,18 +156,15 @@ def _sizes(ct: Volume, lungs: Lungs, median: float) -> list[Implausible]:
 def _density_warnings(median: float) -> list[str]:
     if DENSITY_HU[0] <= median < THIN_HU:
         return [
-            f"The lungs are thin: their median is {median:.0f} HU. In emphysema the walls of small "
-            "airways have "
-            "little contrast, and pockets of air look like airways: look at the thin ones on the way to "
-            "the target."
+            f"The lungs are thin: their median is {median:.0f} HU. In emphysema the walls of small airways "
+            "have little contrast, and pockets of air look like airways: look at the thin ones on the way "
+            "to the target."
         ]
     if DENSE_HU < median <= DENSITY_HU[1]:
         return [
-            f"The lungs are dense: their median is {median:.0f} HU, as after breathing out or with "
-            "oedema. They are "
-            "smaller than when inflated, and vessels have less contrast: plan on the state of breathing "
-            "of the "
-            "procedure."
+            f"The lungs are dense: their median is {median:.0f} HU, as after breathing out or with oedema. "
+            "They are smaller than when inflated, and vessels have less contrast: plan on the state of "
+            "breathing of the procedure."
         ]
     return []
 
@@ -202,6 +199,5 @@ def _doubt(name: str) -> str:
     what = "left and right" if name == "sides" else "front and back"
     return (
         f"The anatomy does not tell {what} for sure: look at segmentation.png whether they are where they "
-        "belong. "
-        "If the header is wrong, every plan is for the wrong place."
+        "belong. If the header is wrong, every plan is for the wrong place."
     )

@@ -40,10 +40,9 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
     """
     return tuple(
         f"About {lost_ml / 1000.0:.2f} l of lung are missing in the {name}: only {100 * share:.0f} % of "
-        "what lies "
-        "there in a healthy chest is lung. It may be solid, full of fluid or collapsed. Its airways and "
-        "vessels "
-        f"are not seen, it counts as outside the lung, and reach in the {name} is understated."
+        "what lies there in a healthy chest is lung. It may be solid, full of fluid or collapsed. Its "
+        f"airways and vessels are not seen, it counts as outside the lung, and reach in the {name} is "
+        "understated."
         for name, share, lost_ml in _zones(left, right, grid, carina_lps)
         if share < LEAST_FILLED
     )

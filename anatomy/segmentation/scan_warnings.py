@@ -37,25 +37,21 @@ def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
     if metal >= LEAST_METAL_ML:
         warnings.append(
             f"{metal:.1f} ml of metal lie between or beside the lungs: its streaks hide airways and "
-            "vessels in "
-            "the slices around it, so a path that looks free there may not be."
+            "vessels in the slices around it, so a path that looks free there may not be."
         )
     noise = noise_hu(ct, near)
     if noise > LOUD_HU:
         loss = 100.0 * LOSS_PER_HU * (noise - 20.0)
         warnings.append(
             f"The noise is {noise:.0f} HU: {loss:.0f} % of the airways or more, the thin ones, are not "
-            "found, and "
-            "reach is understated by what they lead to. A reconstruction with a smoother kernel or "
-            "thicker slices "
-            "(up to 1.5 mm) shows more."
+            "found, and reach is understated by what they lead to. A reconstruction with a smoother "
+            "kernel or thicker slices (up to 1.5 mm) shows more."
         )
     if slice_mm(ct) > COARSE_SLICES_MM:
         warnings.append(
             f"The slices are {slice_mm(ct):.1f} mm apart: bronchi look narrower than they are, and thin "
-            "ones are "
-            "missing, so that reach is understated, most in the upper and lower lobes. Slices of 1 mm "
-            "show more."
+            "ones are missing, so that reach is understated, most in the upper and lower lobes. Slices of "
+            "1 mm show more."
         )
     return tuple(warnings)
 

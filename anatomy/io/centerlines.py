@@ -12,6 +12,7 @@ from anatomy.errors import FileError, FrameError
 from anatomy.grid import transform_points
 from anatomy.io.files import require_suffix, write_text
 from anatomy.io.frames import LPS_FROM, Frame
+from anatomy.io.image_header import MOST_COORDINATE_MM
 from anatomy.io.vtk_xml import VtkFile, VtkPiece, read_vtk_xml
 from anatomy.tree import tree_from_graph
 from anatomy.typed import Float, Int
@@ -71,6 +72,12 @@ def read_centerline_graph(path: str | Path, *, frame: Frame | None = None) -> tu
             remedy="Save the centreline model, not a surface",
         )
     lps = transform_points(lps_from_file, np.concatenate(points))
+    if not np.abs(lps).max() <= MOST_COORDINATE_MM:
+        raise FrameError(
+            f"{path} has points that are no numbers, or absurdly far away",
+            expected=f"coordinates of at most {MOST_COORDINATE_MM:.0f} mm",
+            remedy="Export the centreline again, in mm",
+        )
     return lps, np.concatenate(radii), np.concatenate(edges)
 
 
@@ -103,7 +110,18 @@ def _frame(file: VtkFile, path: str | Path, given: Frame | None) -> Frame:
 def _radius(piece: VtkPiece, path: str | Path) -> Float:
     for name in RADIUS_NAMES:
         if name in piece.point_data:
-            return piece.point_data[name].astype(np.float64)
+            radius = piece.point_data[name].astype(np.float64)
+            if (
+                radius.shape != (len(piece.points),)
+                or not (radius >= 0).all()
+                or not np.isfinite(radius).all()
+            ):
+                raise FileError(
+                    f"{path} has radii in {name!r} that are negative or no numbers",
+                    expected="one length in mm a point",
+                    remedy="Export the centreline again",
+                )
+            return radius
     raise FileError(
         f"{path} has no radius; its point arrays are {sorted(piece.point_data)}",
         expected=f"a point array named {', '.join(RADIUS_NAMES)}",

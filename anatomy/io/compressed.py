@@ -29,11 +29,13 @@ def pieces(path: Path) -> Iterator[bytes]:
         At the end of a compressed file whose checksum is wrong or that was cut short.
     """
     with path.open("rb") as stream:
-        if is_gzip(path):
-            yield from inflate(stream, path)
-        else:
-            while piece := stream.read(PIECE_BYTES):
-                yield piece
+        yield from inflate(stream, path) if is_gzip(path) else plain_pieces(stream)
+
+
+def plain_pieces(stream: BinaryIO) -> Iterator[bytes]:
+    """Yield the rest of `stream` in pieces."""
+    while piece := stream.read(PIECE_BYTES):
+        yield piece
 
 
 def inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
@@ -61,20 +63,6 @@ def inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
         raise _damaged(path, f"its compressed data are corrupt ({error})") from error
     if not decoder.eof:
         raise _damaged(path, "it ends before its compressed data do")
-
-
-def require_intact(path: Path, offset: int) -> None:
-    """Decompress a file from `offset` on only to prove its checksum.
-
-    Raises
-    ------
-    FileError
-        If the data are damaged or end early.
-    """
-    with path.open("rb") as stream:
-        stream.seek(offset)
-        for _ in inflate(stream, path):
-            pass
 
 
 def _damaged(path: Path, why: str) -> FileError:

@@ -10,7 +10,8 @@ import numpy as np
 
 from anatomy.errors import FileError, FrameError
 from anatomy.grid import Grid, Volume
-from anatomy.io.nifti_header import named_grid
+from anatomy.io.files import reading
+from anatomy.io.image_header import image_shape, named_grid
 from anatomy.records import frozen_value
 from anatomy.typed import Float
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 _SPACING_TOLERANCE_MM = 0.05
 _TILT_TOLERANCE_MM = 0.1
 _MISSING_FACTOR = 1.5
-_UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept")
+_UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept", "SamplesPerPixel")
 _NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEYS)
 _SERIES_KEYS = ("SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames")
 
@@ -50,7 +51,8 @@ def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
         If there is no folder, or no DICOM image in it.
     """
     by_uid = _headers_by_series(Path(folder))
-    return tuple(_info(uid, files) for uid, files in sorted(by_uid.items()))
+    with reading(folder):
+        return tuple(_info(uid, files) for uid, files in sorted(by_uid.items()))
 
 
 def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
@@ -78,8 +80,10 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
     by_uid = _headers_by_series(Path(folder))
     headers = by_uid[_choose(by_uid, series_uid, folder)]
     where = f"Series {headers[0][1].SeriesInstanceUID} of {folder}"
-    _require_uniform([header for _, header in headers], where)
-    paths, grid = _geometry(headers, where)
+    with reading(where):
+        _require_uniform([header for _, header in headers], where)
+        _require_grey_values(headers[0][1], where)
+        paths, grid = _geometry(headers, where)
     return Volume(grid=grid, array=_pixels(paths, grid, where))
 
 
@@ -96,12 +100,13 @@ def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]
     by_uid: dict[str, list[tuple[Path, FileDataset]]] = {}
     tags: list[Any] = [*_SERIES_KEYS, *_NEEDED_KEYS]
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR"):
-        try:
-            header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
-        except InvalidDicomError:
-            continue
-        if "SeriesInstanceUID" in header and "Rows" in header:
-            by_uid.setdefault(str(header.SeriesInstanceUID), []).append((path, header))
+        with reading(path):
+            try:
+                header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
+            except InvalidDicomError:
+                continue
+            if "SeriesInstanceUID" in header and "Rows" in header:
+                by_uid.setdefault(str(header.SeriesInstanceUID), []).append((path, header))
     if not by_uid:
         raise FileError(
             f"{folder} holds no DICOM images",
@@ -169,6 +174,18 @@ def _require_uniform(headers: Iterable[FileDataset], where: str) -> None:
                 )
 
 
+def _require_grey_values(first: FileDataset, where: str) -> None:
+    """Refuse slices that do not hold one Hounsfield unit a pixel; all slices say the same as the first."""
+    slope, samples = float(first.RescaleSlope), int(first.SamplesPerPixel)
+    if samples != 1 or slope == 0 or not np.isfinite([slope, float(first.RescaleIntercept)]).all():
+        raise FileError(
+            f"{where} has {samples} samples a pixel, RescaleSlope {slope:g} "
+            f"and RescaleIntercept {first.RescaleIntercept}",
+            expected="one sample a pixel, which slope and intercept turn into Hounsfield units",
+            remedy="Export the CT series again, not a picture of it",
+        )
+
+
 def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[list[Path], Grid]:
     """Sort the slices along their normal and prove that they form a rectangular grid."""
     first = headers[0][1]
@@ -190,7 +207,8 @@ def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([along_i * spacing_i_mm, along_j * spacing_j_mm, normal * spacing_k_mm], axis=1)
     matrix[:3, 3] = positions[0]
-    shape = (int(first.Columns), int(first.Rows), len(headers))
+    stored_bytes = sum(path.stat().st_size for path, _ in headers)
+    shape = image_shape((int(first.Columns), int(first.Rows), len(headers)), 2, Path(where), stored_bytes)
     return [headers[n][0] for n in order], named_grid(shape, matrix, Path(where))
 
 

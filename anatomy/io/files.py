@@ -6,13 +6,24 @@ import hashlib
 import json
 import os
 import secrets
+import struct
 import tomllib
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 from anatomy.errors import FileError, SettingsError
+
+DAMAGE = (
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RecursionError, TypeError,
+    SyntaxError, ValueError, BadZipFile, struct.error, zlib.error,
+)  # fmt: skip
+"""What code raises that reads a damaged file."""
+MOST_REASON = 300
+"""Letters of a reason that are shown: a damaged file can be quoted without end."""
 
 
 def sha256(path: str | Path) -> str:
@@ -23,11 +34,8 @@ def sha256(path: str | Path) -> str:
     FileError
         If the file cannot be read.
     """
-    try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise unreadable(path, error) from error
+    with reading(path), open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def require_file(path: str | Path) -> Path:
@@ -43,10 +51,8 @@ def require_file(path: str | Path) -> Path:
 def read_text(path: str | Path) -> str:
     """Read a UTF-8 text file, or raise `FileError`."""
     path = require_file(path)
-    try:
+    with reading(path):
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise unreadable(path, error) from error
 
 
 def read_toml(
@@ -73,10 +79,26 @@ def read_toml(
         ) from error
 
 
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Turn what reading a damaged file raises into a `FileError` that names the file.
+
+    Raises
+    ------
+    FileError
+        If the block raises one of `DAMAGE`; typed errors pass.
+    """
+    try:
+        yield
+    except DAMAGE as error:
+        raise unreadable(path, error) from error
+
+
 def unreadable(path: str | Path, error: Exception) -> FileError:
     """Make the error for a file that exists but cannot be read."""
+    reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
     return FileError(
-        f"{path} cannot be read: {error}",
+        f"{path} cannot be read: {reason[:MOST_REASON]}",
         expected="a readable, complete file",
         remedy="Copy or export the file again",
     )

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from anatomy.errors import FileError
 from anatomy.grid import Grid, Volume
-from anatomy.io.compressed import require_intact
-from anatomy.io.files import atomic_write, require_file, unreadable
-from anatomy.io.frames import LPS_FROM, Frame
-from anatomy.io.itk_headers import metaimage_payload, nrrd_labels, read_nrrd_header, stated_frame
-from anatomy.io.nifti import begins_as_nifti, read_nifti, read_nifti_header, read_nifti_mask, require_numbers
-from anatomy.io.nifti_header import right_handed_grid
-
-if TYPE_CHECKING:
-    import SimpleITK
+from anatomy.io.files import atomic_write, reading, require_file
+from anatomy.io.frames import Frame
+from anatomy.io.image_header import ImageHeader
+from anatomy.io.metaimage import open_metaimage
+from anatomy.io.nifti import begins_as_nifti, open_nifti
+from anatomy.io.nrrd import open_nrrd
+from anatomy.io.voxels import read_nonzero, read_values
 
 NIFTI, NRRD, METAIMAGE = (".nii.gz", ".nii", ".gz"), (".seg.nrrd", ".nrrd"), (".mha", ".mhd")
-T = TypeVar("T")
 
 MOST_NOTE = 79
 """Letters that the description in a NIfTI header has room for."""
@@ -50,18 +46,8 @@ def images_in(folder: Path) -> list[Path]:
 def read_grid(path: str | Path, *, frame: Frame | None = None) -> Grid:
     """Read the grid of an image from its header alone; parameters and errors as `read_volume`."""
     path = require_file(path)
-    if _suffix(path) in NIFTI:
-        return _guard(path, read_nifti_header, path, frame).grid
-    import SimpleITK
-
-    reader = SimpleITK.ImageFileReader()
-    reader.SetFileName(str(path))
-    try:
-        reader.ReadImageInformation()
-    except RuntimeError as error:
-        raise unreadable(path, RuntimeError(_last_line(error))) from error
-    _require_three_dimensions(path, reader.GetDimension(), reader.GetNumberOfComponents())
-    return _itk_grid(reader, path, frame)[0]
+    with reading(path):
+        return _open(path, frame)[0].grid
 
 
 def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
@@ -82,17 +68,13 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
     Raises
     ------
     FileError
-        If the file is missing, damaged, truncated or no image of three dimensions.
+        If the file is missing, damaged, truncated, absurdly large or no image of three dimensions.
     FrameError
         If the file states no frame and none is given, or its axes are not perpendicular.
     """
     path = require_file(path)
-    if _suffix(path) in NIFTI:
-        return _guard(path, read_nifti, path, frame)
-    image = _read_itk(path)
-    array = np.asarray(_ImageBuffer(image)).T
-    grid, is_reversed = _itk_grid(image, path, frame)
-    return Volume(grid=grid, array=array[::-1] if is_reversed else array)
+    with reading(path):
+        return read_values(*_open(path, frame), path)
 
 
 def read_mask(path: str | Path, *, frame: Frame | None = None) -> Volume:
@@ -106,11 +88,8 @@ def read_mask(path: str | Path, *, frame: Frame | None = None) -> Volume:
         As `read_volume`.
     """
     path = require_file(path)
-    if _suffix(path) in NIFTI:
-        return _guard(path, read_nifti_mask, path, frame)
-    volume = read_volume(path, frame=frame)
-    require_numbers(volume.array, path)
-    return Volume(grid=volume.grid, array=volume.array != 0)
+    with reading(path):
+        return read_nonzero(*_open(path, frame), path)
 
 
 def read_labels(path: str | Path) -> Mapping[int, str]:
@@ -123,10 +102,24 @@ def read_labels(path: str | Path) -> Mapping[int, str]:
         there is none.
     """
     path = require_file(path)
-    suffix = _suffix(path)
+    with reading(path):
+        return _open(path, "lps")[0].labels
+
+
+def _open(path: Path, frame: Frame | None) -> tuple[ImageHeader, Iterator[bytes]]:
+    """Read the header of a file of any format, and return it with the bytes of the voxels."""
+    suffix = image_suffix(path)
     if suffix in NIFTI:
-        return _guard(path, read_nifti_header, path, "lps").labels
-    return nrrd_labels(read_nrrd_header(path)) if suffix in NRRD else {}
+        return open_nifti(path, frame)
+    if suffix in NRRD:
+        return open_nrrd(path, frame)
+    if suffix in METAIMAGE:
+        return open_metaimage(path)
+    raise FileError(
+        f"{path} is of an unknown kind",
+        expected="an image ending in " + ", ".join(SUFFIXES),
+        remedy="Convert the image to NIfTI (.nii.gz) with the program that wrote it",
+    )
 
 
 def write_volume(
@@ -174,81 +167,4 @@ def write_volume(
         try:
             SimpleITK.WriteImage(image, str(temporary), useCompression=path.suffix != ".nii")
         except RuntimeError as error:
-            raise OSError(_last_line(error)) from error
-
-
-class _ImageBuffer:
-    """Keeps an ITK image alive for as long as an array looks into its memory."""
-
-    def __init__(self, image: SimpleITK.Image) -> None:
-        import SimpleITK
-
-        self._image = image
-        self.__array_interface__ = SimpleITK.GetArrayViewFromImage(image).__array_interface__
-
-
-def _suffix(path: Path) -> str:
-    suffix = image_suffix(path)
-    if suffix is None:
-        raise FileError(
-            f"{path} is of an unknown kind",
-            expected="an image ending in " + ", ".join(SUFFIXES),
-            remedy="Convert the image to NIfTI (.nii.gz) with the program that wrote it",
-        )
-    return suffix
-
-
-def _guard(path: Path, function: Callable[..., T], *arguments: object) -> T:
-    try:
-        return function(*arguments)
-    except OSError as error:
-        raise unreadable(path, error) from error
-
-
-def _read_itk(path: Path) -> SimpleITK.Image:
-    import SimpleITK
-
-    _guard(path, _require_intact_payload, path)
-    try:
-        image = SimpleITK.ReadImage(str(path))
-    except RuntimeError as error:
-        raise unreadable(path, RuntimeError(_last_line(error))) from error
-    _require_three_dimensions(path, image.GetDimension(), image.GetNumberOfComponentsPerPixel())
-    return image
-
-
-def _require_three_dimensions(path: Path, dimensions: int, components: int) -> None:
-    if (dimensions, components) != (3, 1):
-        raise FileError(
-            f"{path} is not one image of three dimensions with one number a voxel",
-            expected="one three-dimensional image",
-            remedy="Export overlapping segments to separate files, or merge them into one label map",
-        )
-
-
-def _require_intact_payload(path: Path) -> None:
-    """Prove the checksum of compressed data: ITK returns damaged voxels without a word."""
-    if image_suffix(path) in NRRD:
-        header = read_nrrd_header(path)
-        if header.fields.get("encoding") in ("gzip", "gz"):
-            require_intact(path, header.data_offset)
-    else:
-        payload = metaimage_payload(path)
-        if payload is not None:
-            require_intact(*payload)
-
-
-def _itk_grid(
-    image: SimpleITK.Image | SimpleITK.ImageFileReader, path: Path, frame: Frame | None
-) -> tuple[Grid, bool]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
-    matrix[:3, 3] = image.GetOrigin()
-    if image_suffix(path) in NRRD and not stated_frame(read_nrrd_header(path), path, frame):
-        matrix = LPS_FROM[str(frame)] @ matrix
-    ni, nj, nk = image.GetSize()
-    return right_handed_grid((ni, nj, nk), matrix, path)
-
-
-def _last_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[-1]
+            raise OSError(str(error).strip().splitlines()[-1]) from error

@@ -14,9 +14,9 @@ from anatomy.grid import Grid
 from anatomy.io.files import sha256
 from anatomy.io.frames import Frame
 from anatomy.io.images import read_grid, read_mask, read_volume
-from anatomy.io.nifti import require_numbers
 from anatomy.io.placement import Placed, covers_same_voxels, place, union_grid
 from anatomy.io.placement_words import moved, placement
+from anatomy.io.voxels import require_numbers
 from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Array, Mask, UInt8
 

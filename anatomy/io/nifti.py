@@ -1,81 +1,82 @@
-"""Voxels of NIfTI files, streamed so that a mask never exists as anything but bool."""
+"""NIfTI-1 and NIfTI-2 files: voxel type, grid in LPS, names of labels, and the stream of voxels.
+
+The affine is read here and not by an image library, because libraries silently fall back to
+another transform when the stored one is sheared, and to an invented one when none is stored.
+"""
 
 from __future__ import annotations
 
+import re
+import struct
 from collections.abc import Iterator
+from itertools import chain, product
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, FileError
-from anatomy.grid import Volume
+from anatomy.errors import FileError, FrameError
+from anatomy.grid import transform_points
 from anatomy.io.compressed import pieces
-from anatomy.io.frames import Frame
-from anatomy.io.nifti_header import NiftiHeader, data_offset, is_header, parse_header
-from anatomy.typed import Array
+from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
+from anatomy.io.image_header import MOST_HEADER_BYTES, ImageHeader, image_shape, not_begun, right_handed_grid
+from anatomy.typed import Float
 
+_VERSION_1: dict[str, tuple[int, str]] = {
+    "dim": (40, "8h"), "datatype": (70, "h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),
+    "slope": (112, "2f"), "units": (123, "B"), "codes": (252, "2h"), "quatern": (256, "6f"),
+    "srow": (280, "12f"),
+}  # fmt: skip
+_VERSION_2: dict[str, tuple[int, str]] = {
+    "dim": (16, "8q"), "datatype": (12, "h"), "pixdim": (104, "8d"), "vox_offset": (168, "q"),
+    "slope": (176, "2d"), "units": (500, "i"), "codes": (344, "2i"), "quatern": (352, "6d"),
+    "srow": (400, "12d"),
+}  # fmt: skip
+_LAYOUTS = {348: _VERSION_1, 540: _VERSION_2}
+_DTYPES = {
+    2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8",
+}  # fmt: skip
+_MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
+_TRANSFORM_TOLERANCE_MM = 1.0
 _HEADER_BYTES = 540
 
 
 def begins_as_nifti(path: Path) -> bool:
-    """Tell whether a file, compressed or not, begins with a NIfTI header, whatever its name."""
+    """Tell whether a file, compressed or not, begins with the header of a single-file NIfTI image."""
     try:
         start = next(pieces(path), b"")
     except (FileError, OSError):
         return False
-    return len(start) >= _HEADER_BYTES and is_header(start)
+    if len(start) < _HEADER_BYTES:
+        return False
+    sizes = {struct.unpack_from(order + "i", start)[0] for order in "<>"}
+    return bool(sizes & _LAYOUTS.keys()) and (start[344:347] == b"n+1" or start[4:7] == b"n+2")
 
 
-def read_nifti_header(path: Path, frame: Frame | None = None) -> NiftiHeader:
-    """Read everything before the voxels."""
-    return _open(path, frame)[0]
+def open_nifti(path: Path, frame: Frame | None = None) -> tuple[ImageHeader, Iterator[bytes]]:
+    """Read everything before the voxels, and return it with the bytes of the voxels.
 
-
-def read_nifti(path: Path, frame: Frame | None = None) -> Volume:
-    """Read a NIfTI image with its own type of voxel (float32 where the header scales)."""
-    header, stream = _open(path, frame)
-    values = np.zeros(header.grid.shape, np.float32 if header.is_scaled else header.dtype, order="F")
-    flat = values.reshape(-1, order="F")
-    for at, chunk in _chunks(header, stream, path):
-        flat[at : at + chunk.size] = chunk
-    native = values.astype(values.dtype.newbyteorder("="), copy=False)
-    return Volume(grid=header.grid, array=native[::-1] if header.is_reversed else native)
-
-
-def read_nifti_mask(path: Path, frame: Frame | None = None) -> Volume:
-    """Read a NIfTI image as a bool mask, true where a voxel is not zero.
+    Parameters
+    ----------
+    path : Path
+        A plain or compressed file.
+    frame : "ras" or "lps", optional
+        The frame to assume if the file states none (both transform codes 0).
 
     Raises
     ------
-    AnatomyError
-        If a voxel is not a number.
+    FileError
+        If it is no NIfTI image of three dimensions with plain numbers.
+    FrameError
+        If no frame is stated and none given, or the axes are not perpendicular.
     """
-    header, stream = _open(path, frame)
-    mask = np.zeros(header.grid.shape, dtype=np.bool_, order="F")
-    flat = mask.reshape(-1, order="F")
-    for at, chunk in _chunks(header, stream, path):
-        require_numbers(chunk, path)
-        np.not_equal(chunk, 0, out=flat[at : at + chunk.size])
-    return Volume(grid=header.grid, array=mask[::-1] if header.is_reversed else mask)
-
-
-def require_numbers(values: Array, path: Path) -> None:
-    """Raise `AnatomyError` if a value is not-a-number."""
-    if values.dtype.kind == "f" and bool(np.isnan(values).any()):
-        raise AnatomyError(
-            f"{path} holds voxels that are not a number (NaN)",
-            expected="numbers only",
-            remedy="Replace NaN by 0 where nothing is",
-        )
-
-
-def _open(path: Path, frame: Frame | None) -> tuple[NiftiHeader, Iterator[bytes]]:
-    """Parse the header and return it with the rest of the bytes, from the first voxel on."""
     stream = pieces(path)
     start = _at_least(b"", _HEADER_BYTES, stream)
-    start = _at_least(start, data_offset(start, path), stream)
-    header = parse_header(start, path, frame)
-    return header, _chain(start[header.data_offset :], stream)
+    fields = _fields(start, path)
+    offset = _data_offset(fields, path)
+    start = _at_least(start, offset, stream)
+    return _header(fields, start[:offset], path, frame), chain([start[offset:]], stream)
 
 
 def _at_least(start: bytes, n_bytes: int, stream: Iterator[bytes]) -> bytes:
@@ -84,30 +85,154 @@ def _at_least(start: bytes, n_bytes: int, stream: Iterator[bytes]) -> bytes:
     return start
 
 
-def _chain(first: bytes, rest: Iterator[bytes]) -> Iterator[bytes]:
-    yield first
-    yield from rest
+def _header(
+    fields: dict[str, tuple[Any, ...]], before_voxels: bytes, path: Path, frame: Frame | None
+) -> ImageHeader:
+    dtype = _dtype(fields, path)
+    shape = image_shape(_sizes(fields["dim"]), dtype.itemsize, path, path.stat().st_size)
+    slope, intercept = _scale(fields["slope"], path)
+    grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path, shape, frame), path)
+    return ImageHeader(
+        grid=grid,
+        is_reversed=is_reversed,
+        dtype=dtype,
+        slope=slope,
+        intercept=intercept,
+        labels=_labels(before_voxels[fields["size"][0] :], fields["order"][0]),
+    )
 
 
-def _chunks(header: NiftiHeader, stream: Iterator[bytes], path: Path) -> Iterator[tuple[int, Array]]:
-    """Yield (index of the first voxel, values) until the image is full, then drain the stream.
-
-    Draining proves the checksum, which stands at the end of a compressed file.
-    """
-    n_voxels, size, at, tail = int(np.prod(header.grid.shape)), header.dtype.itemsize, 0, b""
-    for piece in stream:
-        if at == n_voxels:
-            continue
-        data = tail + piece if tail else piece
-        count = min(len(data) // size, n_voxels - at)
-        tail = data[count * size :]
-        if count:
-            stored = np.frombuffer(data, dtype=header.dtype, count=count)
-            yield at, stored * header.slope + header.intercept if header.is_scaled else stored
-            at += count
-    if at < n_voxels:
+def _data_offset(fields: dict[str, tuple[Any, ...]], path: Path) -> int:
+    """Return where the voxels begin; 0 stands for directly after the header and its four bytes."""
+    stated, header_bytes = float(fields["vox_offset"][0]), int(fields["size"][0])
+    if stated == 0:
+        return header_bytes + 4
+    if not header_bytes <= stated <= MOST_HEADER_BYTES or stated != int(stated):
         raise FileError(
-            f"{path} is truncated: it holds {at} of {n_voxels} voxels",
-            expected="a complete file",
-            remedy="Copy or download the file again",
+            f"{path} says that its voxels begin at byte {stated:g}",
+            expected=f"a whole number from {header_bytes}, the length of the header, to {MOST_HEADER_BYTES}",
+            remedy="Copy or export the file again",
         )
+    return int(stated)
+
+
+def _dtype(fields: dict[str, tuple[Any, ...]], path: Path) -> np.dtype[Any]:
+    code = fields["datatype"][0]
+    if code not in _DTYPES:
+        raise FileError(
+            f"{path} holds voxels of the NIfTI type {code}",
+            expected="whole or floating numbers",
+            remedy="Save the image with another type of voxels",
+        )
+    return np.dtype(fields["order"][0] + _DTYPES[code])
+
+
+def _sizes(dim: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the sizes without trailing ones beyond the third."""
+    rank = dim[0] if 3 <= dim[0] <= 7 else 0
+    return dim[1:4] if all(n == 1 for n in dim[4 : rank + 1]) and rank else dim[1 : rank + 1]
+
+
+def _scale(stored: tuple[float, float], path: Path) -> tuple[float, float]:
+    """Return slope and intercept; a slope of 0, or that is no number, stands for voxels as they are."""
+    slope, intercept = stored
+    if slope == 0 or not np.isfinite(slope):
+        return 1.0, 0.0
+    if not np.isfinite(intercept):
+        raise FileError(
+            f"{path} scales its voxels by {slope:g} and adds {intercept}",
+            expected="two finite numbers",
+            remedy="Export the file again",
+        )
+    return slope, intercept
+
+
+def _fields(start: bytes, path: Path) -> dict[str, tuple[Any, ...]]:
+    for order in "<>":
+        size = struct.unpack_from(order + "i", start)[0] if len(start) >= 4 else 0
+        if size in _LAYOUTS and len(start) >= size:
+            layout = _LAYOUTS[size]
+            fields = {
+                name: struct.unpack_from(order + code, start, at) for name, (at, code) in layout.items()
+            }
+            return fields | {"order": (order,), "size": (size,)}
+    raise not_begun(path, "NIfTI", "a single-file NIfTI image (.nii or .nii.gz)")
+
+
+def _lps_from_ijk(
+    fields: dict[str, tuple[Any, ...]], path: Path, shape: tuple[int, int, int], frame: Frame | None
+) -> Float:
+    """Choose the stored transform: sform before qform, as image libraries do."""
+    scale = np.diag([_MM_PER_UNIT.get(fields["units"][0] & 7, 1.0)] * 3 + [1.0])
+    qform_code, sform_code = fields["codes"]
+    if sform_code > 0:
+        rows = np.array(fields["srow"], dtype=np.float64).reshape(3, 4)
+        ras = np.vstack([rows, [0, 0, 0, 1]])
+        if qform_code > 0:
+            _require_agreement(ras, _qform(fields), shape, path)
+    elif qform_code > 0:
+        ras = _qform(fields)
+    elif frame is not None:
+        return LPS_FROM[frame] @ scale @ np.diag([*np.abs(fields["pixdim"][1:4]), 1.0])
+    else:
+        raise FrameError(
+            f"{path} does not state its frame (qform and sform codes are 0)",
+            expected="a NIfTI file with a qform or an sform",
+            remedy="State the frame yourself (frame = 'ras' or 'lps'), or export the file again",
+        )
+    return np.asarray(LPS_FROM_RAS @ scale @ ras)
+
+
+def _qform(fields: dict[str, tuple[Any, ...]]) -> Float:
+    """Build the 4x4 matrix of the quaternion form, RAS."""
+    b, c, d, *offset = fields["quatern"]
+    a = np.sqrt(max(0.0, 1.0 - b * b - c * c - d * d))
+    rotation = np.array(
+        [
+            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
+        ]
+    )
+    handedness = -1.0 if fields["pixdim"][0] < 0 else 1.0
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.array([1.0, 1.0, handedness]) * np.array(fields["pixdim"][1:4])
+    matrix[:3, 3] = offset
+    return matrix
+
+
+def _require_agreement(sform: Float, qform: Float, shape: tuple[int, int, int], path: Path) -> None:
+    corners = list(product(*[(0, n - 1) for n in shape]))
+    apart = np.abs(transform_points(sform, corners) - transform_points(qform, corners)).max()
+    if not apart <= _TRANSFORM_TOLERANCE_MM:
+        raise FrameError(
+            f"{path} states two places for the same voxels: sform and qform differ by {apart:.1f} mm",
+            expected="one place",
+            remedy="Set the code of the wrong transform to 0 in the header",
+        )
+
+
+def _labels(extension_block: bytes, order: str) -> dict[int, str]:
+    """Find the names of labels in the header extensions (XML, as in CIFTI label tables)."""
+    if not extension_block or extension_block[0] == 0:
+        return {}
+    labels: dict[int, str] = {}
+    at = 4
+    while at + 8 <= len(extension_block):
+        size = struct.unpack_from(order + "i", extension_block, at)[0]
+        if size < 8:
+            break
+        labels |= _labels_in_xml(extension_block[at + 8 : at + size])
+        at += size
+    return labels
+
+
+def _labels_in_xml(content: bytes) -> dict[int, str]:
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        return {}
+    try:
+        root = ElementTree.fromstring(content.rstrip(b"\0 \n\r\t"))
+    except ElementTree.ParseError:
+        return {}
+    named = [(label.get("Key", ""), (label.text or "").strip()) for label in root.iter("Label")]
+    return {int(key): name for key, name in named if re.fullmatch(r"-?\d{1,9}", key) and name}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import re
 import zlib
 from pathlib import Path
@@ -12,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from anatomy.io.files import require_file, unreadable
+from anatomy.io.files import reading, require_file
 from anatomy.records import frozen_record
 from anatomy.typed import Array
 
@@ -20,6 +19,9 @@ _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8", "String": "u1",
 }  # fmt: skip
+_HEADER_TYPES = {"UInt32": "u4", "UInt64": "u8"}
+MOST_BYTES = 1 << 28
+"""A file, and all that it inflates to: some million points, which no tree of tubes has."""
 _APPENDED = re.compile(rb"<AppendedData\s+encoding\s*=\s*[\"'](\w+)[\"']\s*>\s*_")
 
 
@@ -52,10 +54,10 @@ def read_vtk_xml(path: str | Path) -> VtkFile:
         If the file is missing, damaged, truncated, of another kind or compressed otherwise than by zlib.
     """
     path = require_file(path)
-    try:
+    with reading(path):
+        if path.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it has more than {MOST_BYTES >> 20} MiB")
         return _Reader(path.read_bytes()).file()
-    except (OSError, ElementTree.ParseError, ValueError, KeyError, zlib.error, binascii.Error) as error:
-        raise unreadable(path, error) from error
 
 
 class _Reader:
@@ -63,7 +65,7 @@ class _Reader:
 
     def __init__(self, content: bytes) -> None:
         match = _APPENDED.search(content)
-        self.appended, self.encoding = b"", ""
+        self.appended, self.encoding, self.inflated_bytes = b"", "", 0
         if match:
             self.appended, self.encoding = content[match.end() :], match.group(1).decode()
             content = content[: match.start()] + b"</VTKFile>"
@@ -76,7 +78,7 @@ class _Reader:
         self.compressed = bool(compressor)
         order = "<" if self.root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
         self.order = order
-        self.header = np.dtype(order + _TYPES[self.root.get("header_type", "UInt32")])
+        self.header = np.dtype(order + _HEADER_TYPES[self.root.get("header_type", "UInt32")])
 
     def file(self) -> VtkFile:
         kind = self.root.get("type", "")
@@ -103,9 +105,8 @@ class _Reader:
         topology = self.named(piece.find(cells))
         empty = np.zeros(0, dtype=np.int64)
         connectivity, offsets = topology.get("connectivity", empty), topology.get("offsets", empty)
-        if len(offsets) and (
-            offsets[-1] > len(connectivity) or (np.diff(offsets, prepend=0) < 0).any()
-        ):  # fmt: skip
+        beyond = len(offsets) and (offsets[-1] > len(connectivity) or (np.diff(offsets, prepend=0) < 0).any())
+        if beyond or ((connectivity < 0) | (connectivity >= count)).any():
             raise ValueError("the cells refer to points that are not listed")
         return VtkPiece(
             points=points,
@@ -135,7 +136,7 @@ class _Reader:
     def payload(self, element: Element, form: str) -> bytes:
         """Return the bytes of an array, decoded and decompressed."""
         if form == "appended":
-            stream = self.appended[int(element.get("offset", "0")) :]
+            stream = self.appended[max(int(element.get("offset", "0")), 0) :]
             base64_coded = self.encoding == "base64"
         else:
             stream = (element.text or "").strip().encode()
@@ -157,8 +158,22 @@ class _Reader:
         stream.skip((3 + blocks) * size)
         sizes = head[3:].tolist()
         packed = stream.take(0, sum(sizes))
-        ends = np.cumsum(sizes).tolist()
-        return b"".join(zlib.decompress(packed[e - n : e]) for e, n in zip(ends, sizes, strict=True))
+        at, block_bytes, out = 0, int(head[1]), []
+        for packed_bytes in sizes:
+            out.append(self.inflated(packed[at : at + packed_bytes], block_bytes))
+            at += packed_bytes
+        return b"".join(out)
+
+    def inflated(self, packed: bytes, most_bytes: int) -> bytes:
+        """Return a decompressed block, which is at most as long as the file says."""
+        self.inflated_bytes += most_bytes
+        if self.inflated_bytes > MOST_BYTES:
+            raise ValueError(f"its arrays say that they inflate to more than {MOST_BYTES >> 20} MiB")
+        decoder = zlib.decompressobj()
+        block = decoder.decompress(packed, most_bytes + 1)
+        if len(block) > most_bytes or not decoder.eof:
+            raise ValueError("a compressed block is longer than the file says, or cut short")
+        return block
 
 
 class _Raw:

@@ -1,0 +1,140 @@
+"""What the header of an image file says, whatever its format, and whether the file can hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anatomy.errors import FileError, FrameError
+from anatomy.grid import Grid
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+
+MOST_IMAGE_BYTES = 1 << 32
+"""Most stored voxels of one image: four times a chest of 1024 x 1024 x 500 voxels of 16 bits."""
+MOST_INFLATION = 1032
+"""No stream of the deflate method becomes more than 1032 times as large."""
+MOST_HEADER_BYTES = 1 << 22
+"""Longest header: those of real images, with segment names and label tables, have some ten thousand bytes."""
+MOST_COORDINATE_MM = 1e5
+"""Farthest place of a voxel from the origin: no scanner or tracker has a frame of 100 m."""
+
+
+@frozen_record
+class ImageHeader:
+    """What is needed to read the voxels of a file.
+
+    Parameters
+    ----------
+    grid : Grid
+    is_reversed : bool
+        Whether the file counts the first index the other way; see `right_handed_grid`.
+    dtype : dtype of the voxels on disk, with byte order
+    slope, intercept : float
+        The value of a voxel is `slope * stored + intercept`.
+    labels : mapping of int to str
+        Names of label values, empty if there are none.
+    """
+
+    grid: Grid
+    is_reversed: bool
+    dtype: np.dtype[Any]
+    slope: float = 1.0
+    intercept: float = 0.0
+    labels: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether stored numbers differ from values."""
+        return (self.slope, self.intercept) != (1.0, 0.0)
+
+    @property
+    def n_voxels(self) -> int:
+        """Number of voxels."""
+        ni, nj, nk = self.grid.shape
+        return ni * nj * nk
+
+
+def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes: int) -> tuple[int, int, int]:
+    """Return the shape of an image of three dimensions that a file of `stored_bytes` can hold.
+
+    Raises
+    ------
+    FileError
+        If there are not three positive sizes, or the file is too short for them, or they are absurd.
+    """
+    if len(sizes) != 3 or min(sizes) < 1:
+        raise FileError(
+            f"{path} has the dimensions {sizes[:8]}",
+            expected="one image of three dimensions with one number a voxel",
+            remedy="Split the file into one image for each time, channel or overlapping segment",
+        )
+    promised = sizes[0] * sizes[1] * sizes[2] * itemsize
+    if promised > MOST_IMAGE_BYTES:
+        raise FileError(
+            f"{path} says that it holds {' x '.join(str(n) for n in sizes)} voxels",
+            expected=f"at most {MOST_IMAGE_BYTES >> 30} GiB of voxels",
+            remedy="Crop the image to the chest, or copy the file again if its header is damaged",
+        )
+    if promised > stored_bytes * MOST_INFLATION:
+        raise truncated(path, f"{stored_bytes} bytes cannot hold {promised // itemsize} voxels")
+    return sizes[0], sizes[1], sizes[2]
+
+
+def truncated(path: Path, why: str) -> FileError:
+    """Make the error for a file that ends too early."""
+    return FileError(
+        f"{path} is truncated: {why}", expected="a complete file", remedy="Copy or download the file again"
+    )
+
+
+def not_begun(path: Path, format_name: str, expected: str) -> FileError:
+    """Make the error for a file that does not begin as its name says."""
+    return FileError(
+        f"{path} does not begin with a {format_name} header",
+        expected=expected,
+        remedy="Copy or export the file again",
+    )
+
+
+def named_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> Grid:
+    """Make a grid; a `FrameError` names the file it came from.
+
+    Raises
+    ------
+    FrameError
+        If the matrix is none of a grid, or a corner lies absurdly far away.
+    """
+    try:
+        grid = Grid(shape=shape, lps_from_ijk=lps_from_ijk)
+    except FrameError as error:
+        raise FrameError(f"{path}: {error.found}", expected=error.expected, remedy=error.remedy) from error
+    farthest = float(np.abs(grid.lps([[0, 0, 0], [n - 1 for n in shape]])).max())
+    if not farthest <= MOST_COORDINATE_MM:
+        raise FrameError(
+            f"{path} places voxels {farthest:.3g} mm from the origin",
+            expected=f"coordinates of at most {MOST_COORDINATE_MM:.0f} mm",
+            remedy="Copy or export the file again; its units may be wrong",
+        )
+    return grid
+
+
+def right_handed_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> tuple[Grid, bool]:
+    """Make the grid of a file, with the first index counted the other way if its axes are left-handed.
+
+    Many programs store images so; nothing is mirrored as long as voxels and matrix agree.
+
+    Returns
+    -------
+    tuple of (Grid, bool)
+        The right-handed grid, and whether the voxels must be reversed along their first axis.
+    """
+    if not np.linalg.det(lps_from_ijk[:3, :3]) < 0.0:
+        return named_grid(shape, lps_from_ijk, path), False
+    reversed_from_stored = np.diag([-1.0, 1.0, 1.0, 1.0])
+    reversed_from_stored[0, 3] = shape[0] - 1
+    return named_grid(shape, lps_from_ijk @ reversed_from_stored, path), True

@@ -1,0 +1,125 @@
+"""MetaImage files (.mha, .mhd): the text header, and the stream of voxels.
+
+The header is read here for the reasons that `anatomy.io.nrrd` gives.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from anatomy.errors import FileError, FrameError
+from anatomy.io.compressed import inflate, plain_pieces
+from anatomy.io.image_header import MOST_HEADER_BYTES, ImageHeader, image_shape, not_begun, right_handed_grid
+from anatomy.typed import Float
+
+_DTYPES = {
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",
+    "MET_UINT": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
+}  # fmt: skip
+_PLAIN = {"BinaryData": "true", "HeaderSize": "0", "ElementNumberOfChannels": "1"}
+"""Fields that may be missing, and the only value that is read."""
+
+
+def open_metaimage(path: Path) -> tuple[ImageHeader, Iterator[bytes]]:
+    """Read the header of a file, and return it with the bytes of the voxels; the frame is LPS by definition.
+
+    Raises
+    ------
+    FileError
+        If it is no MetaImage of three dimensions, or its data lie elsewhere than in one plain file beside it.
+    FrameError
+        If its axes are not perpendicular.
+    """
+    fields, offset = _text(path)
+    _require_plain(fields, path)
+    dtype = np.dtype((">" if _big_endian(fields) else "<") + _DTYPES[fields["ElementType"]])
+    data_path, at = _data_file(fields, path, offset)
+    sizes = tuple(int(n) for n in fields.get("DimSize", "").split()[:8])
+    shape = image_shape(sizes, dtype.itemsize, path, data_path.stat().st_size)
+    grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path), path)
+    compressed = fields.get("CompressedData", "false").lower() == "true"
+    return ImageHeader(grid=grid, is_reversed=is_reversed, dtype=dtype), _stream(data_path, at, compressed)
+
+
+def _text(path: Path) -> tuple[dict[str, str], int]:
+    """Return the fields, and where the data begin if they follow."""
+    with path.open("rb") as stream:
+        start = stream.read(MOST_HEADER_BYTES)
+    end = re.search(rb"^ElementDataFile *= *([^\r\n]*?) *(\r?\n|\Z)", start, re.MULTILINE)
+    if end is None:
+        raise not_begun(path, "MetaImage", "a .mha or .mhd file")
+    pairs = [
+        line.partition("=") for line in start[: end.end()].decode("utf-8", errors="replace").splitlines()
+    ]
+    return {key.strip(): value.strip() for key, _, value in pairs}, end.end()
+
+
+def _require_plain(fields: Mapping[str, str], path: Path) -> None:
+    odd = {key: fields[key] for key, only in _PLAIN.items() if fields.get(key, only).lower() != only}
+    if fields.get("NDims") != "3":
+        odd["NDims"] = fields.get("NDims", "missing")
+    if fields.get("ElementType") not in _DTYPES:
+        odd["ElementType"] = fields.get("ElementType", "missing")
+    if odd:
+        said = ", ".join(f"{key} = {value[:40]}" for key, value in odd.items())
+        raise FileError(
+            f"{path} says {said}",
+            expected="one image of three dimensions with one number a voxel, stored as binary data",
+            remedy="Save the image again, as 3D Slicer or ITK do",
+        )
+
+
+def _big_endian(fields: Mapping[str, str]) -> bool:
+    stated = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "false"))
+    return stated.lower() in ("true", "1")
+
+
+def _data_file(fields: Mapping[str, str], path: Path, offset: int) -> tuple[Path, int]:
+    name = fields["ElementDataFile"]
+    if name.upper() == "LOCAL":
+        return path, offset
+    if not name or name in (".", "..", "LIST") or re.search(r"[%/\\\0]|^LIST\b", name):
+        raise FileError(
+            f"{path} keeps its data in {name[:80]!r}",
+            expected="LOCAL, or the plain name of one file in the same folder",
+            remedy="Save the image as .mha, with header and data in one file",
+        )
+    beside = path.with_name(name)
+    if not beside.is_file():
+        raise FileError(
+            f"{path} keeps its data in {name[:80]!r}, which is not there",
+            expected="both files in one folder",
+            remedy="Copy that file, too",
+        )
+    return beside, 0
+
+
+def _stream(path: Path, offset: int, compressed: bool) -> Iterator[bytes]:
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        yield from inflate(stream, path) if compressed else plain_pieces(stream)
+
+
+def _lps_from_ijk(fields: Mapping[str, str], path: Path) -> Float:
+    """Return the matrix: each row of TransformMatrix is the direction of an axis."""
+
+    def numbers(names: tuple[str, ...], count: int, default: str) -> Float:
+        text = next((fields[name] for name in names if name in fields), default)
+        values = [float(number) for number in text.split()[: count + 1]]
+        if len(values) != count:
+            raise FrameError(
+                f"{path} has no readable {names[0]}",
+                expected=f"{count} numbers",
+                remedy="Export the file again",
+            )
+        return np.array(values)
+
+    matrix = np.eye(4)
+    directions = numbers(("TransformMatrix", "Rotation", "Orientation"), 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
+    matrix[:3, :3] = directions.T * numbers(("ElementSpacing", "ElementSize"), 3, "")
+    matrix[:3, 3] = numbers(("Offset", "Position", "Origin"), 3, "0 0 0")
+    return matrix

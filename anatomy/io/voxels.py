@@ -1,0 +1,83 @@
+"""Voxels of an image file of any format, streamed so that a mask never exists as anything but bool."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from anatomy.errors import AnatomyError, FileError
+from anatomy.grid import Volume
+from anatomy.io.compressed import PIECE_BYTES
+from anatomy.io.image_header import ImageHeader, truncated
+from anatomy.typed import Array
+
+
+def read_values(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume:
+    """Read the voxels in their own type (float32 where the header scales).
+
+    Raises
+    ------
+    FileError
+        If there are fewer or many more bytes than the header says, or they are damaged.
+    """
+    values = np.zeros(header.grid.shape, np.float32 if header.is_scaled else header.dtype, order="F")
+    flat = values.reshape(-1, order="F")
+    for at, chunk in _chunks(header, stream, path):
+        flat[at : at + chunk.size] = chunk
+    native = values.astype(values.dtype.newbyteorder("="), copy=False)
+    return Volume(grid=header.grid, array=native[::-1] if header.is_reversed else native)
+
+
+def read_nonzero(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume:
+    """Read the voxels as a bool mask, true where a voxel is not zero.
+
+    Raises
+    ------
+    AnatomyError
+        If a voxel is not a number.
+    FileError
+        As `read_values`.
+    """
+    mask = np.zeros(header.grid.shape, dtype=np.bool_, order="F")
+    flat = mask.reshape(-1, order="F")
+    for at, chunk in _chunks(header, stream, path):
+        require_numbers(chunk, path)
+        np.not_equal(chunk, 0, out=flat[at : at + chunk.size])
+    return Volume(grid=header.grid, array=mask[::-1] if header.is_reversed else mask)
+
+
+def require_numbers(values: Array, path: Path) -> None:
+    """Raise `AnatomyError` if a value is not-a-number."""
+    if values.dtype.kind == "f" and bool(np.isnan(values).any()):
+        raise AnatomyError(
+            f"{path} holds voxels that are not a number (NaN)",
+            expected="numbers only",
+            remedy="Replace NaN by 0 where nothing is",
+        )
+
+
+def _chunks(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Iterator[tuple[int, Array]]:
+    """Yield (index of the first voxel, values) until the image is full, then drain the stream.
+
+    Draining proves the checksum, which stands at the end of a compressed file.
+    """
+    n_voxels, size, at, tail, beyond = header.n_voxels, header.dtype.itemsize, 0, b"", 0
+    for piece in stream:
+        data = tail + piece if tail else piece
+        count = min(len(data) // size, n_voxels - at)
+        if count:
+            stored = np.frombuffer(data, dtype=header.dtype, count=count)
+            yield at, stored * header.slope + header.intercept if header.is_scaled else stored
+            at += count
+        tail = data[count * size :] if at < n_voxels else b""
+        beyond += len(data) - count * size if at == n_voxels else 0
+        if beyond > PIECE_BYTES:
+            raise FileError(
+                f"{path} holds more data than the {n_voxels} voxels of its header",
+                expected="as many voxels as the header says",
+                remedy="Copy or export the file again",
+            )
+    if at < n_voxels:
+        raise truncated(path, f"it holds {at} of {n_voxels} voxels")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +12,7 @@ import numpy as np
 
 from anatomy.errors import FileError, FrameError
 from anatomy.grid import Grid, Volume
-from anatomy.io.files import reading
+from anatomy.io.files import reading, reason
 from anatomy.io.image_header import image_shape, named_grid
 from anatomy.records import frozen_value
 from anatomy.typed import Float
@@ -51,7 +53,7 @@ def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
         If there is no folder, or no DICOM image in it.
     """
     by_uid = _headers_by_series(Path(folder))
-    with reading(folder):
+    with _reading(folder):
         return tuple(_info(uid, files) for uid, files in sorted(by_uid.items()))
 
 
@@ -80,11 +82,23 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
     by_uid = _headers_by_series(Path(folder))
     headers = by_uid[_choose(by_uid, series_uid, folder)]
     where = f"Series {headers[0][1].SeriesInstanceUID} of {folder}"
-    with reading(where):
+    with _reading(where):
         _require_uniform([header for _, header in headers], where)
         _require_grey_values(headers[0][1], where)
         paths, grid = _geometry(headers, where)
     return Volume(grid=grid, array=_pixels(paths, grid, where))
+
+
+@contextmanager
+def _reading(what: str | Path) -> Iterator[None]:
+    """Do as `reading`, also for what pydicom alone raises."""
+    from pydicom.errors import BytesLengthException
+
+    with reading(what), warnings.catch_warnings(action="ignore"):  # Odd values are judged here.
+        try:
+            yield
+        except BytesLengthException as error:
+            raise ValueError(reason(error)) from error
 
 
 def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]]:
@@ -100,7 +114,7 @@ def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]
     by_uid: dict[str, list[tuple[Path, FileDataset]]] = {}
     tags: list[Any] = [*_SERIES_KEYS, *_NEEDED_KEYS]
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR"):
-        with reading(path):
+        with _reading(path):
             try:
                 header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
             except InvalidDicomError:

@@ -18,8 +18,8 @@ from zipfile import BadZipFile
 from anatomy.errors import FileError, SettingsError
 
 DAMAGE = (
-    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RecursionError, TypeError,
-    SyntaxError, ValueError, BadZipFile, struct.error, zlib.error,
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,
+    SyntaxError, TypeError, ValueError, BadZipFile, struct.error, zlib.error,
 )  # fmt: skip
 """What code raises that reads a damaged file."""
 MOST_REASON = 300
@@ -73,10 +73,31 @@ def read_toml(
             return tomllib.load(stream)
     except OSError as error:
         raise unreadable(path, error) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except DAMAGE as error:
         raise SettingsError(
-            f"{path} is not valid TOML ({error})", expected=expected, remedy=remedy
+            f"{path} is not valid TOML ({reason(error)})", expected=expected, remedy=remedy
         ) from error
+
+
+def read_json(path: str | Path, *, expected: str, remedy: str) -> Any:
+    """Read a JSON file; `expected` and `remedy` are for the message.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read or is not JSON.
+    """
+    text = read_text(path)
+    try:
+        return json.loads(text)
+    except DAMAGE as error:
+        raise FileError(f"{path} is not JSON ({reason(error)})", expected=expected, remedy=remedy) from error
+
+
+def reason(error: Exception) -> str:
+    """Return the last line of what an error says, of bounded length."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[-1][:MOST_REASON]
 
 
 @contextmanager
@@ -96,9 +117,8 @@ def reading(path: str | Path) -> Iterator[None]:
 
 def unreadable(path: str | Path, error: Exception) -> FileError:
     """Make the error for a file that exists but cannot be read."""
-    reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
     return FileError(
-        f"{path} cannot be read: {reason[:MOST_REASON]}",
+        f"{path} cannot be read: {reason(error)}",
         expected="a readable, complete file",
         remedy="Copy or export the file again",
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from io import StringIO
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,7 @@ import numpy as np
 
 from anatomy.errors import FileError, FrameError
 from anatomy.grid import ORTHONORMAL_TOLERANCE, read_only, transform_points
-from anatomy.io.files import read_text
+from anatomy.io.files import DAMAGE, read_text, reason
 from anatomy.typed import Float
 
 Frame = Literal["ras", "lps"]
@@ -109,10 +110,11 @@ def read_points(path: str | Path, frame: Frame) -> Float:
 def _numbers(path: str | Path) -> Float:
     text = read_text(path)
     try:
-        values = np.loadtxt(StringIO(text), dtype=np.float64, ndmin=2) if text.strip() else np.zeros((0, 3))
-    except ValueError as error:
+        with warnings.catch_warnings(action="ignore"):  # A file without numbers is refused by those who ask.
+            values = np.loadtxt(StringIO(text), dtype=np.float64, ndmin=2)
+    except DAMAGE as error:
         raise FileError(
-            f"{path} does not hold a table of numbers: {error}",
+            f"{path} does not hold a table of numbers: {reason(error)}",
             expected="numbers apart by spaces, the same count in each line",
             remedy="`lungaccess template pose` prints a pose that can be read",
         ) from error

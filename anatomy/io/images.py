@@ -109,12 +109,13 @@ def read_labels(path: str | Path) -> Mapping[int, str]:
 def _open(path: Path, frame: Frame | None) -> tuple[ImageHeader, Iterator[bytes]]:
     """Read the header of a file of any format, and return it with the bytes of the voxels."""
     suffix = image_suffix(path)
-    if suffix in NIFTI:
-        return open_nifti(path, frame)
-    if suffix in NRRD:
-        return open_nrrd(path, frame)
-    if suffix in METAIMAGE:
-        return open_metaimage(path)
+    with np.errstate(invalid="ignore", over="ignore"):  # Grids refuse what is not finite.
+        if suffix in NIFTI:
+            return open_nifti(path, frame)
+        if suffix in NRRD:
+            return open_nrrd(path, frame)
+        if suffix in METAIMAGE:
+            return open_metaimage(path)
     raise FileError(
         f"{path} is of an unknown kind",
         expected="an image ending in " + ", ".join(SUFFIXES),

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import require_file, sha256
+from anatomy.io.files import DAMAGE, require_file, sha256
 from anatomy.io.images import image_suffix
 from anatomy.io.own_masks import DESCRIPTION
 
@@ -77,7 +77,7 @@ def _files_named_in(description: Path) -> set[Path]:
     """Return the files that strings of a description name, itself being judged elsewhere."""
     try:
         values = tomllib.loads(description.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError):
+    except DAMAGE:
         return set()
     return {file for text in _strings(values) for file in _files_meant(description.parent, text)}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.errors import AnatomyError, FileError
-from anatomy.io.files import read_text
+from anatomy.io.files import read_json
 from anatomy.io.images import image_stem, read_labels, read_volume
 
 # Class tables published with TotalSegmentator [Wasserthal2023]: task lung_vessels since 2.5, and the lobes
@@ -62,14 +61,11 @@ def label_values(path: Path) -> set[float]:
 
 
 def _sidecar_names(path: Path) -> dict[int, str]:
-    try:
-        content: Any = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise FileError(
-            f"{path} is not JSON: {error}",
-            expected="label names and values",
-            remedy="Correct the file, or take it away if it belongs to nothing here",
-        ) from error
+    content: Any = read_json(
+        path,
+        expected="label names and values",
+        remedy="Correct the file, or take it away if it belongs to nothing here",
+    )
     if isinstance(content, Mapping) and isinstance(content.get("labels"), Mapping):
         content = content["labels"]
     if not isinstance(content, Mapping):

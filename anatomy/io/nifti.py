@@ -24,12 +24,12 @@ from anatomy.io.image_header import MOST_HEADER_BYTES, ImageHeader, image_shape,
 from anatomy.typed import Float
 
 _VERSION_1: dict[str, tuple[int, str]] = {
-    "dim": (40, "8h"), "datatype": (70, "h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),
+    "dim": (40, "8h"), "datatype": (70, "2h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),
     "slope": (112, "2f"), "units": (123, "B"), "codes": (252, "2h"), "quatern": (256, "6f"),
     "srow": (280, "12f"),
 }  # fmt: skip
 _VERSION_2: dict[str, tuple[int, str]] = {
-    "dim": (16, "8q"), "datatype": (12, "h"), "pixdim": (104, "8d"), "vox_offset": (168, "q"),
+    "dim": (16, "8q"), "datatype": (12, "2h"), "pixdim": (104, "8d"), "vox_offset": (168, "q"),
     "slope": (176, "2d"), "units": (500, "i"), "codes": (344, "2i"), "quatern": (352, "6d"),
     "srow": (400, "12d"),
 }  # fmt: skip
@@ -117,14 +117,15 @@ def _data_offset(fields: dict[str, tuple[Any, ...]], path: Path) -> int:
 
 
 def _dtype(fields: dict[str, tuple[Any, ...]], path: Path) -> np.dtype[Any]:
-    code = fields["datatype"][0]
-    if code not in _DTYPES:
+    code, bits = fields["datatype"]
+    stored = _DTYPES.get(code, "")
+    if bits not in (0, 8 * int(stored[1:] or 0)) or not stored:
         raise FileError(
-            f"{path} holds voxels of the NIfTI type {code}",
-            expected="whole or floating numbers",
+            f"{path} holds voxels of the NIfTI type {code} with {bits} bits",
+            expected="whole or floating numbers, with as many bits as their type has",
             remedy="Save the image with another type of voxels",
         )
-    return np.dtype(fields["order"][0] + _DTYPES[code])
+    return np.dtype(fields["order"][0] + stored)
 
 
 def _sizes(dim: tuple[int, ...]) -> tuple[int, ...]:

@@ -9,7 +9,6 @@ import numpy as np
 
 from anatomy.errors import AnatomyError, FileError
 from anatomy.grid import Volume
-from anatomy.io.compressed import PIECE_BYTES
 from anatomy.io.image_header import ImageHeader, truncated
 from anatomy.typed import Array
 
@@ -63,7 +62,7 @@ def _chunks(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Iterato
 
     Draining proves the checksum, which stands at the end of a compressed file.
     """
-    n_voxels, size, at, tail, beyond = header.n_voxels, header.dtype.itemsize, 0, b"", 0
+    n_voxels, size, at, tail = header.n_voxels, header.dtype.itemsize, 0, b""
     for piece in stream:
         data = tail + piece if tail else piece
         count = min(len(data) // size, n_voxels - at)
@@ -71,9 +70,8 @@ def _chunks(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Iterato
             stored = np.frombuffer(data, dtype=header.dtype, count=count)
             yield at, stored * header.slope + header.intercept if header.is_scaled else stored
             at += count
-        tail = data[count * size :] if at < n_voxels else b""
-        beyond += len(data) - count * size if at == n_voxels else 0
-        if beyond > PIECE_BYTES:
+        tail = data[count * size :]
+        if at == n_voxels and tail:
             raise FileError(
                 f"{path} holds more data than the {n_voxels} voxels of its header",
                 expected="as many voxels as the header says",

@@ -14,7 +14,7 @@ import numpy as np
 from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Grid, Volume
 from anatomy.io import cost_maps
-from anatomy.io.files import atomic_write, read_text, require_writable_folder, sha256, write_text
+from anatomy.io.files import DAMAGE, atomic_write, read_text, require_writable_folder, sha256, write_text
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
 from anatomy.lobes import LOBES
 from anatomy.segmentation.canonical import canonical
@@ -160,7 +160,7 @@ def _read_record(path: Path) -> dict[str, Any]:
         return {"format": FORMAT}
     try:
         record = json.loads(read_text(path))
-    except json.JSONDecodeError:
+    except DAMAGE:
         return {"format": FORMAT}
     usable = isinstance(record, dict) and record.get("format") == FORMAT
     return record if usable else {"format": FORMAT}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,13 @@ import numpy as np
 
 from anatomy.errors import FileError, GridMismatchError
 from anatomy.grid import Grid
-from anatomy.io.files import read_text
+from anatomy.io.files import DAMAGE, read_json, reading
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm, largest_piece
 from anatomy.typed import Float, Int16, Mask
 
+_CONTOURS = '{"annotations": [{"contours": [{"z_mm": ..., "ij": [[column, row], ...]}]}]}'
+_REMEDY = "`lungaccess template contours` prints an example; a mask can be given with --nodule-mask"
 RIM_MM = 2.0
 """A nodule blurs this far into the lung around it, and may be taken for a vessel there."""
 ATTACHED_MM = 1.5
@@ -50,7 +52,8 @@ def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
     """
     annotations = _annotations(Path(path))
     _require_axial(grid)
-    masks = [_annotation_mask(annotation, grid, Path(path)) for annotation in annotations]
+    with reading(path):
+        masks = [_annotation_mask(annotation, grid, Path(path)) for annotation in annotations]
     votes = np.zeros(grid.shape, dtype=np.int16, order="F")
     for mask in masks:
         votes += mask
@@ -58,10 +61,7 @@ def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
 
 
 def _annotations(path: Path) -> list[Mapping[str, Any]]:
-    try:
-        content = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise _not_contours(path, f"is not JSON ({error})") from error
+    content = read_json(path, expected=_CONTOURS, remedy=_REMEDY)
     annotations = content.get("annotations") if isinstance(content, Mapping) else None
     if not isinstance(annotations, list) or not annotations:
         raise _not_contours(path, "has no annotations")
@@ -77,17 +77,20 @@ def _is_contour(contour: Any) -> bool:
         return False
     try:
         points = np.asarray(contour.get("ij"), dtype=np.float64)
-    except (TypeError, ValueError):
+        height = float(contour["z_mm"])
+    except DAMAGE:
         return False
-    return points.ndim == 2 and points.shape[1] == 2 and len(points) > 0 and bool(np.isfinite(points).all())
+    return (
+        math.isfinite(height)
+        and points.ndim == 2
+        and points.shape[1] == 2
+        and len(points) > 0
+        and bool(np.isfinite(points).all())
+    )
 
 
 def _not_contours(path: Path, what: str) -> FileError:
-    return FileError(
-        f"{path} {what}",
-        expected='{"annotations": [{"contours": [{"z_mm": ..., "ij": [[column, row], ...]}]}]}',
-        remedy="`lungaccess template contours` prints an example; a mask can be given with --nodule-mask",
-    )
+    return FileError(f"{path} {what}", expected=_CONTOURS, remedy=_REMEDY)
 
 
 def _require_axial(grid: Grid) -> None:

@@ -12,6 +12,7 @@ from statistics import median
 from typing import Any
 
 from anatomy.errors import FileError
+from anatomy.io.files import DAMAGE, reason
 from anatomy.records import frozen_value
 from lungaccess.benchmark.unc_rules import UNC_EXEMPT_MM
 
@@ -59,9 +60,9 @@ def read_peer(path: Path) -> Mapping[Key, PeerResult]:
                 key = (int(run["patient"]), int(run["start"]), float(run["radius_mm"]))
                 found[key][str(run["planner"])].append(run)
         return {key: _best(kinds) for key, kinds in found.items()}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except DAMAGE as error:
         raise FileError(
-            f"{path} holds no recorded results ({type(error).__name__}: {error})",
+            f"{path} holds no recorded results ({type(error).__name__}: {reason(error)})",
             expected='a JSON file {"runs": [...]} with patient, start, radius_mm, start_exemption_mm,'
             " planner, threads, valid_problem, solved, first_cpu_s, length_end_mm of every run",
             remedy="Leave out --peer to run without them",

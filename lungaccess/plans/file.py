@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from anatomy.errors import PlanFileError, SettingsError
+from anatomy.io.files import DAMAGE, reason
 from anatomy.records import LEFT_OUT_IF_EMPTY
 from anatomy.settings import parse, to_mapping
 from lungaccess.plans.record import Record
@@ -54,9 +55,9 @@ def from_json(cls: type[P], text: str) -> P:
     """Return the plan that `to_json` wrote; see `Plan.from_json`."""
     try:
         content = json.loads(text, object_pairs_hook=_unique, parse_constant=_not_finite)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except DAMAGE as error:
         raise PlanFileError(
-            f"The plan is not JSON ({error})",
+            f"The plan is not JSON ({reason(error)})",
             remedy=_REMEDY,
             expected="a plan.json as `lungaccess plan` writes it",
         ) from error
@@ -68,8 +69,16 @@ def from_json(cls: type[P], text: str) -> P:
         )
     _require_schema(content.get("schema"))
     stated = content.pop("digest", None)
-    plan = _decode(cls, content, "plan")
-    if stated != digest(plan):
+    try:
+        plan = _decode(cls, content, "plan")
+        found = digest(plan)
+    except DAMAGE as error:
+        raise PlanFileError(
+            f"The plan holds values that no plan has ({reason(error)})",
+            remedy=_REMEDY,
+            expected="a plan.json as `lungaccess plan` writes it",
+        ) from error
+    if stated != found:
         raise PlanFileError(
             "The plan does not match its own digest: it was edited or damaged",
             expected=str(stated),

@@ -1,0 +1,85 @@
+"""Damage the file of one target again and again, and read it: `python -m tests.fuzz.run TARGET SEED COUNT`.
+
+Each input has at most 20 s of processor time, and all together 4 GiB.  The last line of the output is JSON:
+how many inputs were refused, and what went wrong.  A crash ends the process; the file that the last argument
+names then holds the input.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import sys
+import tempfile
+import traceback
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anatomy.errors import LungaccessError
+from anatomy.grid import Volume
+from tests.fuzz.targets import Target, damaged, targets
+
+MOST_BYTES, MOST_SECONDS = 4 << 30, 20
+
+
+def main(name: str, seed: int, count: int, keep: Path) -> dict[str, Any]:
+    """Return how many inputs were refused, how many read, and the traceback of each fault."""
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
+    signal.signal(signal.SIGVTALRM, _too_long)
+    target, ends, faults = targets()[name], Counter[str](), []
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        target.make(folder)
+        content = (folder / target.file).read_bytes()
+        intact = target.read(folder)
+        for number in range(seed, seed + count):
+            new, same_voxels = damaged(np.random.default_rng(number), target, content)
+            (folder / target.file).write_bytes(new)
+            keep.write_bytes(new)
+            fault = _fault(target, folder, intact, same_voxels, ends)
+            if fault:
+                faults.append({"seed": number, "fault": fault})
+    return {"refused": ends["refused"], "read": ends["read"], "faults": faults}
+
+
+def _fault(target: Target, folder: Path, intact: Any, same_voxels: bool, ends: Counter[str]) -> str:
+    signal.setitimer(signal.ITIMER_VIRTUAL, MOST_SECONDS)
+    try:
+        found = target.read(folder)
+    except LungaccessError:
+        ends["refused"] += 1
+        return ""
+    except BaseException:
+        return traceback.format_exc(limit=-4)
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+    ends["read"] += 1
+    if isinstance(found, Volume):
+        return _silent_change(found, intact, same_voxels)
+    return ""
+
+
+def _silent_change(found: Volume, intact: Volume, same_voxels: bool) -> str:
+    """Tell if voxels moved although the grid is the same; a scale or another type may change their values."""
+    if not same_voxels or found.grid.shape != intact.grid.shape:
+        return ""
+    if (np.abs(found.grid.lps_from_ijk - intact.grid.lps_from_ijk) > 1e-3).any():
+        return ""
+    for value in np.unique(intact.array):
+        there = found.array[intact.array == value]
+        if not (there == there.flat[0]).all():
+            return "voxels changed in silence"
+    return ""
+
+
+def _too_long(signum: int, frame: object) -> None:
+    raise TimeoutError(f"more than {MOST_SECONDS} s")
+
+
+if __name__ == "__main__":
+    stated_name, stated_seed, stated_count, stated_keep = sys.argv[1:]
+    print(json.dumps(main(stated_name, int(stated_seed), int(stated_count), Path(stated_keep))))

@@ -1,0 +1,192 @@
+"""Every reader of files that a user names: an intact file, and how it is read."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import SimpleITK
+
+from anatomy.grid import Grid, Volume
+from anatomy.io.images import read_mask, read_volume
+from tests.anatomy.io.series import write_series
+
+_CONTOURED = Grid.from_spacing((512, 512, 40), [0.7, 0.7, 1.0], [-180.0, -180.0, -540.0])
+GRID = Grid.from_spacing((12, 10, 8), [5.0, 4.0, 2.0], [-30.0, -20.0, 10.0])
+
+
+@dataclass(frozen=True)
+class Target:
+    """A file to damage and how to read it.
+
+    Parameters
+    ----------
+    file : str
+        Name of the damaged file in the folder.
+    make : callable
+        Writes intact files into a folder.
+    read : callable
+        Given the folder; raises typed errors alone.
+    header_bytes : callable, optional
+        How many bytes of the content come before the voxels.  Damage to them that leaves the grid as it is
+        must leave the voxels as they are.
+    """
+
+    file: str
+    make: Callable[[Path], None]
+    read: Callable[[Path], Any]
+    header_bytes: Callable[[bytes], int] | None = None
+
+
+def _voxels() -> np.ndarray:
+    return np.random.default_rng(5).integers(0, 4, GRID.shape).astype(np.int16)
+
+
+def _image(name: str, compressed: bool) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        image = SimpleITK.GetImageFromArray(_voxels().T)
+        image.SetSpacing(GRID.spacing_mm.tolist())
+        image.SetOrigin(GRID.lps_from_ijk[:3, 3].tolist())
+        SimpleITK.WriteImage(image, str(folder / name), useCompression=compressed)
+
+    return make
+
+
+def _image_target(name: str, header: Callable[[bytes], int] | None, compressed: bool = False) -> Target:
+    def read(folder: Path) -> Volume:
+        read_mask(folder / name)
+        return read_volume(folder / name)
+
+    return Target(file=name, make=_image(name, compressed), read=read, header_bytes=header)
+
+
+def _after(mark: bytes) -> Callable[[bytes], int]:
+    return lambda content: content.index(mark) + len(mark)
+
+
+def _before_pixels(content: bytes) -> int:
+    return content.index(b"\xe0\x7f\x10\x00")
+
+
+def _series(folder: Path) -> None:
+    write_series(folder / "ct", Volume(grid=GRID, array=_voxels()))
+    (folder / "ct" / "1-0.dcm").rename(folder / "slice.dcm")
+
+
+def _read_series(folder: Path) -> Any:
+    from anatomy.io.dicom import list_series, read_dicom
+
+    (folder / "slice.dcm").replace(folder / "ct" / "1-0.dcm")
+    list_series(folder / "ct")
+    return read_dicom(folder / "ct")
+
+
+def _centerlines(folder: Path) -> None:
+    from tests.anatomy.io.test_centerlines import _write
+
+    _write(folder / "a.vtp")
+    _write(folder / "b.vtp", "raw", "UInt64", compress=True)
+    _write(folder / "c.vtu", "binary")
+
+
+def _read_centerlines(name: str) -> Callable[[Path], Any]:
+    from anatomy.io.centerlines import read_centerline_graph, read_centerlines
+
+    def read(folder: Path) -> None:
+        read_centerline_graph(folder / name)
+        read_centerlines(folder / name)
+
+    return read
+
+
+def _template(name: str) -> Callable[[Path], None]:
+    text = (resources.files("lungaccess") / "cli" / "templates" / name).read_bytes()
+    return lambda folder: (folder / name).write_bytes(text) and None
+
+
+def _text_targets() -> dict[str, Target]:
+    from anatomy.io.frames import read_points, read_pose
+    from anatomy.io.label_names import stored_names
+    from anatomy.io.own_masks import _read_description, thick_slices_mm
+    from anatomy.segmentation.nodules import nodule_from_contours
+    from lungaccess.one_stage.tour import read_lesions
+    from lungaccess.one_stage.tubes import load_tubes
+    from lungaccess.plans.plan import Plan
+    from lungaccess.problem.system import load_system
+    from lungaccess.procedure.settings import load_procedure
+    from lungaccess.risk.error_files import load_errors
+    from lungaccess.study.settings import read_study
+    from tests.lungaccess.conftest import make_plan
+
+    def preset(folder: Path) -> None:
+        text = (resources.files("lungaccess") / "presets" / "ultrathin.toml").read_bytes()
+        (folder / "system.toml").write_bytes(text)
+
+    def description(folder: Path) -> None:
+        _read_description(folder / "patient.toml")
+        thick_slices_mm(folder)
+
+    def points(folder: Path) -> None:
+        (folder / "points.txt").write_text("1.5 -20 30\n-4e1 5 -6.25\n")
+
+    def labelled(folder: Path) -> None:
+        _image("labels.nii.gz", True)(folder)
+        (folder / "labels.json").write_text('{"labels": {"lung_airways": 1, "lung_vessels": 2}}')
+
+    return {
+        "patient": Target("patient.toml", _template("patient.toml"), description),
+        "system": Target("system.toml", preset, lambda f: load_system(f / "system.toml")),
+        "errors": Target("errors.toml", _template("errors.toml"), lambda f: load_errors(f / "errors.toml")),
+        "procedure": Target(
+            "procedure.toml", _template("procedure.toml"), lambda f: load_procedure(f / "procedure.toml")
+        ),
+        "study": Target("study.toml", _template("study.toml"), lambda f: read_study(f / "study.toml")),
+        "tubes": Target("tubes.toml", _template("tubes.toml"), lambda f: load_tubes(f / "tubes.toml")),
+        "pose": Target("pose.txt", _template("pose.txt"), lambda f: read_pose(f / "pose.txt", "ras")),
+        "points": Target("points.txt", points, lambda f: read_points(f / "points.txt", "lps")),
+        "lesions": Target("lesions.txt", _template("lesions.txt"), lambda f: read_lesions(f / "lesions.txt")),
+        "contours": Target(
+            "contours.json",
+            _template("contours.json"),
+            lambda f: nodule_from_contours(f / "contours.json", _CONTOURED),
+        ),
+        "labels": Target("labels.json", labelled, lambda f: stored_names(f / "labels.nii.gz")),
+        "plan": Target(
+            "plan.json", lambda f: make_plan().save(f / "plan.json"), lambda f: Plan.load(f / "plan.json")
+        ),
+    }
+
+
+def targets() -> dict[str, Target]:
+    """Return all targets by name."""
+    return {
+        "nifti": _image_target("a.nii", lambda content: 352),
+        "nifti-gzip": _image_target("a.nii.gz", None, compressed=True),
+        "nrrd": _image_target("a.nrrd", _after(b"\n\n")),
+        "nrrd-gzip": _image_target("a.nrrd", _after(b"\n\n"), compressed=True),
+        "metaimage": _image_target("a.mha", _after(b"LOCAL\n")),
+        "metaimage-zlib": _image_target("a.mha", _after(b"LOCAL\n"), compressed=True),
+        "metaimage-two-files": _image_target("a.mhd", len),
+        "dicom": Target("slice.dcm", _series, _read_series, _before_pixels),
+        **{
+            f"centerlines-{name[0]}": Target(name, _centerlines, _read_centerlines(name))
+            for name in ("a.vtp", "b.vtp", "c.vtu")
+        },
+        **_text_targets(),
+    }
+
+
+def damaged(rng: np.random.Generator, target: Target, intact: bytes) -> tuple[bytes, bool]:
+    """Return damaged content, and whether the voxels in it are intact."""
+    from tests.fuzz.mutations import mutated
+
+    if target.header_bytes is not None and rng.random() < 0.8:
+        return mutated(rng, intact, target.header_bytes(intact)), True
+    if target.file.endswith(".gz") and rng.random() < 0.5:
+        return gzip.compress(mutated(rng, gzip.decompress(intact), 352), 1), True
+    return mutated(rng, intact), target.file.endswith(".gz")

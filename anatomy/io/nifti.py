@@ -118,14 +118,15 @@ def _data_offset(fields: dict[str, tuple[Any, ...]], path: Path) -> int:
 
 def _dtype(fields: dict[str, tuple[Any, ...]], path: Path) -> np.dtype[Any]:
     code, bits = fields["datatype"]
-    stored = _DTYPES.get(code, "")
+    stored: str = _DTYPES.get(code, "")
     if bits not in (0, 8 * int(stored[1:] or 0)) or not stored:
         raise FileError(
             f"{path} holds voxels of the NIfTI type {code} with {bits} bits",
             expected="whole or floating numbers, with as many bits as their type has",
             remedy="Save the image with another type of voxels",
         )
-    return np.dtype(fields["order"][0] + stored)
+    order: str = fields["order"][0]
+    return np.dtype(order + stored)
 
 
 def _sizes(dim: tuple[int, ...]) -> tuple[int, ...]:

@@ -23,7 +23,7 @@ from anatomy.typed import Array, Mask, UInt16
 Progress = Callable[[str], None]
 Keep = Callable[[str, Array], Array]
 
-FORMAT = 4
+FORMAT = 5
 """Version of the processing: raise it when the same images give another lung."""
 
 PAD_VOXELS = 2

@@ -11,8 +11,9 @@ import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from anatomy.checksums import values_checksum
 from anatomy.errors import FileError
-from anatomy.io.files import write_text
+from anatomy.io.files import DAMAGE, write_text
 
 if TYPE_CHECKING:
     from anatomy.organ import Organ
@@ -35,12 +36,17 @@ def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
     path = lung.folder / f"{name}.json"
     try:
         stored = json.loads(path.read_text(encoding="ascii"))
-        if stored["version"] == version:
+        if stored["version"] == version and stored["checksum"] == values_checksum(stored["values"]):
             return stored["values"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except DAMAGE:
         pass
     values = make()
     # A cache may be read-only, and another process may just have removed the lung.
     with contextlib.suppress(FileError):
-        write_text(path, json.dumps({"version": version, "values": values}))
+        write_text(path, json.dumps(_sealed(version, values)))
     return values
+
+
+def _sealed(version: int, values: Any) -> dict[str, Any]:
+    plain = json.loads(json.dumps(values))
+    return {"version": version, "checksum": values_checksum(plain), "values": plain}

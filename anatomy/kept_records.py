@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,13 +12,12 @@ import numpy as np
 
 from anatomy.cache import cache_limit_bytes, default_cache
 from anatomy.cache_entries import make_room, note_use
-from anatomy.errors import FileError
+from anatomy.checksums import array_checksum, values_checksum, warn_of_damage
+from anatomy.errors import FileError, LungaccessError
 from anatomy.grid import read_only
-from anatomy.io.files import atomic_write
+from anatomy.io.files import DAMAGE, atomic_write
 
 T = TypeVar("T")
-DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile)
-"""What reading a damaged or foreign file raises; the record is then made anew."""
 
 
 def kept_record(
@@ -62,7 +60,7 @@ def kept_record(
     """
     text = json.dumps({"format": version, **depends_on}, sort_keys=True, default=list)
     path = (cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
-    stored = _stored(path, rebuilt)
+    stored = _stored(path, rebuilt) if path.is_file() else None
     if stored is not None:
         note_use(path)
         return stored
@@ -74,18 +72,30 @@ def kept_record(
 
 
 def _stored(path: Path, rebuilt: Callable[[dict[str, Any]], T]) -> T | None:
-    """Return the record in a file; None if there is none or it is damaged."""
+    """Return the record in a file; None if it is damaged, or belongs elsewhere."""
     try:
         with np.load(path) as stored:
             arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
-            return rebuilt(arrays | json.loads(str(stored["rest"])))
-    except DAMAGE:
-        return None
+            rest = json.loads(str(stored["rest"]))
+        if rest.pop("checksum") == _checksum(path, rest, arrays):
+            return rebuilt(arrays | rest)
+    except (*DAMAGE, LungaccessError):
+        pass
+    warn_of_damage(path)
+    return None
+
+
+def _checksum(path: Path, rest: Mapping[str, Any], arrays: Mapping[str, Any]) -> str:
+    """Return what binds the values of a file to each other and to the name of the file."""
+    parts = {name: array_checksum(array) for name, array in arrays.items()}
+    return values_checksum({"file": path.name, "rest": rest, "arrays": parts})
 
 
 def _save(kind: str, values: Mapping[str, Any], path: Path) -> None:
     arrays: dict[str, Any] = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-    rest = {name: value for name, value in values.items() if name not in arrays}
+    plain = {name: value for name, value in values.items() if name not in arrays}
+    rest = json.loads(json.dumps(plain))
+    rest["checksum"] = _checksum(path, rest, arrays)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as temporary, open(temporary, "wb") as stream:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -19,9 +18,11 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.build import FORMAT, build_lung, lung_key
 from anatomy.cache import BUILDING, LUNG_FILE, cache_limit_bytes, default_cache
 from anatomy.cache_entries import make_room, note_use, remove_abandoned
+from anatomy.checksums import are_unchanged, file_states, values_checksum, warn_of_damage
 from anatomy.errors import FileError, LungaccessError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
+from anatomy.io.files import DAMAGE
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
@@ -33,8 +34,6 @@ REPORT_RECORDS: dict[str, Any] = {
     "spurs_pruned": SpurPruned,
     "loops_opened": LoopOpened,
 }
-DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, BadZipFile, LungaccessError)
-"""What reading a damaged folder can raise."""
 FIELD_NAMES = ("airway", "vessel", "pleura", "fissure", "obstacle", "obstacle_fissure")
 
 
@@ -65,7 +64,7 @@ def open_lung(
     """
     key = lung_key(sources)
     folder = (cache or default_cache()) / key
-    stored = _load(folder)
+    stored = _load(folder, warn=True)
     if stored is not None:
         note_use(folder / META)
         return stored
@@ -174,18 +173,29 @@ def _save_rest(lung: Lung, folder: Path) -> None:
         "sources": dict(lung.sources),
         "warnings": lung.warnings,
     }
+    meta["files"] = file_states(folder, sorted(path.name for path in folder.iterdir()))
+    meta = json.loads(json.dumps(meta))
+    meta["checksum"] = values_checksum(meta)
     (folder / META).write_text(json.dumps(meta, indent=1))
 
 
-def _load(folder: Path) -> Lung | None:
-    """Read a stored lung; None if there is none of the present format, or it is damaged."""
+def _load(folder: Path, *, warn: bool = False) -> Lung | None:
+    """Read a stored lung; None if there is none of the present format under its own key, or it is damaged."""
+    if not folder.is_dir():
+        return None
     try:
         meta = json.loads((folder / META).read_text())
         if meta["format"] != FORMAT:
             return None
-        return _from_meta(folder, meta)
-    except DAMAGE:
-        return None
+        stated = meta.pop("checksum")
+        its_own = meta["key"] == folder.name
+        if its_own and stated == values_checksum(meta) and are_unchanged(folder, meta["files"]):
+            return _from_meta(folder, meta)
+    except (*DAMAGE, LungaccessError):
+        pass
+    if warn:
+        warn_of_damage(folder)
+    return None
 
 
 def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:

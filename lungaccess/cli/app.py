@@ -7,11 +7,13 @@ refuses it; 2, the input is bad.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from typing import Annotated, Literal
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
+from anatomy.checksums import DamagedCacheWarning
 from anatomy.errors import AnatomyError, FileError, LungaccessError
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.commands.advise import advise
@@ -125,12 +127,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = _answer(words)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_damage(warnings.showwarning)
+            code = _answer(words)
         sys.stdout.flush()
     except BrokenPipeError:
         terminal.give_up_output()
         return ExitCode.PIPE_CLOSED
     return code
+
+
+def _show_damage(others: Callable[..., None]) -> Callable[..., None]:
+    """Return what shows warnings: one line for what is damaged in the cache; the rest as ever."""
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, DamagedCacheWarning):
+            error_console.print(terminal.escaped(str(message)), soft_wrap=True)
+        else:
+            others(message, category, *where, **more)
+
+    return show
 
 
 def _answer(words: list[str]) -> int:

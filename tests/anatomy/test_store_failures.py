@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 
 from anatomy import store
+from anatomy.build import build_lung, lung_key
+from anatomy.checksums import DamagedCacheWarning
 from anatomy.errors import AnatomyError, FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
@@ -86,6 +88,48 @@ def test_damage_is_repaired(
     assert calls == [1]
     require_same(lung, open_lung(SOURCES, no_reading, cache=cache))
     assert [path.name for path in cache.iterdir()] == [KEY]
+
+
+def _shift_starts(folder: Path) -> None:
+    meta = json.loads((folder / META).read_text())
+    meta["starts"][0][0][3] += 5.0
+    (folder / META).write_text(json.dumps(meta, indent=1))
+
+
+def _open_way(folder: Path) -> None:
+    """Take an obstacle away without another size or type."""
+    distances = np.load(folder / "obstacle.npy", mmap_mode="r+")
+    distances[...] = distances.max()
+    distances.flush()
+
+
+def _shift_tree(folder: Path) -> None:
+    with np.load(folder / "tree.npz") as stored:
+        arrays = dict(stored)
+    np.savez(folder / "tree.npz", **(arrays | {"points_lps": arrays["points_lps"] + 1.0}))
+
+
+def _become_another(folder: Path) -> None:
+    """Put the lung of another patient in its place."""
+    other = {"lung.nii.gz": "f" * 64}
+    open_lung(other, lambda: toy(nodules=None), cache=folder.parent)
+    shutil.rmtree(folder)
+    (folder.parent / lung_key(other)).rename(folder)
+
+
+@pytest.mark.parametrize("change", [_shift_starts, _open_way, _shift_tree, _become_another])
+def test_what_was_changed_is_made_again_with_a_warning(cache: Path, change: Callable[[Path], None]) -> None:
+    change(cache / KEY)
+    with pytest.warns(DamagedCacheWarning, match="made again"):
+        lung = open_lung(SOURCES, toy, cache=cache)
+    require_same(lung, build_lung(toy(), key=KEY))
+    require_same(lung, open_lung(SOURCES, no_reading, cache=cache))
+
+
+def test_a_copy_of_the_cache_is_as_good(cache: Path, tmp_path: Path) -> None:
+    """Files that differ in their time of change alone are read once and found to be the same."""
+    shutil.copytree(cache, tmp_path / "copy", copy_function=shutil.copyfile)
+    require_same(open_lung(SOURCES, no_reading, cache=tmp_path / "copy"), build_lung(toy(), key=KEY))
 
 
 @pytest.mark.parametrize(

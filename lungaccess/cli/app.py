@@ -142,7 +142,7 @@ def _show_damage(others: Callable[..., None]) -> Callable[..., None]:
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
         if issubclass(category, DamagedCacheWarning):
-            error_console.print(terminal.escaped(str(message)), soft_wrap=True)
+            error_console.print(str(message), soft_wrap=True)
         else:
             others(message, category, *where, **more)
 

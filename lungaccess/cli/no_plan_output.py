@@ -88,7 +88,8 @@ def show_explanation(explanation: Explanation) -> None:
     """Print the headline, then what was learned, the most useful first, then the counted reasons."""
     from lungaccess.explanation import sections
 
-    words = terminal.escaped(explanation.headline)
-    terminal.console.print(Panel(words, title="no plan", title_align="left", border_style="yellow"))
+    terminal.console.print(
+        Panel(explanation.headline, title="no plan", title_align="left", border_style="yellow")
+    )
     terminal.show(terminal.table(each.title, each.headings, each.rows) for each in sections(explanation))
     terminal.show_reasons(explanation.failure)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.panel import Panel
 from rich.table import Table
+from rich.text import Text
 
 from lungaccess.appraisal.grade import Grade
 from lungaccess.cli import terminal
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 GRADE_STYLES = {Grade.GOOD: "green", Grade.FAIR: "yellow", Grade.UNKNOWN: "yellow", Grade.POOR: "red"}
-MARKS = {True: "[green]ok[/]", False: "[bold red]refused[/]", None: "[yellow]not checked[/]"}
+MARKS = {True: Text("ok", "green"), False: Text("refused", "bold red"), None: Text("not checked", "yellow")}
 
 
 def plan_record(
@@ -136,10 +137,12 @@ def show_appraisal(appraisal: Appraisal) -> None:
 def show_headline(headline: Headline) -> None:
     """Print the headline in a panel whose colour, mark and title follow the worse of its two parts."""
     style = GRADE_STYLES[headline.grade]
-    lines = [f"[bold {style}]{headline.grade.mark}[/] [bold]{terminal.escaped(headline.text)}[/]"]
-    lines += [f"[dim]{terminal.escaped(each)}[/]" for each in headline.details]
-    title = f"[bold {style}]{headline.verdict}[/]"
-    terminal.console.print(Panel("\n".join(lines), title=title, title_align="left", border_style=style))
+    parts = [(headline.grade.mark, f"bold {style}"), (f" {headline.text}", "bold")]
+    parts += [(f"\n{each}", "dim") for each in headline.details]
+    title = Text(headline.verdict, f"bold {style}")
+    terminal.console.print(
+        Panel(terminal.styled(*parts), title=title, title_align="left", border_style=style)
+    )
 
 
 def limits_table(appraisal: Appraisal) -> Table:
@@ -178,10 +181,10 @@ def _findings_table(stage: str, findings: list[Finding]) -> Table:
         unit = f" {finding.unit}" if finding.unit else ""
         made.add_row(
             mark,
-            terminal.escaped(finding.name),
+            finding.name,
             "" if finding.value is None else f"{finding.value:.4g}{unit}",
             limit,
             "" if finding.margin is None else f"{finding.margin:.3g}",
-            terminal.escaped(finding.detail),
+            finding.detail,
         )
     return made

@@ -8,7 +8,7 @@ from typing import Self
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TaskID, TextColumn
 from rich.text import Text
 
-from lungaccess.cli.terminal import escaped, progress_console
+from lungaccess.cli.terminal import progress_console, safe
 
 BAR_WIDTH = 24
 """Leaves room for the description and the times on a line of 80 characters."""
@@ -49,7 +49,7 @@ def remaining_s(passed_s: float, completed: float, total: float | None) -> float
 def _bar(*more: ProgressColumn) -> Progress:
     return Progress(
         SpinnerColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=BAR_WIDTH),
         _Times(),
         *more,
@@ -93,7 +93,7 @@ class _Shown:
             self._interrupted_words = self._progress.tasks[0].description
         words = f"compiling kernels, once per installation: {kernel}"
         self._progress.update(
-            self._task, description=self._interrupted_words if kernel is None else escaped(words)
+            self._task, description=self._interrupted_words if kernel is None else safe(words)
         )
         if kernel is None:
             self._interrupted_words = None
@@ -108,11 +108,11 @@ class StepDisplay(_Shown):
     def __init__(self, description: str) -> None:
         self._description = description
         self._progress = _bar()
-        self._task = self._progress.add_task(escaped(description), total=None)
+        self._task = self._progress.add_task(safe(description), total=None)
 
     def step(self, words: str, share: float | None = None) -> None:
         """Say what is being done now, and the share of all that is done; None if it is not known."""
-        description = escaped(f"{self._description}: {words}" if words else self._description)
+        description = safe(f"{self._description}: {words}" if words else self._description)
         if share is None:
             self._progress.update(self._task, description=description, total=None)
         else:

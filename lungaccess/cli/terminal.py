@@ -5,21 +5,37 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from rich.console import Console
 from rich.panel import Panel
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from anatomy.errors import LungaccessError
     from lungaccess.plans.no_plan import NoPlan
 
 
+_CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff]")
+"""What a terminal obeys or hides instead of showing it, except for the new line and the tab."""
+
+
 class _Console(Console):
-    """A console that leaves it to the command line what happens when nobody reads on."""
+    """A console on which no text of others is markup or commands the terminal.
+
+    It leaves it to the command line what happens when nobody reads on.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(markup=False, emoji=False, **settings)
+
+    def render_str(self, text: str, **settings: Any) -> Text:
+        """Return a text, of a file name, say, as it is shown."""
+        return super().render_str(safe(text), **settings)
 
     def on_broken_pipe(self) -> NoReturn:
         """Raise BrokenPipeError."""
@@ -70,12 +86,12 @@ def _finite(value: object) -> object:
 
 def say(text: str) -> None:
     """Print a line of plain text."""
-    console.print(escaped(text))
+    console.print(text)
 
 
 def show_warnings(warnings: Iterable[str]) -> None:
     """Print what was odd about an input, if anything was."""
-    text = escaped("\n".join(f"- {warning}" for warning in warnings))
+    text = "\n".join(f"- {warning}" for warning in warnings)
     if text:
         console.print(Panel(text, title="warnings", title_align="left", border_style="yellow"))
 
@@ -89,7 +105,7 @@ def table(title: str, headings: Iterable[str], rows: Iterable[Row]) -> Table:
         numeric = number > 0 and all(_is_number(cell) for cell in cells if cell)
         made.add_column(heading, justify="right" if numeric else "left", overflow="fold")
     for row in listed:
-        made.add_row(*(escaped(cell) for cell in row))
+        made.add_row(*row)
     return made
 
 
@@ -106,9 +122,21 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def escaped(text: str) -> str:
-    """Return text in which rich finds no markup, and odd bytes of a file name are spelled out."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8").replace("[", r"\[")
+def safe(text: str) -> str:
+    """Return text whose odd bytes, and what would command a terminal, are spelled out.
+
+    Examples
+    --------
+    >>> safe("lung\x1b[2J.nii")
+    'lung\\\\x1b[2J.nii'
+    """
+    spelled = text.encode("utf-8", "backslashreplace").decode("utf-8")
+    return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], spelled)
+
+
+def styled(*parts: tuple[str, str]) -> Text:
+    """Return one text of pieces with their styles."""
+    return Text.assemble(*((safe(text), style) for text, style in parts))
 
 
 def show(tables: Iterable[Table]) -> None:
@@ -133,12 +161,12 @@ def show_wide(tables: Iterable[Table]) -> None:
 
 def show_error(error: LungaccessError) -> None:
     """Print what was found, what was expected and what to do, in a short panel on standard error."""
-    lines = [escaped(error.found.rstrip(".") + ".")]
+    parts = [(error.found.rstrip(".") + ".", "")]
     if error.expected:
-        lines.append(f"[dim]expected[/]  {escaped(error.expected)}")
+        parts += [("\nexpected", "dim"), (f"  {error.expected}", "")]
     if error.remedy:
-        lines.append(f"[dim]remedy[/]    {escaped(error.remedy)}")
-    error_console.print(Panel("\n".join(lines), title="bad input", title_align="left", border_style="red"))
+        parts += [("\nremedy", "dim"), (f"    {error.remedy}", "")]
+    error_console.print(Panel(styled(*parts), title="bad input", title_align="left", border_style="red"))
 
 
 def error_record(error: LungaccessError) -> dict[str, object]:
@@ -155,10 +183,10 @@ def error_record(error: LungaccessError) -> dict[str, object]:
 
 def show_no_plan(failure: NoPlan) -> None:
     """Print why no plan was found: the counted reasons, and what would help."""
-    console.print(Panel(escaped(failure.found), title="no plan", title_align="left", border_style="yellow"))
+    console.print(Panel(failure.found, title="no plan", title_align="left", border_style="yellow"))
     show_reasons(failure)
     if failure.advice:
-        console.print(f"\n[bold]What would help:[/] {escaped(failure.advice)}")
+        console.print(styled(("\nWhat would help:", "bold"), (f" {failure.advice}", "")))
 
 
 def show_reasons(failure: NoPlan) -> None:

@@ -111,6 +111,4 @@ def what_to_look_at(out: Path) -> Panel:
         f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
         f"{out / 'report.html'}: all of it in 3-D, playing along a slider; open it in a browser.",
     )
-    return Panel(
-        "\n".join(terminal.escaped(line) for line in lines), title="what to look at", title_align="left"
-    )
+    return Panel("\n".join(lines), title="what to look at", title_align="left")

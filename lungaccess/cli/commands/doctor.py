@@ -58,7 +58,7 @@ def _show(health: Health) -> None:
     if kernels.state != "warm":
         terminal.console.print("The first use of a kernel compiles it, for some seconds each.")
     for complaint in health.complaints:
-        terminal.console.print(f"[bold red]{terminal.escaped(complaint)}.[/]")
+        terminal.console.print(f"{complaint}.", style="bold red")
 
 
 def _folder(folder: Folder) -> str:

@@ -75,13 +75,11 @@ def run(
         return ExitCode.of(not done.failed)
     terminal.show([_table(asked.name, summarise(out))])
     terminal.console.print(
-        terminal.escaped(
-            f"{done.runs} runs: {done.stored_before} were stored, {done.added} added in {done.wall_s:.1f} s. "
-            f"Written to {out}"
-        )
+        f"{done.runs} runs: {done.stored_before} were stored, {done.added} added in {done.wall_s:.1f} s. "
+        f"Written to {out}"
     )
     if done.failed:
-        terminal.console.print(f"[bold red]{done.failed} could not be made; start the study again.[/]")
+        terminal.console.print(f"{done.failed} could not be made; start the study again.", style="bold red")
     return ExitCode.of(not done.failed)
 
 

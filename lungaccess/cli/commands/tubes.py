@@ -74,9 +74,9 @@ def _show_verdict(answer: TubeAnswer, propose: bool) -> None:
     """Print whether the device allows the deployment, why not, and what to try."""
     if answer.acceptable:
         limits = "" if answer.system is None else " and within the limits of the system"
-        terminal.console.print(f"[bold green]Allowed: stable at every step{limits}.[/]")
+        terminal.console.print(f"Allowed: stable at every step{limits}.", style="bold green")
         return
-    terminal.console.print("[bold red]Not allowed by this device.[/]")
+    terminal.console.print("Not allowed by this device.", style="bold red")
     for why in answer.refusals:
         terminal.say(f"- {why}.")
     if answer.system is not None and not propose:

@@ -15,7 +15,7 @@ from anatomy.io.files import require_writable_folder
 from anatomy.records import frozen_value
 from lungaccess.cli.numbers import Count, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
-from stages.needle import NEEDLE_PLANNERS, OUR_PLANNERS, TERMS, Objective
+from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     OurPlannerName = str
     PlannerName = str
 else:
-    ObjectiveText = Literal[tuple(term.option for term in TERMS)] | str
+    ObjectiveText = Literal[DEFAULT, *(term.option for term in TERMS)] | str
     OurPlannerName, PlannerName = Literal[OUR_PLANNERS], Literal[NEEDLE_PLANNERS]
 """The costs by name, for help and completion, or a weighted sum, which `Objective.of` reads; the planners."""
 
@@ -240,10 +240,11 @@ class SearchOptions(BudgetOptions):
         ObjectiveText,
         Parameter(
             help="What to make small: integral of 1/clearance, integral of the patient's cost map, its sum "
-            "over the voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5.  Or "
-            "success: the chance that the procedure succeeds is made large."
+            "over the voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5; default is "
+            "the first, and the second too where there is a map.  Or success: the chance that the procedure "
+            "succeeds is made large."
         ),
-    ] = "inverse-clearance"
+    ] = DEFAULT
     method: Annotated[
         Method,
         Parameter(
@@ -274,9 +275,9 @@ def require_picture(path: Path) -> None:
     require_writable_folder(path.parent)
 
 
-def require_map(lung: Lung, objective: Objective) -> None:
-    """Raise SettingsError if an objective weighs a cost map that the patient does not have."""
-    if objective.weighs_map and lung.cost is None:
+def require_map(lung: Lung, objective: str) -> None:
+    """Raise SettingsError if a stated objective weighs a cost map that the patient does not have."""
+    if objective != DEFAULT and Objective.of(objective).weighs_map and lung.cost is None:
         raise SettingsError(
             f"Patient {lung.name} has no cost map",
             expected=f"a cost map among the patient's files for --objective {objective}",

@@ -19,8 +19,8 @@ from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task
-from stages.needle import Objective
+from lungaccess.problem.task import Task, objective_of
+from stages.needle import DEFAULT, Objective
 
 COUNT = 15
 SEPARATION_MM = 5.0
@@ -62,7 +62,7 @@ def alternatives(
     system: System,
     target: Target,
     *,
-    objective: str | Objective = "inverse_clearance",
+    objective: str | Objective = DEFAULT,
     count: int = COUNT,
     separation_mm: float = SEPARATION_MM,
     atlas: Atlas | None = None,
@@ -95,9 +95,8 @@ def alternatives(
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
-    task = Task(
-        lung=lung, system=system, target=target, objective=Objective.of(objective), method="alternatives"
-    )
+    weighed = objective_of(lung, objective)
+    task = Task(lung=lung, system=system, target=target, objective=weighed, method="alternatives")
     if atlas is not None:
         require_same(atlas, lung, system)
     direct = direct_candidates(task, atlas or build_atlas(lung, system))

@@ -20,8 +20,8 @@ from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task
-from stages.needle import Objective, require_planner
+from lungaccess.problem.task import Task, objective_of
+from stages.needle import DEFAULT, Objective, require_planner
 
 
 def _over_the_atlas(task: Task, atlas: Atlas) -> PlanSearch:
@@ -69,7 +69,7 @@ def plan(
     system: System,
     target: Target,
     *,
-    objective: str | Objective = "inverse_clearance",
+    objective: str | Objective = DEFAULT,
     method: str = "atlas",
     needle_planner: str = "",
     seed: int = 0,
@@ -87,7 +87,8 @@ def plan(
     ----------
     objective : str or Objective
         "inverse_clearance" [Kuntz2015, eq. 1], "cost_map", "voxel_sum" [Fu2018, eq. 1], "length_mm", or a
-        weighted sum of them such as "length=1,cost-map=0.5".
+        weighted sum of them such as "length=1,cost-map=0.5".  "default": the first, and the second as well
+        where the patient has a cost map; see `stages.needle.objective`.
     method : str
         One of METHODS, to which you can add a search of your own; see
         `lungaccess.coupled.search.base.PlanSearch`.  "atlas": direct arcs from every deployment of the atlas,
@@ -132,7 +133,7 @@ def plan(
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
-    weighed = Objective.of(objective)
+    weighed = objective_of(lung, objective)
     if method not in METHODS:
         raise SettingsError(
             f"There is no method {method!r}",

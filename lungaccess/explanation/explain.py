@@ -32,10 +32,10 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task
+from lungaccess.problem.task import Task, objective_of
 from lungaccess.reachability import ReachVerdict, UnreachableProof
 from lungaccess.risk import Share, assess
-from stages.needle import Objective, needle_environment
+from stages.needle import DEFAULT, Objective, needle_environment
 
 DEFAULT_TIME_S = 10.0
 """All parts of a patient whose atlases are cached take about so long, and a user still waits."""
@@ -60,7 +60,7 @@ def explain_no_plan(
     failure: NoPlan,
     *,
     atlas: Atlas | None = None,
-    objective: str | Objective = "inverse_clearance",
+    objective: str | Objective = DEFAULT,
     seed: int = 0,
     time_s: float | None = DEFAULT_TIME_S,
     atlas_of: AtlasOf | None = None,
@@ -87,7 +87,7 @@ def explain_no_plan(
         Told the name of each part as it begins.
     """
     own = atlas or build_atlas(lung, system)
-    task = Task(lung=lung, system=system, target=target, objective=Objective.of(objective), seed=seed)
+    task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective), seed=seed)
     made = Explainer(task, own, time_s, atlas_of or _built(lung), on_part or (lambda _name: None))
     return made.explanation(failure)
 

@@ -18,8 +18,9 @@ from lungaccess.one_stage.rest import RestOfPlan
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task
+from lungaccess.problem.task import Task, objective_of
 from stages.needle import (
+    DEFAULT,
     Objective,
     OptimalSearch,
     easiest_obstruction,
@@ -40,7 +41,7 @@ def replan_from_scope(
     lps_from_scope_tip: ArrayLike,
     target: Target,
     *,
-    objective: str | Objective = "inverse_clearance",
+    objective: str | Objective = DEFAULT,
     seed: int = 0,
     tries: int = TRIES,
     searches: int = SEARCHED,
@@ -81,7 +82,7 @@ def replan_from_tube(
     lps_from_tip: ArrayLike,
     target: Target,
     *,
-    objective: str | Objective = "inverse_clearance",
+    objective: str | Objective = DEFAULT,
     seed: int = 0,
     iterations: int = NEEDLE_ITERATIONS,
 ) -> RestOfPlan:
@@ -123,7 +124,7 @@ def replan_from_tube(
 
 
 def _task(lung: Lung, system: System, target: Target, objective: str | Objective, seed: int) -> Task:
-    weighed = Objective.of(objective)
+    weighed = objective_of(lung, objective)
     return Task(lung=lung, system=system, target=target, objective=weighed, method="replan", seed=seed)
 
 

@@ -33,6 +33,6 @@ if TYPE_CHECKING:
         resolve_target,
         stated_target,
     )
-    from lungaccess.problem.task import Task, fissures_are_obstacles
+    from lungaccess.problem.task import Task, fissures_are_obstacles, objective_of
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

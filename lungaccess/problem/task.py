@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from anatomy.lung import Lung
+from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
-from stages.needle import Objective
+from stages.needle import DEFAULT, Objective
 
 
 @frozen_record
@@ -32,6 +33,18 @@ class Task:
     def with_fissures(self) -> bool:
         """Whether fissures are obstacles."""
         return fissures_are_obstacles(self.lung, self.system)
+
+
+def objective_of(lung: Organ, stated: str | Objective = DEFAULT) -> Objective:
+    """Return what is to be made small in a lung; the default without a cost map is clearance alone.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such objective; see `stages.needle.objective.Objective.of`.
+    """
+    weighed = Objective.of(stated)
+    return weighed.without_map if stated == DEFAULT and lung.cost is None else weighed
 
 
 def fissures_are_obstacles(lung: Lung, system: System) -> bool:

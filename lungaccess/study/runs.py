@@ -19,11 +19,11 @@ from lungaccess.plans.assemble import software_version
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
+from lungaccess.problem.task import objective_of
 from lungaccess.procedure import Procedure, load_procedure
 from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.study.patients import Patient, open_patient, patient_of
 from lungaccess.study.settings import Case, PlannerChoice, Study
-from stages.needle import Objective
 
 OF_THEIR_OWN_CLASS = ("patient", "system", "errors", "procedure")
 """The fields of a problem that are not plain values."""
@@ -182,13 +182,14 @@ def runs_of(
         for planner in study.planner:
             if planner.needs_a_needle:
                 system.require_needle(f"The planner {planner.name!r} of the study")
-        targets = _targets(case, open_patient(patient, cache))
+        lung = open_patient(patient, cache)
+        objective, targets = str(objective_of(lung, case.objective)), _targets(case, lung)
         for number, (point, origin) in enumerate(targets, start=1):
             problem = Problem(
                 case=case.name,
                 patient=patient,
                 system=system,
-                objective=str(Objective.of(case.objective)),
+                objective=objective,
                 target=number,
                 target_lps=point,
                 origin=origin,

@@ -12,7 +12,7 @@ from pydantic import Field
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.io.files import read_toml
 from anatomy.settings import impossible, parse, quantity, settings, switch, text
-from stages.needle import NEEDLE_PLANNERS, OMPL_PLANNERS, Objective
+from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS, Objective
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
@@ -77,7 +77,7 @@ class Case:
     phantom: PhantomPatient = PhantomPatient()
     system: Annotated[str, text("preset or TOML file")] = "lung-default"
     fissures_allowed: Annotated[bool | None, switch("whether a fissure may be crossed")] = None
-    objective: Annotated[str, text("what is minimised")] = "inverse_clearance"
+    objective: Annotated[str, text("what is minimised")] = DEFAULT
     errors: Annotated[str, text("error model: preset or TOML file", may_be_empty=True)] = ""
     procedure: Annotated[str, text("procedure: preset or TOML file")] = "open-loop"
     targets: Annotated[tuple[str, ...], Field(description="points with their frame, or nodules")] = ()

@@ -13,12 +13,11 @@ from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task
+from lungaccess.problem.task import Task, objective_of
 from lungaccess.procedure import Procedure, load_procedure
 from lungaccess.procedure.spread import Spread
 from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.success.estimate import ChanceEstimator, chance_of
-from stages.needle import Objective
 
 METHOD = "success, alternatives"
 """What the method of such plans is called."""
@@ -87,7 +86,7 @@ def alternatives_for_success(
     system.require_needle("A diverse plan set for the chance of success")
     if atlas is not None:
         require_same(atlas, lung, system)
-    objective = Objective.of("inverse_clearance")
+    objective = objective_of(lung)
     task = Task(lung=lung, system=system, target=target, objective=objective, method=METHOD, seed=seed)
     estimator = ChanceEstimator(
         task, errors or load_errors(), procedure or load_procedure(), radius_mm=radius_mm

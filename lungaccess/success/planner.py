@@ -13,12 +13,11 @@ from lungaccess.coupled.planner import Clock, ProgressEvent, atlas_event
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task
+from lungaccess.problem.task import Task, objective_of
 from lungaccess.procedure import Procedure, ProcedureReport, load_procedure
 from lungaccess.risk import ErrorModel, RiskReport, Share, load_errors
 from lungaccess.success.estimate import ChanceEstimator, chance_of
 from lungaccess.success.search import Contender, SuccessSearch
-from stages.needle import Objective
 
 METHOD = "success"
 """What the method of such plans is called."""
@@ -31,7 +30,7 @@ class PlannedSuccess:
     Parameters
     ----------
     plan : Plan
-        Proved as every plan; its costs are those of the objective "inverse_clearance".
+        Proved as every plan; its costs are those of the default objective.
     estimate : RiskReport or ProcedureReport
         How many procedures succeed of draws that no search has seen, and what fails; few draws of a plan
         that may soon be surpassed, and which comes again with all draws if it is not.  What is counted the
@@ -102,7 +101,7 @@ def plan_for_success(
         require_same(atlas, lung, system)
     atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(atlas_event(share)))
     task = Task(
-        lung=lung, system=system, target=target, objective=Objective.of("inverse_clearance"), method=METHOD,
+        lung=lung, system=system, target=target, objective=objective_of(lung), method=METHOD,
         seed=seed,
     )  # fmt: skip
     model, followed = errors or load_errors(), procedure or load_procedure()

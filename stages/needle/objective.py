@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 MAX_CLEARANCE_MM = 256.0
 """No clearance field holds more, so that 1 / clearance has a least value."""
 
+DEFAULT = "default"
+"""The objective of whoever states none: far from obstacles, and from thin vessels where there is a map."""
+DEFAULT_MAP_WEIGHT = 1.0
+"""A mm in a thin vessel costs as much as one at 1 mm from an obstacle: hardly any axis may lie nearer."""
+
 NO_MAP = read_only(np.zeros((2, 2, 2), dtype=np.float32, order="F"))
 """Stands for a map that is not looked at, of the type of all maps: the kernels are compiled once."""
 
@@ -126,6 +131,7 @@ class Objective:
         stated : str or Objective
             The names of costs, each with its weight after "=", separated by commas.  A cost is named by its
             key (``length_mm``) or as on the command line (``length``); a name alone has the weight 1.
+            "default" is ``inverse_clearance=1,cost_map=1``.
 
         Raises
         ------
@@ -134,6 +140,8 @@ class Objective:
         """
         if isinstance(stated, Objective):
             return stated
+        if stated == DEFAULT:
+            return cls(inverse_clearance=1.0, cost_map=DEFAULT_MAP_WEIGHT)
         weights: dict[str, float] = {}
         for part in stated.split(","):
             name, equals, weight = (word.strip() for word in part.partition("="))
@@ -251,8 +259,8 @@ def _term(name: str) -> Term:
     options = [term.option for term in TERMS]
     raise SettingsError(
         f"There is no objective {name!r}",
-        expected=f"one of {', '.join(options)}, or a weighted sum such as length=1,cost-map=0.5",
-        remedy=did_you_mean(name, options) or "Choose one of them",
+        expected=f"one of {DEFAULT}, {', '.join(options)}, or a weighted sum such as length=1,cost-map=0.5",
+        remedy=did_you_mean(name, [DEFAULT, *options]) or "Choose one of them",
     )
 
 

@@ -25,7 +25,7 @@ from lungaccess.cli.options import (
 )
 from lungaccess.cli.plan_search import system_of
 from lungaccess.cli.progress import progress
-from stages.needle import Objective
+from stages.needle import DEFAULT, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -57,7 +57,7 @@ def alternatives(
     objective: Annotated[
         ObjectiveText,
         Parameter(help="By what the best come first, as for `plan`; success: the likeliest to succeed."),
-    ] = "inverse-clearance",
+    ] = DEFAULT,
     errors: ErrorOptions = ErrorOptions(),
     out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on, and trade_off.svg.")] = Path(
         "lungaccess-alternatives"
@@ -76,12 +76,14 @@ def alternatives(
     from lungaccess.success import alternatives_for_success
 
     for_success = objective == SUCCESS
-    stated, weighed = target.stated(), Objective.of("inverse-clearance" if for_success else objective)
+    objective = DEFAULT if for_success else objective
+    Objective.of(objective)
+    stated = target.stated()
     model, procedure = errors.load(), errors.given_procedure()
     require_writable_folder(out)
     systems = system.candidates()
     lung = output.load(patient)
-    require_map(lung, weighed)
+    require_map(lung, objective)
     aim = stated.resolve(lung)
 
     def search(device: System) -> tuple[Alternative, ...]:
@@ -96,7 +98,7 @@ def alternatives(
                 return alternatives_for_success(
                     lung, device, aim, errors=model, procedure=procedure, progress=shown.share, **shared
                 )
-            return find_alternatives(lung, device, aim, objective=weighed, **shared)
+            return find_alternatives(lung, device, aim, objective=objective, **shared)
 
     found = search(systems[0]) if len(systems) == 1 else _of_the_least_invasive(lung, systems, search)
     chosen = system_of(found[0].plan, systems)

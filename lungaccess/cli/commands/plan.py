@@ -63,12 +63,13 @@ def plan(
     if for_success:
         _require_plain(search, system)
         search = replace(search, objective=SearchOptions().objective)
-    stated, objective = target.stated(), Objective.of(search.objective)
+    Objective.of(search.objective)
+    stated = target.stated()
     model, procedure = errors.load(), errors.given_procedure()
     require_writable_folder(out)
     systems = system.candidates()
     lung = output.load(patient, thick_slices=thick_slices)
-    require_map(lung, objective)
+    require_map(lung, search.objective)
     request = PlanRequest(
         systems=systems, target=stated, search=search, errors=model, out=out, output=output,
         pictures=pictures, procedure=procedure, for_success=for_success,

@@ -22,7 +22,7 @@ from lungaccess.cli.options import (
     require_map,
 )
 from lungaccess.cli.progress import progress
-from stages.needle import Objective
+from stages.needle import DEFAULT, Objective
 
 if TYPE_CHECKING:
     from anatomy.typed import Float
@@ -50,9 +50,7 @@ def replan(
     frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    objective: Annotated[
-        ObjectiveText, Parameter(help="What to make small, as for `plan`.")
-    ] = "inverse-clearance",
+    objective: Annotated[ObjectiveText, Parameter(help="What to make small, as for `plan`.")] = DEFAULT,
     seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
@@ -61,16 +59,17 @@ def replan(
     from lungaccess.one_stage import replan_from_scope, replan_from_tube
     from lungaccess.plans.no_plan import NoPlan
 
-    stated, weighed, device = target.stated(), Objective.of(objective), system.load()
+    Objective.of(objective)
+    stated, device = target.stated(), system.load()
     pose, plan = _measured(scope, tube, frame)
     lung = output.load(patient)
     if plan is not None:
         plan.require_lung(lung)
-    require_map(lung, weighed)
+    require_map(lung, objective)
     aim, ask = stated.resolve(lung), replan_from_tube if scope is None else replan_from_scope
     try:
         with progress("planning the rest"):
-            found = ask(lung, device, pose, aim, objective=weighed, seed=seed)
+            found = ask(lung, device, pose, aim, objective=objective, seed=seed)
     except NoPlan as failure:
         if not output.json:
             raise

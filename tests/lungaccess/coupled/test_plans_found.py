@@ -14,7 +14,7 @@ from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from stages.needle import Objective
-from tests.lungaccess.coupled.planning import KEYS, SYSTEM, mapped, plans_of
+from tests.lungaccess.coupled.planning import KEYS, SYSTEM, mapped, plans_of, same_run
 from tests.lungaccess.resample import needle_walk, problems
 
 
@@ -114,6 +114,20 @@ class TestPlans:
         dense = np.arccos(np.clip(walk.tangents @ walk.tangents[0], -1, 1)).max()
         assert plan.needle.max_angle_from_start_rad == pytest.approx(dense, abs=1e-6)
         assert plan.clearance_mm["needle"]["vessel"] >= plan.required_clearance_mm["needle"] - 0.03
+
+
+@pytest.mark.parametrize("has_map", [False, True])
+def test_the_default_objective_weighs_a_map_where_there_is_one(
+    small_lung: Lung, target: Target, atlas: la.Atlas, has_map: bool
+) -> None:
+    lung = mapped(small_lung) if has_map else small_lung
+    stated = "inverse_clearance=1,cost_map=1" if has_map else "inverse_clearance"
+    found = plans_of(lung, target, atlas, iterations=10)
+    assert {plan.objective for plan in found} == {stated}
+    assert same_run(found) == same_run(plans_of(lung, target, atlas, iterations=10, objective=stated))
+    for each in la.alternatives(lung, SYSTEM, target, atlas=atlas, count=2):
+        assert each.plan.objective == stated
+        assert la.check(each.plan, lung).accepted
 
 
 class TestInfiniteCost:

@@ -18,7 +18,7 @@ from anatomy.typed import Float32
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.kernels import cost as kernel
-from stages.needle.objective import NO_MAP, SHORTEST, TERMS, Objective, Term
+from stages.needle.objective import DEFAULT, NO_MAP, SHORTEST, TERMS, Objective, Term
 from tests.stages.scenes import Canvas
 
 NAMES = [field.name for field in fields(Objective)]
@@ -62,6 +62,11 @@ def test_a_single_cost_is_named_by_its_key(term: Term) -> None:
         assert objective == Objective(**{term.weight: 1.0})
         assert str(objective) == term.key
         assert objective.words == term.words_with_unit
+
+
+def test_the_default_weighs_clearance_and_map() -> None:
+    assert str(Objective.of(DEFAULT)) == "inverse_clearance=1,cost_map=1"
+    assert str(Objective.of(DEFAULT).without_map) == "inverse_clearance"
 
 
 def test_every_weight_has_a_cost() -> None:

@@ -26,8 +26,8 @@ LEAST_LIKELIHOOD = 0.15
 """A border counts against a parting if less of it than this is like a fissure: segments have no sheet."""
 WEIGHT_OF_SHARES = 0.05
 """One spread off the usual share weighs as much as a fissure over a twentieth of the lung's cross-section."""
-LEAST_GAIN = 0.02
-"""A twig changes its lobe only for so much: most lobes have one bronchus."""
+COST_OF_BRONCHUS = 0.02
+"""Most lobes have one bronchus: each further one must be worth as much as a fissure over a fiftieth."""
 LEAST_SHARE = 0.03
 """No lobe is smaller, unless it has collapsed."""
 TRUNK_SHARE = 0.9
@@ -113,7 +113,7 @@ def _settled(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> Int:
             for other in lobes:
                 moved = np.where(regions.below[branch] & regions.used, other, lobe)
                 value = _value(regions, moved, lobes)
-                if value > best + LEAST_GAIN:
+                if value > best:
                     best, lobe = value, moved
         part = np.select([lobe == each for each in lobes], range(1, len(lobes) + 1))
         lobe = _named(regions, part, lobes)
@@ -160,4 +160,14 @@ def _value(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> float:
     for part, number in zip(parts, lobes, strict=True):
         usual, spread = USUAL_SHARES[number]
         value -= WEIGHT_OF_SHARES * ((regions.volume[part].sum() / whole - usual) / spread) ** 2
-    return value
+    return value - COST_OF_BRONCHUS * (_bronchi(regions, lobe) - len(lobes))
+
+
+def _bronchi(regions: Regions, lobe: Int) -> int:
+    """Return how many bronchi lead to one lobe alone and do not hang on another that does."""
+    numbers = lobe * regions.used
+    most = np.where(regions.below, numbers, 0).max(axis=1)
+    least = np.where(regions.below & (numbers > 0), numbers, np.iinfo(np.int64).max).min(axis=1)
+    alone = (most == least) & (most > 0)
+    above = (regions.below & alone[:, None]).sum(axis=0)  # of each branch, itself included
+    return int(np.count_nonzero(alone & (above == 1)))

@@ -33,7 +33,7 @@ Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
 Progress = Callable[[str], None]
 
-VERSION = 2
+VERSION = 3
 """Raise it when a step makes other images from the same input."""
 _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 

@@ -135,7 +135,7 @@ def render_ct(images: PatientImages, look: CtLook | None = None) -> SyntheticCt:
     del tissue, lung_share
     fissures = np.zeros(grid.shape, dtype=np.bool_, order="F")
     if images.fissures is not None:
-        sheet = _sheet(images.fissures.array & images.lung.array, spacing)
+        sheet = middle_sheet(images.fissures.array & images.lung.array, spacing)
         thickness = np.float32(min(1.0, look.fissure_mm / float(spacing.mean())))
         _mix(image, thickness * share(sheet), FISSURE_HU)
         fissures = share(sheet) >= HALF
@@ -245,7 +245,7 @@ def _distance_mm(mask: Mask, spacing_mm: ArrayLike) -> Float32:
     return np.asarray(edt.edt(writable, anisotropy=sides, order="F", black_border=False, parallel=2))
 
 
-def _sheet(mask: Mask, spacing: Float) -> Mask:
+def middle_sheet(mask: Mask, spacing: Float) -> Mask:
     """Return the middle of a thick mask of a sheet: voxels as deep as all their neighbours."""
     from scipy.ndimage import maximum_filter
 

@@ -120,6 +120,14 @@ def test_without_fissures_usual_shares_decide() -> None:
     assert found[3:].tolist() == [LEFT_UPPER, LEFT_UPPER, LEFT_LOWER, LEFT_LOWER]
 
 
+def test_a_lobe_with_one_bronchus_is_preferred_to_usual_shares() -> None:
+    """Branch 5 is large for a middle lobe, and hangs on the same bronchus as 6: it stays with it."""
+    volume = [0.0, 10, 10, 300, 300, 180, 160]
+    fissures = regions(volume, PLACES, [(3, 4), (4, 5)])
+    found = lobes_of_branches(fissures, (RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER))
+    assert found[5] == found[6] and len({*found[3:].tolist()} - {0}) == 3
+
+
 def test_too_few_bronchi_give_no_lobes() -> None:
     one = regions([0.0, 0, 0, 300, 0, 0, 0], PLACES, [])
     assert not lobes_of_branches(one, (LEFT_UPPER, LEFT_LOWER)).any()

@@ -92,7 +92,7 @@ def test_lobes_and_fissures_are_those_of_the_patient(patient: Phantom, made: Seg
     for number, name in LOBES.items():
         both = np.count_nonzero((images.lobes.array == number) & (truth == number))
         sizes = np.count_nonzero(images.lobes.array == number) + np.count_nonzero(truth == number)
-        assert 2 * both / sizes > 0.92, name  # the middle lobe; the others are above 0.97
+        assert 2 * both / sizes > 0.95, name
     far = ndimage.distance_transform_edt(~patient.mask("fissure"), sampling=patient.grid.spacing_mm)
     assert np.median(far[made.parts.fissures == SEEN]) <= 1.5
     assert np.mean(made.parts.fissures[made.parts.fissures > 0] == SEEN) > 0.8

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 _SPACING_TOLERANCE_MM = 0.05
 _TILT_TOLERANCE_MM = 0.1
 _MISSING_FACTOR = 1.5
-_UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept", "SamplesPerPixel")
+_GREY_KEYS = ("SamplesPerPixel", "PhotometricInterpretation")
+_UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept", *_GREY_KEYS)
 _NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEYS)
 _SERIES_KEYS = ("SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames")
 
@@ -86,7 +87,7 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
         _require_uniform([header for _, header in headers], where)
         _require_grey_values(headers[0][1], where)
         paths, grid = _geometry(headers, where)
-    return Volume(grid=grid, array=_pixels(paths, grid, where))
+        return Volume(grid=grid, array=_pixels(paths, grid, where))
 
 
 @contextmanager
@@ -190,12 +191,20 @@ def _require_uniform(headers: Iterable[FileDataset], where: str) -> None:
 
 def _require_grey_values(first: FileDataset, where: str) -> None:
     """Refuse slices that do not hold one Hounsfield unit a pixel; all slices say the same as the first."""
-    slope, samples = float(first.RescaleSlope), int(first.SamplesPerPixel)
-    if samples != 1 or slope == 0 or not np.isfinite([slope, float(first.RescaleIntercept)]).all():
+    slope, samples, shown_as = (
+        float(first.RescaleSlope),
+        int(first.SamplesPerPixel),
+        first[_GREY_KEYS[1]].value,
+    )
+    if (
+        (samples, shown_as) != (1, "MONOCHROME2")
+        or slope == 0
+        or not np.isfinite([slope, float(first.RescaleIntercept)]).all()
+    ):
         raise FileError(
-            f"{where} has {samples} samples a pixel, RescaleSlope {slope:g} "
+            f"{where} has {samples} samples a pixel, shown as {shown_as}, RescaleSlope {slope:g} "
             f"and RescaleIntercept {first.RescaleIntercept}",
-            expected="one sample a pixel, which slope and intercept turn into Hounsfield units",
+            expected="one MONOCHROME2 sample a pixel, which slope and intercept turn into Hounsfield units",
             remedy="Export the CT series again, not a picture of it",
         )
 

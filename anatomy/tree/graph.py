@@ -14,6 +14,10 @@ SAME_POINT_MM = 1e-3
 """Files store points in single precision; true neighbours are a hundred times farther apart."""
 
 
+MOST_RADIUS_MM = 100.0
+"""No tube of a body is as wide as this."""
+
+
 def spanned_graph(
     points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike
 ) -> tuple[SkeletonTree, TreeReport]:
@@ -45,6 +49,8 @@ def _checked(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> t
         problem = f"the edges have the shape {pairs.shape}"
     elif not np.isfinite(points).all() or not np.isfinite(radius).all() or (radius < 0).any():
         problem = "a coordinate or radius is not finite, or a radius is negative"
+    elif radius.max() > MOST_RADIUS_MM:
+        problem = f"a radius is {radius.max():.3g} mm"
     elif pairs.min() < 0 or pairs.max() >= len(points):
         problem = f"an edge names the point {pairs.max()} of {len(points)}, or a negative one"
     if problem:

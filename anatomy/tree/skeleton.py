@@ -12,6 +12,8 @@ from anatomy.records import frozen_record
 from anatomy.tree.bridge import face_paths
 from anatomy.typed import Bool, Float, Int
 
+COST_RANGE = (1e-300, 1e300)
+"""The spanning tree leaves out edges that cost nothing, as it does those that are not there."""
 LOOP_EDGES = 12
 """A ring of fewer skeleton voxels is roughness of the mask, not two airways that touch."""
 
@@ -134,6 +136,7 @@ def span(
     a, b = pairs.T
     length = np.linalg.norm(mm[a] - mm[b], axis=1)
     cost = length / np.maximum(np.minimum(depth_mm[a], depth_mm[b]), 1e-3) ** 2 * factor
+    cost = np.clip(cost, *COST_RANGE)
     graph = coo_array((cost, (a, b)), shape=(len(mm), len(mm))).tocsr()
     spanned = minimum_spanning_tree(graph).tocoo()
     neighbours: list[list[int]] = [[] for _ in range(len(mm))]

@@ -16,7 +16,7 @@ from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.plans.file import SCHEMA
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import System, load_system, shipped_names, system_fingerprint
+from lungaccess.problem.system import System, preset_named, system_fingerprint
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -106,9 +106,17 @@ def _check_system(plan: Plan, found: Findings, system: System | None) -> None:
     found.true(
         "system.fingerprint", plan.system_fingerprint == system_fingerprint(plan.system), plan.system.name
     )
-    if plan.system.name in shipped_names():
-        preset = to_mapping(load_system(plan.system.name))
-        found.true("system.preset", stated == preset, "settings of the preset of that name")
+    preset = preset_named(plan.system.name)
+    if preset is not None:
+        found.true("system.preset", plan.system == preset, "settings of the preset of that name")
+    elif system is None:
+        found.unchecked(
+            "system.given", "devices and margins are those that the plan states: name yours to compare"
+        )
+    if plan.system.margins.total_mm == 0.0:
+        found.unchecked(
+            "system.margins", "all margins are 0: the plan keeps clear of the masks, not of what they miss"
+        )
     if system is not None:
         found.true("system.given", stated == to_mapping(system), "settings of the system that was asked for")
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
+import tomllib
 from dataclasses import replace
 from typing import Annotated
 
@@ -18,6 +20,8 @@ from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes
 
+FISSURE_RULES = {True: " (fissures may be crossed)", False: " (fissures are obstacles)"}
+"""How the name of a preset ends that was loaded with another rule for fissures than its own."""
 _PRESETS = "presets"
 _NEEDLES = "presets/needles"
 _TUBES = "presets/tubes"
@@ -210,10 +214,53 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     """
     given = os.fspath(name_or_path)
     loaded = parse(System, _FILES.read(name_or_path), given, remedy=_FILES.remedy)
+    require_own_name(loaded, given)
     if fissures_allowed is None or fissures_allowed == loaded.fissures_allowed:
         return loaded
-    rule = "fissures may be crossed" if fissures_allowed else "fissures are obstacles"
-    return replace(loaded, name=f"{loaded.name} ({rule})", fissures_allowed=fissures_allowed)
+    name = loaded.name + FISSURE_RULES[fissures_allowed]
+    return replace(loaded, name=name, fissures_allowed=fissures_allowed)
+
+
+def preset_named(name: str) -> System | None:
+    """Return the preset with which `load_system` made a system of this name; None if there is none.
+
+    Examples
+    --------
+    >>> preset_named("ultrathin (fissures may be crossed)").fissures_allowed
+    True
+    """
+    for allowed, rule in FISSURE_RULES.items():
+        if name.endswith(rule):
+            return _preset(name.removesuffix(rule), allowed)
+    return _preset(name, None)
+
+
+@functools.cache
+def _preset(name: str, fissures_allowed: bool | None) -> System | None:
+    if name not in shipped_names():
+        return None
+    loaded = parse(System, tomllib.loads(_FILES.text(name)), name)
+    if fissures_allowed is None:
+        return loaded
+    return replace(loaded, name=name + FISSURE_RULES[fissures_allowed], fissures_allowed=fissures_allowed)
+
+
+def require_own_name(system: System, where: str = "The system") -> None:
+    """Refuse a system that bears the name of a preset and is not that preset.
+
+    Raises
+    ------
+    SettingsError
+        If it differs from the preset of its name.
+    """
+    preset = preset_named(system.name)
+    if preset is None or preset == system:
+        return
+    raise SettingsError(
+        f"{where} is named {system.name!r} like a preset and differs from it",
+        expected="a name of its own for a device of its own",
+        remedy='Change the line `name = "..."`, or system.name in Python',
+    )
 
 
 def system_fingerprint(system: System) -> str:

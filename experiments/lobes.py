@@ -24,6 +24,7 @@ from anatomy.phantom import make_phantom
 from anatomy.phantom.patient import Size
 from anatomy.records import frozen_record
 from anatomy.segmentation.airway import segment_airway
+from anatomy.segmentation.airway_warnings import tree_or_error
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.lobes import FISSURES, OF_LUNG, SEEN, Lobes, segment_lobes
 from anatomy.segmentation.lungs import segment_lungs
@@ -121,7 +122,8 @@ def segmented(case: Case) -> tuple[Lobes, Mask, float]:
     airways = segment_airway(ct, lungs)
     vessels = segment_vessels(ct, lungs.mask, airways)
     began = time.process_time()
-    found = segment_lobes(ct, lungs, airways, vessels.mask)
+    tree = tree_or_error(Volume(grid=ct.grid, array=airways.lumen))
+    found = segment_lobes(ct, lungs, airways, vessels.mask, tree)
     return found, lungs.mask, time.process_time() - began
 
 

@@ -11,7 +11,6 @@ from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Volume, freeze_arrays
 from anatomy.morphology import Window, bounds, window
 from anatomy.records import frozen_record
-from anatomy.segmentation.airway_warnings import airway_warnings
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.local_minima import local_minima_map
 from anatomy.typed import Array, Float, Int16, Mask
@@ -46,7 +45,6 @@ class Airways:
 
     lumen: Mask
     wall: Mask
-    warnings: tuple[str, ...] = ()
     leak_mm3: float = 0.0
 
     def __post_init__(self) -> None:
@@ -112,12 +110,7 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     solid = _filled(grown.lumen)
     lumen[box] = solid.T
     wall[box] = (grown.wall & ~solid).T
-    return Airways(
-        lumen=lumen,
-        wall=wall,
-        warnings=airway_warnings(Volume(grid=ct.grid, array=lumen), lungs.left, lungs.right),
-        leak_mm3=grown.undone * ct.grid.voxel_volume_mm3,
-    )
+    return Airways(lumen=lumen, wall=wall, leak_mm3=grown.undone * ct.grid.voxel_volume_mm3)
 
 
 def _box(mask: Mask, spacing_mm: Float) -> Window:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
-from anatomy.grid import Volume
+from anatomy.grid import Grid, Volume
 from anatomy.typed import Mask
 
 LEAST_TRACHEA_MM = 25.0
@@ -18,17 +19,23 @@ GREATEST_LOOPS_SHARE = 0.25
 """An airway with so many rings per end has grown into lung."""
 
 
-def airway_warnings(lumen: Volume, left: Mask, right: Mask) -> tuple[str, ...]:
-    """Judge a lumen by its tree: trachea cut, airway that stops early, leak.
-
-    Lumen and lungs are bool `(ni, nj, nk)` on the same grid.
-    """
+def tree_or_error(lumen: Volume) -> AirwayTree | AnatomyError:
+    """Return the tree of a lumen, or why there is none: it is made once, and many judge by it."""
     from anatomy.tree import tree_from_mask
 
     try:
-        tree = tree_from_mask(lumen)
+        return tree_from_mask(lumen)
     except AnatomyError as error:
-        return (f"No tree can be made from the airway: {error.found}.",)
+        return error
+
+
+def airway_warnings(tree: AirwayTree | AnatomyError, left: Mask, right: Mask, grid: Grid) -> tuple[str, ...]:
+    """Judge a lumen by its tree: trachea cut, airway that stops early, leak.
+
+    Lungs are bool `(ni, nj, nk)` on the grid.
+    """
+    if isinstance(tree, AnatomyError):
+        return (f"No tree can be made from the airway: {tree.found}.",)
     warnings = []
     trachea = tree.distance_from_root_mm[tree.branch_start[1] - 1]
     if trachea < LEAST_TRACHEA_MM:
@@ -38,7 +45,7 @@ def airway_warnings(lumen: Volume, left: Mask, right: Mask) -> tuple[str, ...]:
         )
     ends = np.setdiff1d(np.arange(len(tree.branch_parent)), tree.branch_parent)
     tips = tree.points_lps[tree.branch_start[ends + 1] - 1]
-    at = tuple(np.clip(np.rint(lumen.grid.ijk(tips)).astype(np.int64), 0, np.array(left.shape) - 1).T)
+    at = tuple(np.clip(np.rint(grid.ijk(tips)).astype(np.int64), 0, np.array(left.shape) - 1).T)
     counts = {"left": int(left[at].sum()), "right": int(right[at].sum())}
     for side, count in counts.items():
         if count < max(LEAST_ENDS, LEAST_SHARE * max(counts.values())):

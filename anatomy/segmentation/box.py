@@ -1,63 +1,196 @@
-"""The box around the lungs and trachea, in which the slower steps run."""
+"""The box around lungs and trachea, on voxels near to cubes: what a segmentation works on and writes.
+
+The voxels of a box divide those of the CT, whose edges they share.  Each axis along which the CT has larger
+voxels than asked is interpolated; the others are taken as they are.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from typing import Self
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
 from anatomy.records import frozen_record
+from anatomy.segmentation.closing import distance_mm
+from anatomy.segmentation.folder import onto_grid
+from anatomy.segmentation.interpolation import REACH, between
 from anatomy.segmentation.lungs import Lungs
-from anatomy.typed import Array, Int
+from anatomy.typed import Array, Float, Int, Mask
 
 BOX_PAD_MM = 10.0
 """More than any filter of the segmentation looks beyond a voxel of the lung."""
+VOXEL_MM = 0.75
+"""About the pixel of a chest CT and its blur: finer voxels show no more, and take more memory."""
+VOXEL_RANGE_MM = (0.3, 3.0)
+"""Finer voxels take gigabytes; coarser ones hold no bronchi."""
+LEAST_GAIN = 1.1
+"""An axis whose voxels are at most so many times larger than asked is taken as it is."""
+NEAR_MM = 12.0
+"""Distances between two slices are interpolated near a surface; slices are at most 10 mm apart."""
 
 
 @frozen_record
 class Box:
-    """The voxels `low <= ijk < high` of a whole grid; both ends `(3,)` int64."""
+    """The voxels `low <= ijk < high` of the finer voxels of a CT, of which there are `counts`, all `(3,)`."""
 
-    grid: Grid
+    ct_grid: Grid
+    counts: Int
     low: Int
     high: Int
 
     @classmethod
-    def around(cls, lungs: Lungs, grid: Grid) -> Box:
-        """Return the box of lungs and central airway, 10 mm wider where the image allows."""
+    def whole(cls, ct_grid: Grid, voxel_mm: float) -> Self:
+        """Return the finer voxels of a whole CT.
+
+        Raises
+        ------
+        SettingsError
+            If the size of the voxels is out of its range.
+        """
+        if not VOXEL_RANGE_MM[0] <= voxel_mm <= VOXEL_RANGE_MM[1]:
+            raise SettingsError(
+                f"Voxels of {voxel_mm:g} mm were asked for",
+                expected="{:g} to {:g} mm".format(*VOXEL_RANGE_MM),
+                remedy=f"Leave the size out, for {VOXEL_MM:g} mm",
+            )
+        shape, sides = np.array(ct_grid.shape), ct_grid.spacing_mm
+        counts = np.where(sides > LEAST_GAIN * voxel_mm, np.rint(shape * sides / voxel_mm), shape)
+        counts = counts.astype(np.int64)
+        return cls(ct_grid=ct_grid, counts=counts, low=np.zeros(3, dtype=np.int64), high=counts)
+
+    def around(self, lungs: Lungs) -> Self:
+        """Return the box of lungs of the CT and central airway, 10 mm wider where the image allows."""
         parts = [bounds(mask) for mask in (lungs.left, lungs.right, lungs.central_airway) if mask.any()]
-        pad = np.ceil(BOX_PAD_MM / grid.spacing_mm).astype(np.int64)
+        shape, pad = self.ct_grid.shape, np.ceil(BOX_PAD_MM / self.ct_grid.spacing_mm).astype(np.int64)
         low = np.maximum(np.min([low for low, _ in parts], axis=0) - pad, 0)
-        high = np.minimum(np.max([high for _, high in parts], axis=0) + pad, grid.shape)
-        return cls(grid=grid, low=low, high=high)
+        high = np.minimum(np.max([high for _, high in parts], axis=0) + pad, shape)
+        return self.part(np.floor(low * self.counts / shape), np.ceil(high * self.counts / shape))
+
+    def part(self, low: ArrayLike, high: ArrayLike) -> Self:
+        """Return another box on the same finer voxels."""
+        return replace(self, low=np.asarray(low, dtype=np.int64), high=np.asarray(high, dtype=np.int64))
 
     @property
-    def inner(self) -> Grid:
+    def ratio(self) -> Float:
+        """Size of a voxel of the box over that of the CT, along i, j, k."""
+        return np.array(self.ct_grid.shape) / self.counts
+
+    @property
+    def _is_ct(self) -> bool:
+        return bool((self.counts == self.ct_grid.shape).all())
+
+    @property
+    def lattice(self) -> Grid:
+        """The finer voxels of the whole CT."""
+        if self._is_ct:
+            return self.ct_grid
+        matrix = self.ct_grid.lps_from_ijk.copy()
+        matrix[:3, :3] *= self.ratio
+        matrix[:3, 3] = self.ct_grid.lps((self.ratio - 1.0) / 2.0)
+        ni, nj, nk = (int(n) for n in self.counts)
+        return Grid(shape=(ni, nj, nk), lps_from_ijk=matrix)
+
+    @property
+    def grid(self) -> Grid:
         """The grid of the box."""
-        return self.grid.crop(self.low, self.high)
+        return self.lattice.crop(self.low, self.high)
 
-    def cut(self, array: Array) -> Array:
-        """Copy the part of an array in the box."""
-        return np.array(array[window(self.low, self.high)], order="F")
+    def image(self, ct: Volume) -> Volume:
+        """Return the CT in the box: cubic splines that stay between the two voxels beside them.
 
-    def volume(self, volume: Volume) -> Volume:
-        """Return the part of a volume in the box."""
-        return Volume(grid=self.inner, array=self.cut(volume.array))
+        A spline alone swings beyond its voxels at sharp edges, and draws dark rims around vessels; linear
+        interpolation flattens thin lumens and walls.
+        """
+        start, stop = self._span(REACH)
+        values = ct.array[window(start, stop)]
+        places = [self._middles(axis) - start[axis] for axis in range(3)]
+        if self._is_ct:
+            return Volume(grid=self.grid, array=between(values, places))
+        kind = np.int16 if values.dtype.kind in "iu" else np.float32
+        found = between(values.astype(np.float32), places)
+        return Volume(grid=self.grid, array=(np.rint(found) if kind is np.int16 else found).astype(kind))
+
+    def sampled(self, array: Array) -> Array:
+        """Return what an image on the voxels of the CT holds at the middle of each voxel of the box."""
+        nearest = [np.floor(self._middles(axis) + 0.5).astype(np.int64) for axis in range(3)]
+        return np.asfortranarray(array[np.ix_(*nearest)])
+
+    def placed(self, volume: Volume, name: str) -> Array:
+        """Return an image whose voxels are those of the CT, or its finer ones, on the voxels of the box.
+
+        Raises
+        ------
+        GridMismatchError
+            If its voxels are neither.
+        """
+        try:
+            return onto_grid(volume, self.grid, name).array
+        except GridMismatchError:
+            return self.sampled(onto_grid(volume, self.ct_grid, name).array)
+
+    def placed_on_ct(self, volume: Volume, name: str) -> Volume:
+        """Return such an image on the voxels of the CT; the finer voxels are looked at in the box alone.
+
+        Raises
+        ------
+        GridMismatchError
+            If its voxels are neither.
+        """
+        try:
+            return onto_grid(volume, self.ct_grid, name)
+        except GridMismatchError:
+            if self._is_ct:
+                raise
+            return Volume(grid=self.ct_grid, array=self.on_ct(onto_grid(volume, self.grid, name).array))
+
+    def on_ct(self, array: Array) -> Array:
+        """Return what an image of the box holds at the middle of each voxel of the CT; 0 outside the box."""
+        whole = np.zeros(self.ct_grid.shape, dtype=array.dtype, order="F")
+        start, stop = self._span(0)
+        nearest = []
+        for axis in range(3):
+            at = np.floor((np.arange(start[axis], stop[axis]) + 0.5) / self.ratio[axis]).astype(np.int64)
+            nearest.append(np.clip(at - self.low[axis], 0, array.shape[axis] - 1))
+        whole[window(start, stop)] = array[np.ix_(*nearest)]
+        return whole
 
     def lungs(self, lungs: Lungs) -> Lungs:
-        """Return lungs on the grid of the box."""
+        """Return lungs of the CT in the box; between slices their surface runs smoothly."""
+        right = self._smooth(lungs.right)
+        seed = np.floor((lungs.trachea_seed_ijk + 0.5) / self.ratio).astype(np.int64) - self.low
         return Lungs(
-            left=self.cut(lungs.left),
-            right=self.cut(lungs.right),
-            trachea_seed_ijk=lungs.trachea_seed_ijk - self.low,
-            central_airway=self.cut(lungs.central_airway),
+            left=self._smooth(lungs.left) & ~right,
+            right=right,
+            trachea_seed_ijk=seed,
+            central_airway=self._smooth(lungs.central_airway),
             threshold_hu=lungs.threshold_hu,
             offset_hu=lungs.offset_hu,
             warnings=lungs.warnings,
         )
 
-    def whole(self, part: Array, fill: float = 0) -> Array:
-        """Return an array on the whole grid that holds `part` in the box, and `fill` elsewhere."""
-        whole = np.full(self.grid.shape, fill, dtype=part.dtype, order="F")
-        whole[window(self.low, self.high)] = part
-        return whole
+    def _smooth(self, mask: Mask) -> Mask:
+        """Return a mask of the CT in the box, by its signed distances interpolated [Raya1990]."""
+        start, stop = self._span(1)
+        part, sides = np.asfortranarray(mask[window(start, stop)]), self.ct_grid.spacing_mm
+        places = [self._middles(axis) - start[axis] for axis in range(3)]
+        if self._is_ct or not part.any():
+            return self.sampled(mask)
+        deep = np.minimum(distance_mm(part, sides), np.float32(NEAR_MM))
+        deep -= np.minimum(distance_mm(~part, sides), np.float32(NEAR_MM))
+        return np.asfortranarray(between(deep, places, cubic=False) > 0.0)
+
+    def _middles(self, axis: int) -> Float:
+        """Return where the middles of the voxels of the box lie along an axis of the CT, in its voxels."""
+        number = np.arange(self.low[axis], self.high[axis])
+        return np.asarray((number + 0.5) * self.ratio[axis] - 0.5)
+
+    def _span(self, margin: int) -> tuple[Int, Int]:
+        """Return the voxels of the CT, `start <= ijk < stop`, that the box and a margin cover."""
+        start = np.floor(self.low * self.ratio).astype(np.int64) - margin
+        stop = np.ceil(self.high * self.ratio).astype(np.int64) + margin
+        return np.maximum(start, 0), np.minimum(stop, self.ct_grid.shape)

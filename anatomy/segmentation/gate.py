@@ -7,14 +7,13 @@ from types import MappingProxyType
 
 import numpy as np
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError, SettingsError
 from anatomy.grid import Volume
 from anatomy.records import frozen_value
 from anatomy.segmentation.landmarks import Landmarks, landmarks
 from anatomy.segmentation.lungs import Lungs
 from anatomy.segmentation.missing_lung import missing_lung, solid_tissue
-from anatomy.segmentation.scan_warnings import scan_warnings
-from anatomy.typed import Mask
 
 CHECKS: Mapping[str, str] = MappingProxyType(
     {
@@ -45,7 +44,9 @@ class Implausible:
     remedy: str
 
 
-def plausibility(ct: Volume, lungs: Lungs, lumen: Mask) -> tuple[tuple[Implausible, ...], tuple[str, ...]]:
+def plausibility(
+    ct: Volume, lungs: Lungs, tree: AirwayTree | AnatomyError
+) -> tuple[tuple[Implausible, ...], tuple[str, ...]]:
     """Check lungs and airway by anatomy.
 
     Parameters
@@ -53,7 +54,8 @@ def plausibility(ct: Volume, lungs: Lungs, lumen: Mask) -> tuple[tuple[Implausib
     ct : Volume
         Hounsfield units, in the order of voxels of `canonical`.
     lungs : Lungs
-    lumen : (ni, nj, nk) bool
+    tree : AirwayTree or AnatomyError
+        Of the lumen of the airway, or why there is none.
 
     Returns
     -------
@@ -62,18 +64,14 @@ def plausibility(ct: Volume, lungs: Lungs, lumen: Mask) -> tuple[tuple[Implausib
     tuple of str
         Warnings.
     """
-    from anatomy.tree import tree_from_mask
-
     median_hu = float(np.median(ct.array[lungs.mask]))
     failed = [*_sizes(ct, lungs, median_hu)]
-    warnings = [*_density_warnings(median_hu), *scan_warnings(ct, lungs.mask), *solid_tissue(ct, lungs.mask)]
-    try:
-        tree = tree_from_mask(Volume(grid=ct.grid, array=lumen))
-    except AnatomyError as error:
-        name = "axes" if "upside down" in error.found else "airway"
+    warnings = [*_density_warnings(median_hu), *solid_tissue(ct, lungs.mask)]
+    if isinstance(tree, AnatomyError):
+        name = "axes" if "upside down" in tree.found else "airway"
         remedy = "Check the header of the image" if name == "axes" else "Correct the mask of the airway"
-        return (*failed, Implausible(name=name, found=error.found, remedy=remedy)), tuple(warnings)
-    at = np.clip(np.rint(ct.grid.ijk(tree.points_lps)).astype(np.int64), 0, np.array(lumen.shape) - 1)
+        return (*failed, Implausible(name=name, found=tree.found, remedy=remedy)), tuple(warnings)
+    at = np.clip(np.rint(ct.grid.ijk(tree.points_lps)).astype(np.int64), 0, np.array(ct.grid.shape) - 1)
     for name, lung in (("left", lungs.left), ("right", lungs.right)):
         if lung.any() and not lung[tuple(at.T)].any():
             failed.append(

@@ -74,7 +74,9 @@ class Lobes:
     warnings: tuple[str, ...]
 
 
-def segment_lobes(ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask) -> Lobes:
+def segment_lobes(
+    ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask, tree: AirwayTree | AnatomyError
+) -> Lobes:
     """Return the lobes and fissures of a CT.
 
     Parameters
@@ -85,18 +87,16 @@ def segment_lobes(ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask) -> 
         On the grid of the CT.
     vessels : (ni, nj, nk) bool
         All vessels.
+    tree : AirwayTree or AnatomyError
+        Of the lumen of the airways, or why there is none.
 
     References
     ----------
     [Lassen2013], [Ukil2009], [Wiemker2005]
     """
-    from anatomy.tree import tree_from_mask
-
-    try:
-        tree = tree_from_mask(Volume(grid=ct.grid, array=airways.lumen))
-    except AnatomyError as error:
+    if isinstance(tree, AnatomyError):
         nothing = np.zeros(ct.grid.shape, dtype=np.uint8, order="F")
-        said = f"Lobes and fissures are not known, because the airway gives no tree: {error.found}"
+        said = f"Lobes and fissures are not known, because the airway gives no tree: {tree.found}"
         return Lobes(lobes=nothing, fissures=nothing, seen={}, warnings=(said,))
     cubic = Cubic.over(ct.grid)
     masks = {"right": cubic.sampled(lungs.right), "left": cubic.sampled(lungs.left)}

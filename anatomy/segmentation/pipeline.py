@@ -32,19 +32,23 @@ BYTES_PER_VOXEL = 40
 
 @frozen_record
 class Segmentation:
-    """What a segmentation wrote; all images lie on the voxels of the CT, in the order of `canonical`.
+    """What a segmentation wrote; all images lie on the voxels of one `Box`, in the order of `canonical`.
 
     Steps not in `recomputed` were up to date; `corrected` images are a person's; `kept_description` tells
     whether an edited `patient.toml` was kept.
     """
 
     folder: Path
-    grid: Grid
     parts: Parts
     recomputed: tuple[str, ...]
     corrected: tuple[str, ...]
     kept_description: bool
     warnings: tuple[str, ...]
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of all images."""
+        return self.parts.ct.grid
 
 
 def memory_estimate_gib(grid: Grid) -> float:
@@ -88,7 +92,7 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     steps = Steps(request, folder, description, ct_digest, tell)
     parts = steps.run()
     if parts.nodule.any() and target is None:
-        target = centre_of(parts.nodule, grid)
+        target = centre_of(parts.nodule, parts.ct.grid)
     warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
     folder.save(provenance=_provenance(request, steps, warnings))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
@@ -98,7 +102,6 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     text = description_text(request.name, bool(parts.nodule.any()), said, target, thick_mm, steps.accepted)
     return Segmentation(
         folder=folder.path,
-        grid=grid,
         parts=parts,
         recomputed=tuple(steps.recomputed),
         corrected=tuple(steps.corrected),
@@ -107,14 +110,16 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     )
 
 
-def target_warnings(target_lps: Float | None, parts: Parts, grid: Grid) -> list[str]:
+def target_warnings(target_lps: Float | None, parts: Parts, ct_grid: Grid) -> list[str]:
     """Warn of a target that lies outside the lungs or in an obstacle."""
     if target_lps is None:
         return []
     place = f"The target at LPS ({', '.join(f'{x:.1f}' for x in target_lps)}) mm"
-    if not bool(grid.contains(target_lps)):
+    if not bool(ct_grid.contains(target_lps)):
         return [f"{place} lies outside the image: check its frame."]
-    i, j, k = (int(n) for n in np.floor(grid.ijk(target_lps) + 0.5))
+    grid = parts.ct.grid
+    at = np.floor(grid.ijk(target_lps) + 0.5).astype(np.int64)
+    i, j, k = (int(n) for n in np.clip(at, 0, np.array(grid.shape) - 1))
     if parts.nodule[i, j, k]:
         return []
     if not (parts.left[i, j, k] or parts.right[i, j, k]):
@@ -133,7 +138,9 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
         "lungaccess": program,
         "steps_version": VERSION,
         "numpy": np.__version__,
-        "grid": request.ct.grid.describe(),
+        "ct_grid": request.ct.grid.describe(),
+        "grid": steps.grid.describe(),
+        "voxel_mm": request.voxel_mm,
         "ct_files": dict(request.sources),
         "given_files": request.given.hashes(),
         "ex_vivo": request.ex_vivo,

@@ -8,7 +8,6 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
-from anatomy.grid import Grid, Volume
 from anatomy.records import frozen_record
 from anatomy.segmentation.steps import Parts
 
@@ -46,11 +45,9 @@ class Quality:
         }
 
 
-def quality_of(parts: Parts, grid: Grid) -> Quality:
+def quality_of(parts: Parts) -> Quality:
     """Measure a segmentation."""
-    from anatomy.tree import tree_from_mask
-
-    litre = grid.voxel_volume_mm3 * 1e-6
+    litre = parts.ct.grid.voxel_volume_mm3 * 1e-6
     counted = {
         "right lung": parts.right,
         "left lung": parts.left,
@@ -62,10 +59,9 @@ def quality_of(parts: Parts, grid: Grid) -> Quality:
     }
     volumes = {name: float(np.count_nonzero(mask)) * litre for name, mask in counted.items()}
     warnings = _volume_warnings(volumes)
-    try:
-        tree = tree_from_mask(Volume(grid=grid, array=parts.lumen))
-    except AnatomyError as error:
-        failed = f"No airway tree could be made: {error}"
+    tree = parts.tree
+    if isinstance(tree, AnatomyError):
+        failed = f"No airway tree could be made: {tree}"
         return Quality(volumes_l=volumes, tree=None, ends=0, warnings=(*warnings, failed))
     ends = tree_ends(tree)
     warnings += [*tree.report.warnings, *_leaks(tree)]

@@ -13,6 +13,7 @@ from anatomy.io.images import read_volume
 from anatomy.io.masks import read_masks
 from anatomy.io.totalsegmentator import mask_sources
 from anatomy.records import frozen_record, frozen_value
+from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.folder import onto_grid
 from anatomy.typed import Float
 
@@ -124,6 +125,8 @@ class SegmentationRequest:
     seed_lps : (3,) float64, optional
         A point in the trachea, LPS mm.
     given : Given
+    voxel_mm : float
+        Axes along which the CT has larger voxels are interpolated to about this size.
     """
 
     ct: Volume
@@ -135,3 +138,4 @@ class SegmentationRequest:
     accept: tuple[str, ...] = ()
     seed_lps: Float | None = None
     given: Given = field(default_factory=Given)
+    voxel_mm: float = VOXEL_MM

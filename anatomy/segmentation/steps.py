@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
-from anatomy.grid import Volume
+from anatomy.grid import Grid, Volume
 from anatomy.io.cost_maps import OBSTACLE_COST, as_stored, from_stored
 from anatomy.io.files import sha256
+from anatomy.io.images import read_volume
 from anatomy.records import frozen_record
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.description import Description
@@ -23,6 +25,7 @@ from anatomy.segmentation.larynx import without_larynx
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
 from anatomy.segmentation.request import Given, SegmentationRequest
+from anatomy.segmentation.scan_warnings import scan_warnings
 from anatomy.segmentation.wall import wall_around
 from anatomy.typed import Array, Float32, Mask, UInt8
 
@@ -40,18 +43,23 @@ _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 
 @frozen_record
 class Parts:
-    """The images of a segmentation on the grid of the CT, `(ni, nj, nk)`.
+    """The images of a segmentation, `(ni, nj, nk)` on the voxels of its box, and the airway's tree or why
+    there is none.
+
+    `ct` is the CT on these voxels, in Hounsfield units.
 
     The nodule is empty if none was given.  Lobes have numbers of `anatomy.lobes.LOBES`; fissures are 1 where
     they are inferred and 2 where they are seen; both are 0 where nothing is known.  Vesselness is in [0, 1],
     cost too, or infinite in obstacles, which the large vessels are.
     """
 
+    ct: Volume
     left: Mask
     right: Mask
     central_airway: Mask
     lumen: Mask
     wall: Mask
+    tree: AirwayTree | AnatomyError
     nodule: Mask
     vesselness: Float32
     large_vessels: Mask
@@ -61,15 +69,19 @@ class Parts:
     cost: Float32
 
     @classmethod
-    def begun(cls, lungs: Lungs, lumen: Mask, wall: Mask) -> Parts:
+    def begun(
+        cls, ct: Volume, lungs: Lungs, lumen: Mask, wall: Mask, tree: AirwayTree | AnatomyError
+    ) -> Parts:
         """Return the images of a segmentation that ended with the airway."""
         none = np.zeros(lumen.shape, dtype=np.bool_, order="F")
         return cls(
+            ct=ct,
             left=lungs.left,
             right=lungs.right,
             central_airway=lungs.central_airway,
             lumen=lumen,
             wall=wall,
+            tree=tree,
             nodule=none,
             vesselness=none.astype(np.float32),
             large_vessels=none,
@@ -100,35 +112,46 @@ class Steps:
         progress: Progress,
     ) -> None:
         self._request, self._folder, self._description = request, folder, description
-        self._ct_digest, self._tell, self._ct = ct_digest, progress, request.ct
+        self._ct_digest, self._tell = ct_digest, progress
+        self._work_in(Box.whole(request.ct.grid, request.voxel_mm))
+        self._ct = request.ct
         self._digests: dict[str, str] = {}
         self.recomputed: list[str] = []
         self.corrected: list[str] = []
         self.warnings: list[str] = []
         self.accepted: tuple[str, ...] = ()
-        self._sources = request.given.images(folder.grid)
+        self._tree: tuple[Mask, AirwayTree | AnatomyError] | None = None
+        self._sources = request.given.images(request.ct.grid)
         for name in IMAGES:
             path = folder.correction(name)
             if path is not None:
-                self._sources[name] = folder.read(path)
+                self._sources[name] = read_volume(path)
                 self.corrected.append(name)
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of the images."""
+        return self._box.grid
 
     def run(self) -> Parts:
         """Bring every step up to date and return all images."""
         lungs = self._lungs()
-        self._ct = without_offset(self._ct, lungs.offset_hu)
+        self._ct = self._box.image(without_offset(self._ct, lungs.offset_hu))
         airway = self._airway(lungs)
-        self._require_plausible(lungs, airway)
+        tree = self._tree_of(airway["airway"])
+        self._require_plausible(lungs, airway, tree)
         nodule = self._nodule()
         vessels = self._vessels(lungs, airway, nodule)
-        lobes = self._lobes(lungs, airway, vessels)
+        lobes = self._lobes(lungs, airway, vessels, tree)
         cost = self._cost(lungs, airway, nodule, vessels)
         return Parts(
+            ct=self._ct,
             left=lungs.left,
             right=lungs.right,
             central_airway=lungs.central_airway,
             lumen=airway["airway"],
             wall=airway["airway_wall"],
+            tree=tree,
             nodule=nodule,
             vesselness=vessels["vesselness"],
             large_vessels=vessels["vessels"],
@@ -139,26 +162,33 @@ class Steps:
         )
 
     def _lungs(self) -> Lungs:
-        request = self._request
+        request, whole = self._request, self._box
         seed = None if request.seed_lps is None else request.seed_lps.tolist()
         key = self._key("lungs", sources=("lungs",), ct=self._ct_digest, ex_vivo=request.ex_vivo, seed=seed)
 
         def compute() -> tuple[Images, dict[str, Any]]:
             if "lungs" in self._sources:
-                left, right = sides_of(self._sources["lungs"], "The mask of the lungs")
-                lungs = lungs_given(request.ct, left, right, seed_lps=seed)
+                given = whole.placed_on_ct(self._sources["lungs"], "lungs")
+                left, right = sides_of(given, "The mask of the lungs")
+                found = lungs_given(request.ct, left, right, seed_lps=seed)
             else:
-                lungs = segment_lungs(request.ct, ex_vivo=request.ex_vivo, seed_lps=seed, progress=self._tell)
+                found = segment_lungs(request.ct, ex_vivo=request.ex_vivo, seed_lps=seed, progress=self._tell)
+            box = whole.around(found)
+            self._work_in(box)
+            lungs = box.lungs(found)
             images = {"lungs": lung_labels(lungs.left, lungs.right), "central_airway": lungs.central_airway}
-            seed_ijk = [int(n) for n in lungs.trachea_seed_ijk]
             facts = {
-                "seed": seed_ijk,
+                "box": [box.low.tolist(), box.high.tolist()],
+                "seed": lungs.trachea_seed_ijk.tolist(),
                 "threshold_hu": lungs.threshold_hu,
                 "offset_hu": lungs.offset_hu,
                 "warnings": list(lungs.warnings),
             }
             return images, facts
 
+        known = self._folder.facts("lungs").get("box")
+        if known:
+            self._work_in(whole.part(*known))
         images, facts = self._bring_up_to_date("lungs", ("lungs", "central_airway"), key, compute)
         return Lungs(
             left=images["lungs"] == LEFT,
@@ -179,40 +209,46 @@ class Steps:
             from anatomy.segmentation.airway import segment_airway
             from anatomy.segmentation.airway_warnings import airway_warnings
 
+            grid = self._folder.grid
             lumen, wall = self._source_mask("airway"), self._source_mask("airway_wall")
             warnings: tuple[str, ...] = ()
             if lumen is None:
-                box = Box.around(lungs, self._folder.grid)
-                found = segment_airway(box.volume(self._ct), box.lungs(lungs), progress=self._tell)
-                trachea, cut_mm = without_larynx(found.lumen, lungs.trachea_seed_ijk - box.low, box.inner)
-                lumen, warnings = box.whole(trachea), found.warnings
+                found = segment_airway(self._ct, lungs, progress=self._tell)
+                lumen, cut_mm = without_larynx(found.lumen, lungs.trachea_seed_ijk, grid)
                 # The wall of what was cut off stays: it is an obstacle.
-                wall = box.whole(found.wall | (found.lumen & ~trachea)) if wall is None else wall
+                wall = found.wall | (found.lumen & ~lumen) if wall is None else wall
                 if cut_mm:
                     warnings = (
-                        *warnings,
                         f"The upper {cut_mm:.0f} mm of the airway were too narrow for a trachea: left out.",
                     )
-            else:
-                volume = Volume(grid=self._folder.grid, array=lumen)
-                warnings = airway_warnings(volume, lungs.left, lungs.right)
-                wall = wall_around(lumen, self._folder.grid) if wall is None else wall
-            return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": list(warnings)}
+            wall = wall_around(lumen, grid) if wall is None else wall
+            said = airway_warnings(self._tree_of(lumen), lungs.left, lungs.right, grid)
+            return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": [*said, *warnings]}
 
         return self._bring_up_to_date("airway", ("airway", "airway_wall"), key, compute)[0]
 
-    def _require_plausible(self, lungs: Lungs, airway: Images) -> None:
+    def _tree_of(self, lumen: Mask) -> AirwayTree | AnatomyError:
+        """Return the tree of the lumen, which is made once, or why there is none."""
+        from anatomy.segmentation.airway_warnings import tree_or_error
+
+        if self._tree is None or self._tree[0] is not lumen:
+            self._tell("airway tree")
+            self._tree = (lumen, tree_or_error(Volume(grid=self._folder.grid, array=lumen)))
+        return self._tree[1]
+
+    def _require_plausible(self, lungs: Lungs, airway: Images, tree: AirwayTree | AnatomyError) -> None:
         """Refuse lungs and airway that cannot be those of a patient, unless that is accepted by name."""
         if self._request.ex_vivo:
             return
         self._tell("checking lungs and airway")
-        failed, warnings = plausibility(self._ct, lungs, airway["airway"])
-        self.warnings += warnings
+        failed, warnings = plausibility(self._ct, lungs, tree)
+        self.warnings += [*warnings, *scan_warnings(self._request.ct, self._box.on_ct(lungs.mask))]
         try:
             self.accepted = require_plausible(failed, self._request.accept)
         except AnatomyError as error:
             self._description.set_aside()
-            raise RefusedError(error, Parts.begun(lungs, airway["airway"], airway["airway_wall"])) from None
+            shown = Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree)
+            raise RefusedError(error, shown) from None
 
     def _nodule(self) -> Mask:
         given, grid = self._request.given, self._folder.grid
@@ -225,9 +261,11 @@ class Steps:
                 return {"nodule": corrected}, {}
             nodule = np.zeros(grid.shape, dtype=np.bool_, order="F")
             if given.nodule_contours is not None:
-                nodule |= nodule_from_contours(given.nodule_contours, grid)
+                nodule |= self._box.sampled(
+                    nodule_from_contours(given.nodule_contours, self._request.ct.grid)
+                )
             if given.nodule_mask is not None:
-                nodule |= self._folder.read(given.nodule_mask).array != 0
+                nodule |= self._box.placed(read_volume(given.nodule_mask), given.nodule_mask.name) != 0
             return {"nodule": nodule}, {}
 
         return self._bring_up_to_date("nodule", ("nodule",), key, compute)[0]["nodule"]
@@ -240,25 +278,23 @@ class Steps:
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.vessels import segment_vessels
 
-            box = Box.around(lungs, self._folder.grid)
-            inside = box.lungs(lungs).mask
-            found = segment_vessels(box.volume(self._ct), inside, _airways(box, airway), progress=self._tell)
-            target = box.cut(nodule)
+            found = segment_vessels(self._ct, lungs.mask, _airways(airway), progress=self._tell)
             masks = {"vessels": found.large, "all_vessels": found.mask}
             for name, mask in masks.items():
                 source = self._source_mask(name)
                 masks[name] = (
-                    without_nodule(mask, target, box.inner) if source is None else box.cut(source & ~nodule)
+                    without_nodule(mask, nodule, self._folder.grid) if source is None else source & ~nodule
                 )
             masks["all_vessels"] |= masks["vessels"]
             response = np.where(found.mask & ~masks["all_vessels"], np.float32(0.0), found.vesselness)
             images = {"vesselness": response, **masks}
-            whole = {name: box.whole(image) for name, image in images.items()}
-            return whole, {"threshold": float(found.threshold), "warnings": list(found.warnings)}
+            return images, {"threshold": float(found.threshold), "warnings": list(found.warnings)}
 
         return self._bring_up_to_date("vessels", names, key, compute)[0]
 
-    def _lobes(self, lungs: Lungs, airway: Images, vessels: Images) -> Images:
+    def _lobes(
+        self, lungs: Lungs, airway: Images, vessels: Images, tree: AirwayTree | AnatomyError
+    ) -> Images:
         names = ("lobes", "fissures")
         key = self._key(
             "lobes", sources=names, of=("lungs", "airway", "airway_wall", "all_vessels"), ct=self._ct_digest
@@ -267,16 +303,12 @@ class Steps:
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.lobes import lobes_given, segment_lobes
 
-            given = {
-                name: self._sources[name].array.astype(np.uint8) for name in names if name in self._sources
-            }
+            given = {name: self._source(name).astype(np.uint8) for name in names if name in self._sources}
             if "lobes" in given:
                 return lobes_given(given["lobes"], given.get("fissures")), {}
-            box = Box.around(lungs, self._folder.grid)
             self._tell("lobes and fissures")
-            ct, vessel = box.volume(self._ct), box.cut(vessels["all_vessels"])
-            found = segment_lobes(ct, box.lungs(lungs), _airways(box, airway), vessel)
-            images = {"lobes": box.whole(found.lobes), "fissures": box.whole(found.fissures), **given}
+            found = segment_lobes(self._ct, lungs, _airways(airway), vessels["all_vessels"], tree)
+            images = {"lobes": found.lobes, "fissures": found.fissures, **given}
             return images, {"seen": dict(found.seen), "warnings": list(found.warnings)}
 
         return self._bring_up_to_date("lobes", names, key, compute)[0]
@@ -289,17 +321,14 @@ class Steps:
             from anatomy.segmentation.cost_map import cost_map
             from anatomy.segmentation.vessels import Vessels
 
-            box = Box.around(lungs, self._folder.grid)
-            parts = {name: box.cut(image) for name, image in vessels.items()}
             found = Vessels(
-                vesselness=parts["vesselness"],
-                large=parts["vessels"],
-                mask=parts["all_vessels"],
+                vesselness=vessels["vesselness"],
+                large=vessels["vessels"],
+                mask=vessels["all_vessels"],
                 threshold=float(self._folder.facts("vessels")["threshold"]),
             )
-            inside = box.lungs(lungs).mask | box.cut(nodule)
-            cost = cost_map(found, _airways(box, airway), inside, box.inner)
-            return {"cost": as_stored(box.whole(cost.array, fill=np.inf))}, {}
+            cost = cost_map(found, _airways(airway), lungs.mask | nodule, self._folder.grid)
+            return {"cost": as_stored(cost.array)}, {}
 
         self._tell("cost map")
         return from_stored(self._bring_up_to_date("cost map", ("cost",), key, compute)[0]["cost"])
@@ -308,13 +337,25 @@ class Steps:
         self, step: str, *, sources: tuple[str, ...] = (), of: tuple[str, ...] = (), **others: Any
     ) -> str:
         """Return the key of a step: its settings, the images before it, and what replaces its own."""
-        replaced = {name: digest_of(self._sources[name].array) for name in sources if name in self._sources}
+        replaced = {
+            name: [digest_of(self._sources[name].array), grid_digest(self._sources[name].grid)]
+            for name in sources
+            if name in self._sources
+        }
         before = {name: self._digests[name] for name in of}
-        return key_of(step, version=VERSION, replaced=replaced, before=before, **others)
+        place = grid_digest(self._folder.grid)
+        return key_of(step, version=VERSION, replaced=replaced, before=before, place=place, **others)
+
+    def _work_in(self, box: Box) -> None:
+        """Have all further images lie on the voxels of a box."""
+        self._box, self._folder.grid = box, box.grid
+
+    def _source(self, name: str) -> Array:
+        """Return what replaces an image, on the voxels of the box."""
+        return self._box.placed(self._sources[name], name)
 
     def _source_mask(self, name: str) -> Mask | None:
-        volume = self._sources.get(name)
-        return None if volume is None else np.asfortranarray(volume.array != 0)
+        return np.asfortranarray(self._source(name) != 0) if name in self._sources else None
 
     def _bring_up_to_date(
         self, step: str, names: tuple[str, ...], key: str, compute: Compute
@@ -345,7 +386,7 @@ def _nodule_files(given: Given) -> dict[str, Path]:
     return {name: path for name, path in files.items() if path is not None}
 
 
-def _airways(box: Box, airway: Images) -> Airways:
+def _airways(airway: Images) -> Airways:
     from anatomy.segmentation.airway import Airways
 
-    return Airways(lumen=box.cut(airway["airway"]), wall=box.cut(airway["airway_wall"]))
+    return Airways(lumen=airway["airway"], wall=airway["airway_wall"])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.grid import Grid
-from anatomy.morphology import bounds
-from anatomy.segmentation.box import Box
+from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm
 from anatomy.typed import Mask
 
@@ -16,7 +15,7 @@ WALL_MM = 1.5
 
 def wall_around(lumen: Mask, grid: Grid) -> Mask:
     """Return the wall of airways that came without one: all within `WALL_MM` of the lumen."""
-    low, high = bounds(lumen, np.ceil(WALL_MM / grid.spacing_mm).astype(np.int64) + 1)
-    box = Box(grid=grid, low=low, high=high)
-    inside = box.cut(lumen)
-    return box.whole((distance_mm(~inside, grid.spacing_mm) <= WALL_MM) & ~inside)
+    box = window(*bounds(lumen, np.ceil(WALL_MM / grid.spacing_mm).astype(np.int64) + 1))
+    wall = np.zeros(lumen.shape, dtype=np.bool_, order="F")
+    wall[box] = (distance_mm(~lumen[box], grid.spacing_mm) <= WALL_MM) & ~lumen[box]
+    return wall

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from matplotlib.lines import Line2D
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds
 from anatomy.segmentation.steps import Parts
-from anatomy.typed import Array, Float, Int, Mask
+from anatomy.typed import Array, Float, Mask
 from lungaccess.report import style
 
 SLICES = 5
@@ -28,23 +27,21 @@ PLANES = (("sagittal", 0, (1, 2)), ("coronal", 1, (0, 2)), ("axial", 2, (0, 1)))
 
 
 def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[str]) -> Path:
-    """Draw the masks over the CT: five sagittal, coronal and axial slices through the lungs.
+    """Draw the masks over the CT as it was measured: five sagittal, coronal and axial slices.
 
     Axial slices are seen from the feet, coronal ones from the front: the patient's right is on the left.
 
     Parameters
     ----------
     parts : Parts or None
-        On the grid of the CT; None draws the whole CT alone.
+        Its voxels run along those of the CT; None draws the whole CT alone.
 
     Raises
     ------
     anatomy.errors.FileError
         If the file cannot be written.
     """
-    pad = np.ceil(MARGIN_MM / ct.grid.spacing_mm).astype(np.int64)
-    shown = ct.array < np.inf if parts is None else parts.left | parts.right | parts.lumen
-    low, high = bounds(shown, pad)
+    low, high = _shown_lps(ct, parts)
     axis_of = [int(np.argmax(np.abs(ct.grid.lps_from_ijk[row, :3]))) for row in range(3)]
     figure = style.new_figure(SLICES * PANEL_IN, 3 * PANEL_IN + 0.7)
     panels = figure.subplots(3, SLICES, squeeze=False)
@@ -52,72 +49,85 @@ def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[st
         through = axis_of[normal]
         for column in range(SLICES):
             share = (column + 0.5) / SLICES
-            level = int(low[through] + share * (high[through] - low[through]))
+            middle = np.where(np.arange(3) == normal, low + share * (high - low), 0.5 * (low + high))
             axes = panels[row, column]
-            _panel(axes, ct, parts, (low, high), through, level, (axis_of[across], axis_of[up]), up == 1)
-            place = ct.grid.lps(np.where(np.arange(3) == through, level, low))[normal]
-            axes.set_title(f"{name}, LPS {'xyz'[normal]} = {place:.0f} mm", fontsize=8, color=style.INK)
+            shown = _Section(low, high, middle, through, (axis_of[across], axis_of[up]))
+            _panel(axes, ct, parts, shown, up == 1)
+            axes.set_title(
+                f"{name}, LPS {'xyz'[normal]} = {middle[normal]:.0f} mm", fontsize=8, color=style.INK
+            )
     if parts is not None:
         figure.legend(handles=_legend(), loc="lower center", ncol=8, fontsize=9, frameon=False)
     figure.subplots_adjust(left=0.005, right=0.995, top=0.975, bottom=0.045, wspace=0.02, hspace=0.09)
     return style.save_png(figure, path)
 
 
-def _panel(
-    axes: Axes,
-    ct: Volume,
-    parts: Parts | None,
-    box: tuple[Int, Int],
-    through: int,
-    level: int,
-    shown: tuple[int, int],
-    downwards: bool,
-) -> None:
-    """Draw one slice; `shown` are the voxel axes across and up, `downwards` if LPS grows down the page."""
-    extent = _extent(ct.grid, box, shown)
+def _shown_lps(ct: Volume, parts: Parts | None) -> tuple[Float, Float]:
+    """Return the least and greatest LPS mm of what is shown."""
+    grid, ends = ct.grid, np.array([(0.0, 0.0, 0.0), np.array(ct.grid.shape) - 1.0])
+    if parts is not None:
+        grid = parts.ct.grid
+        pad = np.ceil(MARGIN_MM / grid.spacing_mm).astype(np.int64)
+        low, high = bounds(parts.left | parts.right | parts.lumen, pad)
+        ends = np.array([low, high - 1]).astype(np.float64)
+    corners = grid.lps(ends)
+    return corners.min(axis=0), corners.max(axis=0)
 
-    def cut(array: Array) -> Array:
-        window: list[Any] = [slice(int(a), int(b)) for a, b in zip(*box, strict=True)]
-        window[through] = level
-        plane: Array = array[tuple(window)]
-        return plane.T if shown[0] < shown[1] else plane
 
+class _Section:
+    """A section through images: a box LPS mm, a point in it, the voxel axis through, those across and up."""
+
+    def __init__(self, low: Float, high: Float, point: Float, through: int, shown: tuple[int, int]) -> None:
+        self._low, self._high, self._point, self._through, self._shown = low, high, point, through, shown
+
+    def of(self, array: Array, grid: Grid) -> tuple[Array, tuple[float, float, float, float]]:
+        """Return the part of an image to show, and its left, right, bottom and top in LPS mm.
+
+        They are reversed where voxels run against LPS.
+        """
+        window = list(grid.window(np.array([self._low, self._high]), 0.0))
+        level = int(np.rint(grid.ijk(self._point)[self._through]))
+        ends: list[float] = []
+        for axis in self._shown:
+            along = int(np.argmax(np.abs(grid.lps_from_ijk[:3, axis])))
+            for edge in (window[axis].start - 0.5, window[axis].stop - 0.5):
+                ends.append(float(grid.lps(np.where(np.arange(3) == axis, edge, 0.0))[along]))
+        index: list[Any] = list(window)
+        index[self._through] = min(max(level, 0), grid.shape[self._through] - 1)
+        plane: Array = array[tuple(index)]
+        return plane.T if self._shown[0] < self._shown[1] else plane, (ends[0], ends[1], ends[2], ends[3])
+
+
+def _panel(axes: Axes, ct: Volume, parts: Parts | None, section: _Section, downwards: bool) -> None:
+    """Draw one slice, `downwards` if LPS grows down the page."""
+    plane, extent = section.of(ct.array, ct.grid)
     axes.imshow(
-        cut(ct.array), cmap="gray", vmin=WINDOW_HU[0], vmax=WINDOW_HU[1], extent=extent, origin="lower",
+        plane, cmap="gray", vmin=WINDOW_HU[0], vmax=WINDOW_HU[1], extent=extent, origin="lower",
         interpolation="nearest",
     )  # fmt: skip
     if parts is not None:
-        _draw_parts(axes, parts, cut, extent)
+        _draw_parts(axes, parts, section)
     if downwards:
         axes.invert_yaxis()
     axes.set_aspect("equal")
     axes.set_axis_off()
 
 
-def _draw_parts(axes: Axes, parts: Parts, cut: Callable[[Array], Array], extent: Any) -> None:
+def _draw_parts(axes: Axes, parts: Parts, section: _Section) -> None:
     for mask, colour, alpha in (
         (parts.all_vessels, SMALL_VESSEL, 0.55),
         (parts.large_vessels, LARGE_VESSEL, 0.75),
         (parts.wall, WALL, 0.8),
         (parts.lumen, style.SCOPE, 0.9),
     ):
-        _fill(axes, cut(mask), colour, alpha, extent)
+        plane, extent = section.of(mask, parts.ct.grid)
+        _fill(axes, plane, colour, alpha, extent)
     for mask, colour in (
         (parts.right, RIGHT), (parts.left, LEFT), (parts.central_airway, CENTRAL), (parts.nodule, NODULE)
     ):  # fmt: skip
-        plane = cut(mask)
+        plane, extent = section.of(mask, parts.ct.grid)
         if plane.any():
             axes.contour(plane, [0.5], colors=colour, linewidths=0.8, extent=extent, origin="lower")
-
-
-def _extent(grid: Grid, box: tuple[Int, Int], shown: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Return left, right, bottom and top in LPS mm: reversed where voxels run against LPS."""
-    first, last = grid.lps(box[0] - 0.5), grid.lps(box[1] - 0.5)
-    ends: list[float] = []
-    for axis in shown:
-        along = int(np.argmax(np.abs(grid.lps_from_ijk[:3, axis])))
-        ends += [float(first[along]), float(last[along])]
-    return ends[0], ends[1], ends[2], ends[3]
 
 
 def _fill(axes: Axes, plane: Mask, colour: str, alpha: float, extent: Any) -> None:

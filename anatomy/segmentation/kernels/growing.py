@@ -26,6 +26,8 @@ DARK_SHARE = 0.1
 """Where more than this of what lies behind a cross-section is dark, it is a narrow of an airway."""
 POCKET_SHARE = 0.2
 """A piece of which more than this lies in or behind pockets is one."""
+MOST_RINGS = 5
+"""A piece with more rings is lung between vessels: bronchi have none, and their noise makes a few."""
 REPEATS = 8
 """How often a piece is grown anew around the leaks that were cut out of it."""
 
@@ -88,6 +90,33 @@ def flood(depth, state, near, start, level, mark, front_factor, front_slack, que
                 return tail, layer, True
     layer_ends[layer - 1] = tail
     return tail, layer, False
+
+
+@numba.njit(cache=True)
+def rings_of(state, shape, mark, queue, size):
+    """Return how many rings a piece has, less the hollows in it: one less its Euler characteristic.
+
+    Its voxels, listed in `queue`, are those of `mark`.  Each corner, edge and face of the voxels is counted by
+    the first voxel that has it.
+    """
+    steps = np.array((shape[1] * shape[2], shape[2], 1))
+    characteristic = 0
+    for q in range(size):
+        at = queue[q]
+        for dk in range(-1, 2):
+            for dj in range(-1, 2):
+                for di in range(-1, 2):
+                    first = True
+                    for k in range(min(dk, 0), max(dk, 0) + 1):
+                        for j in range(min(dj, 0), max(dj, 0) + 1):
+                            for i in range(min(di, 0), max(di, 0) + 1):
+                                d = k * steps[0] + j * steps[1] + i * steps[2]
+                                if d < 0 and state[at + d] == mark:
+                                    first = False
+                    if first:
+                        odd = (abs(dk) + abs(dj) + abs(di)) % 2
+                        characteristic += 1 if odd == 1 else -1
+    return 1 - characteristic
 
 
 @numba.njit(cache=True)
@@ -254,7 +283,8 @@ def grow_airway(
                         parent,
                         layer_ends,
                     )
-                    if burst or count + size > len(lumen):
+                    burst = burst or count + size > len(lumen)
+                    if burst or rings_of(state, shape, mark, queue, size) > MOST_RINGS:
                         for q in range(size):
                             state[queue[q]] = mark + 1
                         burst_here += size

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
 from anatomy.phantom import make_phantom
 from anatomy.records import frozen_record
 from anatomy.segmentation.pipeline import read_ct, segment
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
-from anatomy.tree import tree_from_mask
 from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, require_data
 from stages.needle.device import Needle
@@ -76,7 +76,9 @@ def case_of(name: str, work: Path, seed: int) -> Case:
     """
     title, ct, given = _input_of(name, seed)
     parts = segment(SegmentationRequest(ct=ct, out=work / title, name=title, given=given)).parts
-    tree = tree_from_mask(Volume(grid=ct.grid, array=parts.lumen))
+    ct, tree = parts.ct, parts.tree
+    if isinstance(tree, AnatomyError):
+        raise tree
     generation = tree.generation[tree.branch_of_point]
     inner = tree.points_lps[(generation >= GENERATIONS[0]) & (generation <= GENERATIONS[1])]
     lung = parts.left | parts.right

@@ -13,15 +13,20 @@ from anatomy.grid import Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.airway import segment_airway
+from anatomy.segmentation.airway_warnings import airway_warnings, tree_or_error
+from anatomy.segmentation.box import Box
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.gate import plausibility, require_plausible
 from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.input import require_chest_ct
 from anatomy.segmentation.lungs import Lungs, segment_lungs
+from anatomy.segmentation.scan_warnings import scan_warnings
 from anatomy.typed import Mask
 from experiments.support.segmentation.hard_images import HardImage, upright
 from experiments.support.segmentation.scores import dice
 
+VOXEL_MM = 1.25
+"""Those of the phantom: cases of thicker slices are interpolated to them, which keeps the suite fast."""
 LEAST_DICE = 0.95
 """Of each lung: a lobe or a pleural pocket that is lost or gained lies below."""
 LEAST_TREE = 0.9
@@ -93,16 +98,23 @@ def segmented(
     ct: Volume, *, thick: bool = False, accepted: tuple[str, ...] = ()
 ) -> tuple[Lungs, Mask, tuple[str, ...]]:
     """Return the lungs, the lumen of the airways, and all warnings; the voxels are those of `canonical`."""
-
     warnings = require_chest_ct(ct, thick_slices=thick)
     ct = canonical(ct)
-    lungs = segment_lungs(ct)
-    ct = without_offset(ct, lungs.offset_hu)
-    airways = segment_airway(ct, lungs)
-    failed, further = plausibility(ct, lungs, airways.lumen)
-    accepted_names = require_plausible(failed, accepted)
-    said = (*warnings, *lungs.warnings, *airways.warnings, *further, *accepted_names)
-    return lungs, airways.lumen, said
+    found = segment_lungs(ct)
+    box = Box.whole(ct.grid, VOXEL_MM).around(found)
+    finer, lungs = box.image(without_offset(ct, found.offset_hu)), box.lungs(found)
+    lumen = segment_airway(finer, lungs).lumen
+    tree = tree_or_error(Volume(grid=finer.grid, array=lumen))
+    failed, further = plausibility(finer, lungs, tree)
+    said = (
+        *warnings,
+        *lungs.warnings,
+        *airway_warnings(tree, lungs.left, lungs.right, finer.grid),
+        *further,
+        *scan_warnings(ct, found.mask),
+        *require_plausible(failed, accepted),
+    )
+    return found, box.on_ct(lumen), said
 
 
 def tree_share(image: HardImage, lumen: Mask) -> float:

@@ -9,6 +9,7 @@ from anatomy.errors import AnatomyError
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import parse_point
+from anatomy.segmentation.box import VOXEL_MM
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import OutputOptions
@@ -26,7 +27,7 @@ STEP_SHARES = {
     "checking the CT": 0.06,
     "lungs: coarse image": 0.08,
     "lungs: boundary": 0.14,
-    "airway tree": 0.85,
+    "lobes and fissures": 0.7,
     "pictures": 0.95,
 }
 """Share of the work that is done when a step begins, as measured on a CT of 512 x 512 x 275 voxels."""
@@ -44,6 +45,7 @@ def segment(
     thick_slices: bool = False,
     accept: tuple[str, ...] = (),
     seed: str | None = None,
+    voxel_mm: float = VOXEL_MM,
     lungs: Path | None = None,
     airway: Path | None = None,
     airway_wall: Path | None = None,
@@ -82,6 +84,8 @@ def segment(
         volume or density. It is recorded in patient.toml.
     seed : str
         A point in the trachea, ras:x,y,z or lps:x,y,z, if it is not found by itself.
+    voxel_mm : float
+        Where the CT has larger voxels, as between thick slices, it is interpolated to about this size.
     lungs : Path
         Lungs from elsewhere: label map (1 right, 2 left; or lobes 1 to 5) or one mask.
     airway : Path
@@ -126,6 +130,7 @@ def segment(
             thick_slices=thick_slices,
             accept=accept,
             seed_lps=None if seed is None else parse_point(seed),
+            voxel_mm=voxel_mm,
             given=Given(
                 lungs=lungs,
                 airway=airway,
@@ -144,8 +149,7 @@ def segment(
                 _show_refused(volume, error, out / "refused.png")
             raise
         (out / "refused.png").unlink(missing_ok=True)
-        shown.step("airway tree", STEP_SHARES["airway tree"])
-        quality = quality_of(result.parts, result.grid)
+        quality = quality_of(result.parts)
         if pictures:
             from lungaccess.report.segmentation import segmentation_png
 

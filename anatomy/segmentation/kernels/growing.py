@@ -96,8 +96,8 @@ def flood(depth, state, near, start, level, mark, front_factor, front_slack, que
 def rings_of(state, shape, mark, queue, size):
     """Return how many rings a piece has, less the hollows in it: one less its Euler characteristic.
 
-    Its voxels, listed in `queue`, are those of `mark`.  Each corner, edge and face of the voxels is counted by
-    the first voxel that has it.
+    Its voxels, listed in `queue`, are those of `mark`.  Each corner, edge and face of them is counted by the
+    first voxel that has it.
     """
     steps = np.array((shape[1] * shape[2], shape[2], 1))
     characteristic = 0

@@ -16,7 +16,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom, make_phantom
 from anatomy.segmentation import growing
 from anatomy.segmentation.airway import Airways, segment_airway
-from anatomy.segmentation.airway_warnings import airway_warnings
+from anatomy.segmentation.airway_warnings import airway_warnings, tree_or_error
 from anatomy.segmentation.growing import LEVEL_RATIO, levels
 from anatomy.segmentation.kernels import local_minima as kernel
 from anatomy.segmentation.kernels.lumen_edge import grow_wall, join_corners
@@ -331,6 +331,7 @@ def test_warnings_name_a_cut_trachea_and_a_lung_without_airways() -> None:
     short[:, :, 78:] = False
     short[:40, :, :60] = False
     grid = Grid.from_spacing(lumen.shape, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
-    text = " ".join(airway_warnings(Volume(grid=grid, array=short), lungs.left, lungs.right))
+    tree = tree_or_error(Volume(grid=grid, array=short))
+    text = " ".join(airway_warnings(tree, lungs.left, lungs.right, grid))
     assert "right lung" in text or "No tree" in text
     assert "trachea" in text.lower()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from anatomy.segmentation.growing import AIR_HU, WALL_MM, Ground, Grown, grow
+from anatomy.segmentation.kernels.growing import rings_of
 from anatomy.typed import Mask
 
 OLD_ROOM = 128
@@ -60,3 +61,14 @@ def test_the_end_of_the_image_is_the_end_of_the_wall(corner: tuple[int, int, int
     assert grown.wall[box(shape, corner, 1)].all()
     assert box(shape, corner, 3).sum() <= grown.wall.sum()
     assert not (grown.wall & ~box(shape, corner, 5)).any()
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9])
+def test_rings_of_a_piece_are_one_less_its_euler_characteristic(share: float) -> None:
+    from skimage.measure import euler_number
+
+    state = np.zeros((12, 13, 14), dtype=np.uint8)
+    state[1:-1, 1:-1, 1:-1] = np.random.default_rng(0).random((10, 11, 12)) < share
+    voxels = np.flatnonzero(state)
+    rings = rings_of(state.reshape(-1), np.array(state.shape), np.uint8(1), voxels, len(voxels))
+    assert rings == 1 - euler_number(state > 0, connectivity=3)

@@ -13,21 +13,25 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError, FileError, GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume
 from anatomy.lobes import LOBES
 from anatomy.phantom import LABELS, Phantom
-from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, digest_of, onto_grid
+from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, digest_of
 from anatomy.segmentation.labels import sides_of
 from anatomy.segmentation.lobes import SEEN
 from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
 from anatomy.segmentation.quality import quality_of
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.segmentation.steps import RefusedError
+from experiments.support.segmentation.hard_images import phantom_image, turned
 
 ALL = ("lungs", "airway", "nodule", "vessels", "lobes", "cost map")
+VOXEL_MM = 1.25
+"""Those of the patient, so that nothing is interpolated, which tests of their own do."""
 IMAGES = (
     "lungs",
     "central_airway",
@@ -58,7 +62,13 @@ def copy(made: Segmentation, tmp_path: Path) -> Path:
 
 
 def _request(patient: Phantom, out: Path, **given: Any) -> SegmentationRequest:
-    return SegmentationRequest(ct=patient.ct, out=out, name="P", given=Given(**given))
+    return SegmentationRequest(ct=patient.ct, out=out, name="P", given=Given(**given), voxel_mm=VOXEL_MM)
+
+
+def _in_box(patient: Phantom, made: Segmentation, array: np.ndarray) -> np.ndarray:
+    """Return the part of an image of the patient that a segmentation covers."""
+    low = np.rint(patient.ct.grid.ijk(made.grid.lps((0, 0, 0)))).astype(int)
+    return array[tuple(slice(a, a + n) for a, n in zip(low, made.grid.shape, strict=True))]
 
 
 def _again(patient: Phantom, made: Segmentation, folder: Path) -> Segmentation:
@@ -73,8 +83,8 @@ def test_the_folder_is_a_patient(patient: Phantom, made: Segmentation) -> None:
     images = load_patient(made.folder)
     truth = patient.images
     assert images.name == "P"
-    assert images.grid.is_close(patient.ct.grid)
-    both = np.count_nonzero(images.lung.array & truth.lung.array)
+    assert images.grid.is_close(made.grid) and made.grid.shape != patient.ct.grid.shape
+    both = np.count_nonzero(images.lung.array & _in_box(patient, made, truth.lung.array))
     assert 2 * both / (np.count_nonzero(images.lung.array) + np.count_nonzero(truth.lung.array)) > 0.98
     assert images.cost is not None
     assert np.isinf(images.cost.array[~images.lung.array & (made.parts.nodule == 0)]).all()
@@ -88,12 +98,13 @@ def test_the_folder_is_a_patient(patient: Phantom, made: Segmentation) -> None:
 def test_lobes_and_fissures_are_those_of_the_patient(patient: Phantom, made: Segmentation) -> None:
     images = load_patient(made.folder)
     assert images.lobes is not None and images.fissures is not None
-    truth = patient.lobes.array * (made.parts.left | made.parts.right)
+    truth = _in_box(patient, made, patient.lobes.array) * (made.parts.left | made.parts.right)
     for number, name in LOBES.items():
         both = np.count_nonzero((images.lobes.array == number) & (truth == number))
         sizes = np.count_nonzero(images.lobes.array == number) + np.count_nonzero(truth == number)
         assert 2 * both / sizes > 0.95, name
-    far = ndimage.distance_transform_edt(~patient.mask("fissure"), sampling=patient.grid.spacing_mm)
+    fissure = _in_box(patient, made, patient.mask("fissure"))
+    far = ndimage.distance_transform_edt(~fissure, sampling=patient.grid.spacing_mm)
     assert np.median(far[made.parts.fissures == SEEN]) <= 1.5
     assert np.mean(made.parts.fissures[made.parts.fissures > 0] == SEEN) > 0.8
     assert not [said for said in images.warnings if "fissure" in said]
@@ -200,7 +211,7 @@ def test_a_correction_on_other_voxels_is_refused(patient: Phantom, made: Segment
 
 def test_corrections_of_another_ct_are_not_used(patient: Phantom, made: Segmentation, copy: Path) -> None:
     other = Volume(grid=patient.ct.grid, array=np.asarray(patient.ct.array) + np.int16(1))
-    request = SegmentationRequest(ct=other, out=copy)
+    request = SegmentationRequest(ct=other, out=copy, voxel_mm=VOXEL_MM)
     SegmentationFolder(copy, made.grid, "another")  # without corrections, another CT may be segmented into it
     write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=_cut_airway(made)))
     with pytest.raises(AnatomyError, match="another CT.*airway"):
@@ -274,11 +285,12 @@ def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentat
         "lung_upper_lobe_right": lobes & ~x,
     }
     for name, mask in parts.items():
-        write_volume(folder / f"{name}.nii.gz", Volume(grid=made.grid, array=mask))
+        write_volume(folder / f"{name}.nii.gz", Volume(grid=patient.grid, array=mask))
     result = segment(_request(patient, tmp_path / "out", totalsegmentator=folder))
-    assert (result.parts.lumen == truth.lumen.array).all()
-    assert (result.parts.large_vessels == truth.vessels.array).all()
-    both = np.count_nonzero((result.parts.left | result.parts.right) & truth.lung.array)
+    assert (result.parts.lumen == _in_box(patient, result, truth.lumen.array)).all()
+    assert (result.parts.large_vessels == _in_box(patient, result, truth.vessels.array)).all()
+    lung = _in_box(patient, result, truth.lung.array)
+    both = np.count_nonzero((result.parts.left | result.parts.right) & lung)
     assert both > 0.95 * np.count_nonzero(truth.lung.array)
     with pytest.raises(FileError, match="holds no lobes"):
         segment(_request(patient, tmp_path / "out", totalsegmentator=tmp_path))
@@ -316,25 +328,12 @@ def test_thick_slices_are_marked(patient: Phantom, tmp_path: Path) -> None:
     with pytest.raises(AnatomyError, match="5.0 mm apart"):
         segment(SegmentationRequest(ct=ct, out=tmp_path))
     assert not (tmp_path / "patient.toml").exists()
-    segment(SegmentationRequest(ct=ct, out=tmp_path, thick_slices=True))
+    segment(SegmentationRequest(ct=ct, out=tmp_path, thick_slices=True, voxel_mm=VOXEL_MM))
     assert any("5.0 mm apart" in warning for warning in load_patient(tmp_path).warnings)
 
 
-def test_an_image_is_placed_by_its_voxels() -> None:
-    grid = Grid.from_spacing((10, 11, 12), (1.0, 2.0, 3.0), (0, 0, 0))
-    part = Volume(grid=grid.crop((-2, 3, 4), (5, 20, 9)), array=np.ones((7, 17, 5), dtype=np.uint8))
-    placed = onto_grid(part, grid, "part").array
-    assert placed[:5, 3:, 4:9].all()
-    assert placed.sum() == 5 * 8 * 5
-    matrix = part.grid.lps_from_ijk.copy()
-    matrix[0, 3] += 0.3
-    shifted = Grid(shape=part.grid.shape, lps_from_ijk=matrix)
-    with pytest.raises(GridMismatchError):
-        onto_grid(Volume(grid=shifted, array=part.array), grid, "part")
-
-
 def test_quality_counts_ends_and_volumes(patient: Phantom, made: Segmentation) -> None:
-    quality = quality_of(made.parts, made.grid)
+    quality = quality_of(made.parts)
     assert quality.tree is not None
     assert quality.ends == np.count_nonzero(
         [not len(quality.tree.children(b)) for b in range(quality.tree.n_branches)]
@@ -373,15 +372,25 @@ def test_what_cannot_be_a_patient_leaves_none_and_is_accepted_by_name(
 
 
 @pytest.mark.slow
-def test_the_order_of_the_voxels_does_not_matter(
-    patient: Phantom, made: Segmentation, tmp_path: Path
+@pytest.mark.parametrize(
+    ("order", "flips"),
+    [
+        pytest.param((0, 1, 2), (0, 1), id="180 degrees about the body"),
+        pytest.param((1, 0, 2), (0,), id="90 degrees about the body"),
+        pytest.param((0, 2, 1), (), id="coronal slices"),
+        pytest.param((2, 0, 1), (1, 2), id="sagittal slices, head first"),
+    ],
+)
+def test_how_the_voxels_are_stored_does_not_matter(
+    patient: Phantom, made: Segmentation, tmp_path: Path, order: tuple[int, ...], flips: tuple[int, ...]
 ) -> None:
-    grid = patient.ct.grid
-    matrix = grid.lps_from_ijk.copy()
-    matrix[:3, 3] = grid.lps((grid.shape[0] - 1, grid.shape[1] - 1, 0))
-    matrix[:3, :2] *= -1
-    turned = Volume(grid=Grid(shape=grid.shape, lps_from_ijk=matrix), array=patient.ct.array[::-1, ::-1])
+    """Masks, lobes, cost map and tree are the same, if the header says how the image is turned."""
+    stored = turned(phantom_image(patient), order, flips, header=True).ct
     nodule = made.folder.parent / "given-nodule.nii.gz"
-    again = segment(SegmentationRequest(ct=turned, out=tmp_path, given=Given(nodule_mask=nodule)))
+    again = segment(replace(_request(patient, tmp_path, nodule_mask=nodule), ct=stored))
     assert _voxels(again.folder) == _voxels(made.folder)
     assert again.grid.is_close(made.grid)
+    assert isinstance(again.parts.tree, AirwayTree) and isinstance(made.parts.tree, AirwayTree)
+    for name in ("branch_parent", "generation", "branch_start"):
+        np.testing.assert_array_equal(getattr(again.parts.tree, name), getattr(made.parts.tree, name))
+    np.testing.assert_allclose(again.parts.tree.points_lps, made.parts.tree.points_lps, atol=1e-9)

@@ -17,6 +17,8 @@ from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from tests.anatomy.io.series import write_series
 
+AS_IT_IS = ("--voxel-mm", "1.25")
+"""The voxels of the patient: nothing is interpolated, which takes time."""
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -43,7 +45,10 @@ def test_a_ct_becomes_a_patient_that_info_reads(
 ) -> None:
     out = tmp_path / "patient"
     centre = ",".join(f"{x:.2f}" for x in small_phantom.nodules[0].centre_lps)
-    assert cli.main(["segment", str(ct_file), "--out", str(out), "--target", f"lps:{centre}"]) == ExitCode.OK
+    assert (
+        cli.main(["segment", str(ct_file), "--out", str(out), "--target", f"lps:{centre}", *AS_IT_IS])
+        == ExitCode.OK
+    )
     shown = capsys.readouterr().out
     assert "right lung" in shown
     assert "ends" in shown
@@ -60,7 +65,7 @@ def test_a_ct_becomes_a_patient_that_info_reads(
 def test_the_second_run_says_that_nothing_was_to_do(
     ct_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["segment", str(ct_file), "--out", str(tmp_path / "patient"), "--no-pictures"]
+    words = ["segment", str(ct_file), "--out", str(tmp_path / "patient"), "--no-pictures", *AS_IT_IS]
     assert cli.main(words) == ExitCode.OK
     capsys.readouterr()
     assert cli.main(words) == ExitCode.OK
@@ -82,7 +87,7 @@ def test_planning_on_thick_slices_must_be_allowed(
     )
     words = (str(tmp_path / "ct.nii.gz"), "--out", str(tmp_path / "patient"))
     assert "5.0 mm apart" in _refused(capsys, *words)
-    assert cli.main(["segment", *words, "--thick-slices", "--no-pictures"]) == ExitCode.OK
+    assert cli.main(["segment", *words, "--thick-slices", "--no-pictures", *AS_IT_IS]) == ExitCode.OK
     capsys.readouterr()
     plan = ["plan", str(tmp_path / "patient"), "--target", "lps:50,0,0", "--iterations", "1"]
     plan += ["--out", str(tmp_path / "plan"), "--cache", str(tmp_path / "cache")]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from anatomy.grid import Grid, Volume
 from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.lung import Lung
 from anatomy.morphology import bounds, window
+from anatomy.motion.motion import Motion
+from anatomy.motion.source import MotionSource
 from anatomy.patient import PatientImages
 from anatomy.sides import septum
 from anatomy.typed import Array, Mask, UInt16
@@ -96,6 +99,10 @@ def build_lung(
     tell("labels")
     box = WorkingBox(images.lung.array | images.lumen.array, images.grid)
     labels = keep("labels", _labels(images, box, tree, warnings))
+    motion = None
+    if images.motion is not None:
+        tell("motion of breathing")
+        motion = _motion(images.motion, labels, box.grid, tree, keep, warnings)
     return Lung(
         name=images.name,
         kind=images.kind,
@@ -108,6 +115,7 @@ def build_lung(
         nodules=_cut_volume(images.nodules, box, "nodules", keep),
         cost=_cut_volume(images.cost, box, "cost", keep),
         lobes=_cut_volume(images.lobes, box, "lobes", keep),
+        motion=motion,
         starts=images.starts,
         targets_lps=images.targets_lps,
         start_names=images.start_names,
@@ -116,6 +124,17 @@ def build_lung(
         sources=images.sources,
         warnings=tuple(warnings),
     )
+
+
+def _motion(
+    source: MotionSource, labels: UInt16, grid: Grid, tree: AirwayTree, keep: Keep, warnings: list[str]
+) -> Motion:
+    """Bring the breathing to the masks; its warnings are among those of the patient."""
+    from anatomy.motion.prepare import prepare_motion
+
+    motion = prepare_motion(source, labels, grid, float(tree.carina_lps[0]))
+    warnings += motion.warnings
+    return replace(motion, nodes=keep("motion", motion.nodes))
 
 
 def _require_tissue(images: PatientImages) -> None:

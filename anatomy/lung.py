@@ -11,6 +11,7 @@ from anatomy.fields import DistanceField
 from anatomy.grid import Volume
 from anatomy.lobes import LOBES
 from anatomy.morphology import voxels_in
+from anatomy.motion.motion import Motion
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE
@@ -33,11 +34,14 @@ class Lung(Organ):
     tree : AirwayTree
     lobes : Volume or None
         uint8 numbers of `anatomy.lobes.LOBES` on `grid`, if the patient came with lobes.
+    motion : Motion or None
+        How it breathes, if that is known.
     """
 
     lumen_depth: DistanceField
     tree: AirwayTree
     lobes: Volume | None = None
+    motion: Motion | None = None
 
     def _repr_html_(self) -> str:
         """Return the lung as HTML: what it is, its tree, and the warnings that came with it."""
@@ -50,6 +54,7 @@ class Lung(Organ):
             ("fissures", "given" if self.has_fissures else "not given"),
             ("nodule mask", "not given" if self.nodules is None else "given"),
             ("cost map", "not given" if self.cost is None else "given"),
+            ("breathing", "not known" if self.motion is None else self.motion.source),
             ("start poses, targets", f"{len(self.starts)}, {len(self.targets_lps)}"),
             *self.tree.figures(),
             ("content", self.key[:16]),

@@ -10,6 +10,7 @@ import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume, read_only
+from anatomy.motion.source import MotionSource
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 
@@ -42,6 +43,8 @@ class PatientImages:
         How users name them; "start1", "target1", ... if not given.
     breath_hold : str or None
         In which state of breathing the image was taken, if that is stated.
+    motion : MotionSource or None
+        What is known of the breathing.
     sources : mapping of str to str
         File name to the SHA-256 of its bytes.
     warnings : tuple of str
@@ -71,6 +74,7 @@ class PatientImages:
     start_names: tuple[str, ...] = ()
     target_names: tuple[str, ...] = ()
     breath_hold: str | None = None
+    motion: MotionSource | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 

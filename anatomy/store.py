@@ -24,6 +24,7 @@ from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.io.files import DAMAGE
 from anatomy.lung import Lung
+from anatomy.motion.motion import stored_motion
 from anatomy.patient import PatientImages
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.typed import Array, Float
@@ -165,6 +166,7 @@ def _save_rest(lung: Lung, folder: Path) -> None:
         "nodules": lung.nodules is not None,
         "cost": lung.cost is not None,
         "lobes": lung.lobes is not None,
+        **({} if lung.motion is None else {"motion": lung.motion.record()}),
         "starts": [pose.tolist() for pose in lung.starts],
         "targets_lps": [point.tolist() for point in lung.targets_lps],
         "start_names": lung.start_names,
@@ -222,6 +224,7 @@ def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
         nodules=Volume(grid=grid, array=array("nodules")) if meta["nodules"] else None,
         cost=Volume(grid=grid, array=array("cost")) if meta["cost"] else None,
         lobes=Volume(grid=grid, array=array("lobes")) if meta["lobes"] else None,
+        motion=stored_motion(meta["motion"], array("motion")) if "motion" in meta else None,
         starts=tuple(_frozen(pose) for pose in meta["starts"]),
         targets_lps=tuple(_frozen(point) for point in meta["targets_lps"]),
         start_names=tuple(meta["start_names"]),

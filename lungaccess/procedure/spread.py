@@ -18,7 +18,7 @@ from lungaccess.problem.task import fissures_are_obstacles
 from lungaccess.procedure.kernels import spread as kernel
 from lungaccess.procedure.residuals import Residuals
 from lungaccess.procedure.settings import Procedure
-from lungaccess.risk.breathing import share_of_motion
+from anatomy.motion.population import share_of_motion
 from lungaccess.risk.errors import CURVATURE, ErrorModel
 from stages.tube import Deployments
 

@@ -4,7 +4,8 @@ A place at height h of its lung (0 at the apex, 1 at the base) moves to the feet
 to end-inhale, A being the patient's.  Scope and target move in the same phase.  The tip of the scope goes
 along with the airway that holds it, so that only the difference of the two counts: in the frame of the
 reference image the scope stays, and the target moves by `A f (g(h_target) - g(h_scope))`.  The phase f runs
-from 0 at end-exhale, where the image was taken, to 1; the procedure is at any time of the cycle.
+from 0 at end-exhale, where the image was taken, to 1; the procedure is at any time of the cycle.  g is that of
+`anatomy.motion.population`.
 """
 
 from __future__ import annotations
@@ -13,18 +14,8 @@ import numpy as np
 
 from anatomy.typed import Float
 
-HEIGHTS = np.arange(0.05, 1.0, 0.1)
-"""Middles of the tenths of a lung's height, from the apex."""
-SHARE_OF_MOTION = np.array([0.04, 0.08, 0.15, 0.21, 0.29, 0.39, 0.52, 0.65, 0.74, 0.69])
-"""g at these heights: means over ten patients with 4-D CT of quiet breathing (DIR-Lab), computed from the
-landmarks of [Fu2019]."""
 EXHALE_POWER = 6
 """The phase in time is cos^6, the form that [Lujan1999] fits to quiet breathing: long at end-exhale."""
-
-
-def share_of_motion(height: float) -> float:
-    """Return g: motion of a place by its height in the lung, as a share of A."""
-    return float(np.interp(height, HEIGHTS, SHARE_OF_MOTION))
 
 
 def phase(share_of_time: Float) -> Float:

@@ -16,7 +16,8 @@ from scipy.stats import kstest, norm, uniform
 from anatomy.errors import FileError, SettingsError
 from anatomy.lung import Lung
 from lungaccess.risk import UNITS, AngleError, BreathingError, CurvatureError, ErrorModel, PositionError
-from lungaccess.risk.breathing import phase, share_of_motion
+from anatomy.motion.population import share_of_motion
+from lungaccess.risk.breathing import phase
 from lungaccess.risk.deviations import FIELD_OF, Deviations
 from lungaccess.risk.draws import Draws
 from lungaccess.risk.error_files import DEFAULT_ERRORS, error_preset_names, load_errors

@@ -1,0 +1,151 @@
+"""The breathing of one patient: where each place of the masks is in each phase."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.errors import SettingsError
+from anatomy.grid import Grid, freeze_arrays, read_only
+from anatomy.kernels import motion as kernel
+from anatomy.motion.stretch import cell_bounds
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+
+RIGHT, LEFT = 0, 1
+"""Each lung slides along chest wall and mediastinum by itself, and has a displacement of its own."""
+
+
+@frozen_record
+class Motion:
+    """Motion between end-exhale (phase 0) and end-inhale (phase 1), linear in the phase, in LPS mm.
+
+    A place X of the masks is at `X + amplitude (phase - masks_phase) d(X)`; d is trilinear between nodes.
+
+    Parameters
+    ----------
+    grid : Grid
+        The nodes; axes along LPS, one spacing.
+    nodes : (2, ni, nj, nk, 3) float64
+        d as the right and as the left lung has it, mm, at places of the masks; continued beyond that lung.
+    middle_x_mm : float
+        x of the carina: what lies at larger x belongs to the left lung.
+    masks_phase : float
+        The phase that the masks show, 0 to 1.
+    amplitude : float
+        Share of the motion of the source.
+    source : str
+        Where the motion came from, in words.
+    warning_only : bool
+        Whether it is a model of other people's lungs, which may warn but not promise.
+    figures : mapping of str to float
+        What was measured of it, such as residuals; units are in the names.
+    warnings : tuple of str
+    """
+
+    grid: Grid
+    nodes: Float
+    middle_x_mm: float
+    masks_phase: float
+    amplitude: float
+    source: str
+    warning_only: bool
+    figures: Mapping[str, float]
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
+        freeze_arrays(self, "nodes")
+        object.__setattr__(self, "figures", MappingProxyType(dict(self.figures)))
+
+    @cached_property
+    def frame(self) -> Float:
+        """First node and spacing `(4,)`, for kernels."""
+        return read_only(np.append(self.grid.lps_from_ijk[:3, 3], self.grid.spacing_mm[0]))
+
+    @cached_property
+    def cells(self) -> Float:
+        """Bounds of the gradient on every cell `(2, ni - 1, nj - 1, nk - 1, 3)`; see `stretch`."""
+        return read_only(np.ascontiguousarray(cell_bounds(self.nodes, float(self.frame[3]))))
+
+    @cached_property
+    def key(self) -> str:
+        """SHA-256 of all that places depend on."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.nodes).tobytes())
+        numbers = [*self.frame, *self.nodes.shape, self.middle_x_mm, self.masks_phase, self.amplitude]
+        digest.update(np.array(numbers, dtype=np.float64).tobytes())
+        return digest.hexdigest()
+
+    def side_of(self, point_lps: ArrayLike) -> int:
+        """Return the lung, RIGHT or LEFT, to which a point `(3,)` LPS mm belongs."""
+        return int(np.asarray(point_lps)[0] > self.middle_x_mm)
+
+    def share(self, phase: float) -> float:
+        """Return which share of d places of the masks are moved by in a phase, negative before the masks'.
+
+        Raises
+        ------
+        SettingsError
+            If the phase is not from 0 to 1.
+        """
+        return self.amplitude * (require_phase(phase) - self.masks_phase)
+
+    def displacements_mm(self, points_lps: ArrayLike, side: int) -> Float:
+        """Return d `(N, 3)` of a lung at places of the masks `(N, 3)` LPS mm."""
+        points, out = _plain(points_lps)
+        kernel.displacements(self.nodes[side], self.frame, points, out)
+        return out
+
+    def moved(self, points_lps: ArrayLike, phase: float, side: int) -> Float:
+        """Return where places of the masks `(N, 3)` LPS mm are in a phase."""
+        points = _plain(points_lps)[0]
+        return np.asarray(points + self.share(phase) * self.displacements_mm(points, side))
+
+    def pulled_back(self, points_lps: ArrayLike, phase: float, side: int) -> Float:
+        """Return the places of the masks that are at points `(N, 3)` LPS mm in a phase."""
+        points, out = _plain(points_lps)
+        kernel.points_pulled_back(self.nodes[side], self.frame, self.share(phase), points, out)
+        return out
+
+    def least_stretch(self, side: int) -> Float:
+        """Return by what factor each cell shortens lengths at most, over all phases: `(ni - 1, ...)`."""
+        low, high = self.cells[side, ..., 0], self.cells[side, ..., 1]
+        begin, end = self.share(0.0), self.share(1.0)
+        return np.asarray(np.minimum(1.0, np.minimum(1.0 + end * low, 1.0 + begin * high)))
+
+    def record(self) -> dict[str, Any]:
+        """Return everything but the nodes as plain values, from which `stored_motion` restores it."""
+        names = ("middle_x_mm", "masks_phase", "amplitude", "source", "warning_only", "warnings")
+        return {
+            **{name: getattr(self, name) for name in names},
+            "figures": dict(self.figures),
+            "shape": self.grid.shape,
+            "lps_from_ijk": self.grid.lps_from_ijk.tolist(),
+        }
+
+
+def stored_motion(record: Mapping[str, Any], nodes: Float) -> Motion:
+    """Return the motion of a `record` and its nodes."""
+    rest = dict(record)
+    grid = Grid(shape=tuple(rest.pop("shape")), lps_from_ijk=np.array(rest.pop("lps_from_ijk")))
+    return Motion(grid=grid, nodes=nodes, **rest | {"warnings": tuple(rest["warnings"])})
+
+
+def require_phase(phase: float) -> float:
+    """Return a phase, or raise SettingsError if it is not from 0, end-exhale, to 1, end-inhale."""
+    if not 0.0 <= phase <= 1.0:
+        raise SettingsError(
+            f"The phase is {phase}", expected="0 (end-exhale) to 1 (end-inhale)", remedy="Write 0.3 for 30 %"
+        )
+    return float(phase)
+
+
+def _plain(points_lps: ArrayLike) -> tuple[Float, Float]:
+    points = np.array(points_lps, dtype=np.float64, order="C").reshape(-1, 3)
+    return points, np.zeros_like(points)

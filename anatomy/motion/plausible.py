@@ -1,0 +1,117 @@
+"""Whether a motion can be that of lungs: it does not fold, and inhaling moves the bases to the feet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy.errors import AnatomyError
+from anatomy.motion.motion import LEFT, RIGHT, Motion
+from anatomy.typed import Float
+
+BASAL_SHARE = 1.0 / 3.0
+"""The third of the height next to the diaphragm, which moves most."""
+SEEN_MM = 1.0
+"""A motion of the bases below this has no direction that could be wrong."""
+UNLIKE_FACTOR = 3.0
+"""One lung that moves so much more than the other is unusual; in ten patients none did twice."""
+GREATEST_MM = 60.0
+"""Twice the greatest motion of landmarks in quiet breathing: more is a wrong unit or frame."""
+
+
+def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
+    """Return a motion with its figures and warnings, or raise AnatomyError if it cannot be that of lungs.
+
+    `lungs` holds places `(N, 3)` LPS mm of the right and the left lung.
+    """
+    least = _require_invertible(motion)
+    moved = {side: motion.amplitude * motion.displacements_mm(lungs[side], side) for side in lungs}
+    far = {side: float(np.percentile(np.linalg.norm(each, axis=1), 95)) for side, each in moved.items()}
+    down = {side: _basal_mm(lungs[side], moved[side]) for side in lungs}
+    if max(far.values()) > GREATEST_MM:
+        raise AnatomyError(
+            f"The lungs move by up to {max(far.values()):.0f} mm",
+            expected=f"less than {GREATEST_MM:g} mm in quiet breathing",
+            remedy="Check that the displacements are mm, and their frame",
+        )
+    if max(down.values()) < -SEEN_MM:
+        raise AnatomyError(
+            f"Inhaling moves the bases of the lungs to the head, by {-down[RIGHT]:.1f} mm (right) and "
+            f"{-down[LEFT]:.1f} mm (left)",
+            expected="a motion to the feet",
+            remedy="The direction is reversed: state the other end in maps_from, or swap the two ends",
+        )
+    warnings = [
+        f"Inhaling moves the base of the {name} lung to the head, by {-down[side]:.1f} mm."
+        for side, name in ((RIGHT, "right"), (LEFT, "left"))
+        if down[side] < -SEEN_MM
+    ]
+    if max(far.values()) > UNLIKE_FACTOR * max(min(far.values()), SEEN_MM):
+        warnings.append(
+            f"The right lung moves by {far[RIGHT]:.1f} mm and the left one by {far[LEFT]:.1f} mm: look whether "
+            "the motion is that of this patient, and not mirrored."
+        )
+    if motion.warning_only:
+        warnings.append(
+            "The motion is that of other people's lungs: a window of breathing made with it is a warning, "
+            f"not a promise; the model leaves {motion.figures['residual_mm']:.1f} mm."
+        )
+    figures = {
+        **motion.figures,
+        "right_95_mm": far[RIGHT],
+        "left_95_mm": far[LEFT],
+        "right_base_to_feet_mm": down[RIGHT],
+        "left_base_to_feet_mm": down[LEFT],
+        "least_stretch": least,
+        **_volume_factors(motion, lungs),
+    }
+    return replace(motion, figures=figures, warnings=tuple(warnings))
+
+
+def _basal_mm(places: Float, moved: Float) -> float:
+    base, apex = places[:, 2].min(), places[:, 2].max()
+    return float(-moved[places[:, 2] < base + BASAL_SHARE * (apex - base), 2].mean())
+
+
+def _require_invertible(motion: Motion) -> float:
+    """Return a bound of how little of a length is left anywhere in any phase; it must be above 0.
+
+    Then `x_phi` is strictly monotone on the convex box of the nodes, and no two places meet.
+    """
+    least = np.stack([motion.least_stretch(side) for side in (RIGHT, LEFT)])
+    worst = np.unravel_index(int(least.argmin()), least.shape)
+    value = float(least[worst])
+    if value <= 0.0:
+        at = motion.grid.lps(np.array(worst[1:]) + 0.5)
+        folded = float((least <= 0.0).mean())
+        raise AnatomyError(
+            f"The motion is not proved to be invertible in {100.0 * folded:.2g} % of its cells: at "
+            f"lps:{at[0]:.0f},{at[1]:.0f},{at[2]:.0f} lengths may shrink by a factor of {value:.2f}",
+            expected="a motion that squeezes tissue nowhere to nothing, a factor above 0",
+            remedy="Smooth the field or register again with more regularisation; or state a smaller amplitude",
+        )
+    return value
+
+
+def _volume_factors(motion: Motion, lungs: dict[int, Float]) -> dict[str, float]:
+    """Return the factors by which each lung's volume grows from end-exhale to end-inhale."""
+    out = {}
+    for side, name in ((RIGHT, "right"), (LEFT, "left")):
+        step = 0.5 * float(motion.frame[3])
+        gradient = np.stack(
+            [
+                (
+                    motion.displacements_mm(lungs[side] + step * axis, side)
+                    - motion.displacements_mm(lungs[side] - step * axis, side)
+                )
+                / (2.0 * step)
+                for axis in np.eye(3)
+            ],
+            axis=-1,
+        )
+        volumes = [
+            np.linalg.det(np.eye(3) + motion.share(phase) * gradient).mean() for phase in (0.0, 1.0)
+        ]
+        out[f"{name}_volume_factor"] = float(volumes[1] / volumes[0])
+    return out

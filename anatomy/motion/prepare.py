@@ -1,0 +1,219 @@
+"""From what was read of a patient's breathing to its `Motion`: at places of the masks, on coarse nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage
+
+from anatomy.errors import AnatomyError
+from anatomy.grid import Grid
+from anatomy.motion.continuation import continued_unfolded
+from anatomy.motion.landmarks import Fitted, fit_landmarks
+from anatomy.motion.motion import LEFT, RIGHT, Motion
+from anatomy.motion.plausible import require_plausible
+from anatomy.motion.population import POPULATION_ERROR_MM, shares_of_motion
+from anatomy.motion.source import MotionSource
+from anatomy.structures import OUTSIDE
+from anatomy.typed import Float, Labels, Mask
+
+NODE_MM = 5.0
+"""Distance of nodes: motion varies over centimetres, and its bounds are tighter the smaller the cells."""
+BORDER_MM = 20.0
+"""Nodes around the lungs, so that what lies near the pleura has cells on all sides."""
+LEAST_COVERED = 0.99
+"""Share of the lungs that a field must cover: a field in a wrong frame covers far less."""
+SAMPLE_MM = 4.0
+"""Distance of the places in the lungs at which a motion is looked at."""
+INVERSE_STEPS = 60
+"""Of the fixed point that brings a field to the masks' phase; it converges as a lung's motion contracts."""
+SIDES = {RIGHT: "right", LEFT: "left"}
+
+At = Callable[[Float], Float]
+
+
+def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm: float) -> Motion:
+    """Bring what was read to the masks, and test it.
+
+    Parameters
+    ----------
+    source : MotionSource
+    labels : (ni, nj, nk) uint16
+        See `anatomy.structures`; on `grid`.
+    middle_x_mm : float
+        x of the carina.
+
+    Raises
+    ------
+    AnatomyError
+        If the motion folds tissue, leads to the head on inhalation, or too few landmarks lie in a lung.
+    FrameError
+        If a field does not cover the lungs.
+    """
+    places = _places(labels, grid)
+    nodes_grid = _nodes_grid(places)
+    at = nodes_grid.lps(np.stack(np.indices(nodes_grid.shape), axis=-1)).reshape(-1, 3)
+    is_left = places[:, 0] > middle_x_mm
+    if not is_left.any() or is_left.all():
+        raise AnatomyError(
+            "The lungs lie on one side of the carina, so that left and right cannot be told apart",
+            expected="a left and a right lung",
+            remedy="Leave [motion] out, or segment both lungs",
+        )
+    lungs = {RIGHT: places[~is_left], LEFT: places[is_left]}
+    if source.vectors is not None:
+        nodes, figures = _of_field(source, nodes_grid, at, labels, grid, lungs, middle_x_mm)
+    elif source.exhale_lps is not None and source.inhale_lps is not None:
+        nodes, figures = _of_landmarks(source, at, middle_x_mm)
+    else:
+        nodes, figures = _of_population(source, at, lungs)
+    motion = Motion(
+        grid=nodes_grid,
+        nodes=nodes.reshape(2, *nodes_grid.shape, 3),
+        middle_x_mm=middle_x_mm,
+        masks_phase=source.masks_phase,
+        amplitude=source.amplitude,
+        source=source.description,
+        warning_only=source.population_motion_mm is not None,
+        figures=figures,
+    )
+    return require_plausible(motion, lungs)
+
+
+def _places(labels: Labels, grid: Grid) -> Float:
+    """Return places `(N, 3)` LPS mm spread over the lungs."""
+    steps = np.maximum(np.rint(SAMPLE_MM / grid.spacing_mm).astype(int), 1)
+    inside = np.argwhere((labels[tuple(slice(None, None, n) for n in steps)] & OUTSIDE) == 0)
+    return grid.lps(inside * steps)
+
+
+def _nodes_grid(places: Float) -> Grid:
+    low, high = places.min(axis=0) - BORDER_MM, places.max(axis=0) + BORDER_MM
+    shape = np.ceil((high - low) / NODE_MM).astype(int) + 1
+    return Grid.from_spacing(shape, (NODE_MM,) * 3, low)
+
+
+def _of_landmarks(source: MotionSource, at: Float, middle_x_mm: float) -> tuple[Float, dict[str, float]]:
+    """Fit each lung's pairs at the masks' phase; nothing has to be inverted."""
+    exhale, inhale = np.asarray(source.exhale_lps), np.asarray(source.inhale_lps)
+    vectors = inhale - exhale
+    points = exhale + source.masks_phase * vectors
+    is_left = points[:, 0] > middle_x_mm
+    fits: dict[int, Fitted] = {}
+    for side, chosen in ((RIGHT, ~is_left), (LEFT, is_left)):
+        fits[side] = fit_landmarks(points[chosen], vectors[chosen], SIDES[side])
+    left_out = np.concatenate([fit.left_out_mm for fit in fits.values()])
+    figures = {
+        "landmark_pairs": float(len(points)),
+        "residual_mm": float(np.concatenate([fit.residual_mm for fit in fits.values()]).mean()),
+        "left_out_mm": float(left_out.mean()),
+        "left_out_95_mm": float(np.percentile(left_out, 95)),
+    }
+    return np.stack([fits[side].at(at) for side in (RIGHT, LEFT)]), figures
+
+
+def _of_population(
+    source: MotionSource, at: Float, lungs: dict[int, Float]
+) -> tuple[Float, dict[str, float]]:
+    """Move each height of a lung to the feet as ten others do."""
+    nodes = np.zeros((2, *at.shape))
+    for side, places in lungs.items():
+        apex, base = places[:, 2].max(), places[:, 2].min()
+        height = (apex - at[:, 2]) / max(apex - base, NODE_MM)
+        nodes[side, :, 2] = -float(source.population_motion_mm or 0.0) * shares_of_motion(height)
+    return nodes, {"residual_mm": POPULATION_ERROR_MM}
+
+
+def _of_field(
+    source: MotionSource,
+    nodes_grid: Grid,
+    at: Float,
+    labels: Labels,
+    grid: Grid,
+    lungs: dict[int, Float],
+    middle_x_mm: float,
+) -> tuple[Float, dict[str, float]]:
+    """Bring a field to the masks' phase, and continue that of each lung beyond it."""
+    own, smooth = _field_at(source, 0.0), _field_at(source, NODE_MM)
+    d, rest_mm = _at_masks(source, smooth, at)
+    exact_of = lambda places: _at_masks(source, own, places)[0]  # noqa: E731
+    nodes = np.zeros((2, *at.shape))
+    errors, mended = [], []
+    for side, places in lungs.items():
+        inside = _near_lung(labels, grid, nodes_grid, side, middle_x_mm)
+        whole, share = continued_unfolded(d.reshape(*nodes_grid.shape, 3), inside, NODE_MM)
+        mended.append(share)
+        nodes[side] = whole.reshape(-1, 3)
+        order_one = [
+            ndimage.map_coordinates(whole[..., n], nodes_grid.ijk(places).T, order=1) for n in range(3)
+        ]
+        errors.append(np.linalg.norm(np.stack(order_one, axis=1) - exact_of(places), axis=1))
+    error = np.concatenate(errors)
+    return nodes, {
+        "to_masks_phase_mm": rest_mm,
+        "residual_mm": float(error.mean()),
+        "residual_95_mm": float(np.percentile(error, 95)),
+        "mended_share": max(mended),
+        "sliding_at_pleura_mm": _sliding(labels, grid, exact_of),
+    }
+
+
+def _field_at(source: MotionSource, smooth_mm: float) -> At:
+    """Return the field as a function of points; smoothed, so that coarse nodes do not sample its noise."""
+    grid, vectors = source.grid, source.vectors
+    if grid is None or vectors is None:
+        raise ValueError("a displacement field has a grid and vectors")
+    sigma = np.maximum(0.5 * smooth_mm / grid.spacing_mm - 0.5, 0.0)
+    parts = [
+        ndimage.gaussian_filter(vectors[..., n], sigma, mode="nearest") if sigma.any() else vectors[..., n]
+        for n in range(3)
+    ]
+
+    def at(points: Float) -> Float:
+        index = grid.ijk(points).T
+        return np.stack([ndimage.map_coordinates(p, index, order=1, mode="nearest") for p in parts], axis=1)
+
+    return at
+
+
+def _at_masks(source: MotionSource, field: At, places: Float) -> tuple[Float, float]:
+    """Return end-exhale to end-inhale displacements at places of the masks, and what is left of the search.
+
+    A point Y of the field is at `Y + share D(Y)` in the masks' phase; Y is found by fixed point.
+    """
+    backwards = source.maps_from == "end-inhale"
+    share = 1.0 - source.masks_phase if backwards else source.masks_phase
+    found, rest = places, 0.0
+    for _ in range(INVERSE_STEPS if share else 0):
+        nearer = places - share * field(found)
+        rest = float(np.abs(nearer - found).max())
+        found = nearer
+        if rest < 1e-4:
+            break
+    d = field(found)
+    return (-d if backwards else d), rest
+
+
+def _near_lung(labels: Labels, grid: Grid, nodes_grid: Grid, side: int, middle_x_mm: float) -> Mask:
+    """Return the nodes that lie in a lung."""
+    points = nodes_grid.lps(np.stack(np.indices(nodes_grid.shape), axis=-1))
+    index = np.rint(grid.ijk(points)).astype(int)
+    within = ((index >= 0) & (index < np.asarray(grid.shape))).all(axis=-1)
+    held = labels[tuple(np.clip(index, 0, np.asarray(grid.shape) - 1).reshape(-1, 3).T)]
+    inside = within & ((held.reshape(within.shape) & OUTSIDE) == 0)
+    return np.asarray(inside & ((points[..., 0] > middle_x_mm) == (side == LEFT)))
+
+
+def _sliding(labels: Labels, grid: Grid, field: At) -> float:
+    """Return the mean difference in mm of a field 5 mm inside and 5 mm outside of the pleura."""
+    steps = np.maximum(np.rint(SAMPLE_MM / grid.spacing_mm).astype(int), 1)
+    inside = (labels[tuple(slice(None, None, n) for n in steps)] & OUTSIDE) == 0
+    spacing = steps * grid.spacing_mm
+    depth = ndimage.distance_transform_edt(inside, sampling=spacing)
+    depth = depth - ndimage.distance_transform_edt(~inside, sampling=spacing)
+    normal = np.stack(np.gradient(ndimage.gaussian_filter(depth, 1.0), *spacing), axis=-1)
+    at = np.argwhere(np.abs(depth) < 1.5 * float(spacing.max()))[::7]
+    n = normal[tuple(at.T)] @ (grid.lps_from_ijk[:3, :3] / grid.spacing_mm).T
+    points = grid.lps(at * steps)
+    return float(np.linalg.norm(field(points + 5.0 * n) - field(points - 5.0 * n), axis=1).mean())

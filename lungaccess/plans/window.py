@@ -1,0 +1,118 @@
+"""The window of a plan in the breath: the phases in which it is proved clear and on target."""
+
+from __future__ import annotations
+
+from dataclasses import field
+
+import numpy as np
+
+from anatomy.errors import PlanFileError
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+from lungaccess.plans.record import Record, shaped
+
+
+@frozen_record
+class WindowLimit(Record):
+    """What ends a window, or leaves none.
+
+    Parameters
+    ----------
+    phase : float
+        The end of the window; without a window a phase near that of the masks.
+    reason : str
+        "target" if the end of the devices is too far from it, "lumen" if the tubes leave the airway before
+        their exit, else the structure that is too near: "airway", "vessel", "outside" or "fissure".
+    device : str
+        "tube" or "needle".
+    arc_length_mm : float
+        Where on the device, from the tip of the scope or of the tubes.
+    place_lps : (3,) float64, LPS mm
+        The same in the frame of the plan.
+    """
+
+    phase: float
+    reason: str
+    device: str
+    arc_length_mm: float
+    place_lps: Float = field(metadata=shaped(3))
+
+    @property
+    def words(self) -> str:
+        """What ends the window, in words."""
+        what = {
+            "target": "the devices end too far from the target",
+            "lumen": "the tubes leave the lumen before their exit",
+            "outside": f"the {self.device} comes too near to the pleura",
+        }.get(self.reason, f"the {self.device} comes too near to a {self.reason}")
+        return f"{what}, {self.arc_length_mm:.1f} mm along the {self.device}"
+
+
+@frozen_record
+class BreathingWindow(Record):
+    """Phases from 0 (end-exhale) to 1 (end-inhale) in which tubes and needle, held still, may be in the lung.
+
+    Parameters
+    ----------
+    motion_key : str
+        SHA-256 of the motion that it was made with.
+    motion_source : str
+        Where that came from, in words.
+    warning_only : bool
+        Whether it is a model of other people's lungs.
+    masks_phase, amplitude : float
+        The phase that the masks show, and the motion as a share of the source's.
+    tolerance_mm : float
+        Largest distance between the end of the devices and the moving target.
+    phases : (N, 2) float64
+        First and last phase of each stretch that is proved.
+    undecided_share : float
+        Share of the breath of which neither could be proved; it is not in the window.
+    limits : tuple of WindowLimit
+        What ends the stretches within the breath, in their order; without any, what forbids a phase near
+        that of the masks.
+
+    Raises
+    ------
+    PlanFileError
+        If the phases are not stretches in order within 0 to 1.
+    """
+
+    motion_key: str
+    motion_source: str
+    warning_only: bool
+    masks_phase: float
+    amplitude: float
+    tolerance_mm: float
+    phases: Float = field(metadata=shaped(None, 2))
+    undecided_share: float
+    limits: tuple[WindowLimit, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        ends = np.asarray(self.phases).ravel()
+        if len(ends) and not (ends[0] >= 0.0 and ends[-1] <= 1.0 and (np.diff(ends) >= 0.0).all()):
+            raise PlanFileError(
+                f"The window of a plan has the phases {self.phases.tolist()}",
+                expected="stretches within 0 to 1, in order, that do not overlap",
+                remedy="Run `lungaccess plan` again",
+            )
+
+    @property
+    def share(self) -> float:
+        """The share of the phases that the window holds."""
+        return float(np.diff(self.phases, axis=1).sum())
+
+    def holds(self, phase: float) -> bool:
+        """Tell whether a phase is in the window."""
+        return bool(((self.phases[:, 0] <= phase) & (phase <= self.phases[:, 1])).any())
+
+    @property
+    def words(self) -> str:
+        """The window in a sentence."""
+        if not len(self.phases):
+            return f"No phase of the breath is proved: {self.limits[0].words if self.limits else 'unknown'}."
+        parts = [f"{100.0 * a:.0f} % and {100.0 * b:.0f} %" for a, b in self.phases]
+        ends = "; ".join(f"at {100.0 * each.phase:.0f} % {each.words}" for each in self.limits)
+        said = f"Insert between {', or '.join(parts)} of the breath (0 % is end-exhale, 100 % end-inhale)."
+        return f"{said} {ends[:1].upper()}{ends[1:]}." if ends else said

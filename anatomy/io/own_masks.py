@@ -16,6 +16,7 @@ from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume
 from anatomy.io.label_names import stored_names
 from anatomy.io.masks import MaskSource, read_masks
+from anatomy.io.motion_files import MotionFile, read_motion
 from anatomy.lobes import LOBES, lobe_named
 from anatomy.patient import PatientImages
 from anatomy.settings import parse, quantity, settings
@@ -66,6 +67,7 @@ class PatientFile:
     accepted: Annotated[
         tuple[str, ...], _key("Checks of the segmentation that failed and were overruled by --accept")
     ] = ()
+    motion: Annotated[MotionFile | None, _key("How the lungs breathe")] = None
 
 
 def load_own_masks(description: Path) -> PatientImages:
@@ -91,6 +93,11 @@ def load_own_masks(description: Path) -> PatientImages:
         cost_path = _named_file(folder, keys.cost)
         cost = require_cost(read_volume(cost_path, frame=frame), masks.grid)
         hashes[keys.cost] = sha256(cost_path)
+    motion = None
+    if keys.motion is not None:
+        for name in filter(None, (keys.motion.file, keys.motion.end_exhale, keys.motion.end_inhale)):
+            hashes[name] = sha256(_named_file(folder, name))
+        motion = read_motion(keys.motion, folder, masks.grid)
     return assemble(
         masks,
         name=keys.name or folder.resolve().name,
@@ -99,6 +106,7 @@ def load_own_masks(description: Path) -> PatientImages:
         cost=cost,
         targets_lps=targets,
         breath_hold=keys.breath_hold or None,
+        motion=motion,
         sources=hashes,
         warnings=(*_thick_slices(keys.thick_slices_mm), *_accepted(keys.accepted), *keys.warnings),
     )

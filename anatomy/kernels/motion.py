@@ -1,9 +1,10 @@
 """Breathing at points: displacements between nodes, their gradient, and points pulled back to the masks.
 
-`nodes` is `(ni, nj, nk, 3)` float64: displacements in mm from end-exhale to end-inhale at places of the masks.
-`frame` is `(4,)`: LPS of the first node, and the distance of nodes along all three axes, which are those of
-LPS.  Between nodes a displacement is trilinear; beyond them it is that of the nearest place on the border.
-`share` is the amplitude times the phase less that of the masks: a place X of the masks is at `X + share d(X)`.
+`nodes` is `(ni, nj, nk, 3)` float64: displacements in mm from end-exhale to end-inhale at places of the
+masks. `frame` is `(4,)`: LPS of the first node, and the distance of nodes along all three axes, which are
+those of LPS.  Between nodes a displacement is trilinear; beyond them it is that of the nearest place on the
+border. `share` is the amplitude times the phase less that of the masks: a place X of the masks is at `X +
+share d(X)`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numba
-import numpy as np
 
 MOST_STEPS = 60
 """Of a fixed point whose error falls by the norm of the gradient, 0.2 to 0.4 in a lung, with each step."""

@@ -1,4 +1,4 @@
-"""Continues a displacement from the nodes of a lung to all others, so that it does not slide at the pleura."""
+"""Continues a displacement from the nodes of a lung to all others, so that nothing slides at the pleura."""
 
 from __future__ import annotations
 

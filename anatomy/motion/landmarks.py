@@ -52,7 +52,7 @@ def fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
         raise AnatomyError(
             f"There are {len(points)} pairs of landmarks in the {lung} lung",
             expected=f"at least {LEAST_PAIRS} in each lung, spread over it",
-            remedy="Mark more pairs; check that their coordinates are LPS mm of the masks, else state the frame",
+            remedy="Mark more pairs; check that their coordinates are mm of the masks in the frame stated",
         )
     try:
         return _fitted(points, vectors)

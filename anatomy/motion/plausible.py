@@ -16,6 +16,8 @@ SEEN_MM = 1.0
 """A motion of the bases below this has no direction that could be wrong."""
 UNLIKE_FACTOR = 3.0
 """One lung that moves so much more than the other is unusual; in ten patients none did twice."""
+MENDED_SHARE = 0.05
+"""A field that is split where the lungs touch is mended in 1 % of a lung."""
 GREATEST_MM = 60.0
 """Twice the greatest motion of landmarks in quiet breathing: more is a wrong unit or frame."""
 
@@ -49,8 +51,13 @@ def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
     ]
     if max(far.values()) > UNLIKE_FACTOR * max(min(far.values()), SEEN_MM):
         warnings.append(
-            f"The right lung moves by {far[RIGHT]:.1f} mm and the left one by {far[LEFT]:.1f} mm: look whether "
-            "the motion is that of this patient, and not mirrored."
+            f"The right lung moves by {far[RIGHT]:.1f} mm and the left one by {far[LEFT]:.1f} mm: look "
+            "whether the motion is that of this patient, and not mirrored."
+        )
+    if motion.figures.get("mended_share", 0.0) > MENDED_SHARE:
+        warnings.append(
+            f"The motion slides or folds in {100.0 * motion.figures['mended_share']:.0f} % of a lung; there "
+            "it is continued from elsewhere, which leaves what the residual says."
         )
     if motion.warning_only:
         warnings.append(
@@ -89,7 +96,7 @@ def _require_invertible(motion: Motion) -> float:
             f"The motion is not proved to be invertible in {100.0 * folded:.2g} % of its cells: at "
             f"lps:{at[0]:.0f},{at[1]:.0f},{at[2]:.0f} lengths may shrink by a factor of {value:.2f}",
             expected="a motion that squeezes tissue nowhere to nothing, a factor above 0",
-            remedy="Smooth the field or register again with more regularisation; or state a smaller amplitude",
+            remedy="Smooth the field, or register again with more regularisation",
         )
     return value
 
@@ -110,8 +117,6 @@ def _volume_factors(motion: Motion, lungs: dict[int, Float]) -> dict[str, float]
             ],
             axis=-1,
         )
-        volumes = [
-            np.linalg.det(np.eye(3) + motion.share(phase) * gradient).mean() for phase in (0.0, 1.0)
-        ]
+        volumes = [np.linalg.det(np.eye(3) + motion.share(phase) * gradient).mean() for phase in (0.0, 1.0)]
         out[f"{name}_volume_factor"] = float(volumes[1] / volumes[0])
     return out

@@ -53,7 +53,7 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
     """
     places = _places(labels, grid)
     nodes_grid = _nodes_grid(places)
-    at = nodes_grid.lps(np.stack(np.indices(nodes_grid.shape), axis=-1)).reshape(-1, 3)
+    at = nodes_grid.lps(np.moveaxis(np.indices(nodes_grid.shape), 0, -1)).reshape(-1, 3)
     is_left = places[:, 0] > middle_x_mm
     if not is_left.any() or is_left.all():
         raise AnatomyError(
@@ -137,7 +137,10 @@ def _of_field(
     """Bring a field to the masks' phase, and continue that of each lung beyond it."""
     own, smooth = _field_at(source, 0.0), _field_at(source, NODE_MM)
     d, rest_mm = _at_masks(source, smooth, at)
-    exact_of = lambda places: _at_masks(source, own, places)[0]  # noqa: E731
+
+    def exact_of(places: Float) -> Float:
+        return _at_masks(source, own, places)[0]
+
     nodes = np.zeros((2, *at.shape))
     errors, mended = [], []
     for side, places in lungs.items():
@@ -197,7 +200,7 @@ def _at_masks(source: MotionSource, field: At, places: Float) -> tuple[Float, fl
 
 def _near_lung(labels: Labels, grid: Grid, nodes_grid: Grid, side: int, middle_x_mm: float) -> Mask:
     """Return the nodes that lie in a lung."""
-    points = nodes_grid.lps(np.stack(np.indices(nodes_grid.shape), axis=-1))
+    points = nodes_grid.lps(np.moveaxis(np.indices(nodes_grid.shape), 0, -1))
     index = np.rint(grid.ijk(points)).astype(int)
     within = ((index >= 0) & (index < np.asarray(grid.shape))).all(axis=-1)
     held = labels[tuple(np.clip(index, 0, np.asarray(grid.shape) - 1).reshape(-1, 3).T)]

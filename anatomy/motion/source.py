@@ -1,4 +1,4 @@
-"""What is known of a patient's breathing, as it was read: a field, landmark pairs, or the population's motion."""
+"""What is known of a patient's breathing, as it was read: a field, landmark pairs, or other people's."""
 
 from __future__ import annotations
 

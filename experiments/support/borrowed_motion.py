@@ -1,7 +1,7 @@
 """Carries the breathing of a patient with landmark pairs onto the lungs of another: the motion is borrowed.
 
-A quadratic in the normalised height, left-right and front-back coordinates of each lung's box is fitted to the
-pairs and evaluated at the same coordinates of the other lung; nothing is scaled.
+A quadratic in the normalised height, left-right and front-back coordinates of each lung's box is fitted to
+the pairs and evaluated at the same coordinates of the other lung; nothing is scaled.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def carried(pairs: str | Path, lung: Lung) -> MotionSource:
     exhale, vectors = table[:, :3] * LPS_FROM_IMAGE, (table[:, 3:] - table[:, :3]) * LPS_FROM_IMAGE
     middle = 0.5 * (exhale[:, 0].min() + exhale[:, 0].max())
     grid = _grid(lung)
-    at = grid.lps(np.stack(np.indices(grid.shape), axis=-1)).reshape(-1, 3)
+    at = grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1)).reshape(-1, 3)
     places = lung.grid.lps(4 * np.argwhere((lung.labels[::4, ::4, ::4] & OUTSIDE) == 0))
     carina_x = float(lung.tree.carina_lps[0])
     field = np.zeros_like(at)

@@ -14,7 +14,7 @@ from lungaccess.plans.curves import needle_pieces, tube_pieces, tube_radii
 from lungaccess.plans.plan import Plan
 
 POINT_MM = 0.05
-"""Distance of the points: between two of them the chord of the tightest arc is off by less than 0.00005 mm."""
+"""Distance of the points: between two the chord of the tightest arc is off by less than 0.00005 mm."""
 WALL_ZONE_MM = 1.0
 """Length of tube that is spent on piercing the wall; so far the hole may move along it, either way."""
 SHORTEST_MM = 1e-9
@@ -47,23 +47,20 @@ def device_points(plan: Plan) -> DevicePoints:
     system, tube, needle = plan.system, plan.tube, plan.needle
     pieces = tube_pieces(tube, system.tubes)
     length, way_out = float(pieces[:, 0].sum()), tube.exit.arc_length_mm
-    edges = _edges(
-        [0.0, way_out - WALL_ZONE_MM, way_out, way_out + WALL_ZONE_MM, length, *tube.insertions_mm(system.tubes)],
-        length,
-    )
+    at_exit = (way_out - WALL_ZONE_MM, way_out, way_out + WALL_ZONE_MM)
+    edges = _edges([*at_exit, length, *tube.insertions_mm(system.tubes)], length)
     extra = system.margins.total_mm + tube.clearance_loss_mm
     parts, rows = [], []
     for begin, end in zip(edges[:-1], edges[1:], strict=True):
         middle = 0.5 * (begin + end)
         radius = float(tube_radii(tube, system.tubes, np.array([middle]))[0])
-        kind = sum(middle > edge for edge in (way_out - WALL_ZONE_MM, way_out, way_out + WALL_ZONE_MM))
-        kind = (IN_LUMEN, BEFORE_WALL, IN_WALL, TUBE)[kind]
+        kind = (IN_LUMEN, BEFORE_WALL, IN_WALL, TUBE)[sum(middle > edge for edge in at_exit)]
         parts.append(_arcs(begin, end))
         rows.append((kind, radius + extra, radius))
     points = [points_on_pieces(plan.scope.lps_from_scope_tip, pieces, arcs) for arcs in parts]
     if needle is not None and system.needle is not None:
         exempt = plan.exemption.needle_length_mm
-        edges = _edges([0.0, exempt, needle.length_mm], needle.length_mm)
+        edges = _edges([exempt, needle.length_mm], needle.length_mm)
         for begin, end in zip(edges[:-1], edges[1:], strict=True):
             kind = NEEDLE_AT_EXIT if 0.5 * (begin + end) < exempt else NEEDLE
             arcs = _arcs(begin, end)

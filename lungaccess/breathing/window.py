@@ -79,7 +79,7 @@ def require_motion(lung: Lung) -> Motion:
             f"Nothing is known of the breathing of {lung.name}",
             expected="a [motion] in its patient.toml",
             remedy='Write there [motion], file = "field.nrrd" (or landmarks.csv) and masks_phase = 0.0, or '
-            'population = true for a warning without data; docs/explanation/breathing.md says more',
+            "population = true for a warning without data; docs/explanation/breathing.md says more",
         )
     return lung.motion
 

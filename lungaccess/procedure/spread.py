@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from anatomy.lung import Lung
+from anatomy.motion.population import share_of_motion
 from anatomy.typed import Float
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from lungaccess.procedure.kernels import spread as kernel
 from lungaccess.procedure.residuals import Residuals
 from lungaccess.procedure.settings import Procedure
-from anatomy.motion.population import share_of_motion
 from lungaccess.risk.errors import CURVATURE, ErrorModel
 from stages.tube import Deployments
 

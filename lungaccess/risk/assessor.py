@@ -12,11 +12,11 @@ import numpy as np
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.morphology import components
+from anatomy.motion.population import share_of_motion
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
-from anatomy.motion.population import share_of_motion
 from lungaccess.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations
 from lungaccess.risk.draws import Draws
 from lungaccess.risk.errors import OF_NEEDLE, UNITS, ErrorModel

@@ -4,8 +4,8 @@ A place at height h of its lung (0 at the apex, 1 at the base) moves to the feet
 to end-inhale, A being the patient's.  Scope and target move in the same phase.  The tip of the scope goes
 along with the airway that holds it, so that only the difference of the two counts: in the frame of the
 reference image the scope stays, and the target moves by `A f (g(h_target) - g(h_scope))`.  The phase f runs
-from 0 at end-exhale, where the image was taken, to 1; the procedure is at any time of the cycle.  g is that of
-`anatomy.motion.population`.
+from 0 at end-exhale, where the image was taken, to 1; the procedure is at any time of the cycle.  g is that
+of `anatomy.motion.population`.
 """
 
 from __future__ import annotations

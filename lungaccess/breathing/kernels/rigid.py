@@ -1,8 +1,8 @@
 """The rigid motion of the devices with the airway around the scope's tip, and bounds of its rates.
 
-F = I + share G is the deformation about the tip, G a mean gradient; devices turn by its rotation R in the polar
-decomposition F = R U.  With K = R'G, R' d/dshare R = W solves W U + U W = K - K', so its axis w solves
-(tr(U) I - U) w = axis of K - K'.
+F = I + share G is the deformation about the tip, G a mean gradient; devices turn by its rotation R in the
+polar decomposition F = R U.  With K = R'G, R' d/dshare R = W solves W U + U W = K - K', so its axis w
+solves (tr(U) I - U) w = axis of K - K'.
 """
 
 from __future__ import annotations

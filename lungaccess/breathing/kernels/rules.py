@@ -1,10 +1,10 @@
 """What must hold at a point of the devices in a stretch of phases, and how far along them it is then proved.
 
-Within the ball of `reach` mm about X, the place of the masks where the point is, tissue is stretched by at least
-`least` in all phases of the stretch, and d changes by at most `norm` a mm.  If no obstacle is nearer to X than
-`reach`, none is nearer to the point than `least reach`.  Going on by `step` along the device and by `half` in
-the share moves X by at most `(step + half speed) / least`; so the clearance stays above
-`least reach - step - half speed`.  The derivation stands in docs/explanation/proofs.md.
+Within the ball of `reach` mm about X, the place of the masks where the point is, tissue is stretched by at
+least `least` in all phases of the stretch, and d changes by at most `norm` a mm.  If no obstacle is nearer
+to X than `reach`, none is nearer to the point than `least reach`.  Going on by `step` along the device and
+by `half` in the share moves X by at most `(step + half speed) / least`; so the clearance stays above `least
+reach - step - half speed`.  The derivation stands in docs/explanation/proofs.md.
 """
 
 from __future__ import annotations
@@ -33,15 +33,17 @@ CORNER_MM = 0.05
 OUT_OF_LUMEN_MM = 0.02
 """So far the axis of a tube stays from every lumen beyond its wall, as there."""
 MOST_MM = 4.0
-"""Clearance beyond this is not looked for: it takes long steps already, and more cells would loosen the bounds."""
+"""Clearance beyond this is not looked for: steps are long already, and more cells would loosen the bounds."""
 SEARCH_MM = 0.5
 """How far beyond what decides an exact distance is looked for, as in the proof of the masks' phase."""
 LONG_STEP_MM = 0.05
 """A step that is long enough not to look closer."""
 BEYOND_MM = 0.1
 """How much farther than what is to be kept deformed voxels are looked for."""
-LEAST_STEP_MM = 0.002
-"""A proof that goes on by less gives up: so little of a clearance is lost."""
+LEAST_STEP_MM = 0.0005
+"""A proof that goes on by less gives up: near its exit a tube moves by so little in 1 % of a breath."""
+BROKEN_MM = 0.001
+"""With less than this to spare a rule counts as broken."""
 NEAR_MM = 5e-5
 """Taken off every clearance: more than the sagitta between two points, and far more than rounding."""
 
@@ -51,7 +53,7 @@ _LUMEN = np.int64(LUMEN)
 
 
 class Tissue(NamedTuple):
-    """What the devices collide with; see `stages.tube.kernels.wall_exit.Environment`.  `branch` is pierced."""
+    """What the devices collide with; see `stages.tube.kernels.wall_exit.Environment`; the pierced branch."""
 
     clearance: UInt16
     labels: Labels
@@ -71,7 +73,7 @@ class Breath(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """A stretch of phases: its middle and half as shares, the devices' pose in the middle, bounds of rates."""
+    """A stretch of phases: middle and half as shares, the devices' pose in the middle, bounds of rates."""
 
     share: float
     half: float
@@ -169,9 +171,7 @@ def step_clear_of(tissue, breath, stretch, at, rest, speed, lever, bits, branch,
     step = step_left(stretch, breath, at, rest, speed, lever, free, kept)
     if step >= LONG_STEP_MM or free <= 0.0:
         return step, label
-    other, _over, nearest = gap_to_voxels(
-        tissue, breath, stretch, at, rest, speed, lever, bits, branch, kept
-    )
+    other, _over, nearest = gap_to_voxels(tissue, breath, stretch, at, rest, speed, lever, bits, branch, kept)
     return max(step, other), nearest if nearest else label
 
 

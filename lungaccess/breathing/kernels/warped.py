@@ -1,8 +1,8 @@
 """Distances in the middle phase of a stretch to voxels as the motion deforms them, within bounds.
 
-Near a place X of the masks a vector r becomes F r, F = I + share G(X), but for what the gradient changes on the
-way: on a cell each column of G is affine in every coordinate, so G is nowhere in a box farther from G(X) than at
-the corners of the parts into which the cells divide the box.
+Near a place X of the masks a vector r becomes F r, F = I + share G(X), but for what the gradient changes on
+the way: on a cell each column of G is affine in every coordinate, so G is nowhere in a box farther from
+G(X) than at the corners of the parts into which the cells divide the box.
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ def _nearest_in_box(m, low, high, y):
 def deformed_distance(tissue, breath, share, at, bits, branch, reach):
     """Return bounds of the distance to deformed voxels within `reach` mm of X, the nearest label, and why.
 
-    Voxels are taken as `anatomy.kernels.field.exact_distance` takes them; without any the bounds are infinite.
+    Voxels are taken as `anatomy.kernels.field.exact_distance` takes them; without any the bounds are
+    infinite.
     """
     labels, geometry = tissue.labels, tissue.geometry
     own, m = np.zeros((3, 3)), np.zeros((3, 3))

@@ -14,6 +14,7 @@ from lungaccess.breathing.kernels.rigid import carried, rate_bounds, turned
 from lungaccess.breathing.kernels.rules import (
     BEFORE_WALL,
     BLOCKED,
+    BROKEN_MM,
     CLEAR,
     CORNER_MM,
     IN_LUMEN,
@@ -179,9 +180,7 @@ def refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect):
     guess[:] = points[0]
     for s in range(sections.shape[0]):
         if int(sections[s, KIND]) != BEFORE_WALL:
-            n, reason = _refusal_in_section(
-                tissue, breath, rigid, stretch, points, arc, sections[s], guess
-            )
+            n, reason = _refusal_in_section(tissue, breath, rigid, stretch, points, arc, sections[s], guess)
             if n >= 0:
                 return n, reason
     return _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess)
@@ -218,13 +217,14 @@ def _excess(tissue, breath, rigid, stretch, point, row, reason, guess):
 def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
     """Tell whether a rule is broken in all phases of the stretch, near a point that is not proved, and where.
 
-    The search goes along the section to where less and less is left.
+    Less than BROKEN_MM to spare counts as broken.  The search goes along the section to where less and less
+    is left.
     """
     row = sections[_row_of(sections, n)]
     guess = points[n].copy()
     best = _excess(tissue, breath, rigid, stretch, points[n], row, reason, guess)
     hop = FIRST_HOP
-    while hop >= 1 and best >= 0.0:
+    while hop >= 1 and best >= BROKEN_MM:
         better = False
         for m in (n + hop, n - hop):
             if row[BEGIN] <= m <= row[END]:
@@ -235,7 +235,7 @@ def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
                     break
         if not better:
             hop //= 2
-    return best < 0.0, n
+    return best < BROKEN_MM, n
 
 
 @numba.njit(cache=True)

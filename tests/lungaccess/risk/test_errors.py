@@ -15,8 +15,8 @@ from scipy.stats import kstest, norm, uniform
 
 from anatomy.errors import FileError, SettingsError
 from anatomy.lung import Lung
-from lungaccess.risk import UNITS, AngleError, BreathingError, CurvatureError, ErrorModel, PositionError
 from anatomy.motion.population import share_of_motion
+from lungaccess.risk import UNITS, AngleError, BreathingError, CurvatureError, ErrorModel, PositionError
 from lungaccess.risk.breathing import phase
 from lungaccess.risk.deviations import FIELD_OF, Deviations
 from lungaccess.risk.draws import Draws

@@ -1,0 +1,255 @@
+"""Reads what a patient.toml says of breathing: a displacement field, a transform, landmarks, two images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from anatomy.errors import AnatomyError, FileError, FrameError, SettingsError
+from anatomy.grid import Grid, transform_points
+from anatomy.io.files import read_text, require_file, unreadable
+from anatomy.io.frames import LPS_FROM
+from anatomy.io.images import NRRD, SUFFIXES, image_suffix
+from anatomy.io.itk_headers import read_nrrd_header
+from anatomy.io.nifti_header import right_handed_grid
+from anatomy.motion.source import MotionSource
+from anatomy.settings import quantity, settings, switch, text
+from anatomy.typed import Float
+
+TRANSFORMS = (".h5", ".hdf5", ".tfm", ".txt", ".mat", ".xfm")
+LANDMARKS = ".csv"
+SAMPLE_MM = 4.0
+"""Spacing of the points at which a transform is evaluated: finer than the nodes of a motion."""
+MEDIAN_MOTION_MM = 17.3
+"""Median of the population's 95 % motion (exp 2.85)."""
+LPS_WORDS = ("left-posterior-superior", "lps")
+
+
+@settings
+class MotionFile:
+    """The keys of [motion] in a `patient.toml`: `file`, `end_exhale` and `end_inhale`, or `population`."""
+
+    file: Annotated[str, text("Displacement field, ITK transform or landmark pairs", may_be_empty=True)] = ""
+    end_exhale: Annotated[str, text("Image or mask of the lungs at end-exhale", may_be_empty=True)] = ""
+    end_inhale: Annotated[str, text("The same at end-inhale, to be registered", may_be_empty=True)] = ""
+    population: Annotated[bool, switch("Whether other people's motion is to be used, as a warning")] = False
+    population_motion_mm: Annotated[
+        float, quantity("95 % motion of the patient for the population's model", above=0.0, at_most=60.0)
+    ] = MEDIAN_MOTION_MM
+    maps_from: Annotated[
+        Literal["", "end-exhale", "end-inhale"],
+        Field(description="Where the points of a field or transform lie"),
+    ] = ""
+    frame: Annotated[Literal["", "lps", "ras"], Field(description="Frame of landmark pairs")] = ""
+    masks_phase: Annotated[
+        float | None,
+        quantity("Phase that the masks show: 0 end-exhale, 1 end-inhale", at_least=0.0, at_most=1.0),
+    ] = None
+    amplitude: Annotated[
+        float, quantity("Share of the source's motion that the patient has", at_least=0.0, at_most=3.0)
+    ] = 1.0
+
+
+def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
+    """Read the motion that a patient.toml names; paths are relative to its folder.
+
+    A displacement field or transform follows ITK: at a point p in LPS mm stands the vector, LPS mm, that
+    leads p to the same tissue at the other end of the breath.  (NIfTI fields with the intent code 1006 are
+    RAS on disk.)  Landmark pairs are lines of six numbers: a place at end-exhale and the same tissue at
+    end-inhale.
+
+    Parameters
+    ----------
+    masks : Grid
+        Of the masks; a transform is evaluated over it.
+
+    Raises
+    ------
+    SettingsError
+        If the keys contradict each other, or the phase of the masks or the direction is not stated.
+    FileError
+        If a file is missing, damaged or of another kind.
+    FrameError
+        If a file states no frame, or one in which vectors are not LPS.
+    AnatomyError
+        If a file holds numbers that are not finite.
+    """
+    phase = _require_phase(keys)
+    kinds = [bool(keys.file), bool(keys.end_exhale or keys.end_inhale), keys.population]
+    if sum(kinds) != 1 or bool(keys.end_exhale) != bool(keys.end_inhale):
+        raise SettingsError(
+            "[motion] of patient.toml names " + ("nothing" if not any(kinds) else "more than one motion"),
+            expected="one of: file; end_exhale and end_inhale; population = true",
+            remedy='Write for instance file = "field.nrrd", maps_from = "end-exhale"',
+        )
+    common: dict[str, Any] = {"masks_phase": phase, "amplitude": keys.amplitude}
+    if keys.population:
+        words = f"population: other people's motion by height, {keys.population_motion_mm:g} mm"
+        return MotionSource(description=words, population_motion_mm=keys.population_motion_mm, **common)
+    if keys.end_exhale:
+        from anatomy.io.registration import register
+
+        exhale, inhale = folder / keys.end_exhale, folder / keys.end_inhale
+        grid, vectors = register(exhale, inhale)
+        words = f"registration of {keys.end_exhale} and {keys.end_inhale}"
+        return MotionSource(description=words, grid=grid, vectors=vectors, **common)
+    path = require_file(folder / keys.file)
+    if path.suffix.lower() == LANDMARKS:
+        exhale_lps, inhale_lps = read_landmarks(path, _require_frame(keys, path))
+        words = f"{len(exhale_lps)} landmark pairs of {keys.file}"
+        return MotionSource(description=words, exhale_lps=exhale_lps, inhale_lps=inhale_lps, **common)
+    if not keys.maps_from:
+        raise SettingsError(
+            f"[motion] of patient.toml does not say at which end of the breath the points of {keys.file} lie",
+            expected="maps_from",
+            remedy='Write maps_from = "end-exhale" where end-exhale was the fixed image of the registration, '
+            'else maps_from = "end-inhale"',
+        )
+    grid, vectors = read_transform(path, masks) if image_suffix(path) is None else read_vectors(path)
+    return MotionSource(
+        description=f"displacement of {keys.file}, from {keys.maps_from}",
+        maps_from=keys.maps_from,
+        grid=grid,
+        vectors=vectors,
+        **common,
+    )
+
+
+def _require_phase(keys: MotionFile) -> float:
+    if keys.masks_phase is None:
+        raise SettingsError(
+            "[motion] of patient.toml does not say in which phase of the breath the masks were taken",
+            expected="masks_phase from 0 (end-exhale) to 1 (end-inhale)",
+            remedy="Write masks_phase = 0.0 where the CT was taken at end-exhale, 1.0 at end-inhale of quiet "
+            "breathing, 0.5 halfway; a CT of deep inspiration lies beyond all of them and cannot be used",
+        )
+    return keys.masks_phase
+
+
+def _require_frame(keys: MotionFile, path: Path) -> str:
+    if not keys.frame:
+        raise FrameError(
+            f"[motion] of patient.toml does not state the frame of {path.name}",
+            expected='frame = "lps" or frame = "ras"',
+            remedy="3D Slicer shows RAS coordinates, DICOM and ITK use LPS",
+        )
+    return keys.frame
+
+
+def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
+    """Return the places `(N, 3)` LPS mm at end-exhale and at end-inhale that a CSV of six columns states.
+
+    Lines that begin with a letter or # are headings.
+
+    Raises
+    ------
+    FileError
+        If a line does not hold six finite numbers.
+    """
+    rows = []
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        if not line.strip() or line.lstrip()[0] == "#" or line.lstrip()[0].isalpha():
+            continue
+        try:
+            row = [float(each) for each in line.replace(";", ",").split(",")]
+        except ValueError:
+            row = []
+        if len(row) != 6 or not np.isfinite(row).all():
+            raise FileError(
+                f"Line {number} of {path} is {line.strip()!r:.60}",
+                expected="six finite numbers: x, y, z at end-exhale, then x, y, z at end-inhale, mm",
+                remedy="Correct the line",
+            )
+        rows.append(row)
+    values = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    lps = LPS_FROM[frame]
+    return transform_points(lps, values[:, :3]), transform_points(lps, values[:, 3:])
+
+
+def read_vectors(path: Path) -> tuple[Grid, Float]:
+    """Return the grid and the vectors `(ni, nj, nk, 3)` LPS mm of an image of displacements.
+
+    Raises
+    ------
+    FileError
+        If it is no image of three dimensions with three numbers a voxel.
+    FrameError
+        If its axes are not LPS, or not perpendicular.
+    AnatomyError
+        If a number is not finite.
+    """
+    import SimpleITK
+
+    if image_suffix(path) in NRRD:
+        space = read_nrrd_header(path).fields.get("space", "")
+        if space.strip().lower() not in LPS_WORDS:
+            raise FrameError(
+                f"{path} states the space {space!r}, in which the frame of its vectors is not certain",
+                expected="space: left-posterior-superior",
+                remedy="Write the field with ITK, SimpleITK or 3D Slicer",
+            )
+    try:
+        image = SimpleITK.ReadImage(str(path), SimpleITK.sitkVectorFloat64)
+    except RuntimeError as error:
+        raise unreadable(path, RuntimeError(str(error).strip().splitlines()[-1])) from error
+    if (image.GetDimension(), image.GetNumberOfComponentsPerPixel()) != (3, 3):
+        raise FileError(
+            f"{path} has {image.GetDimension()} dimensions and {image.GetNumberOfComponentsPerPixel()} "
+            "numbers a voxel",
+            expected="a displacement field: three dimensions, three numbers a voxel",
+            remedy="Export the displacement field, not the deformed image",
+        )
+    return _grid_and_vectors(image, path)
+
+
+def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
+    """Return grid and displacements of an ITK transform, evaluated over the grid of the masks.
+
+    Raises
+    ------
+    FileError
+        If it is no transform that ITK reads.
+    """
+    import SimpleITK
+
+    if path.suffix.lower() not in TRANSFORMS:
+        raise FileError(
+            f"{path} is of an unknown kind",
+            expected=f"a displacement field ({', '.join(SUFFIXES)}), an ITK transform "
+            f"({', '.join(TRANSFORMS)}) or landmark pairs ({LANDMARKS})",
+            remedy="Export the registration in one of them",
+        )
+    try:
+        transform = SimpleITK.ReadTransform(str(path))
+    except RuntimeError as error:
+        raise unreadable(path, RuntimeError(str(error).strip().splitlines()[-1])) from error
+    corners = masks.lps(np.array(np.meshgrid(*[(0, n - 1) for n in masks.shape])).reshape(3, -1).T)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    size = [int(n) for n in np.ceil((high - low) / SAMPLE_MM) + 1]
+    spacing = (SAMPLE_MM,) * 3
+    image = SimpleITK.TransformToDisplacementField(
+        transform, SimpleITK.sitkVectorFloat64, size, low.tolist(), spacing, np.eye(3).ravel().tolist()
+    )
+    return _grid_and_vectors(image, path)
+
+
+def _grid_and_vectors(image: Any, path: Path) -> tuple[Grid, Float]:
+    import SimpleITK
+
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
+    matrix[:3, 3] = image.GetOrigin()
+    ni, nj, nk = image.GetSize()
+    grid, is_reversed = right_handed_grid((ni, nj, nk), matrix, path)
+    vectors = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0, 3)
+    vectors = np.ascontiguousarray(vectors[::-1] if is_reversed else vectors, dtype=np.float64)
+    if not np.isfinite(vectors).all():
+        raise AnatomyError(
+            f"{path} holds displacements that are not finite",
+            expected="finite numbers in mm",
+            remedy="Register again, or fill what is missing",
+        )
+    return grid, vectors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,11 +11,10 @@ from pydantic import Field
 
 from anatomy.errors import AnatomyError, FileError, FrameError, SettingsError
 from anatomy.grid import Grid, transform_points
-from anatomy.io.files import read_text, require_file, unreadable
+from anatomy.io.files import atomic_write, read_text, require_file, unreadable
 from anatomy.io.frames import LPS_FROM
+from anatomy.io.image_header import MOST_HEADER_BYTES, right_handed_grid
 from anatomy.io.images import NRRD, SUFFIXES, image_suffix
-from anatomy.io.itk_headers import read_nrrd_header
-from anatomy.io.nifti_header import right_handed_grid
 from anatomy.motion.source import MotionSource
 from anatomy.settings import quantity, settings, switch, text
 from anatomy.typed import Float
@@ -184,13 +184,7 @@ def read_vectors(path: Path) -> tuple[Grid, Float]:
     import SimpleITK
 
     if image_suffix(path) in NRRD:
-        space = read_nrrd_header(path).fields.get("space", "")
-        if space.strip().lower() not in LPS_WORDS:
-            raise FrameError(
-                f"{path} states the space {space!r}, in which the frame of its vectors is not certain",
-                expected="space: left-posterior-superior",
-                remedy="Write the field with ITK, SimpleITK or 3D Slicer",
-            )
+        _require_lps(path)
     try:
         image = SimpleITK.ReadImage(str(path), SimpleITK.sitkVectorFloat64)
     except RuntimeError as error:
@@ -203,6 +197,19 @@ def read_vectors(path: Path) -> tuple[Grid, Float]:
             remedy="Export the displacement field, not the deformed image",
         )
     return _grid_and_vectors(image, path)
+
+
+def _require_lps(path: Path) -> None:
+    """Refuse a NRRD file of another frame: ITK turns its axes to LPS, but not its vectors."""
+    with path.open("rb") as stream:
+        stated = re.search(rb"^space: *([\w-]+)", stream.read(MOST_HEADER_BYTES), re.MULTILINE)
+    space = stated[1].decode("ascii", errors="replace") if stated else ""
+    if space.lower() not in LPS_WORDS:
+        raise FrameError(
+            f"{path} states the space {space!r}, in which the frame of its vectors is not certain",
+            expected="space: left-posterior-superior",
+            remedy="Write the field with ITK, SimpleITK or 3D Slicer",
+        )
 
 
 def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
@@ -253,3 +260,22 @@ def _grid_and_vectors(image: Any, path: Path) -> tuple[Grid, Float]:
             remedy="Register again, or fill what is missing",
         )
     return grid, vectors
+
+
+def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
+    """Write a displacement field, `(ni, nj, nk, 3)` LPS mm, in single precision, as `read_vectors` reads it.
+
+    Raises
+    ------
+    FileError
+        If the folder cannot be written to.
+    """
+    import SimpleITK
+
+    image = SimpleITK.GetImageFromArray(vectors.transpose(2, 1, 0, 3).astype(np.float32), isVector=True)
+    spacing = grid.spacing_mm
+    image.SetSpacing(spacing.tolist())
+    image.SetOrigin(grid.lps_from_ijk[:3, 3].tolist())
+    image.SetDirection((grid.lps_from_ijk[:3, :3] / spacing).ravel().tolist())
+    with atomic_write(path) as temporary:
+        SimpleITK.WriteImage(image, str(temporary), useCompression=True)

@@ -12,11 +12,15 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 MOST_STEPS = 60
 """Of a fixed point whose error falls by the norm of the gradient, 0.2 to 0.4 in a lung, with each step."""
 CONVERGED_MM = 1e-9
 """A step below this ends the search; what is left is returned, and counts."""
+
+SMALL = 1e-6
+"""Taken off bounds for rounding, of which closed-form eigenvalues of size 1 have less than 1e-7."""
 
 
 @numba.njit(cache=True, inline="always")
@@ -103,6 +107,57 @@ def points_pulled_back(nodes, frame, share, points, out):
         out[n, 0], out[n, 1], out[n, 2] = x, y, z
         worst = max(worst, rest)
     return worst
+
+
+@numba.njit(cache=True)
+def _eigenvalue_ends(g):
+    """Return least and greatest eigenvalue of the symmetric part of a matrix (3, 3), in closed form."""
+    mean = (g[0, 0] + g[1, 1] + g[2, 2]) / 3.0
+    a, b, c = g[0, 0] - mean, g[1, 1] - mean, g[2, 2] - mean
+    d, e, f = 0.5 * (g[0, 1] + g[1, 0]), 0.5 * (g[0, 2] + g[2, 0]), 0.5 * (g[1, 2] + g[2, 1])
+    size = math.sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
+    if size < SMALL:
+        return mean - 3.0 * size, mean + 3.0 * size
+    det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+    angle = math.acos(min(max(0.5 * det / size**3, -1.0), 1.0)) / 3.0
+    return mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0), mean + 2.0 * size * math.cos(angle)
+
+
+@numba.njit(cache=True)
+def fill_cell_bounds(nodes, spacing, out):
+    """Fill `out` (ni - 1, nj - 1, nk - 1, 3), see `anatomy.motion.stretch.cell_bounds`."""
+    edges, mean = np.zeros((4, 3)), np.zeros((3, 3))
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            for k in range(out.shape[2]):
+                spread, squares = 0.0, 0.0
+                for axis in range(3):
+                    for edge in range(4):
+                        u, v = edge & 1, edge >> 1
+                        if axis == 0:
+                            low, high = nodes[i, j + u, k + v], nodes[i + 1, j + u, k + v]
+                        elif axis == 1:
+                            low, high = nodes[i + u, j, k + v], nodes[i + u, j + 1, k + v]
+                        else:
+                            low, high = nodes[i + u, j + v, k], nodes[i + u, j + v, k + 1]
+                        for row in range(3):
+                            edges[edge, row] = (high[row] - low[row]) / spacing
+                    farthest = 0.0
+                    for row in range(3):
+                        total = edges[0, row] + edges[1, row] + edges[2, row] + edges[3, row]
+                        mean[row, axis] = 0.25 * total
+                        squares += mean[row, axis] ** 2
+                    for edge in range(4):
+                        away = 0.0
+                        for row in range(3):
+                            away += (edges[edge, row] - mean[row, axis]) ** 2
+                        farthest = max(farthest, away)
+                    spread += farthest
+                spread = math.sqrt(spread) + SMALL
+                low_end, high_end = _eigenvalue_ends(mean)
+                out[i, j, k, 0] = low_end - spread
+                out[i, j, k, 1] = high_end + spread
+                out[i, j, k, 2] = math.sqrt(squares) + spread
 
 
 @numba.njit(cache=True)

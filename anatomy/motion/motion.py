@@ -72,7 +72,7 @@ class Motion:
     @cached_property
     def cells(self) -> Float:
         """Bounds of the gradient on every cell `(2, ni - 1, nj - 1, nk - 1, 3)`; see `stretch`."""
-        return read_only(np.ascontiguousarray(cell_bounds(self.nodes, float(self.frame[3]))))
+        return read_only(np.stack([cell_bounds(nodes, float(self.frame[3])) for nodes in self.nodes]))
 
     @cached_property
     def key(self) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
-from anatomy.errors import AnatomyError
+from anatomy.errors import AnatomyError, FrameError
 from anatomy.grid import Grid
 from anatomy.motion.continuation import continued_unfolded
 from anatomy.motion.landmarks import Fitted, fit_landmarks
@@ -135,6 +135,7 @@ def _of_field(
     middle_x_mm: float,
 ) -> tuple[Float, dict[str, float]]:
     """Bring a field to the masks' phase, and continue that of each lung beyond it."""
+    _require_covered(source, np.concatenate(list(lungs.values())))
     own, smooth = _field_at(source, 0.0), _field_at(source, NODE_MM)
     d, rest_mm = _at_masks(source, smooth, at)
 
@@ -160,6 +161,16 @@ def _of_field(
         "mended_share": max(mended),
         "sliding_at_pleura_mm": _sliding(labels, grid, exact_of),
     }
+
+
+def _require_covered(source: MotionSource, places: Float) -> None:
+    covered = 0.0 if source.grid is None else float(source.grid.contains(places).mean())
+    if covered < LEAST_COVERED:
+        raise FrameError(
+            f"The {source.description} covers {100.0 * covered:.0f} % of the lungs",
+            expected="a field over both lungs, LPS mm of the masks",
+            remedy="Export the field on the whole image; check that it and the masks come from the same one",
+        )
 
 
 def _field_at(source: MotionSource, smooth_mm: float) -> At:

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from anatomy.grid import Volume
 from anatomy.io.files import require_writable_folder, write_text
 from anatomy.io.images import write_volume
+from anatomy.io.motion_files import write_vectors
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.phantom.branching import Centerlines
+from anatomy.phantom.breathing import PhantomBreathing
 from anatomy.phantom.chest import LOBES
 from anatomy.phantom.patient import Phantom
 from anatomy.phantom.rasterize import LABELS
 
+MOTION_FILE = "motion.nrrd"
 
-def write_phantom(phantom: Phantom, folder: str | Path) -> Path:
+
+def write_phantom(phantom: Phantom, folder: str | Path, *, breathing: bool = False) -> Path:
     """Write masks, `patient.toml`, CT and the truth of a phantom into `folder`, which is made if needed.
 
     `lumen`, `wall`, `vessels`, `lung`, `fissures`, `nodules`, `ct`, `labels` and `lobes` become NIfTI
     images; `truth.json` holds the centrelines, the nodules and the meaning of the labels (LPS mm).
-    `patient.toml` is written last, so that a folder that has it is complete.
+    With `breathing` there is `motion.nrrd` as well, and `patient.toml` names it.  `patient.toml` is written
+    last, so that a folder that has it is complete.
 
     Returns
     -------
@@ -49,8 +55,14 @@ def write_phantom(phantom: Phantom, folder: str | Path) -> Path:
     for name, volume in volumes.items():
         if volume is not None:
             write_volume(folder / f"{name}.nii.gz", volume)
-    write_text(folder / "truth.json", json.dumps(_truth(phantom)))
-    write_text(folder / DESCRIPTION, _description(phantom))
+    truth, lines = _truth(phantom), _description(phantom)
+    if breathing:
+        motion = PhantomBreathing.of(phantom)
+        write_vectors(folder / MOTION_FILE, *motion.field(phantom))
+        truth["breathing"] = asdict(motion)
+        lines += f'\n[motion]\nfile = "{MOTION_FILE}"\nmaps_from = "end-exhale"\nmasks_phase = 1.0\n'
+    write_text(folder / "truth.json", json.dumps(truth))
+    write_text(folder / DESCRIPTION, lines)
     return folder
 
 

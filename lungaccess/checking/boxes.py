@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from anatomy.meshes import MeshDistance, box_surface
+from anatomy.meshes import MeshDistance, SurfaceMesh, box_surface
 from anatomy.typed import Bool, Float
 from lungaccess.checking.space import Select, labels_at
 from lungaccess.checking.tiles import Cluster, Tiles
@@ -109,7 +109,7 @@ class Boxes:
         near = np.flatnonzero(np.maximum(bounds[:-1], bounds[1:]) - length < within_mm)
         if len(near):
             ends = np.union1d(near, near + 1)
-            mesh = self._mesh_near(points[ends], within_mm + float(length.max()))
+            mesh = MeshDistance(self.surface_near(points[ends], within_mm + float(length.max())))
             out[near] = np.minimum(mesh.segment_distance_mm(points[near], points[near + 1]), within_mm)
             exact = np.full(len(points), within_mm)
             exact[ends] = self.distance_mm(points[ends])
@@ -118,7 +118,7 @@ class Boxes:
         out[inside[:-1] | inside[1:]] = 0.0
         return out
 
-    def _mesh_near(self, points: Float, within_mm: float) -> MeshDistance:
+    def surface_near(self, points: Float, within_mm: float) -> SurfaceMesh:
         """Return the exact surface of the surface voxels that come nearer than `within_mm` to a point."""
         local = self._tiles.local_mm(points)
         bound = within_mm + self._half_diagonal
@@ -133,7 +133,7 @@ class Boxes:
         grid = self._tiles.lung.grid.crop(low, high)
         mask = np.zeros(grid.shape, dtype=bool)
         mask[tuple((voxels - low).T)] = True
-        return MeshDistance(box_surface(mask, grid))
+        return box_surface(mask, grid)
 
 
 def _to_bounding_box(cluster: Cluster, local: Float) -> Float:

@@ -14,6 +14,7 @@ from lungaccess.checking.outcome import check_tubes_at_target
 from lungaccess.checking.record import check_record
 from lungaccess.checking.scope import check_scope
 from lungaccess.checking.steering import check_needle
+from lungaccess.checking.window import check_window
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 
@@ -47,6 +48,7 @@ class Checker:
                 check_tubes_at_target(plan, self._environment, tube_tip, found)
             else:
                 check_needle(plan, needle, device, self._environment, tube_tip, found)
+            check_window(plan, self._environment, found)
         return found.report()
 
 

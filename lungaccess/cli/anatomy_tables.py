@@ -9,6 +9,25 @@ from rich.table import Table
 
 from lungaccess.cli import terminal
 
+MOTION_WORDS = {
+    "landmark_pairs": "pairs of landmarks",
+    "residual_mm": "left at the source's points, mean, mm",
+    "residual_95_mm": "left at the source's points, 95 %, mm",
+    "left_out_mm": "left at each half of the pairs as the other half predicts it, mean, mm",
+    "left_out_95_mm": "the same, 95 %, mm",
+    "to_masks_phase_mm": "left of bringing the field to the masks' phase, mm",
+    "mended_share": "share of a lung in which the field slides or folds, and is continued",
+    "sliding_at_pleura_mm": "difference of the field 5 mm inside and outside of the pleura, mm",
+    "right_95_mm": "motion of the right lung, 95 %, mm",
+    "left_95_mm": "motion of the left lung, 95 %, mm",
+    "right_base_to_feet_mm": "base of the right lung to the feet, mean, mm",
+    "left_base_to_feet_mm": "base of the left lung to the feet, mean, mm",
+    "least_stretch": "proved: no length becomes shorter than this share of itself",
+    "right_volume_factor": "volume of the right lung at end-inhale by that at end-exhale",
+    "left_volume_factor": "volume of the left lung at end-inhale by that at end-exhale",
+}
+"""What the figures of a motion are, see `anatomy.motion`."""
+
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.organ import Organ
@@ -32,6 +51,7 @@ def organ_record(lung: Organ) -> dict[str, Any]:
         "breath_hold": lung.breath_hold,
         "volumes_ml": {name: count * ml for name, count in structure_voxels(lung).items()},
         "has_cost_map": lung.cost is not None,
+        **_breathing(lung),
         "starts": len(lung.starts),
         "start_names": list(lung.start_names),
         "targets_lps": [point.tolist() for point in lung.targets_lps],
@@ -40,6 +60,18 @@ def organ_record(lung: Organ) -> dict[str, Any]:
         "sources": dict(lung.sources),
         "warnings": list(lung.warnings),
     }
+
+
+def _breathing(lung: Organ) -> dict[str, Any]:
+    """Return what is known of the breathing, as plain values; nothing where nothing is."""
+    from anatomy.lung import Lung
+
+    motion = lung.motion if isinstance(lung, Lung) else None
+    if motion is None:
+        return {}
+    names = ("source", "key", "masks_phase", "amplitude", "warning_only")
+    stated = {name: getattr(motion, name) for name in names}
+    return {"breathing": {**stated, **motion.figures}}
 
 
 def _airways(lung: Lung) -> dict[str, Any]:
@@ -96,6 +128,7 @@ def anatomy_tables(lung: Organ) -> list[Table]:
         terminal.table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
         *(_tree_tables(lung) if isinstance(lung, Lung) else ()),
+        *(_motion_tables(lung) if isinstance(lung, Lung) else ()),
         terminal.table("Starts and targets", ("name", "LPS, mm"), _place_rows(lung)),
         terminal.table(
             "Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]
@@ -115,6 +148,20 @@ def _tree_tables(lung: Lung) -> list[Table]:
             "Repairs of the airway tree", ("repair", "at LPS, mm", "length, mm"), _repair_rows(lung)
         ),
     ]
+
+
+def _motion_tables(lung: Lung) -> list[Table]:
+    """Return what is known of the breathing; nothing where nothing is."""
+    motion = lung.motion
+    if motion is None:
+        return []
+    rows: list[terminal.Row] = [
+        ("motion", motion.source),
+        ("phase of the masks", f"{100.0 * motion.masks_phase:.0f} % (0 % end-exhale, 100 % end-inhale)"),
+        ("amplitude", f"{100.0 * motion.amplitude:.0f} % of the source's"),
+        *((MOTION_WORDS.get(name, name), f"{value:.2f}") for name, value in motion.figures.items()),
+    ]
+    return [terminal.table("Breathing", ("", ""), rows)]
 
 
 def _place_rows(lung: Organ) -> list[terminal.Row]:

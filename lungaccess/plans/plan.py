@@ -27,6 +27,7 @@ from lungaccess.plans.curves import (
 )
 from lungaccess.plans.parts import Exemption, NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.plans.record import Record, shaped
+from lungaccess.plans.window import BreathingWindow
 from lungaccess.problem.system import System
 
 if TYPE_CHECKING:
@@ -76,6 +77,8 @@ class Plan(Record):
     chance : Chance or None
         Of success, counted on draws that no search saw: for a plan that was searched by it, and of studies
         that count it; None for any other.
+    window : BreathingWindow or None
+        The phases of the breath in which it is proved clear and on target; None where no motion was known.
     """
 
     schema: str = plan_file.SCHEMA
@@ -104,6 +107,7 @@ class Plan(Record):
     needle_planner: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
     system_choice: tuple[str, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
     chance: Chance | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
+    window: BreathingWindow | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
@@ -190,6 +194,7 @@ class Plan(Record):
             ("costs", f"{costs}; made small: {self.objective}"),
             ("made by", f"{self.method}, seed {self.seed}, {self.iterations} iterations"),
             ("digest", self.digest[:16]),
+            *((("window of breathing", self.window.words),) if self.window else ()),
             *((("choice of the system", " ".join(self.system_choice)),) if self.system_choice else ()),
         ]
 

@@ -26,6 +26,10 @@ def phantom(
         Positive | None,
         Parameter(help="Edge of the voxels, mm; 1 for the adult, 1.25 for the small patient."),
     ] = None,
+    breathing: Annotated[
+        bool,
+        Parameter(negative="", help="Also motion.nrrd, how the lungs breathe; the masks show end-inhale."),
+    ] = False,
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Write a synthetic patient: masks, CT and the truth about it; no data are needed."""
@@ -35,7 +39,7 @@ def phantom(
     with progress("making a synthetic patient"):
         made = make_phantom(seed=seed, spacing_mm=spacing, size=size)
     with progress(f"writing {out}"):
-        write_phantom(made, out)
+        write_phantom(made, out, breathing=breathing)
     nodules = [
         {"lps_mm": nodule.centre_lps.tolist(), "radius_mm": float(nodule.radius_mm)}
         for nodule in made.nodules

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from anatomy.errors import LungaccessError
     from anatomy.lung import Lung
     from lungaccess.appraisal import Appraisal, appraise
+    from lungaccess.breathing.window import breathing_window
     from lungaccess.checking import CheckReport, check
     from lungaccess.coupled import (
         Alternative,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     )
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
+    from lungaccess.plans.window import BreathingWindow
     from lungaccess.problem import (
         System,
         Target,

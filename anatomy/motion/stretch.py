@@ -12,9 +12,10 @@ def cell_bounds(nodes: Float, spacing_mm: float) -> Float:
     """Return bounds of the gradient of a trilinear displacement on its cells.
 
     In a cell the derivative along an axis is a mean of those along its four edges of that axis; so the
-    gradient is nowhere farther from the mean one than the edges are.  With G the gradient and S its symmetric
-    part, `|v + share G v| >= v'(v + share G v) >= 1 + share v'S v` for unit vectors v: a segment that stays in
-    cells is stretched by no less than `1 + share low` (share >= 0) or `1 + share high` (share < 0).
+    gradient is nowhere farther from the mean one than the edges are.  With G the gradient and S its
+    symmetric part, `|v + share G v| >= v'(v + share G v) >= 1 + share v'S v` for unit vectors v: a segment
+    that stays in cells is stretched by no less than `1 + share low` (share >= 0) or `1 + share high` (share
+    < 0).
 
     Parameters
     ----------

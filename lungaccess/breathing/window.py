@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from anatomy.errors import AnatomyError, SettingsError
@@ -37,7 +39,7 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
     lung : Lung
         The patient of the plan, with a motion.
     tolerance_mm : float
-        How far from the moving target the devices may end.
+        How far from the moving target the devices may end, at most 2 mm.
 
     Raises
     ------
@@ -46,13 +48,13 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
     PlanFileError
         If the plan was made for another patient.
     SettingsError
-        If the tolerance is negative or not finite.
+        If the tolerance is not from 0 to 2 mm.
     """
     plan.require_lung(lung)
     motion = require_motion(lung)
-    if not 0.0 <= tolerance_mm < np.inf:
+    if not 0.0 <= tolerance_mm <= TOLERANCE_MM:
         raise SettingsError(
-            f"The tolerance of the window is {tolerance_mm} mm", expected="a finite length of 0 mm or more"
+            f"The tolerance of the window is {tolerance_mm} mm", expected=f"0 to {TOLERANCE_MM:g} mm"
         )
     side, devices = motion.side_of(plan.target_lps), device_points(plan)
     leaves = np.zeros((MOST_LEAVES, 5))
@@ -70,6 +72,11 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
         leaves,
     )
     return _window(motion, float(tolerance_mm), leaves[:count], devices)
+
+
+def with_window(plan: Plan, lung: Lung) -> Plan:
+    """Return a plan with its window of breathing; itself if no breathing is known."""
+    return plan if lung.motion is None else replace(plan, window=breathing_window(plan, lung))
 
 
 def require_motion(lung: Lung) -> Motion:

@@ -16,6 +16,8 @@ TIP_BALL_MM = 10.0
 """Tissue so near to the tip of the scope turns it."""
 TIP_STEP_MM = 2.5
 """Distance of the places that are looked at in it."""
+CONVERGED_MM = 1e-8
+"""A step below this ends the search for a place."""
 STEPS = 50
 """Of the fixed point that pulls a point back; each takes a third of the error or less in a lung."""
 
@@ -53,7 +55,9 @@ class Breath:
         """Return which places of the masks are at points."""
         share, found = self.share(phase), np.asarray(points)
         for _ in range(STEPS):
-            found = points - share * self.displacement(found)
+            before, found = found, points - share * self.displacement(found)
+            if float(np.abs(found - before).max(initial=0.0)) < CONVERGED_MM:
+                break
         return found
 
     def carried(self, points: Float, phase: float) -> Float:

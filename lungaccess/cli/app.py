@@ -42,6 +42,7 @@ from lungaccess.cli.commands.study import study
 from lungaccess.cli.commands.template import template
 from lungaccess.cli.commands.tour import tour
 from lungaccess.cli.commands.tubes import tubes
+from lungaccess.cli.commands.window import window
 from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXIT_CODES, START_PAGE, epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.terminal import error_console
@@ -88,7 +89,8 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 
 for _command in (
     plan, needle, replan, certify, check, info, presets, template, phantom, demo, advise, alternatives, route,
-    tour, tubes, shapes, steps, risk, start_region, reach, segment, report, export, doctor, completion,
+    tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report, export, doctor,
+    completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 app.command(study)

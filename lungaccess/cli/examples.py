@@ -10,7 +10,7 @@ from types import MappingProxyType
 EXAMPLES = MappingProxyType(
     {
         "demo": "lungaccess demo --out demo-output",
-        "phantom": "lungaccess phantom --out PATIENT",
+        "phantom": "lungaccess phantom --out PATIENT --breathing",
         "info": "lungaccess info PATIENT --out info",
         "presets": "lungaccess presets --show ultrathin",
         "template": "lungaccess template study --out study.toml",
@@ -19,6 +19,7 @@ EXAMPLES = MappingProxyType(
         "report": "lungaccess report plan/plan.json PATIENT",
         "steps": "lungaccess steps plan/plan.json PATIENT",
         "risk": "lungaccess risk plan/plan.json PATIENT --samples 2000",
+        "window": "lungaccess window plan/plan.json PATIENT",
         "start-region": "lungaccess start-region plan/plan.json PATIENT",
         "export": "lungaccess export plan/plan.json PATIENT --slicer slicer",
         "alternatives": "lungaccess alternatives PATIENT --nodule --count 5 --out plans",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -203,8 +204,14 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     target, search = request.target.resolve(lung), request.search
     display = SearchDisplay(search.time_s, search.iterations, FAILURE if request.for_success else "cost")
     best, history = run_search(lung, target, request, display)
-    found = best.plan
-    from lungaccess.appraisal import appraise  # After the search: the first plan does not wait for it.
+    # After the search: the first plan does not wait for these.
+    from lungaccess.appraisal import appraise
+    from lungaccess.breathing.window import with_window
+
+    found = with_window(best.plan, lung)
+    if found.window is not None:
+        best = replace(best, plan=found)
+        found.save(request.out / PLAN_FILE)
 
     with progress("checking the plan and its chance"):
         appraisal = appraise(
@@ -235,6 +242,8 @@ def system_of(plan: Plan, systems: Sequence[System]) -> System:
 def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal) -> None:
     """Print headline and limits of a plan, then the plan."""
     plan_tables.show_appraisal(appraisal)
+    if plan.window is not None:
+        terminal.say(plan.window.words)
     if plan.system_choice:
         terminal.say(" ".join(plan.system_choice))
     terminal.show(plan_tables.plan_tables(plan, lung))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import field
 
 import numpy as np
@@ -43,6 +45,7 @@ class WindowLimit(Record):
         what = {
             "target": "the devices end too far from the target",
             "lumen": "the tubes leave the lumen before their exit",
+            "airway": f"the {self.device} comes too near to an airway",
             "outside": f"the {self.device} comes too near to the pleura",
         }.get(self.reason, f"the {self.device} comes too near to a {self.reason}")
         return f"{what}, {self.arc_length_mm:.1f} mm along the {self.device}"
@@ -112,7 +115,12 @@ class BreathingWindow(Record):
         """The window in a sentence."""
         if not len(self.phases):
             return f"No phase of the breath is proved: {self.limits[0].words if self.limits else 'unknown'}."
-        parts = [f"{100.0 * a:.0f} % and {100.0 * b:.0f} %" for a, b in self.phases]
-        ends = "; ".join(f"at {100.0 * each.phase:.0f} % {each.words}" for each in self.limits)
+        parts = [f"{_percent(a, math.ceil)} and {_percent(b, math.floor)}" for a, b in self.phases]
+        ends = "; ".join(f"at {100.0 * each.phase:.1f} % {each.words}" for each in self.limits)
         said = f"Insert between {', or '.join(parts)} of the breath (0 % is end-exhale, 100 % end-inhale)."
         return f"{said} {ends[:1].upper()}{ends[1:]}." if ends else said
+
+
+def _percent(phase: float, inwards: Callable[[float], int]) -> str:
+    """Return a phase in percent, rounded into the window."""
+    return f"{inwards(1000.0 * phase) / 10.0:g} %"

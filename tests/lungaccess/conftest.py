@@ -97,6 +97,7 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         mask=lambda name: Volume(grid=grid, array=masks[name]),
         tree=_tree(trunk),
         breath_hold=None,
+        motion=None,
         warnings=("The toy is [made by hand].",),
     )
 

@@ -89,6 +89,7 @@ def toy_lung() -> Any:
         has_fissures=True,
         nodules=None,
         breath_hold="inspiration",
+        motion=None,
         sources={"airway.nii.gz": "0" * 64},
         warnings=(),
     )

@@ -101,8 +101,9 @@ class UnreachableProof:
             masks.append(distance_corners(mask, spacing_mm))
         self._masks = tuple(masks)
         pause()
-        # Corners are rounded down, and between them a bound lacks at most half a diagonal of a voxel.
-        self._loss_mm = 0.5 * float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
+        # Corners are rounded down, and between them a bound lacks at most a diagonal of a voxel: on the half
+        # to the nearest corner the distance may grow, and from there on the bound falls.
+        self._loss_mm = float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
         self._free = _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)
         self._least_depth_mm = system.scope.radius_mm + system.scope.lumen_margin_mm
         tips, centres = places_of_tips(lung, self._not_lumen, self._least_depth_mm)

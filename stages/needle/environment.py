@@ -209,8 +209,9 @@ def workspace_lengths(
 ) -> Float:
     """Return the shortest path length from each start pose to a target, infinite where there is none.
 
-    The test is exact in free space for curvature and the greatest length, and for turning limits of which
-    either is at most 180 degrees, see `stages.needle.kernels.connections`.
+    A path may end anywhere within the goal tolerance.  Nothing that a needle reaches is left out.  In free
+    space what is left in can be reached if the angle from the start is limited to 90 degrees, or the turn to
+    180, see `stages.needle.kernels.goal_ball`.
 
     Parameters
     ----------

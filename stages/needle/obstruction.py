@@ -11,7 +11,8 @@ from anatomy.records import frozen_record
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import obstruction as kernels
-from stages.needle.kernels.connections import length_ahead, seen_from
+from stages.needle.kernels.connections import seen_from
+from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.limits import Limits
 from stages.needle.kernels.proof import exact_gap
 from stages.needle.query import Query
@@ -202,8 +203,7 @@ def _rules_out(rho: float, h: float, tolerance_mm: float, limit: str, limits: Li
 
 
 def _reaches(rho: float, h: float, limits: Limits) -> bool:
-    length = length_ahead(rho, h, limits, limits.max_angle_rad, limits.max_turn_rad)
-    return length < math.inf and bool(length <= limits.max_length_mm)
+    return bool(workspace_length(rho, h, limits) < math.inf)
 
 
 def _largest_radius(rho: float, h: float, limits: Limits) -> float | None:

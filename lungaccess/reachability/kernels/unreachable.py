@@ -111,11 +111,15 @@ def _outside_workspace(limits, seen, sums):
     _pose, rho, ahead, size, moved, second = seen
     spare = limits.goal_tolerance_mm + SPARE_MM
     radius = 1.0 / limits.kappa
+    if math.hypot(rho, ahead) - moved - spare > limits.max_length_mm:
+        return True
     forward_only = limits.max_angle_rad <= 0.5 * math.pi
+    if not forward_only and limits.max_turn_rad > math.pi:
+        return False  # A needle that may turn so much comes to every point.
     depth = escape_depth(rho, ahead, radius)
     if forward_only:
         depth = min(depth, ahead)
-    if depth + moved + spare < 0.0 or math.hypot(rho, ahead) - moved - spare > limits.max_length_mm:
+    if depth + moved + spare < 0.0:
         return True
     if math.hypot(size + sums[0], sums[1]) + second + spare < radius:
         return True

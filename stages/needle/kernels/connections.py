@@ -107,34 +107,11 @@ def shortest_path(rho, h, kappa, max_angle, max_turn):
 
 
 @numba.njit(cache=True)
-def length_ahead(rho, h, limits, max_angle, max_turn):
-    """Return the length of the shortest path that ends within the goal tolerance of a point, inf if none.
-
-    Only a point that cannot be reached exactly is missed: by the arc of radius R that passes it nearest.
-    """
-    kappa = limits.kappa
-    length = shortest_path(rho, h, kappa, max_angle, max_turn)
-    if length < math.inf or limits.goal_tolerance_mm == 0.0:
-        return length
-    turn, miss = nearest_turn(rho, h, kappa)
-    if miss > limits.goal_tolerance_mm or turn > min(max_angle, max_turn):
-        return math.inf
-    return turn / kappa
-
-
-@numba.njit(cache=True)
 def nearest_turn(rho, h, kappa):
     """Return the turn (rad) at which the arc of radius 1 / kappa passes a point nearest, and how near."""
     radius = 1.0 / kappa
     turn = math.atan2(h, radius - rho)
     return max(turn, 0.0), abs(radius - math.hypot(radius - rho, h)) if turn >= 0.0 else math.hypot(rho, h)
-
-
-@numba.njit(cache=True)
-def workspace_length(rho, h, limits):
-    """Return the length of the shortest path within all limits, inf outside the workspace (the trumpet)."""
-    length = length_ahead(rho, h, limits, limits.max_angle_rad, limits.max_turn_rad)
-    return length if length <= limits.max_length_mm else math.inf
 
 
 @numba.njit(cache=True)

@@ -16,8 +16,9 @@ from anatomy.kernels.arcs import arc_to_point, point_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import UNITS_PER_MM, distance_bound, exact_distance, interpolate_squared
 from anatomy.kernels.labels import AIRWAY
-from stages.needle.kernels.connections import seen_from, single_arc_exceeds, workspace_length
+from stages.needle.kernels.connections import seen_from, single_arc_exceeds
 from stages.needle.kernels.cost import inverse_clearance_on_arc
+from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.proof import PROBE_SPACING_MM, blocker_on_arc
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of

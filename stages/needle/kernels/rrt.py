@@ -9,7 +9,8 @@ import numba
 from anatomy.kernels.arcs import any_normal, arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
-from stages.needle.kernels.connections import seen_from, workspace_length
+from stages.needle.kernels.connections import seen_from
+from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.limits import MIN_ARC_MM
 from stages.needle.kernels.tree import (
     PATH_LENGTH,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numba
 
 from anatomy.kernels.arcs import arc_to_point
-from stages.needle.kernels.connections import seen_from, single_arc_exceeds, workspace_length
+from stages.needle.kernels.connections import seen_from, single_arc_exceeds
 from stages.needle.kernels.cost import inverse_clearance_on_arc
+from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.proof import blocker_on_arc
 
 

@@ -17,7 +17,8 @@ import math
 import numba
 
 from anatomy.kernels.compiling import inner_kernel
-from stages.needle.kernels.connections import seen_from, workspace_length
+from stages.needle.kernels.connections import seen_from
+from stages.needle.kernels.goal_ball import workspace_length
 
 MIDDLE, DIRECTION, DISTANCE, ANGLE, N_BOUNDS = 0, 3, 6, 7, 8
 
@@ -65,11 +66,12 @@ def _out_of_reach(bound, target, limits):
     dz = target[2] - bound[MIDDLE + 2]
     far2 = dx * dx + dy * dy + dz * dz
     far = math.sqrt(far2)
-    if far - bound[DISTANCE] - ROUNDING_MM > limits.max_length_mm:
+    spare = limits.goal_tolerance_mm + ROUNDING_MM
+    if far - bound[DISTANCE] - spare > limits.max_length_mm:
         return True
     if limits.max_angle_rad > 0.5 * math.pi:
         return False
-    off = bound[DISTANCE] + far * bound[ANGLE] + ROUNDING_MM
+    off = bound[DISTANCE] + far * bound[ANGLE] + spare
     h = dx * bound[DIRECTION] + dy * bound[DIRECTION + 1] + dz * bound[DIRECTION + 2]
     radius = 1.0 / limits.kappa
     if h < -off:

@@ -10,7 +10,8 @@ import numpy as np
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import MIN_GAP_MM
-from stages.needle.kernels.connections import nearest_turn, seen_from, single_arc_exceeds, workspace_length
+from stages.needle.kernels.connections import nearest_turn, seen_from, single_arc_exceeds
+from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.limits import MIN_ARC_MM
 from stages.needle.kernels.proof import blocker_on_arc, exact_gap
 from stages.needle.kernels.rrt import grow_rrt

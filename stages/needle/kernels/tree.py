@@ -15,14 +15,9 @@ import numba
 from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
-from stages.needle.kernels.connections import (
-    least_cosine,
-    length_ahead,
-    nearest_turn,
-    seen_from,
-    shortest_legs,
-)
+from stages.needle.kernels.connections import least_cosine, nearest_turn, seen_from, shortest_legs
 from stages.needle.kernels.cost import cost_of_arc
+from stages.needle.kernels.goal_ball import least_length_from
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 from stages.needle.kernels.proof import blocker_on_arc
 
@@ -48,11 +43,10 @@ def reference_of(root):
 
 @inner_kernel
 def angle_kept(limits, reference, pose, bend, turn):
-    """Tell whether an arc keeps the limit of the angle to `reference`; return the cosine at its end too."""
+    """Tell whether an arc keeps the limit of the angle to `reference`."""
     forward = pose[3] * reference[0] + pose[4] * reference[1] + pose[5] * reference[2]
     aside = bend[1] * reference[0] + bend[2] * reference[1] + bend[3] * reference[2]
-    kept = least_cosine(forward, aside, turn) >= math.cos(limits.max_angle_rad) - TINY
-    return kept, forward * math.cos(turn) + aside * math.sin(turn)
+    return least_cosine(forward, aside, turn) >= math.cos(limits.max_angle_rad) - TINY
 
 
 @numba.njit(cache=True)
@@ -70,22 +64,19 @@ def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, b
     path_turn = node[PATH_TURN] + turn
     if path_length > limits.max_length_mm or path_turn > limits.max_turn_rad + TINY:
         return False
-    kept, cosine = angle_kept(limits, reference_of(nodes[0]), pose, bend, turn)
-    if not kept:
+    reference = reference_of(nodes[0])
+    if not angle_kept(limits, reference, pose, bend, turn):
         return False
     end = pose_on_arc(pose, bend, length)
-    angle = math.acos(min(max(cosine, -1.0), 1.0))
-    rho, h = seen_from(end, goal)
     ahead = 0.0
-    missing = math.hypot(rho, h)
+    missing = math.hypot(*seen_from(end, goal))
     if missing > limits.goal_tolerance_mm + TINY:
         missing = 0.0
-        turn_left = limits.max_turn_rad - path_turn
-        ahead = length_ahead(rho, h, limits, min(limits.max_angle_rad + angle, math.pi), turn_left)
-    if path_length + ahead > limits.max_length_mm + limits.goal_tolerance_mm:
+        ahead = least_length_from(end, goal, limits, reference, limits.max_turn_rad - path_turn)
+    if path_length + ahead > limits.max_length_mm + TINY:
         return False
     rate = objective.least_rate
-    if node[PATH_COST] + rate * (length + ahead - limits.goal_tolerance_mm) >= best:
+    if node[PATH_COST] + rate * (length + ahead) >= best:
         return False
     if blocker_on_arc(obstacles, limits, pose, bend, length, node[PATH_LENGTH], branch) != 0:
         return False
@@ -93,7 +84,7 @@ def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, b
         obstacles, objective, limits.cost_step_mm, pose, bend, length, near == 0
     )
     cost += rate * missing
-    if cost + rate * max(ahead - limits.goal_tolerance_mm, 0.0) >= best:
+    if cost + rate * ahead >= best:
         return False
     new = nodes[count]
     for m in range(6):

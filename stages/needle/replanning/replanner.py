@@ -18,7 +18,8 @@ from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
-from stages.needle.kernels.connections import length_ahead, nearest_turn, seen_from
+from stages.needle.kernels.connections import nearest_turn, seen_from
+from stages.needle.kernels.goal_ball import least_length_from
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import CURVATURE, ArcPath
 from stages.needle.query import Query
@@ -328,16 +329,13 @@ class Replanner:
         pose, reference = pose_at(query.lps_from_start), tree.reference_of(root_of(query))
         angle = math.acos(float(np.clip(np.dot(pose[3:], reference), -1.0, 1.0)))
         turn_left = limits.max_turn_rad - query.turned_rad
-        length = length_ahead(
-            *seen_from(pose, query.goal), limits,
-            min(limits.max_angle_rad + angle, math.pi), turn_left,
-        )  # fmt: skip
+        length = least_length_from(pose, query.goal, limits, reference, turn_left)
         if not length < math.inf:
             return Failure.OUT_OF_REACH, (
                 f"The target cannot be reached from a tip turned by {math.degrees(angle):.1f} degrees from "
                 f"the start, with {math.degrees(max(turn_left, 0.0)):.1f} degrees of turning left"
             )
-        if length > left + tolerance:
+        if length > left:
             return Failure.OUT_OF_LENGTH, f"The target is {length:.1f} mm ahead, {left:.1f} mm are left"
         return None, ""
 

@@ -29,6 +29,7 @@ from lungaccess.reachability.kernels import deployment_boxes as boxes
 from lungaccess.reachability.kernels import unreachable as kernel
 from lungaccess.reachability.tip_places import PlacePiece
 from lungaccess.reachability.unreachable import UnreachableProof, _may_be_left
+from stages.needle.kernels.limits import Limits
 from stages.scope import MAX_OFF_AXIS_MM, find_motions, in_tip_region
 from stages.tube import tube_environment
 from stages.tube.kernels import ACCEPTED, N_TRACE, NEAR_VESSEL, validate_deployment
@@ -49,6 +50,29 @@ def not_ruled_out(environment, tubes, insertions, limits, target, frame, cones, 
         sums,
         costs,
     )[0]
+
+
+@numba.njit
+def outside_workspace(limits, seen, sums):  # type: ignore[no-untyped-def]
+    return kernel._outside_workspace(limits, seen, sums)
+
+
+@pytest.mark.parametrize("max_turn_deg", [90.0, 180.0, 540.0])
+@pytest.mark.parametrize("max_angle_deg", [60.0, 90.0, 120.0, 180.0])
+def test_a_needle_that_may_turn_without_end_comes_to_every_point(
+    max_angle_deg: float, max_turn_deg: float
+) -> None:
+    """A point in the tightest circle, and one behind: ruled out unless the needle can go round to it."""
+    values = dict.fromkeys(Limits._fields, 0.0) | {"kappa": 1.0 / 50.0, "max_length_mm": 400.0}
+    limits = Limits(
+        **values | {"max_angle_rad": math.radians(max_angle_deg), "max_turn_rad": math.radians(max_turn_deg)}
+    )
+    pose = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    bounded = max_angle_deg <= 90.0 or max_turn_deg <= 180.0
+    for rho, ahead in ((40.0, 5.0), (20.0, -10.0)):
+        seen = (pose, rho, ahead, math.hypot(rho - 50.0, ahead), 0.1, 0.01)
+        assert outside_workspace(limits, seen, np.full(3, 0.1)) == bounded
+    assert outside_workspace(limits, (pose, 0.0, 401.0, 500.0, 0.1, 0.01), np.full(3, 0.1))
 
 
 @numba.njit

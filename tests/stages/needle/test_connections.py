@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from anatomy.kernels.arcs import pose_on_arc
-from stages.needle.kernels import connections
+from stages.needle.kernels import connections, goal_ball
 from stages.needle.kernels.limits import Limits
 
 RADIUS = 50.0
@@ -109,11 +109,13 @@ def test_a_goal_just_out_of_reach_is_reached_within_the_tolerance() -> None:
         values = dict.fromkeys(Limits._fields, 0.0) | {"kappa": KAPPA, "max_length_mm": 150.0}
         values |= {"max_angle_rad": math.pi / 2, "max_turn_rad": math.pi / 2}
         limits = Limits(**values | {"goal_tolerance_mm": goal_tolerance_mm})
-        return float(connections.workspace_length(rho, h, limits))
+        return float(goal_ball.workspace_length(rho, h, limits))
 
     turn = 0.7
     rho, h = (RADIUS - 0.8) * -math.cos(turn) + RADIUS, (RADIUS - 0.8) * math.sin(turn)
     assert workspace_length(0.0) == math.inf
     assert workspace_length(0.7) == math.inf
-    assert workspace_length(0.9) == pytest.approx(turn * RADIUS)
+    centre = RADIUS - 0.8
+    entered = turn - math.acos((RADIUS**2 + centre**2 - 0.9**2) / (2.0 * RADIUS * centre))
+    assert workspace_length(0.9) == pytest.approx(entered * RADIUS)
     assert connections.nearest_turn(rho, h, KAPPA) == pytest.approx((turn, 0.8))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.needle.kernels import connections
+from stages.needle.kernels import connections, goal_ball
 from stages.needle.path import ArcPath
 from tests.stages.needle.needles import RADIUS, limits_of
 
@@ -18,46 +18,44 @@ class TestWorkspace:
     """The set of points that the needle reaches in free space."""
 
     def test_straight_ahead(self) -> None:
-        assert connections.workspace_length(0.0, 40.0, limits_of()) == 40.0
-        assert connections.workspace_length(0.0, 0.0, limits_of()) == 0.0
+        assert goal_ball.workspace_length(0.0, 40.0, limits_of()) == 40.0
+        assert goal_ball.workspace_length(0.0, 0.0, limits_of()) == 0.0
 
     def test_quarter_circle(self) -> None:
-        assert connections.workspace_length(RADIUS, RADIUS, limits_of()) == pytest.approx(
-            math.pi * RADIUS / 2
-        )
+        assert goal_ball.workspace_length(RADIUS, RADIUS, limits_of()) == pytest.approx(math.pi * RADIUS / 2)
 
     @pytest.mark.parametrize("limit", ["max_angle_rad", "max_turn_rad"])
     def test_either_turning_limit_cuts_the_quarter_circle_off(self, limit: str) -> None:
         assert (
-            connections.workspace_length(RADIUS, RADIUS, limits_of(**{limit: math.radians(89.9)})) == math.inf
+            goal_ball.workspace_length(RADIUS, RADIUS, limits_of(**{limit: math.radians(89.9)})) == math.inf
         )
 
     def test_length_limit(self) -> None:
         quarter = math.pi * RADIUS / 2
         within, beyond = limits_of(max_length_mm=quarter + 1e-6), limits_of(max_length_mm=quarter - 1e-6)
-        assert connections.workspace_length(RADIUS, RADIUS, within) < math.inf
-        assert connections.workspace_length(RADIUS, RADIUS, beyond) == math.inf
-        assert connections.workspace_length(0.0, 40.0, limits_of(max_length_mm=39.9)) == math.inf
+        assert goal_ball.workspace_length(RADIUS, RADIUS, within) < math.inf
+        assert goal_ball.workspace_length(RADIUS, RADIUS, beyond) == math.inf
+        assert goal_ball.workspace_length(0.0, 40.0, limits_of(max_length_mm=39.9)) == math.inf
 
     def test_quarter_circle_then_straight(self) -> None:
-        found = connections.workspace_length(RADIUS + 30.0, RADIUS, limits_of())
+        found = goal_ball.workspace_length(RADIUS + 30.0, RADIUS, limits_of())
         assert found == pytest.approx(math.pi * RADIUS / 2 + 30.0)
 
     @pytest.mark.parametrize("rho", [0.0, 1e-6, 5.0, 60.0, 120.0])
     def test_behind_is_out_of_reach(self, rho: float) -> None:
-        assert connections.workspace_length(rho, -1.0, limits_of()) == math.inf
+        assert goal_ball.workspace_length(rho, -1.0, limits_of()) == math.inf
 
     def test_inside_the_tightest_circle_only_a_path_of_more_than_half_a_turn_leads(self) -> None:
-        assert connections.workspace_length(RADIUS, 10.0, limits_of(max_length_mm=500.0)) == math.inf
+        assert goal_ball.workspace_length(RADIUS, 10.0, limits_of(max_length_mm=500.0)) == math.inf
         wide = limits_of(max_angle_rad=math.pi, max_turn_rad=3 * math.pi, max_length_mm=500.0)
-        assert math.pi * RADIUS < connections.workspace_length(RADIUS, 10.0, wide) < 2.5 * math.pi * RADIUS
+        assert math.pi * RADIUS < goal_ball.workspace_length(RADIUS, 10.0, wide) < 2.5 * math.pi * RADIUS
 
     @given(angle=st.floats(1e-3, math.pi / 2), share=st.floats(0.05, 1.0))
     def test_ends_of_arcs_within_the_limits_are_in(self, angle: float, share: float) -> None:
         """Also those of the tightest arc, where rounding decides."""
         radius = RADIUS / share
         length = radius * angle
-        found = connections.workspace_length(
+        found = goal_ball.workspace_length(
             radius * (1 - math.cos(angle)), radius * math.sin(angle), limits_of(max_length_mm=length + 1e-9)
         )
         assert found <= length + 1e-9
@@ -68,7 +66,7 @@ class TestWorkspace:
         limits = limits_of(max_angle_rad=math.radians(70.0), max_length_mm=120.0)
         angle = np.linspace(0.0, math.radians(70.0), 20001)
         for rho, h in rng.uniform([0.0, -20.0], [110.0, 120.0], (400, 2)):
-            found = connections.workspace_length(rho, h, limits)
+            found = goal_ball.workspace_length(rho, h, limits)
             x, z = RADIUS * (1 - np.cos(angle)), RADIUS * np.sin(angle)
             ahead = (rho - x) * np.sin(angle) + (h - z) * np.cos(angle)
             miss = np.abs((rho - x) * np.cos(angle) - (h - z) * np.sin(angle))
@@ -95,9 +93,7 @@ class TestWorkspace:
                 continue
             tested += 1
             x, y, z = path.frames()[-1][:3, 3]
-            assert connections.workspace_length(math.hypot(x, y), z, limits) <= path.length_mm + 1e-6, (
-                path.arcs
-            )
+            assert goal_ball.workspace_length(math.hypot(x, y), z, limits) <= path.length_mm + 1e-6, path.arcs
         assert tested > 1000
 
     @given(

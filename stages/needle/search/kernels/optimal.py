@@ -9,7 +9,7 @@ import numba
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.random import uniform
-from stages.needle.kernels.connections import length_ahead, seen_from
+from stages.needle.kernels.connections import seen_from, shortest_path
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 from stages.needle.kernels.rrt import goal_from_root, random_arc, sample_between
 from stages.needle.kernels.tree import (
@@ -55,7 +55,7 @@ def _choose(nodes, count, q, limits, rate, cost_bound):
         node = nodes[m]
         pose = pose_of(node)
         rho, h = seen_from(pose, q)
-        length = length_ahead(rho, h, limits, math.pi, limits.max_turn_rad - node[PATH_TURN])
+        length = shortest_path(rho, h, limits.kappa, math.pi, limits.max_turn_rad - node[PATH_TURN])
         if not node[PATH_LENGTH] + length <= limits.max_length_mm:
             continue
         if cost_bound < math.inf:

@@ -17,10 +17,10 @@ from anatomy.kernels.arcs import pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.cost import cost_of_arc
+from stages.needle.kernels.goal_ball import least_length_from, shortest_into_ball, single_into_ball
 from stages.needle.kernels.limits import TINY
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.kernels.tree import angle_kept
-from stages.needle.search.kernels.goal_ball import least_length, shortest_into_ball, single_into_ball
 from stages.needle.search.kernels.rank_queue import WAITING, pop, push
 from stages.needle.search.kernels.resolution_nodes import (
     CLEAR,
@@ -54,12 +54,11 @@ SPENT, BETTER, EXHAUSTED, FULL_OF_NODES, FULL_OF_ENTRIES = range(5)
 @inner_kernel
 def _estimate(nodes, row, rates, goal, limits, reference):
     """Return a cost below which no path within the limits leads by a node to the goal; inf if none does."""
-    rho, h = seen_from(node_pose(nodes, row), goal)
-    cosine = nodes[row, 3] * reference[0] + nodes[row, 4] * reference[1] + nodes[row, 5] * reference[2]
-    ahead = least_length(rho, h, limits, cosine, limits.max_turn_rad - nodes[row, PATH_TURN])
+    pose = node_pose(nodes, row)
+    ahead = least_length_from(pose, goal, limits, reference, limits.max_turn_rad - nodes[row, PATH_TURN])
     if nodes[row, PATH_LENGTH] + ahead > limits.max_length_mm + TINY:
         return math.inf
-    missing = limits.goal_tolerance_mm if ahead > 0.0 else math.hypot(rho, h)
+    missing = limits.goal_tolerance_mm if ahead > 0.0 else math.hypot(*seen_from(pose, goal))
     return nodes[row, PATH_COST] + rates[0] * ahead + rates[1] * missing
 
 
@@ -95,7 +94,7 @@ def _push_level(
         within = nodes[row, PATH_TURN] <= limits.max_turn_rad + TINY
         # The cosine of an angle falls by no more than the arc turns.
         if within and forward - turn < least:
-            within = angle_kept(limits, reference, node_pose(nodes, at), bend, turn)[0]
+            within = angle_kept(limits, reference, node_pose(nodes, at), bend, turn)
         estimate = math.inf
         if within:
             follow(nodes, words, bend, at, direction, steps, row)
@@ -193,7 +192,7 @@ def _connect(obstacles, limits, objective, rates, branch, goal, reference, nodes
                 if not (
                     within
                     and found + rates[0] * length < most
-                    and angle_kept(limits, reference, pose, bend, bend[0] * length)[0]
+                    and angle_kept(limits, reference, pose, bend, bend[0] * length)
                     and blocker_on_arc(obstacles, limits, pose, bend, length, begun, branch) == 0
                 ):
                     break

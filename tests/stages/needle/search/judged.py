@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,8 +53,6 @@ def judge(environment: NeedleEnvironment, maze: Maze, path: ArcPath) -> None:
 
 
 def shortest_mm(maze: Maze) -> float:
-    """Length of the shortest path without obstacles."""
-    start = maze.start
-    return float(
-        workspace_lengths(maze.environment(), start[None, :3, 3], start[None, :3, 2], maze.target)[0]
-    )
+    """Length of the shortest path to the target itself without obstacles."""
+    start, environment = maze.start, replace(maze, goal_tolerance_mm=0.0).environment()
+    return float(workspace_lengths(environment, start[None, :3, 3], start[None, :3, 2], maze.target)[0])

@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anatomy.kernels.arcs import pose_on_arc
+from stages.needle.kernels import goal_ball
 from stages.needle.kernels.limits import Limits
-from stages.needle.search.kernels import goal_ball, rank_queue
+from stages.needle.search.kernels import rank_queue
 
 
 class TestGoalBall:

@@ -1,4 +1,4 @@
-"""Shortest paths from a pose into the ball of the goal tolerance.
+"""Shortest paths from a pose into the ball of the goal tolerance, and what turning limits rule out.
 
 With R the smallest radius and r the tolerance: where the shortest path CS to the goal itself has a straight
 piece of at least r, it is that path less its last r mm; else it is the arc C as far as the ball
@@ -13,8 +13,11 @@ import numba
 
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
-from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, shortest_path
+from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, two_arcs
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
+
+CONE_ROUNDING = 1e-6
+"""Share of a distance: the limit of the angle itself is kept up to a cosine of TINY."""
 
 
 @inner_kernel
@@ -46,7 +49,7 @@ def least_turn_into_ball(rho, h, kappa, tolerance):
         return 0.0
     radius = 1.0 / kappa
     centre = math.hypot(radius - rho, h)
-    if centre < radius - tolerance:
+    if centre < radius - tolerance - TINY:
         return math.inf
     turn = math.atan2(h, radius - rho) - math.acos(min((radius - tolerance) / centre, 1.0))
     return turn if turn >= -TINY else turn + 2.0 * math.pi
@@ -56,7 +59,10 @@ def least_turn_into_ball(rho, h, kappa, tolerance):
 def least_length(rho, h, limits, cosine, turn_left):
     """Return a length below which no path leads into the ball, inf if none does within the turning limits.
 
-    Exact where no more than 180 degrees of turn are left, up to turning limits.
+    Nothing within the limits is ruled out, and no length stated that a path could do without
+    (docs/explanation/proofs.md, "Workspace").  The limit of the angle counts where no tangent of a path can
+    lean from the tip by more than 90 degrees: else a tilted tip can wind around the reference, and reaches
+    farther than by one arc.  The turn that is left counts up to 180 degrees.
 
     Parameters
     ----------
@@ -74,22 +80,56 @@ def least_length(rho, h, limits, cosine, turn_left):
     distance2 = rho * rho + h * h
     if distance2 <= tolerance * tolerance:
         return 0.0
+    allowed = turn_left if turn_left <= math.pi else math.inf
+    from_tip = limits.max_angle_rad + math.acos(min(max(cosine, -1.0), 1.0))
+    if from_tip <= 0.5 * math.pi:
+        allowed = min(allowed, from_tip)
     if distance2 < 2.0 * radius * rho - tolerance * (2.0 * radius - tolerance) - 2.0 * radius * TINY:
         # Inside the circle and farther from it than the tolerance.
-        if turn_left <= math.pi:
+        if allowed < math.inf:
             return math.inf
         if tolerance > 0.0:
             return math.sqrt(distance2) - tolerance
-        return shortest_path(rho, h, kappa, math.pi, turn_left)
+        away, back = two_arcs(rho, h, kappa)
+        return (away + back) / kappa
     turn, straight = arc_and_straight(rho, h, kappa)
     length = turn / kappa + straight - tolerance
     if not tolerance <= straight < math.inf:
         turn = turn_into_ball(rho, h, kappa, tolerance)
         length = turn / kappa
-    if turn <= limits.max_angle_rad and turn <= turn_left or turn_left > math.pi:
+    if turn <= allowed:
         return length
-    allowed = min(limits.max_angle_rad + math.acos(min(max(cosine, -1.0), 1.0)), turn_left)
     return length if least_turn_into_ball(rho, h, kappa, tolerance) <= allowed + TINY else math.inf
+
+
+@numba.njit(cache=True)
+def workspace_length(rho, h, limits):
+    """Return a length below which no path within all limits leads into the ball, inf outside the workspace.
+
+    The pose looks along its own reference, and nothing lies behind it; see `least_length`.
+    """
+    length = least_length(rho, h, limits, 1.0, limits.max_turn_rad)
+    return length if length <= limits.max_length_mm else math.inf
+
+
+@numba.njit(cache=True)
+def least_length_from(pose, goal, limits, reference, turn_left):
+    """Return `least_length` for a tip on its way, inf also where its displacement would lean too far.
+
+    All tangents of a path lean from `reference` by at most the limit of the angle.  Up to 90 degrees such
+    directions form a convex cone, which then holds the displacement too.
+    """
+    rho, h = seen_from(pose, goal)
+    cosine = pose[3] * reference[0] + pose[4] * reference[1] + pose[5] * reference[2]
+    if limits.max_angle_rad <= 0.5 * math.pi:
+        dx, dy, dz = goal[0] - pose[0], goal[1] - pose[1], goal[2] - pose[2]
+        ahead = dx * reference[0] + dy * reference[1] + dz * reference[2]
+        far = math.hypot(rho, h)
+        beyond = math.atan2(math.sqrt(max(far * far - ahead * ahead, 0.0)), ahead) - limits.max_angle_rad
+        from_cone = far if beyond >= 0.5 * math.pi else far * math.sin(beyond)
+        if from_cone > limits.goal_tolerance_mm + far * CONE_ROUNDING:
+            return math.inf
+    return least_length(rho, h, limits, cosine, turn_left)
 
 
 @numba.njit(cache=True)

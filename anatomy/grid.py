@@ -12,7 +12,9 @@ from anatomy.records import frozen_record
 from anatomy.typed import Array, Bool, Float
 
 ORTHONORMAL_TOLERANCE = 1e-4
-"""Headers store directions in single precision with six digits or so."""
+"""Headers store directions in single precision with six digits or so; grids have the nearest rotation."""
+ROUNDING = 1e-12
+"""Axes that differ by less are perpendicular up to the rounding of double precision."""
 AFFINE_TOLERANCE = 1e-9
 """The last row of a homogeneous matrix is exact in every format."""
 
@@ -86,6 +88,10 @@ class Grid:
                 expected="three perpendicular unit axes (no shear or gantry tilt)",
                 remedy="Resample the image onto an orthogonal grid",
             )
+        if np.abs(direction.T @ direction - np.eye(3)).max() > ROUNDING:
+            # Distances are computed as if the axes were perpendicular, so they are made so.
+            left, _stretch, right = np.linalg.svd(direction)
+            matrix[:3, :3] = left @ right * spacing
         if np.linalg.det(direction) < 0:
             raise FrameError(
                 "The axes of an image form a left-handed frame (determinant < 0)",

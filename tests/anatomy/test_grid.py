@@ -166,3 +166,18 @@ def test_transform_points_takes_any_leading_shape() -> None:
     matrix = _matrix(entries={(0, 3): 1.0, (1, 3): 2.0, (2, 3): 3.0})
     assert transform_points(matrix, np.zeros(3)).tolist() == [1.0, 2.0, 3.0]
     assert transform_points(matrix, np.zeros((2, 5, 3))).shape == (2, 5, 3)
+
+
+@pytest.mark.parametrize("shear", [1e-7, 9e-5])
+def test_axes_that_a_header_rounded_are_made_perpendicular(shear: float) -> None:
+    """Distances are computed as if they were."""
+    matrix = np.diag([0.7, 0.8, 1.5, 1.0])
+    matrix[0, 1] = shear * 0.8
+    grid = Grid(shape=(300, 300, 200), lps_from_ijk=matrix)
+    axes = grid.lps_from_ijk[:3, :3] / grid.spacing_mm
+    assert np.abs(axes.T @ axes - np.eye(3)).max() < 1e-12
+    assert np.abs(grid.lps_from_ijk - matrix).max() <= shear
+    again = Grid(shape=grid.shape, lps_from_ijk=grid.lps_from_ijk)
+    assert np.array_equal(again.lps_from_ijk, grid.lps_from_ijk)
+    plain = np.diag([0.7, 0.8, 1.5, 1.0])
+    assert np.array_equal(Grid(shape=(3, 3, 3), lps_from_ijk=plain).lps_from_ijk, plain)

@@ -29,6 +29,8 @@ THIN_VOXELS = 6.0
 """Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to half."""
 FINE_MM = 0.05
 """Spacing of the places at which a cone is compared with the mask."""
+TINY_MM = 1e-9
+"""More than the rounding of lengths."""
 SMOOTHING_ROUNDS = 30
 KEPT_DEPTH = 0.9
 """Smoothing never takes a point of a skeleton to less than this share of the depth it had."""
@@ -319,23 +321,29 @@ def _smoothed(nodes: Float, edges: Int, walls: _Walls) -> Float:
 def _proved(nodes: Float, edges: Int, walls: _Walls) -> Centreline:
     """Give every node the largest radius with which the cones are proved to lie in the lumen.
 
-    The depth is 1-Lipschitz, so it is at least its value at the nearest of the places tried, less half of
-    their spacing.  Where the interpolated radius is larger, the radii at both ends are reduced.
+    The depth is 1-Lipschitz: between two places `h` apart where it is `d` and `e`, it is nowhere less than
+    `max(d - x, e - (h - x))`, `x` from the first.  The radius is linear there, so that it exceeds this bound
+    most where the parts cross, or at one of the places.  Where it does, the radii at both ends of the edge
+    are reduced, and again where one of them has become 0 and could not be reduced by as much.
     """
-    radius = walls.depth_mm(nodes)
+    radius = np.maximum(walls.depth_mm(nodes), 0.0)
     begin, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
     length = np.linalg.norm(end - begin, axis=1)
     count = max(1, int(np.ceil(float(length.max()) / FINE_MM)))
-    excess = np.zeros(len(edges))
-    for share in np.linspace(0.0, 1.0, count + 1)[1:-1]:
-        depth = walls.depth_mm(begin * (1.0 - share) + end * share)
-        wanted = radius[edges[:, 0]] * (1.0 - share) + radius[edges[:, 1]] * share
-        excess = np.maximum(excess, wanted - depth)
-    excess += length / count
-    lowered = np.zeros(len(nodes))
-    np.maximum.at(lowered, edges[:, 0], excess)
-    np.maximum.at(lowered, edges[:, 1], excess)
-    return Centreline(nodes_mm=nodes, radius_mm=np.maximum(radius - lowered, 0.0), edges=edges)
+    step, places = length / count, np.arange(count + 1)[:, None] / count
+    depth = np.stack([walls.depth_mm(begin * (1.0 - share) + end * share) for share in places])
+    crossing = np.clip(0.5 * (depth[:-1] - depth[1:] + step), 0.0, step)
+    shares = np.vstack((places + np.zeros(len(edges)), places[:-1] + crossing / np.maximum(length, TINY_MM)))
+    bound = np.vstack((depth, np.maximum(depth[:-1] - crossing, depth[1:] - (step - crossing))))
+    while True:
+        first, last = radius[edges].T
+        excess = (first * (1.0 - shares) + last * shares - bound).max(axis=0)
+        lowered = np.zeros(len(nodes))
+        for side in range(2):
+            np.maximum.at(lowered, edges[:, side], excess)
+        if not (lowered[radius > 0.0] > 0.0).any():
+            return Centreline(nodes_mm=nodes, radius_mm=radius, edges=edges)
+        radius = np.maximum(radius - np.where(lowered > 0.0, lowered + TINY_MM, 0.0), 0.0)
 
 
 class _Walls:

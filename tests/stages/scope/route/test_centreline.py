@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from anatomy.errors import AnatomyError, TargetError
+from anatomy.fields import SOLID
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN
+from stages.scope.route import centreline
 from stages.scope.route.centreline import Centreline, from_graph, from_image, from_lung, from_mask
 from tests.stages.scope.route.tubes import fork, straight
 
@@ -89,6 +91,24 @@ def test_the_lumen_of_a_mask_lies_in_the_mask(rounded: bool) -> None:
     assert tube.radius_mm.max() > 2.0
     rho = np.hypot(*tube.nodes_mm.T[:2])
     assert np.abs(rho - 30.0).max() < 1.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_ball_on_a_line_leaves_the_mask(seed: int) -> None:
+    """Lines that touch the wall and lead out of the lumen, where radii become 0."""
+    mask, rng = bent_tube(), np.random.default_rng(seed)
+    angle = np.sort(rng.uniform(0.1, 1.4, 40))
+    rho, z = 30.0 + rng.uniform(-3.4, 3.4, 40), rng.uniform(-2.5, 2.5, 40)
+    nodes = np.stack((rho * np.cos(angle), rho * np.sin(angle), z), axis=1)
+    edges = np.stack((np.arange(39), np.arange(1, 40)), axis=1)
+    walls = centreline._Walls(mask.array, mask.grid, SOLID)
+    tube = centreline._proved(*centreline._refined(nodes, edges, 0.75), walls)
+    for share in np.linspace(0.0, 1.0, 97):
+        balls = tube.nodes_mm[tube.edges[:, 0]] * (1.0 - share) + tube.nodes_mm[tube.edges[:, 1]] * share
+        radius = tube.radius_mm[tube.edges[:, 0]] * (1.0 - share) + tube.radius_mm[tube.edges[:, 1]] * share
+        over = radius - np.maximum(walls.depth_mm(balls), 0.0)
+        assert over[radius > 0.0].max() <= 1e-6
+    assert (tube.radius_mm > 0.5).sum() > 20
 
 
 def test_a_drawing_becomes_a_flat_centreline() -> None:

@@ -64,6 +64,10 @@ class PatientFile:
     thick_slices_mm: Annotated[
         float, quantity("Distance of slices too thick to show small airways and vessels", at_least=0.0)
     ] = 0.0
+    large_radius_mm: Annotated[
+        float,
+        quantity("Radius from which a segmented vessel is an obstacle; thinner ones are costs", at_least=0.0),
+    ] = 0.0
     accepted: Annotated[
         tuple[str, ...], _key("Checks of the segmentation that failed and were overruled by --accept")
     ] = ()

@@ -49,12 +49,14 @@ def description_text(
     target_lps: Float | None,
     thick_slices_mm: float,
     accepted: tuple[str, ...] = (),
+    large_radius_mm: float = 0.0,
 ) -> str:
     """Return the `patient.toml` of a segmentation.
 
     An empty name is left out; `fissure_warnings` is what to say of the fissures, or None where they are not
     known; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that were accepted
-    although they are thick, else 0; `accepted` are checks that failed and were overruled.
+    although they are thick, else 0; `accepted` are checks that failed and were overruled; `large_radius_mm`,
+    from which vessels are obstacles, is 0 if a given mask says what they are.
     """
     lines = [f"name = {json.dumps(name, ensure_ascii=False)}"] if name else []
     lines += [
@@ -75,6 +77,8 @@ def description_text(
         lines.append('targets = ["lps:{:.3f},{:.3f},{:.3f}"]'.format(*target_lps))
     if thick_slices_mm:
         lines.append(f"thick_slices_mm = {thick_slices_mm:.3f}")
+    if large_radius_mm:
+        lines.append(f"large_radius_mm = {large_radius_mm:.3f}")
     if accepted:
         lines.append(f"accepted = {json.dumps(list(accepted))}")
     return "\n".join(lines) + "\n"

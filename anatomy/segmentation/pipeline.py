@@ -22,6 +22,7 @@ from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice
 from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.request import SegmentationRequest
 from anatomy.segmentation.steps import VERSION, Parts, Steps
+from anatomy.segmentation.vessels import require_large_radius
 from anatomy.typed import Float
 
 Progress = Callable[[str], None]
@@ -75,12 +76,15 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
         holds corrections of another CT.
     GridMismatchError
         If a given mask does not fit the CT.
+    SettingsError
+        If a check that is accepted is none, or vessels cannot be told by the radius.
     FileError
         If a file cannot be read or written.
     """
     tell = progress or (lambda _step: None)
     tell("checking the CT")
     require_known_checks(request.accept)
+    require_large_radius(request.large_radius_mm)
     request = replace(request, ct=canonical(request.ct))
     warnings = list(require_chest_ct(request.ct, thick_slices=request.thick_slices))
     grid = request.ct.grid
@@ -99,7 +103,10 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     sides = [side for side in (parts.left, parts.right) if side.any()]
     known = all(parts.lobes[side].any() for side in sides)
     said = tuple(folder.facts("lobes").get("warnings", ())) if known else None
-    text = description_text(request.name, bool(parts.nodule.any()), said, target, thick_mm, steps.accepted)
+    large_mm = 0.0 if "vessels" in steps.given_names else request.large_radius_mm
+    text = description_text(
+        request.name, bool(parts.nodule.any()), said, target, thick_mm, steps.accepted, large_mm
+    )
     return Segmentation(
         folder=folder.path,
         parts=parts,
@@ -145,6 +152,7 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
         "given_files": request.given.hashes(),
         "ex_vivo": request.ex_vivo,
         "thick_slices": request.thick_slices,
+        "large_radius_mm": request.large_radius_mm,
         "accepted": list(steps.accepted),
         "seed_lps": None if request.seed_lps is None else request.seed_lps.tolist(),
         "corrected": steps.corrected,

@@ -15,6 +15,7 @@ from anatomy.io.totalsegmentator import mask_sources
 from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.folder import onto_grid
+from anatomy.segmentation.vessels import LARGE_RADIUS_MM
 from anatomy.typed import Float
 
 _ROLES = {"lumen": "airway", "wall": "airway_wall", "vessels": "vessels", "lung": "lungs"}
@@ -120,6 +121,8 @@ class SegmentationRequest:
         The image shows an inflated lung in air.
     thick_slices : bool
         Accept slices of more than 3 mm; the folder is marked, and planning on it must be allowed too.
+    large_radius_mm : float
+        Vessels of this radius or more are obstacles, thinner ones costs.
     accept : tuple of str
         Checks of `anatomy.segmentation.gate.CHECKS` whose failure a person accepts; it is recorded.
     seed_lps : (3,) float64, optional
@@ -135,6 +138,7 @@ class SegmentationRequest:
     sources: Mapping[str, str] = field(default_factory=dict)
     ex_vivo: bool = False
     thick_slices: bool = False
+    large_radius_mm: float = LARGE_RADIUS_MM
     accept: tuple[str, ...] = ()
     seed_lps: Float | None = None
     given: Given = field(default_factory=Given)

@@ -36,7 +36,7 @@ Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
 Progress = Callable[[str], None]
 
-VERSION = 3
+VERSION = 5
 """Raise it when a step makes other images from the same input."""
 _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 
@@ -132,6 +132,11 @@ class Steps:
     def grid(self) -> Grid:
         """The grid of the images."""
         return self._box.grid
+
+    @property
+    def given_names(self) -> frozenset[str]:
+        """The images that files stand for."""
+        return frozenset(self._sources)
 
     def run(self) -> Parts:
         """Bring every step up to date and return all images."""
@@ -273,12 +278,17 @@ class Steps:
     def _vessels(self, lungs: Lungs, airway: Images, nodule: Mask) -> Images:
         names = ("vesselness", "vessels", "all_vessels")
         made_of = ("lungs", "airway", "airway_wall", "nodule")
-        key = self._key("vessels", sources=names[1:], of=made_of, ct=self._ct_digest)
+        radius_mm = self._request.large_radius_mm
+        key = self._key(
+            "vessels", sources=names[1:], of=made_of, ct=self._ct_digest, large_radius_mm=radius_mm
+        )
 
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.vessels import segment_vessels
 
-            found = segment_vessels(self._ct, lungs.mask, _airways(airway), progress=self._tell)
+            found = segment_vessels(
+                self._ct, lungs.mask, _airways(airway), large_radius_mm=radius_mm, progress=self._tell
+            )
             masks = {"vessels": found.large, "all_vessels": found.mask}
             for name, mask in masks.items():
                 source = self._source_mask(name)

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import GridMismatchError
+from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.grid import Volume
 from anatomy.records import frozen_record
+from anatomy.segmentation.closing import closed
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
 from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, add_vesselness_of
 from anatomy.typed import Float, Float32, Int16, Mask, UInt8
@@ -23,6 +24,12 @@ VESSEL_THRESHOLD = 0.25
 """Fixed on made cylinders and the phantom, see docs/explanation/segmentation.md."""
 LARGE_RADIUS_MM = 2.0 * math.sqrt(2.0)
 """One of the paper's scales: from this radius on vessels are obstacles, thinner ones are costs."""
+LARGE_RADII_MM = (1.0, 4.0)
+"""The least and the greatest of the scales: R_L tells no other radii."""
+HILUM_MM, HILUM_REACH_MM = 7.0, 20.0
+"""Ten voxels of 0.7 mm, as the authors' own code closes lungs; soft tissue in between, near airways."""
+HILUM_STEP = 2
+"""It lies outside the lung, where voxels are obstacles anyway: every other one tells enough."""
 REFERENCE_HU, BRIGHTEST_HU = 300.0, 200.0
 """I_ref and I_max of R_L."""
 LARGE_RESPONSE = 0.3
@@ -33,8 +40,9 @@ SIGMA_TOLERANCE_MM = 1e-6
 """Rounding of scales that are given as decimals."""
 BLOOD_HU = 40.0
 """Blood without contrast medium."""
-SOLID_SHARE, EDGE_SHARE = 0.5, 0.35
-"""Way from the lung's median to blood: where a voxel counts as solid, and as the edge of a vessel."""
+SOLID_SHARE, EDGE_SHARE = 0.5, 0.25
+"""Way from the lung's median to blood: where a voxel counts as solid, and as the edge of a vessel.  A vessel
+of half a voxel's radius gives no more; chosen on phantoms."""
 EDGE_VOXELS = 2
 """How far the response of a vessel's core carries to its edge."""
 
@@ -43,8 +51,8 @@ EDGE_VOXELS = 2
 class Vessels:
     """Vessels of both lungs on the grid of the CT, all `(ni, nj, nk)`.
 
-    Vesselness is 1 in large vessels, of more than about 2.8 mm radius, and 0 in airways and their walls
-    and outside the lung; `mask` are the voxels that reach `threshold`, which is fixed on other data.
+    Vesselness is 1 in large vessels and in those of the hilum, 0 in airways and their walls and elsewhere
+    outside the lung; `mask` are the voxels that reach `threshold`, which is fixed on other data.
     """
 
     vesselness: Float32
@@ -59,6 +67,7 @@ def segment_vessels(
     lungs: Mask,
     airways: Airways,
     *,
+    large_radius_mm: float = LARGE_RADIUS_MM,
     threads: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Vessels:
@@ -72,6 +81,8 @@ def segment_vessels(
         Both lungs, filled.
     airways : Airways
         Its lumen and wall never become vessel.
+    large_radius_mm : float
+        Vessels of this radius or more are `large`.
     threads : int
         0 for all processors; the result does not depend on it.
     progress : callable or None
@@ -83,7 +94,10 @@ def segment_vessels(
         If the shapes differ.
     AnatomyError
         If the lung is empty.
+    SettingsError
+        If the radius is none of `LARGE_RADII_MM` or between.
     """
+    require_large_radius(large_radius_mm)
     shape = ct.array.shape
     for name, mask in (("lung", lungs), ("lumen", airways.lumen), ("wall", airways.wall)):
         if mask.shape != shape:
@@ -95,7 +109,9 @@ def segment_vessels(
     lung_hu = space.hu[space.n_scales > 0]
     solid = space.hu >= towards_blood(lung_hu, SOLID_SHARE)
     best, response, at_scale = _responses(space, solid & ~airway, progress)
-    large = _large(space, solid, airway, response, at_scale)
+    large = _large(space, solid, airway, response, at_scale, large_radius_mm)
+    warnings = () if large.any() else ("No large vessel was found: is the CT one of the chest?",)
+    large |= _hilum(space, solid, airways)
     best[airway] = 0.0
     edges = (space.hu >= towards_blood(lung_hu, EDGE_SHARE)) & ~airway & (space.n_scales > 0)
     for _ in range(EDGE_VOXELS):
@@ -105,7 +121,6 @@ def segment_vessels(
     everywhere = np.zeros(shape, dtype=np.bool_, order="F")
     everywhere[space.box] = large.T
     mask = found >= np.float32(VESSEL_THRESHOLD)
-    warnings = () if large.any() else ("No large vessel was found: is the CT one of the chest?",)
     return Vessels(
         vesselness=found, large=everywhere, mask=mask, threshold=VESSEL_THRESHOLD, warnings=warnings
     )
@@ -154,8 +169,37 @@ def _add_large(
     space.share(lambda first, last: add_large_response(image, space.hu, first, last, *given))
 
 
-def _large(space: ScaleSpace, solid: Mask, airway: Mask, response: Float32, at_scale: UInt8) -> Mask:
-    """Return the large vessels in the box: solid voxels within `LARGE_RADIUS_MM` of what tells their inside.
+def require_large_radius(radius_mm: float) -> None:
+    """Raise SettingsError unless vessels of a radius can be told by their response."""
+    least, most = LARGE_RADII_MM
+    if not least <= radius_mm <= most:
+        raise SettingsError(
+            f"The radius from which vessels are obstacles is {radius_mm:g} mm",
+            expected=f"{least:g} to {most:g} mm, the scales at which vessels are sought",
+            remedy='To avoid all vessels, write vessels = "all_vessels.nii.gz" into patient.toml',
+        )
+
+
+def _hilum(space: ScaleSpace, solid: Mask, airways: Airways) -> Mask:
+    """Return the solid voxels of the hilum: between the lung and its closing, near airways, in neither."""
+    sides = space.spacing_mm[::-1]
+    few = (slice(None, None, HILUM_STEP),) * 3
+    lung, lumen = space.n_scales[few] > 0, airways.lumen[space.box].T[few]
+    if not lumen.any():
+        return np.zeros_like(solid)
+    coarse = sides * HILUM_STEP
+    beyond = closed(lung, HILUM_MM, coarse) & ~lung
+    beyond &= _distance_mm(~lumen, coarse, space.threads) <= HILUM_REACH_MM
+    for axis in range(3):
+        beyond = np.repeat(beyond, HILUM_STEP, axis=axis).take(range(solid.shape[axis]), axis=axis)
+    airway = (airways.lumen[space.box] | airways.wall[space.box]).T
+    return np.asarray(beyond & solid & (space.n_scales == 0) & ~airway)
+
+
+def _large(
+    space: ScaleSpace, solid: Mask, airway: Mask, response: Float32, at_scale: UInt8, radius_mm: float
+) -> Mask:
+    """Return the large vessels in the box: solid voxels within `radius_mm` of what tells their inside.
 
     That is a great R_L at a large scale, or the centre of a solid ball of that radius: where vessels are
     wider than the greatest scale R_L has faded, and at their edges smaller scales respond most.  The ball
@@ -163,13 +207,13 @@ def _large(space: ScaleSpace, solid: Mask, airway: Mask, response: Float32, at_s
     through vessels, and masks of walls reach into the vessels beside them.
     """
     tissue = (space.n_scales > 0) & ~airway
-    first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= LARGE_RADIUS_MM - SIGMA_TOLERANCE_MM)
+    first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= radius_mm - SIGMA_TOLERANCE_MM)
     sides, h = space.spacing_mm[::-1], float(space.spacing_mm.mean())
     inside = (response >= LARGE_RESPONSE) & (at_scale >= first)
-    inside |= tissue & (_distance_mm(solid, sides, space.threads) >= LARGE_RADIUS_MM + 0.5 * h)
+    inside |= tissue & (_distance_mm(solid, sides, space.threads) >= radius_mm + 0.5 * h)
     if not inside.any():
         return inside
-    found = solid & tissue & (_distance_mm(~inside, sides, space.threads) <= LARGE_RADIUS_MM)
+    found = solid & tissue & (_distance_mm(~inside, sides, space.threads) <= radius_mm)
     return _without_small(found, LEAST_LARGE_MM3 / float(np.prod(sides)))
 
 

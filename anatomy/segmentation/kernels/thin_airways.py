@@ -13,7 +13,7 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.segmentation.kernels.lumen_ends import heading_between
 from anatomy.segmentation.kernels.states import LUMEN
-from anatomy.segmentation.kernels.tube_stretch import ANGLES, END_COS, best_stretch
+from anatomy.segmentation.kernels.tube_stretch import ANGLES, END_COS, NOTHING, best_stretch
 
 TURN_COS = np.cos(np.radians(30.0))
 """A tube turns by 30 degrees at most from one stretch to the next: more would be a fork."""
@@ -22,11 +22,17 @@ ADVANCE_MM = 1.5
 TAIL_MM = 4.0
 """So much of the last stretch is airway: its end may lie beyond the end of the tube."""
 HALF_SHARE = 0.3
-"""Each half of a stretch has at least this share of the contrast asked of it: no stretch is half a tube."""
-HOLD_SHARE = 0.75
-"""A stretch is added down to this share of the contrast asked of the best of its tube."""
+"""Each half of the last stretch has this share of the contrast asked of a tube: no end is half a tube."""
+DRIFT = 0.6
+"""Of the contrast asked of a tube a place without one has about half, and a tube as thin as a voxel 0.8."""
+GREATEST = 1.5
+"""No stretch alone, however dark, counts for more."""
+EVIDENCE = 1.3
+"""Between three and four stretches of the contrast asked give so much, 9 mm; fewer may be chance."""
+DEBT = 1.0
+"""A gap may cost so much: where mucus, noise or a narrow place hides some mm of a tube."""
 LEAST_STRETCHES = 2
-"""One stretch alone may be chance."""
+"""What is followed is longer than one stretch."""
 MOST_STRETCHES = 60
 """90 mm: longer than any airway goes on behind the lumen that is seen well."""
 
@@ -38,38 +44,42 @@ def trace(
 ):  # fmt: skip
     """Follow one tube from an end; fill `path`, `(N, 3)` mm, and return the number of its points.
 
-    Stretch joins stretch while its contrast reaches `HOLD_SHARE` of `least_contrast`, that of each half
-    `HALF_SHARE`, and the mean of its ring `least_ring_hu`.  The best of them has to reach `least_contrast`.
+    Stretch joins stretch.  Each adds to the evidence its contrast over `least_contrast`, less `DRIFT`.  The
+    tube ends where the evidence is greatest, and no more is sought where it has fallen by `DEBT`: so a tube
+    goes on beyond a gap if what lies there makes up for it.  The evidence has to reach `EVIDENCE`, the best
+    stretch `least_contrast`, and every ring the mean `least_ring_hu`.
     """
-    point, along = np.zeros(3), np.zeros(3)
+    point, along, tail = np.zeros(3), np.zeros(3), np.zeros(3)
     point[:] = end
     along[:] = about
     path[0] = end
-    size = 1
+    size, found = 1, 0
     least_cos = END_COS
-    greatest = 0.0
-    for n in range(MOST_STRETCHES):
+    evidence, most, greatest = 0.0, 0.0, 0.0
+    while size <= MOST_STRETCHES and evidence >= most - DEBT:
         contrast, half, mean = best_stretch(
             hu, state, lung, per_mm, point, along, least_cos, other, directions, radii_mm, work,
             begin, heading,
         )  # fmt: skip
-        held = contrast >= HOLD_SHARE * least_contrast and half >= HALF_SHARE * least_contrast
-        if not held or mean < least_ring_hu:
+        if contrast == NOTHING or mean < least_ring_hu:
             break
+        evidence += min(contrast / least_contrast, GREATEST) - DRIFT
         greatest = max(greatest, contrast)
         for k in range(3):
             path[size, k] = begin[k] + ADVANCE_MM * heading[k]
-            path[size + 1, k] = begin[k] + TAIL_MM * heading[k]
-        size += 1
-        point[:] = path[size - 1]
+        if evidence > most and half >= HALF_SHARE * least_contrast:
+            most, found = evidence, size
+            for k in range(3):
+                tail[k] = begin[k] + TAIL_MM * heading[k]
+        point[:] = path[size]
         along[:] = heading
+        size += 1
         other = np.zeros(3)
         least_cos = TURN_COS
-        if n == MOST_STRETCHES - 1:
-            break
-    if size - 1 < LEAST_STRETCHES or greatest < least_contrast:
+    if found < LEAST_STRETCHES or most < EVIDENCE or greatest < least_contrast:
         return 0
-    return size + 1
+    path[found + 1] = tail
+    return found + 2
 
 
 @inner_kernel

@@ -26,8 +26,9 @@ HALF = STATIONS // 2
 ANGLES = 8
 """On a ring of two voxels' radius their spacing is that of the voxels."""
 ACROSS = np.stack([f(2.0 * np.pi * np.arange(ANGLES) / ANGLES) for f in (np.cos, np.sin)])
-OFFSETS_MM = np.array([[0.0, 0.0], [0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
-"""Where a stretch may begin beside the point it is sought from: the end of a lumen is known to a voxel."""
+OFFSETS_MM = np.vstack([np.zeros((1, 2)), 0.5 * ACROSS.T[::2], ACROSS.T])
+"""Where a stretch may begin beside the point it is sought from: the end of a lumen is known to a voxel, and
+the branches of a fork begin about 1 mm beside its middle."""
 SHIFTS_MM = np.array([0.35, 0.175])
 """Both ends of the best stretch are moved to and fro by these: half the offsets, then half of that."""
 END_COS = np.cos(np.radians(70.0))

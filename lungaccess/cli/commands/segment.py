@@ -10,6 +10,7 @@ from anatomy.io.ct_cases import ct_case
 from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import parse_point
 from anatomy.segmentation.box import VOXEL_MM
+from anatomy.segmentation.vessels import LARGE_RADIUS_MM
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import OutputOptions
@@ -43,6 +44,7 @@ def segment(
     series: str | None = None,
     ex_vivo: bool = False,
     thick_slices: bool = False,
+    large_radius_mm: float = LARGE_RADIUS_MM,
     accept: tuple[str, ...] = (),
     seed: str | None = None,
     voxel_mm: float = VOXEL_MM,
@@ -78,6 +80,9 @@ def segment(
         The image shows an inflated lung in air, not a patient.
     thick_slices : bool
         Accept slices of more than 3 mm; planning on the result must then be allowed as well.
+    large_radius_mm : float
+        Vessels of this radius in mm or more are obstacles, thinner ones cost: 1 to 4.  It is recorded in
+        patient.toml.
     accept : tuple[str, ...]
         A check that failed and is overruled, by the name in its message: axes, sides, airway, bronchi,
         one-lung,
@@ -128,6 +133,7 @@ def segment(
             sources=sources,
             ex_vivo=ex_vivo,
             thick_slices=thick_slices,
+            large_radius_mm=large_radius_mm,
             accept=accept,
             seed_lps=None if seed is None else parse_point(seed),
             voxel_mm=voxel_mm,

@@ -27,8 +27,13 @@ def course(k: Float) -> tuple[Float, Float]:
     return 30.0 + 0.25 * beyond - 0.004 * beyond**2, 28.0 + 0.15 * beyond
 
 
-def block(lumen_mm: float, outer_mm: float, fill_hu: float, seed: int = 0) -> Int16:
-    """Render lung with a wider airway, and from its end on a tube with what fills it and a wall."""
+def block(
+    lumen_mm: float, outer_mm: float, fill_hu: float, seed: int = 0, narrow: tuple[int, int] = (0, 0)
+) -> Int16:
+    """Render lung with a wider airway, and from its end on a tube with what fills it and a wall.
+
+    Between the `narrow` planes its lumen has 0.7 of its radius.
+    """
     fine = tuple(FINE * n for n in SHAPE)
     k, j, i = ((np.arange(n) + 0.5) / FINE - 0.5 for n in fine)
     middle_j, middle_i = course(k)
@@ -40,7 +45,8 @@ def block(lumen_mm: float, outer_mm: float, fill_hu: float, seed: int = 0) -> In
         image[:, np.hypot(j[:, None] - at[0], i[None, :] - at[1]) <= VESSEL_VOXELS] = BLOOD_HU
     image[away_mm <= np.where(wide, 2.0, outer_mm)] = WALL_HU
     image[wide & (away_mm <= 1.1)] = AIR_HU
-    image[~wide & (away_mm <= lumen_mm)] = fill_hu
+    radius_mm = np.where((k > narrow[0]) & (k <= narrow[1]), 0.7 * lumen_mm, lumen_mm)[:, None, None]
+    image[~wide & (away_mm <= radius_mm)] = fill_hu
     image = image.reshape(SHAPE[0], FINE, SHAPE[1], FINE, SHAPE[2], FINE).mean(axis=(1, 3, 5))
     image = ndimage.gaussian_filter(image, 0.6 / 0.7)
     noise = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal(SHAPE), 0.5)
@@ -82,6 +88,13 @@ def test_a_thin_airway_is_followed(seed: int) -> None:
     wide[END, 29:32, 27:30] = True
     _, pieces = ndimage.label(added | wide, np.ones((3, 3, 3)))
     assert pieces == 1
+
+
+def test_a_tube_goes_on_beyond_a_short_narrow_place_and_not_beyond_a_long_one() -> None:
+    _, beyond = follow(block(0.85, 1.65, AIR_HU, narrow=(54, 60)))
+    assert np.nonzero(beyond)[0].max() > 80
+    _, before = follow(block(0.85, 1.65, AIR_HU, narrow=(54, 66)))
+    assert 48 < np.nonzero(before)[0].max() < 62
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from anatomy.errors import GridMismatchError
+from anatomy.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import grown_by_one
 from anatomy.phantom import make_phantom
@@ -103,6 +103,30 @@ def test_nothing_outside_the_lung() -> None:
     lung[:, :, :30] = True
     found = segment_vessels(image_of(distance, 40.0, 0.7), lung, airways(distance.shape))
     assert not found.mask[~lung].any() and not found.large[~lung].any() and found.large[lung].any()
+
+
+def test_the_radius_from_which_vessels_are_obstacles_is_chosen() -> None:
+    distance = distance_to_surface("cylinder", 2.0, 0.7, SIZE_MM)
+    ct, inside = image_of(distance, 40.0, 0.7), np.ones(distance.shape, dtype=bool)
+    axis = (distance <= -1.0) & (distance_to_surface("ball", 12.0, 0.7, SIZE_MM) <= 0.0)
+    shares = [
+        segment_vessels(ct, inside, airways(distance.shape), large_radius_mm=radius_mm).large[axis].mean()
+        for radius_mm in (1.4, 2.83)
+    ]
+    assert shares[0] > 0.95 and shares[1] == 0.0
+    with pytest.raises(SettingsError, match="0.7 mm"):
+        segment_vessels(ct, inside, airways(distance.shape), large_radius_mm=0.7)
+
+
+def test_soft_tissue_of_the_hilum_is_vessel_near_an_airway_alone() -> None:
+    distance = distance_to_surface("cylinder", 4.0, 0.7, SIZE_MM)
+    ct, lung = image_of(distance, 40.0, 0.7), distance > 1.0
+    inner = distance_to_surface("ball", 15.0, 0.7, SIZE_MM) <= 0.0
+    near, far = np.zeros((2, *distance.shape), dtype=bool)
+    near[30:33, 10:13, 30:33], far[:2, :2, :2] = True, True
+    found = segment_vessels(ct, lung, airways(distance.shape, near))
+    assert found.large[(distance < -1.0) & inner].mean() > 0.95
+    assert not segment_vessels(ct, lung, airways(distance.shape, far)).large[(distance < -1.0) & inner].any()
 
 
 def test_threads_and_repeats_give_the_same_bits() -> None:

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from anatomy.errors import AnatomyError, FrameError
 from anatomy.grid import Grid
-from anatomy.motion.continuation import continued_unfolded
+from anatomy.motion.continuation import continued, continued_unfolded
 from anatomy.motion.landmarks import Fitted, fit_landmarks
 from anatomy.motion.motion import LEFT, RIGHT, Motion
 from anatomy.motion.plausible import require_plausible
@@ -26,6 +26,8 @@ LEAST_COVERED = 0.99
 """Share of the lungs that a field must cover: a field in a wrong frame covers far less."""
 SAMPLE_MM = 4.0
 """Distance of the places in the lungs at which a motion is looked at."""
+FITTED_NODES = 2
+"""A fit is evaluated so many nodes beyond its lung, which is slow; farther out it is continued."""
 INVERSE_STEPS = 60
 """Of the fixed point that brings a field to the masks' phase; it converges as a lung's motion contracts."""
 SIDES = {RIGHT: "right", LEFT: "left"}
@@ -65,7 +67,7 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
     if source.vectors is not None:
         nodes, figures = _of_field(source, nodes_grid, at, labels, grid, lungs, middle_x_mm)
     elif source.exhale_lps is not None and source.inhale_lps is not None:
-        nodes, figures = _of_landmarks(source, at, middle_x_mm)
+        nodes, figures = _of_landmarks(source, nodes_grid, at, labels, grid, middle_x_mm)
     else:
         nodes, figures = _of_population(source, at, lungs)
     motion = Motion(
@@ -94,8 +96,10 @@ def _nodes_grid(places: Float) -> Grid:
     return Grid.from_spacing(shape, (NODE_MM,) * 3, low)
 
 
-def _of_landmarks(source: MotionSource, at: Float, middle_x_mm: float) -> tuple[Float, dict[str, float]]:
-    """Fit each lung's pairs at the masks' phase; nothing has to be inverted."""
+def _of_landmarks(
+    source: MotionSource, nodes_grid: Grid, at: Float, labels: Labels, grid: Grid, middle_x_mm: float
+) -> tuple[Float, dict[str, float]]:
+    """Fit each lung's pairs at the masks' phase, where nothing has to be inverted, and continue the fit."""
     exhale, inhale = np.asarray(source.exhale_lps), np.asarray(source.inhale_lps)
     vectors = inhale - exhale
     points = exhale + source.masks_phase * vectors
@@ -110,7 +114,13 @@ def _of_landmarks(source: MotionSource, at: Float, middle_x_mm: float) -> tuple[
         "left_out_mm": float(left_out.mean()),
         "left_out_95_mm": float(np.percentile(left_out, 95)),
     }
-    return np.stack([fits[side].at(at) for side in (RIGHT, LEFT)]), figures
+    nodes = np.zeros((2, *at.shape))
+    for side, fit in fits.items():
+        inside = _near_lung(labels, grid, nodes_grid, side, middle_x_mm)
+        known = ndimage.binary_dilation(inside, iterations=FITTED_NODES)
+        nodes[side][known.ravel()] = fit.at(at[known.ravel()])
+        nodes[side] = continued(nodes[side].reshape(*nodes_grid.shape, 3), known).reshape(-1, 3)
+    return nodes, figures
 
 
 def _of_population(

@@ -16,7 +16,9 @@ from lungaccess.plans.plan import Plan
 POINT_MM = 0.05
 """Distance of the points: between two the chord of the tightest arc is off by less than 0.00005 mm."""
 WALL_ZONE_MM = 1.0
-"""Length of tube that is spent on piercing the wall; so far the hole may move along it, either way."""
+"""Length of tube that is spent on piercing the wall."""
+FLATTEST_RAD = math.radians(10.0)
+"""The least angle at which the tubes of the presets may pierce a wall."""
 SHORTEST_MM = 1e-9
 
 
@@ -34,12 +36,18 @@ class DevicePoints:
         First and last point, rule, required clearance and radius in mm, see `kernels.rules`.
     tube_mm : float
         Length of the tubes.
+    hole_lps : (3,) float64, LPS mm
+        Where the tubes pierce the wall.
+    hole_mm : float
+        How far that place of the wall may shift: the radius of the tube there, so that it stays in its body.
     """
 
     points: Float
     arc_mm: Float
     sections: Float
     tube_mm: float
+    hole_lps: Float
+    hole_mm: float
 
 
 def device_points(plan: Plan) -> DevicePoints:
@@ -47,7 +55,9 @@ def device_points(plan: Plan) -> DevicePoints:
     system, tube, needle = plan.system, plan.tube, plan.needle
     pieces = tube_pieces(tube, system.tubes)
     length, way_out = float(pieces[:, 0].sum()), tube.exit.arc_length_mm
-    at_exit = (way_out - WALL_ZONE_MM, way_out, way_out + WALL_ZONE_MM)
+    hole_mm = float(tube_radii(tube, system.tubes, np.array([way_out]))[0])
+    zone = exit_zone_mm(hole_mm, tube.exit.wall_angle_rad)
+    at_exit = (way_out - zone, way_out, way_out + zone)
     edges = _edges([*at_exit, length, *tube.insertions_mm(system.tubes)], length)
     extra = system.margins.total_mm + tube.clearance_loss_mm
     parts, rows = [], []
@@ -74,7 +84,14 @@ def device_points(plan: Plan) -> DevicePoints:
         arc_mm=np.concatenate(parts),
         sections=np.array([(a, b - 1, *row) for a, b, row in zip(first, last, rows, strict=True)]),
         tube_mm=length,
+        hole_lps=np.array(tube.exit.point_lps, dtype=np.float64),
+        hole_mm=hole_mm,
     )
+
+
+def exit_zone_mm(hole_mm: float, wall_angle_rad: float) -> float:
+    """Return how far along the tube, either way of the exit, a hole is that shifts sideways by its limit."""
+    return WALL_ZONE_MM + hole_mm / math.sin(max(wall_angle_rad, FLATTEST_RAD))
 
 
 def _edges(lengths: list[float], most: float) -> list[float]:

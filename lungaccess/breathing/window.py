@@ -67,6 +67,8 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
         devices.sections,
         np.array(plan.target_lps),
         float(tolerance_mm),
+        devices.hole_lps,
+        devices.hole_mm,
         float(motion.amplitude),
         float(motion.masks_phase),
         leaves,
@@ -150,7 +152,9 @@ def _limit(leaf: Float, phase: float, devices: DevicePoints) -> WindowLimit:
     """Return what a stretch that is not clear says of the phase where it begins or ends."""
     reason, point = int(leaf[3]), int(leaf[4])
     arc, in_tube = float(devices.arc_mm[point]), devices.arc_mm[point] <= devices.tube_mm
-    named = {rules.TARGET_MISSED: "target", rules.LEAVES_LUMEN: "lumen"}.get(reason)
+    named = {rules.TARGET_MISSED: "target", rules.LEAVES_LUMEN: "lumen", rules.HOLE_SHIFTS: "hole"}.get(
+        reason
+    )
     return WindowLimit(
         phase=phase,
         reason=named or next((name for bits, name in NAMES if reason & bits), "airway"),

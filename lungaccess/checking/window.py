@@ -41,6 +41,10 @@ LIMIT_MM = 0.1
 """At an end of the window the structure that is named has no more than this to spare."""
 LIMIT_PHASE = 0.01
 """So far outside of a window what ends it is looked for."""
+FLATTEST_DEG = 10.0
+"""A wall that is pierced at less counts as pierced at this angle."""
+HOLE_TOLERANCE_MM = 0.02
+"""The point of the exit is known to this."""
 ROUNDING = 1e-9
 
 
@@ -89,7 +93,10 @@ class _Devices:
         self._plan, self._has_fissures = plan, environment.lung.has_fissures
         way_out = plan.tube.exit.arc_length_mm
         pieces = shapes.tube_pieces(plan)
-        for at in (way_out, way_out + WALL_ZONE_MM, *plan.tube.insertions_mm(plan.system.tubes)):
+        self.hole_mm = float(shapes.radius_at(plan, np.array([way_out]))[0])
+        angle = max(plan.tube.exit.wall_angle_rad, np.deg2rad(FLATTEST_DEG))
+        self.zone_mm = WALL_ZONE_MM + self.hole_mm / float(np.sin(angle))
+        for at in (way_out, way_out + self.zone_mm, *plan.tube.insertions_mm(plan.system.tubes)):
             pieces = cut_at(pieces, at)
         self.tube: Curve = integrate(plan.scope.lps_from_scope_tip, pieces)
         self.needle: Curve | None = None
@@ -126,7 +133,7 @@ class _Devices:
                 required = 0.5 * tube.outer_diameter_mm + extra
                 yield Part(name=f"{name}_tube", points=points, select=others, required_mm=required)
                 yield Part(name=f"{name}_tube", points=points, select=not_own, required_mm=required)
-        beyond = _between(self.tube, way_out + WALL_ZONE_MM, float(self.tube.arc_mm[-1]))
+        beyond = _between(self.tube, way_out + self.zone_mm, float(self.tube.arc_mm[-1]))
         if len(beyond) > 1:
             lumen = has(structures.LUMEN)
             yield Part(name="beyond_wall", points=beyond, select=lumen, required_mm=OUT_OF_LUMEN_MM)
@@ -174,6 +181,11 @@ def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings
     most = max(_miss(plan, breath, devices, float(phase)) for phase in phases)
     detail = f"end of the devices to the moving target, at {len(phases)} phases of the window"
     found.at_most("window.target", most, window.tolerance_mm, "mm", detail, ROUNDING)
+    hole = np.asarray(plan.tube.exit.point_lps)[None]
+    shifts = [breath.carried(hole, float(phase)) - breath.moved(hole, float(phase)) for phase in phases]
+    most = float(np.linalg.norm(np.concatenate(shifts), axis=1).max())
+    detail = "shift of the tubes in the hole in the airway wall; at most their radius"
+    found.at_most("window.hole", most, devices.hole_mm, "mm", detail, HOLE_TOLERANCE_MM)
 
 
 def _miss(plan: Plan, breath: Breath, devices: _Devices, phase: float) -> float:
@@ -235,7 +247,7 @@ def _out_of_airway(
     """Return how many samples before the exit leave the lumen, or touch its wall with something behind it."""
     curve = devices.in_airway()
     places = breath.pulled_back(breath.carried(curve.points, phase), phase)
-    before = curve.arc_mm <= plan.tube.exit.arc_length_mm - WALL_ZONE_MM
+    before = curve.arc_mm <= plan.tube.exit.arc_length_mm - devices.zone_mm
     out = environment.boxes(has(structures.LUMEN), 1.0).distance_mm(places[before])
     return int((out > CORNER_MM).sum()) + _touching(plan, environment, breath, curve, phase)
 

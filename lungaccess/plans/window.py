@@ -24,7 +24,8 @@ class WindowLimit(Record):
         The end of the window; without a window a phase near that of the masks.
     reason : str
         "target" if the end of the devices is too far from it, "lumen" if the tubes leave the airway before
-        their exit, else the structure that is too near: "airway", "vessel", "outside" or "fissure".
+        their exit, "hole" if they shift in the hole in its wall by more than their radius, else the structure
+        that is too near: "airway", "vessel", "outside" or "fissure".
     device : str
         "tube" or "needle".
     arc_length_mm : float
@@ -44,6 +45,7 @@ class WindowLimit(Record):
         """What ends the window, in words."""
         what = {
             "target": "the devices end too far from the target",
+            "hole": "the tubes shift by more than their radius in the hole in the airway wall",
             "lumen": "the tubes leave the lumen before their exit",
             "airway": f"the {self.device} comes too near to an airway",
             "outside": f"the {self.device} comes too near to the pleura",

@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.report.cost_points import CostPoint, cost_over_time_csv
+    from lungaccess.report.motion import motion_png
     from lungaccess.report.needle import needle_png
     from lungaccess.report.no_plan import no_plan_png
     from lungaccess.report.organ import organ_png

@@ -25,7 +25,7 @@ from lungaccess.breathing.kernels.warped import deformed_distance
 IN_LUMEN, BEFORE_WALL, IN_WALL, TUBE, NEEDLE_AT_EXIT, NEEDLE = range(6)
 """Where a section of the devices is: the rule that holds for it, see docs/explanation/proofs.md."""
 CLEAR, BLOCKED, UNDECIDED = range(3)
-TARGET_MISSED, LEAVES_LUMEN = -1, -2
+TARGET_MISSED, LEAVES_LUMEN, HOLE_SHIFTS = -1, -2, -3
 """Reasons beside the label of the voxel that is too near."""
 
 CORNER_MM = 0.05

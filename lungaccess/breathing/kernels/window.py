@@ -17,6 +17,7 @@ from lungaccess.breathing.kernels.rules import (
     BROKEN_MM,
     CLEAR,
     CORNER_MM,
+    HOLE_SHIFTS,
     IN_LUMEN,
     LEAST_STEP_MM,
     LEAVES_LUMEN,
@@ -64,7 +65,7 @@ def stretch_between(rigid, amplitude, reference, begin, end):
 
 @numba.njit(cache=True)
 def miss_of_target(breath, rigid, stretch, end, target):
-    """Return how far the end of the devices is from the moved target, and by how much that changes, mm."""
+    """Return the distance of a point of the devices from a place of the masks, and how it changes, mm."""
     qx, qy, qz, vx, vy, vz = carried(
         rigid, stretch.share, stretch.rotation, stretch.rate, end[0], end[1], end[2]
     )
@@ -128,6 +129,19 @@ def _hazard_at(tissue, breath, rigid, stretch, point, row, guess):
 
 
 @numba.njit(cache=True)
+def _comes_free(tissue, breath, rigid, stretch, points, sections, first, guess):
+    """Tell whether a tube is free of the wall somewhere between a point and its exit."""
+    for s in range(sections.shape[0]):
+        row = sections[s]
+        if int(row[KIND]) > BEFORE_WALL:
+            continue
+        for n in range(max(first, int(row[BEGIN])), int(row[END]) + 1):
+            if _hazard_at(tissue, breath, rigid, stretch, points[n], row, guess)[0] == math.inf:
+                return True
+    return False
+
+
+@numba.njit(cache=True)
 def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
     """Return the first point, back from the exit, where what lies behind the wall is not proved clear.
 
@@ -148,6 +162,8 @@ def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
             if step == math.inf:
                 return -1, 0
             if step < LEAST_STEP_MM:
+                if _comes_free(tissue, breath, rigid, stretch, points, sections, n, guess):
+                    return -1, 0
                 return n, reason
             if s <= arc[first]:
                 break
@@ -239,7 +255,21 @@ def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
 
 
 @numba.njit(cache=True)
-def divide(tissue, breath, rigid, points, arc, sections, target, tolerance, amplitude, reference, leaves):
+def divide(
+    tissue,
+    breath,
+    rigid,
+    points,
+    arc,
+    sections,
+    target,
+    tolerance,
+    hole,
+    hole_limit,
+    amplitude,
+    reference,
+    leaves,
+):
     """Fill `leaves` (MOST_LEAVES, 5) with stretches in order; return how many there are.
 
     Columns: first and last phase; CLEAR, BLOCKED or UNDECIDED; reason, and point, of what is not clear.
@@ -249,16 +279,24 @@ def divide(tissue, breath, rigid, points, arc, sections, target, tolerance, ampl
     for n in range(FIRST_STRETCHES - 1, -1, -1):
         stack[top, 0], stack[top, 1], stack[top, 2] = n / FIRST_STRETCHES, (n + 1) / FIRST_STRETCHES, -1.0
         top += 1
-    count, last = 0, points.shape[0] - 1
+    count, last, exit_at = 0, points.shape[0] - 1, 0
+    for s in range(sections.shape[0]):
+        if sections[s, KIND] <= BEFORE_WALL:
+            exit_at = int(sections[s, END])
     while top > 0:
         top -= 1
         begin, end, suspect = stack[top, 0], stack[top, 1], int(stack[top, 2])
         stretch = stretch_between(rigid, amplitude, reference, begin, end)
         miss, change = miss_of_target(breath, rigid, stretch, points[last], target)
+        shift, shifts = miss_of_target(breath, rigid, stretch, hole, hole)
         state, reason, at = CLEAR, 0, -1
         if not miss + change <= tolerance:
             state, reason, at = UNDECIDED, TARGET_MISSED, last
             if miss - change > tolerance:
+                state = BLOCKED
+        elif not shift + shifts <= hole_limit:
+            state, reason, at = UNDECIDED, HOLE_SHIFTS, exit_at
+            if shift - shifts > hole_limit:
                 state = BLOCKED
         else:
             at, reason = refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect)
@@ -269,11 +307,11 @@ def divide(tissue, breath, rigid, points, arc, sections, target, tolerance, ampl
                     state = BLOCKED
         if state == UNDECIDED and end - begin > LEAST_WIDTH:
             middle = 0.5 * (begin + end)
-            behind_wall = reason != TARGET_MISSED and reason != LEAVES_LUMEN
-            if behind_wall and sections[_row_of(sections, at), KIND] <= BEFORE_WALL:
+            of_point = reason != TARGET_MISSED and reason != HOLE_SHIFTS
+            if of_point and reason != LEAVES_LUMEN and sections[_row_of(sections, at), KIND] <= BEFORE_WALL:
                 suspect = -1  # A place where the tube is free may yet make it count no more.
             else:
-                suspect = -1 if reason == TARGET_MISSED else at
+                suspect = at if of_point else -1
             stack[top, 0], stack[top, 1], stack[top, 2] = middle, end, suspect
             stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = begin, middle, suspect
             top += 2

@@ -23,7 +23,9 @@ def info(
     *,
     out: Annotated[
         Path | None,
-        Parameter(help="Folder for tree.png, a picture of the airway tree; for a liver organ.png."),
+        Parameter(
+            help="Folder for tree.png, a picture of the airway tree, and motion.png; for a liver organ.png."
+        ),
     ] = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
@@ -38,7 +40,7 @@ def info(
         terminal.show_warnings(lung.warnings)
     if out is not None:
         from anatomy.lung import Lung
-        from lungaccess.report import organ_png, tree_png
+        from lungaccess.report import motion_png, organ_png, tree_png
 
         if isinstance(lung, Lung):
             what, picture = "tree", tree_png(lung, out / "tree.png")
@@ -46,6 +48,10 @@ def info(
             what, picture = "organ", organ_png(lung, out / "organ.png")
         if not output.json:
             terminal.say(f"Picture of the {what}: {picture}")
+        if isinstance(lung, Lung) and lung.motion is not None:
+            picture = motion_png(lung, out / "motion.png")
+            if not output.json:
+                terminal.say(f"Picture of the breathing: {picture}")
     return ExitCode.OK
 
 

@@ -11,6 +11,7 @@ from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.grid import Volume, freeze_arrays
 from anatomy.morphology import Window, bounds, window
 from anatomy.records import frozen_record
+from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.local_minima import local_minima_map
 from anatomy.typed import Array, Float, Int16, Mask
@@ -23,6 +24,9 @@ BOX_MARGIN_MM = 3.0
 """More than the wall reaches beyond the lumen."""
 EDGE_MM = 3.0
 """How far the wall may lie from the rough central airway."""
+AROUND_MM, WIDE_MM = 15.0, 2.0
+"""So near to it, air in which a ball of this radius fits belongs to it: the middle of a trachea has no walls
+around it to be seen by, and the tissue of the lung is nowhere so dark."""
 SMOOTH_MM = 0.6
 """Standard deviation of the smoothing that tells a dark voxel from noise."""
 NOISE_PERCENTILE = 97.0
@@ -133,14 +137,18 @@ def _smoothed(hu: Int16, spacing_mm: Float) -> Int16:
 
 
 def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
-    """Return the air of trachea and main bronchi up to their walls, the piece with the seed."""
+    """Return the air of trachea and wide bronchi up to their walls, the piece with the seed."""
     from scipy import ndimage
 
     air = ground.smooth < ground.dark_hu
     certain = rough & air
     reach = int(np.ceil(EDGE_MM / ground.spacing_mm.min()))
-    inner = window(*bounds(certain, reach))
-    certain[inner] = ndimage.binary_dilation(certain[inner], iterations=reach, mask=air[inner])
+    inner = window(*bounds(certain, np.ceil(AROUND_MM / ground.spacing_mm).astype(np.int64)))
+    wide = distance_mm(air[inner].T, ground.spacing_mm[::-1]).T >= WIDE_MM
+    pieces, count = ndimage.label(wide | certain[inner])
+    kept = np.bincount(pieces.ravel(), weights=certain[inner].ravel(), minlength=count + 1) > 0
+    kept[0] = False
+    certain[inner] = ndimage.binary_dilation(kept[pieces], iterations=reach, mask=air[inner])
     labels, _ = ndimage.label(certain)
     label = int(labels[seed]) if all(0 <= n < m for n, m in zip(seed, labels.shape, strict=True)) else 0
     if label == 0:

@@ -34,6 +34,9 @@ SKIN_SHARE = 0.5
 EDGE_MM = 1.2
 """The edge of a lumen is blurred over about so much."""
 
+GAP_MM = 3.0
+"""Gaps in the open lumen are as thick as a slice: none accepted without a word is thicker."""
+
 WALL_LEAST_HU = -600.0
 """T_abs of the paper: what is darker is lung or air, not wall."""
 WALL_DIFFERENCE_HU = 10.0
@@ -138,7 +141,7 @@ def grow(ground: Ground, start: Mask) -> Grown:
 def _to_its_edge(
     ground: Ground, hu: Int16, smooth: Int16, state: UInt8, shape: Int, grown: Int
 ) -> tuple[Int, int]:
-    """Bring the lumen in `state` to its edge.
+    """Bring the lumen in `state` to its edge, and fill its gaps.
 
     All arrays are padded and flat.  Returns its voxels and their count.
     """
@@ -154,6 +157,8 @@ def _to_its_edge(
         count = lumen_edge.refine_edge(
             hu, state, faces, int(shape[2]), int(ground.least_depth), lumen, count, core_hu
         )
+    reach = np.ceil(GAP_MM / ground.spacing_mm).astype(np.int64) + 1
+    count = lumen_edge.fill_gaps(smooth, state, shape, reach, ground.dark_hu, lumen, count)
     return lumen, int(count)
 
 

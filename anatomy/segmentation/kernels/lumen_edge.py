@@ -103,6 +103,38 @@ def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
 
 
 @numba.njit(cache=True)
+def fill_gaps(hu, state, shape, reach, dark_hu, lumen, count):
+    """Add to the lumen what lies between two of its voxels along an axis and is as dark as air on average.
+
+    Slices with noise or streaks leave such gaps in the open lumen.  `shape` and `reach` are (3,) int64: at
+    most `reach - 1` voxels are bridged along each axis, none beyond the image.  Returns the new count.
+    """
+    s = 0
+    filled = -1
+    while s < count or count > filled:
+        if s == count:
+            filled, s = count, 0
+        step = 1
+        for axis in range(2, -1, -1):
+            room = shape[axis] - lumen[s] // step % shape[axis]
+            total = 0.0
+            for n in range(1, min(reach[axis] + 1, room)):
+                at = lumen[s] + n * step
+                if state[at] != LUMEN:
+                    total += hu[at]
+                    continue
+                if n > 1 and total < dark_hu * (n - 1):
+                    for m in range(1, n):
+                        state[lumen[s] + m * step] = LUMEN
+                        lumen[count] = lumen[s] + m * step
+                        count += 1
+                break
+            step *= shape[axis]
+        s += 1
+    return count
+
+
+@numba.njit(cache=True)
 def join_corners(hu, state, shape, lumen, count):
     """Add the darkest voxels between voxels of the lumen that touch by an edge or corner alone.
 

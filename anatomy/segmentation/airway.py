@@ -95,11 +95,12 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     depth = local_minima_map(hu, spacing_mm, upright)
     rough = np.ascontiguousarray(lungs.central_airway[box].T)
     sample = lung.reshape(-1)[::SAMPLE_STEP]
-    tissue_hu = np.median(smooth.reshape(-1)[::SAMPLE_STEP][sample])
-    dark_hu = float(np.median(smooth[rough]) + tissue_hu) / 2
+    lung_hu = float(np.median(smooth.reshape(-1)[::SAMPLE_STEP][sample]))
+    dark_hu = (float(np.median(smooth[rough])) + lung_hu) / 2
     noise = float(np.percentile(depth.reshape(-1)[::SAMPLE_STEP][sample], NOISE_PERCENTILE))
     ground = Ground(
         hu=hu,
+        lung_hu=lung_hu,
         dark_hu=dark_hu,
         smooth=smooth,
         depth=depth,

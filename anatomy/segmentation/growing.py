@@ -64,8 +64,8 @@ class Ground:
         Where thin airways may go on.
     spacing_mm : (3,) float64
         Voxel size along these axes.
-    dark_hu : float
-        Half-way between air and the tissue of the lung.
+    lung_hu, dark_hu : float
+        The tissue of the lung, and half-way between air and it.
     least_depth : float
         Shallower minima are noise.
     """
@@ -75,6 +75,7 @@ class Ground:
     depth: Int16
     lung: Mask
     spacing_mm: Float
+    lung_hu: float
     dark_hu: float
     least_depth: float
 
@@ -145,17 +146,14 @@ def _to_its_edge(
 
     All arrays are padded and flat.  Returns its voxels and their count.
     """
-    near, faces = box_offsets(shape, 1), face_offsets(shape)
-    count = len(grown)
+    faces, count = face_offsets(shape), len(grown)
     # A voxel joins a list once, when its state changes: no list can be longer than the image.  Memory that
     # is not written to is not taken.
     lumen = np.zeros(state.size, dtype=np.int64)
     lumen[:count] = grown
-    core_hu = np.zeros(state.size, dtype=np.int16)
-    lumen_edge.darkest_beside(smooth, state, near, lumen, count, core_hu)
     for _ in range(max(round(EDGE_MM / float(ground.spacing_mm.mean())), 1)):
         count = lumen_edge.refine_edge(
-            hu, state, faces, int(shape[2]), int(ground.least_depth), lumen, count, core_hu
+            hu, state, faces, int(shape[2]), int(ground.least_depth), ground.lung_hu, lumen, count
         )
     reach = np.ceil(GAP_MM / ground.spacing_mm).astype(np.int64) + 1
     count = lumen_edge.fill_gaps(smooth, state, shape, reach, ground.dark_hu, lumen, count)

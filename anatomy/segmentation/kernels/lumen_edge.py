@@ -15,7 +15,8 @@ from anatomy.segmentation.kernels.states import LUMEN
 
 WALL = np.uint8(2)
 REPLACING_HU = np.int16(0)
-"""r: what the lumen is painted with before it is closed."""
+"""r: what the lumen is painted with before it is closed; a thick wall has it, too."""
+AIR_HU = -1000.0
 
 
 @numba.njit(cache=True)
@@ -48,24 +49,14 @@ def cross(n, row):
 
 
 @numba.njit(cache=True)
-def darkest_beside(hu, state, near, lumen, count, core_hu):
-    """Write for every voxel of the lumen the lowest HU among it and its neighbours in the lumen."""
-    for s in range(count):
-        least = hu[lumen[s]]
-        for d in near:
-            if state[lumen[s] + d] == LUMEN:
-                least = min(least, hu[lumen[s] + d])
-        core_hu[s] = least
+def refine_edge(hu, state, faces, row, least_depth, lung_hu, lumen, count):
+    """Add the voxels beside the lumen that lie on its side of the wall's inner surface.
 
-
-@numba.njit(cache=True)
-def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
-    """Add the voxels beside the lumen that are nearer to its HU than to those of the closing around them.
-
-    A voxel joins if the closing with painted lumen lies at least `least_depth` above it, and farther above
-    it than it lies above the core of the lumen beside it, `core_hu`, which it then shares.  All voxels are
-    judged before the first one joins.  None of the border does if `least_depth` is positive: there the
-    closing is not above -1024 HU.
+    The closing with painted lumen tells how bright the wall appears.  A voxel joins if it lies at least
+    `least_depth` below that, and below the HU that the inner surface has: half-way from air to a wall that
+    appears as bright as tissue, and the nearer to the peak the fainter the wall appears, because a thin wall
+    is blurred into the lung behind it.  All voxels are judged before the first one joins.  None of the border
+    does if `least_depth` is positive: there the closing is not above -1024 HU.
 
     Parameters
     ----------
@@ -77,13 +68,21 @@ def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
         Flat step from one row of a slice to the next.
     least_depth : int
         HU.
-    lumen, core_hu : (V,) int64, int16
-        Their first `count` entries list the lumen and the HU of its core; what joins follows.
+    lung_hu : float
+        Tissue of the lung.
+    lumen : (V,) int64
+        Its first `count` entries list the lumen; what joins follows.
 
     Returns
     -------
     int
         The new count.
+
+    Notes
+    -----
+    A wall of the thickness w and 0 HU between air and lung, blurred by a Gaussian of sigma, has at its inner
+    surface the share 0.93, 0.86, 0.76, 0.68, 0.57 of the way from air to its peak for w = 0.5, 1, 1.5, 2, 3
+    sigma.  `1 - (peak - lung) / (2 (0 - lung))` gives 0.94, 0.84, 0.74, 0.67, 0.57.
     """
     known = count
     for s in range(known):
@@ -91,10 +90,10 @@ def refine_edge(hu, state, faces, row, least_depth, lumen, count, core_hu):
             at = lumen[s] + d
             if state[at] != 0:
                 continue
-            depth = np.int32(closing_at(hu, state, at, row)) - hu[at]
-            if depth >= least_depth and depth > np.int32(hu[at]) - core_hu[s]:
+            peak = np.float64(closing_at(hu, state, at, row))
+            share = min(max(1.0 - 0.5 * (peak - lung_hu) / (REPLACING_HU - lung_hu), 0.5), 1.0)
+            if peak - hu[at] >= least_depth and hu[at] - AIR_HU < share * (peak - AIR_HU):
                 lumen[count] = at
-                core_hu[count] = core_hu[s]
                 count += 1
                 state[at] = WALL
     for s in range(known, count):

@@ -7,6 +7,7 @@ import pytest
 
 from anatomy.segmentation.growing import AIR_HU, WALL_MM, Ground, Grown, grow
 from anatomy.segmentation.kernels.growing import rings_of
+from anatomy.segmentation.kernels.lumen_edge import fill_gaps
 from anatomy.typed import Mask
 
 OLD_ROOM = 128
@@ -24,6 +25,7 @@ def ground(shape: tuple[int, int, int], spacing_mm: float, hu: int, hole: tuple[
         depth=np.zeros(shape, dtype=np.int16),
         lung=np.zeros(shape, dtype=np.bool_),
         spacing_mm=np.full(3, spacing_mm),
+        lung_hu=-850.0,
         dark_hu=-900.0,
         least_depth=20.0,
     )
@@ -72,3 +74,28 @@ def test_rings_of_a_piece_are_one_less_its_euler_characteristic(share: float) ->
     voxels = np.flatnonzero(state)
     rings = rings_of(state.reshape(-1), np.array(state.shape), np.uint8(1), voxels, len(voxels))
     assert rings == 1 - euler_number(state > 0, connectivity=3)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_gap_of_a_slice_is_filled_where_it_is_air_alone(axis: int) -> None:
+    """Two slices across an open lumen are air by their HU, though the map of minima does not show them."""
+    hu = np.full((20, 20, 20), TISSUE_HU, dtype=np.int16)
+    lumen = np.zeros(hu.shape, dtype=np.bool_)
+    tube = [slice(8, 13)] * 3
+    tube[axis] = slice(3, 17)
+    lumen[tuple(tube)] = True
+    gap = [slice(None)] * 3
+    gap[axis] = slice(9, 11)
+    hole = np.zeros_like(lumen)
+    hole[tuple(gap)] = True
+    hole &= lumen
+    for between_hu, filled in ((AIR_HU + 60, True), (-500, False)):
+        hu[lumen] = AIR_HU
+        hu[hole] = between_hu
+        state, listed = (lumen & ~hole).astype(np.uint8), np.zeros(hu.size, dtype=np.int64)
+        known = np.flatnonzero(state)
+        listed[: len(known)] = known
+        reach, shape = np.full(3, 5), np.array(hu.shape)
+        count = fill_gaps(hu.reshape(-1), state.reshape(-1), shape, reach, -900.0, listed, len(known))
+        np.testing.assert_array_equal(state > 0, lumen if filled else lumen & ~hole)
+        assert count == np.count_nonzero(state) and len(set(listed[:count])) == count

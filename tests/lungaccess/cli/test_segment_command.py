@@ -59,6 +59,7 @@ def test_a_ct_becomes_a_patient_that_info_reads(
     assert both == pytest.approx(truth_l, rel=0.03)
     assert quality["airway"]["ends"] >= 10
     assert len(load_patient(out).targets_lps) == 1
+    assert "large_radius_mm = 2.828\n" in (out / "patient.toml").read_text()
     assert cli.main(["info", str(out), "--cache", str(tmp_path / "cache")]) == ExitCode.OK
 
 
@@ -71,6 +72,13 @@ def test_the_second_run_says_that_nothing_was_to_do(
     assert cli.main(words) == ExitCode.OK
     assert "all was up to date" in _one_line(capsys.readouterr().out)
     assert not (tmp_path / "patient" / "segmentation.png").exists()
+
+
+def test_a_radius_that_no_scale_tells_is_refused(
+    ct_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(ct_file), "--out", str(tmp_path / "patient"), "--large-radius-mm", "0.5"]
+    assert "1 to 4 mm" in _refused(capsys, *words)
 
 
 def test_planning_on_thick_slices_must_be_allowed(

@@ -23,7 +23,7 @@ from anatomy.lobes import LOBES
 from anatomy.phantom import make_phantom
 from anatomy.phantom.patient import Size
 from anatomy.records import frozen_record
-from anatomy.segmentation.airway import segment_airway
+from anatomy.segmentation.airway import Airways, segment_airway
 from anatomy.segmentation.airway_warnings import tree_or_error
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.lobes import FISSURES, OF_LUNG, SEEN, Lobes, segment_lobes
@@ -39,7 +39,8 @@ SPACING_MM, COARSE_MM = 0.8, 1.25
 MISSING_SHARES = (0.0, 0.2, 0.4, 0.6)
 """Share of the fissures that is left out, from the hilum outwards, where they are incomplete most often."""
 WITH_LOBES = "med-rad-respiratory/Patient2"
-"""A patient with masks of the lobes, from which fissures are drawn."""
+"""A patient with masks of the lobes, from which fissures are drawn.  The trachea lies above the tissue that
+is drawn around the lungs, so that the airways are those of the masks."""
 
 
 @frozen_record
@@ -47,7 +48,8 @@ class Case:
     """A rendered CT and its truth.
 
     `fissures_lps` are points (N, 3) on the fissures; `lobes` `(ni, nj, nk)` is 0 everywhere where they are
-    not known; `drawn` is the share of each fissure that the CT shows, if that is known.
+    not known; `drawn` is the share of each fissure that the CT shows, if that is known.  Airways are
+    segmented like the rest if they are None.
     """
 
     name: str
@@ -55,6 +57,7 @@ class Case:
     fissures_lps: Float
     lobes: Array
     drawn: Mapping[str, float]
+    airways: Airways | None = None
 
 
 def phantom_case(seed: int, missing: float, look: CtLook, size: Size = "adult") -> Case:
@@ -102,6 +105,7 @@ def patient_case(part: str, look: CtLook) -> Case:
         fissures_lps=images.grid.lps(np.argwhere(sheet)),
         lobes=lobes,
         drawn={},
+        airways=Airways(lumen=made.lumen, wall=made.wall) if look.convex else None,
     )
 
 
@@ -119,7 +123,7 @@ def segmented(case: Case) -> tuple[Lobes, Mask, float]:
     """Return the lobes of a CT, its lungs, and the CPU time of the lobes alone in s."""
     ct = case.made.ct
     lungs = segment_lungs(ct)
-    airways = segment_airway(ct, lungs)
+    airways = case.airways or segment_airway(ct, lungs)
     vessels = segment_vessels(ct, lungs.mask, airways)
     began = time.process_time()
     tree = tree_or_error(Volume(grid=ct.grid, array=airways.lumen))
@@ -199,7 +203,7 @@ def main() -> None:
         add_rows(result, phantom_case(options.seed + 1, 0.0, coarse))
     add_rows(result, phantom_case(options.seed + 2, 0.0, coarse, "small"))
     for name in options.patients:
-        add_rows(result, patient_case(name, look))
+        add_rows(result, patient_case(name, replace(look, convex=name == WITH_LOBES)))
     print(write_result(result, options.results))
 
 

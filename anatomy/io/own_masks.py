@@ -71,6 +71,9 @@ class PatientFile:
     accepted: Annotated[
         tuple[str, ...], _key("Checks of the segmentation that failed and were overruled by --accept")
     ] = ()
+    sources: Annotated[
+        Mapping[str, str], _key("What other programs made of the masks, and the files they were in")
+    ] = Field(default_factory=dict)
     motion: Annotated[MotionFile | None, _key("How the lungs breathe")] = None
 
 
@@ -112,7 +115,12 @@ def load_own_masks(description: Path) -> PatientImages:
         breath_hold=keys.breath_hold or None,
         motion=motion,
         sources=hashes,
-        warnings=(*_thick_slices(keys.thick_slices_mm), *_accepted(keys.accepted), *keys.warnings),
+        warnings=(
+            *_thick_slices(keys.thick_slices_mm),
+            *_accepted(keys.accepted),
+            *_from_elsewhere(keys.sources),
+            *keys.warnings,
+        ),
     )
 
 
@@ -147,6 +155,13 @@ def _accepted(names: tuple[str, ...]) -> tuple[str, ...]:
         f"The segmentation failed its check of {', '.join(names)}, and a person accepted that: look at the "
         "masks before planning.",
     )
+
+
+def _from_elsewhere(sources: Mapping[str, str]) -> tuple[str, ...]:
+    if not sources:
+        return ()
+    words = "; ".join(f"{name.replace('_', ' ')} from {source}" for name, source in sources.items())
+    return (f"Masks of other programs or people took the place of steps of the segmentation: {words}.",)
 
 
 def _read_description(path: Path) -> PatientFile:

@@ -86,14 +86,22 @@ def mask_sources(folder: Path, label_map: Path | None = None) -> tuple[list[Mask
     sources: list[MaskSource] = []
     statements: list[str] = []
     for path in images_in(folder):
-        if path == label_map or image_stem(path) == "lung_vessels" or image_stem(path) not in ROLES:
-            names, statement = _label_names(path, must_have=path == label_map)
-            sources += _named_sources(path, names)
-            statements += statement
-        else:
-            stem = image_stem(path)
-            sources.append(MaskSource(role=ROLES[stem], path=path, lobe=_lobe(stem)))
+        of_file, said = file_sources(path, is_label_map=path == label_map)
+        sources += of_file
+        statements += said
     return sources, statements
+
+
+def file_sources(path: Path, *, is_label_map: bool = False) -> tuple[list[MaskSource], list[str]]:
+    """Return the masks of one file, which is named after a structure or has labels that are.
+
+    Nothing is returned for a file that names no structure, unless `is_label_map` says that it must.
+    """
+    stem = image_stem(path)
+    if is_label_map or stem == "lung_vessels" or stem not in ROLES:
+        names, statement = _label_names(path, must_have=is_label_map)
+        return _named_sources(path, names), statement
+    return [MaskSource(role=ROLES[stem], path=path, lobe=_lobe(stem))], []
 
 
 def _label_names(path: Path, *, must_have: bool) -> tuple[dict[int, str], list[str]]:

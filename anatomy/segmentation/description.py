@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 from anatomy.io.files import sha256, write_text
 from anatomy.lobes import LOBES
@@ -44,21 +46,26 @@ class Description:
 
 def description_text(
     name: str,
+    *,
     has_nodule: bool,
-    fissure_warnings: tuple[str, ...] | None,
+    lobes: Sequence[int],
+    has_fissures: bool,
+    warnings: tuple[str, ...],
     target_lps: Float | None,
     thick_slices_mm: float,
     accepted: tuple[str, ...] = (),
     large_radius_mm: float = 0.0,
+    sources: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
     """Return the `patient.toml` of a segmentation.
 
-    An empty name is left out; `fissure_warnings` is what to say of the fissures, or None where they are not
-    known; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that were accepted
-    although they are thick, else 0; `accepted` are checks that failed and were overruled; `large_radius_mm`,
-    from which vessels are obstacles, is 0 if a given mask says what they are.
+    An empty name is left out; `lobes` are the numbers of those that are known, and `warnings` what to say of
+    them; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that were accepted
+    although they are thick, else 0; `accepted` are checks that failed and were overruled; `sources` tells
+    what images were taken from elsewhere, by their names; `large_radius_mm`, from which vessels are
+    obstacles, is 0 if a given mask says what they are.
     """
-    lines = [f"name = {json.dumps(name, ensure_ascii=False)}"] if name else []
+    lines = [f"name = {_quoted(name)}"] if name else []
     lines += [
         'lumen = "airway.nii.gz"',
         'wall = "airway_wall.nii.gz"',
@@ -66,11 +73,13 @@ def description_text(
         'lung = "lungs.nii.gz"',
         'cost = "cost.nii.gz"',
     ]
-    if fissure_warnings is not None:
-        lobes = (f'"{name}" = "lobes.nii.gz#{number}"' for number, name in LOBES.items())
-        lines += ['fissures = "fissures.nii.gz"', f"lobes = {{ {', '.join(lobes)} }}"]
-    if fissure_warnings:
-        lines.append(f"warnings = {json.dumps(list(fissure_warnings))}")
+    if has_fissures:
+        lines.append('fissures = "fissures.nii.gz"')
+    if lobes:
+        files = (f'"{LOBES[number]}" = "lobes.nii.gz#{number}"' for number in lobes)
+        lines.append(f"lobes = {{ {', '.join(files)} }}")
+    if warnings:
+        lines.append(f"warnings = {_quoted(list(warnings))}")
     if has_nodule:
         lines.append('nodule = "nodule.nii.gz"')
     if target_lps is not None:
@@ -80,5 +89,11 @@ def description_text(
     if large_radius_mm:
         lines.append(f"large_radius_mm = {large_radius_mm:.3f}")
     if accepted:
-        lines.append(f"accepted = {json.dumps(list(accepted))}")
+        lines.append(f"accepted = {_quoted(list(accepted))}")
+    if sources:
+        lines.append(f"sources = {{ {', '.join(f'{key} = {_quoted(v)}' for key, v in sources.items())} }}")
     return "\n".join(lines) + "\n"
+
+
+def _quoted(value: str | list[str]) -> str:
+    return json.dumps(value, ensure_ascii=False)

@@ -24,6 +24,7 @@ CHECKS: Mapping[str, str] = MappingProxyType(
         "one-lung": "there are two lungs",
         "volume": "the lungs are as large as lungs can be",
         "density": "the lungs are as dense as lungs can be",
+        "masks": "masks from elsewhere lie on what they show in the CT",
     }
 )
 """What is checked, by the name that `--accept` takes."""

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+
 import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
+from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.sides import grow_sides
-from anatomy.typed import Array, Int32, Mask, UInt8
+from anatomy.typed import Array, Float, Int32, Mask, UInt8
 
 RIGHT, LEFT = 1, 2
-_LOBES_RIGHT, _LOBES_LEFT = (3, 4, 5), (1, 2)
-"""Labels of lungmask's model of lobes: 1, 2 left upper and lower; 3, 4, 5 right upper, middle, lower."""
+NUMBERINGS: Mapping[str, tuple[int, ...]] = MappingProxyType(
+    {
+        "our own": (RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER),
+        "lungmask": (LEFT_UPPER, LEFT_LOWER, RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER),
+    }
+)
+"""The lobes that the labels 1 to 5 mean: of this program, and of lungmask's model LTRCLobes (0.2)."""
+FIRST_OF_TOTAL = 10
+"""TotalSegmentator's task total (2.x) has the lobes in the order of lungmask, from this label on."""
 
 
 def lung_labels(left: Mask, right: Mask) -> UInt8:
@@ -27,14 +38,14 @@ def lung_labels(left: Mask, right: Mask) -> UInt8:
 def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
     """Return the left and the right lung of a label map or mask.
 
-    The values may be 1 right, 2 left (lungmask, and our own files); 1 to 5 for the lobes (lungmask
-    LTRCLobes); or one value for both lungs, which are then told apart by their shape.  One lung alone is the
+    The values may be 1 right, 2 left (lungmask, and our own files); those of lobes, see `lobe_numbers`; or
+    one value for both lungs, which are then told apart by their shape.  One lung alone is the
     left one if its value is 2, else the right one.
 
     Raises
     ------
     AnatomyError
-        If there is no lung, or other values occur.
+        If there is no lung, other values occur, or they are on the wrong side.
     """
     values = {float(v) for v in np.unique(volume.array)} - {0.0}
     if not values:
@@ -44,9 +55,17 @@ def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
             remedy="Give another mask with --lungs, or leave the option out",
         )
     if values == {RIGHT, LEFT}:
-        return volume.array == LEFT, volume.array == RIGHT
-    if values <= {1, 2, 3, 4, 5} and len(values) > 2:
-        return np.isin(volume.array, _LOBES_LEFT), np.isin(volume.array, _LOBES_RIGHT)
+        left, right = volume.array == LEFT, volume.array == RIGHT
+        if _middles(volume.grid, (left, right))[0, 0] < _middles(volume.grid, (left, right))[1, 0]:
+            raise AnatomyError(
+                f"{name} has label 1, the right lung, on the patient's left",
+                expected="1 right and 2 left lung, as lungmask writes them, and a header that fits",
+                remedy="Check whether the mask is mirrored, or exchange the labels",
+            )
+        return left, right
+    if values <= set(range(1, FIRST_OF_TOTAL + 5)) and len(values) > 2:
+        sides = sides_of_lobes(lobe_numbers(volume, name))
+        return sides == LEFT, sides == RIGHT
     if len(values) == 1:
         left, right = split_sides(np.asfortranarray(volume.array != 0), volume.grid)
         return (right, left) if values == {LEFT} and not left.any() else (left, right)
@@ -55,6 +74,64 @@ def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
         expected="1 right and 2 left lung, lobes 1 to 5, or one value for both lungs",
         remedy="Export the lungs again as one of these",
     )
+
+
+def sides_of_lobes(lobes: Array) -> UInt8:
+    """Return the label map of the lungs that lobes `(ni, nj, nk)` by our own numbers make up."""
+    return lung_labels(lobes >= LEFT_UPPER, (lobes > 0) & (lobes <= RIGHT_LOWER))
+
+
+def lobe_numbers(volume: Volume, name: str) -> UInt8:
+    """Return lobes by the numbers of `anatomy.lobes.LOBES`.
+
+    Labels are 1 to 5 by one of `NUMBERINGS`, or 10 to 14 of TotalSegmentator's task total.  Which one it is,
+    is told by where the lobes lie: right ones on the right, and upper ones above lower ones.
+
+    Raises
+    ------
+    AnatomyError
+        If other values occur, or the lobes lie as in none of these.
+    """
+    values = sorted({int(v) for v in np.unique(volume.array)} - {0})
+    first = FIRST_OF_TOTAL if values and values[0] >= FIRST_OF_TOTAL else 1
+    fitting: tuple[int, ...] = ()
+    if len(values) >= 2 and first <= values[0] and values[-1] <= first + 4:
+        middles = _middles(volume.grid, [volume.array == value for value in values])
+        known = (NUMBERINGS["lungmask"],) if first > 1 else tuple(NUMBERINGS.values())
+        lobes = [[numbering[value - first] for value in values] for numbering in known]
+        fitting = next((n for n, each in zip(known, lobes, strict=True) if _fits(each, middles)), ())
+    if not fitting:
+        raise AnatomyError(
+            f"{name} holds the values {values[:9]}, which lie as the lobes of no known numbering do",
+            expected="1 to 5 as this program or lungmask numbers them, or 10 to 14 of TotalSegmentator, with "
+            "right lobes on the right and upper ones above lower ones",
+            remedy="Check whether the mask is mirrored or upside down, and name its labels after their lobes",
+        )
+    table = np.zeros(first + 5, dtype=np.uint8)
+    table[first:] = fitting
+    return np.asfortranarray(table[volume.array.astype(np.int64)])
+
+
+def _fits(lobes: list[int], middles: Float) -> bool:
+    """Tell whether lobes lie where they belong, `middles` `(N, 3)` being LPS mm."""
+    at = dict(zip(lobes, middles, strict=True))
+    right = [place[0] for lobe, place in at.items() if lobe <= RIGHT_LOWER]
+    left = [place[0] for lobe, place in at.items() if lobe > RIGHT_LOWER]
+    above = [
+        at[upper][2] > at[lower][2]
+        for upper, lower in ((RIGHT_UPPER, RIGHT_LOWER), (LEFT_UPPER, LEFT_LOWER))
+        if upper in at and lower in at
+    ]
+    return all(above) and max(right, default=-np.inf) < min(left, default=np.inf)
+
+
+def _middles(grid: Grid, masks: Iterable[Mask]) -> Float:
+    """Return the middle of each mask, LPS mm, `(N, 3)`."""
+    found = []
+    for mask in masks:
+        lines = [mask.sum(axis=axes) for axes in ((1, 2), (0, 2), (0, 1))]
+        found.append([float(np.average(np.arange(len(line)), weights=line)) for line in lines])
+    return np.asarray(grid.lps(np.array(found)))
 
 
 def split_sides(mask: Mask, grid: Grid) -> tuple[Mask, Mask]:

@@ -98,10 +98,8 @@ def segment_lobes(
         nothing = np.zeros(ct.grid.shape, dtype=np.uint8, order="F")
         said = f"Lobes and fissures are not known, because the airway gives no tree: {tree.found}"
         return Lobes(lobes=nothing, fissures=nothing, seen={}, warnings=(said,))
-    cubic = Cubic.over(ct.grid)
+    cubic, sheets = _sheets(ct, lungs, airways, vessels)
     masks = {"right": cubic.sampled(lungs.right), "left": cubic.sampled(lungs.left)}
-    barred = cubic.sampled(vessels | airways.lumen | airways.wall)
-    sheets = fissureness(cubic.mean(ct.array), masks["right"] | masks["left"], barred)
     found, vessel, warnings = np.zeros(cubic.shape, dtype=np.uint8), cubic.sampled(vessels), []
     for side, mask in masks.items():
         if not mask.any():
@@ -122,7 +120,14 @@ def segment_lobes(
                 f"The lobes of the {side} lung are not known: its oblique fissure is seen on {share:.0%} of "
                 "what would be its course."
             )
-    lobes = cubic.back(found) * (lungs.right | lungs.left)
+    lobes = cubic.back(found)
+    lobes *= np.where(lobes >= LEFT_UPPER, lungs.left, lungs.right)
+    return _with_fissures(lobes, seen, sheets, cubic, warnings)
+
+
+def _with_fissures(
+    lobes: UInt8, seen: dict[str, float], sheets: Fissureness, cubic: Cubic, warnings: list[str]
+) -> Lobes:
     for name, share in seen.items():
         if share < LEAST_SEEN:
             warnings.append(
@@ -131,6 +136,21 @@ def segment_lobes(
     near = cubic.back(_grown(sheets.seen, SEEN_WITHIN_VOXELS))
     fissures = np.where(near, np.uint8(SEEN), np.uint8(BORDER)) * fissures_between(lobes)
     return Lobes(lobes=lobes, fissures=fissures, seen=seen, warnings=tuple(warnings))
+
+
+def confirmed_lobes(ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask, lobes: UInt8) -> Lobes:
+    """Return lobes from elsewhere with the fissures between them, and how much of these the CT shows.
+
+    The parameters are those of `segment_lobes`, and lobes `(ni, nj, nk)` by our own numbers.
+    """
+    cubic, sheets = _sheets(ct, lungs, airways, vessels)
+    return _with_fissures(lobes, _seen_shares(cubic.sampled(lobes), sheets), sheets, cubic, [])
+
+
+def _sheets(ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask) -> tuple[Cubic, Fissureness]:
+    cubic = Cubic.over(ct.grid)
+    barred = cubic.sampled(vessels | airways.lumen | airways.wall)
+    return cubic, fissureness(cubic.mean(ct.array), cubic.sampled(lungs.mask), barred)
 
 
 def lobes_given(lobes: UInt8, fissures: UInt8 | None) -> dict[str, UInt8]:

@@ -20,8 +20,9 @@ from anatomy.segmentation.folder import SegmentationFolder, digest_of, grid_dige
 from anatomy.segmentation.gate import require_known_checks
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
 from anatomy.segmentation.nodules import centre_of
+from anatomy.segmentation.parts import Parts
 from anatomy.segmentation.request import SegmentationRequest
-from anatomy.segmentation.steps import VERSION, Parts, Steps
+from anatomy.segmentation.steps import VERSION, Steps
 from anatomy.segmentation.vessels import require_large_radius
 from anatomy.typed import Float
 
@@ -35,14 +36,16 @@ BYTES_PER_VOXEL = 40
 class Segmentation:
     """What a segmentation wrote; all images lie on the voxels of one `Box`, in the order of `canonical`.
 
-    Steps not in `recomputed` were up to date; `corrected` images are a person's; `kept_description` tells
-    whether an edited `patient.toml` was kept.
+    Steps not in `recomputed` were up to date; `corrected` images are a person's; `from_elsewhere` tells
+    what images were given or made by a network, and from what; `kept_description` whether an edited
+    `patient.toml` was kept.
     """
 
     folder: Path
     parts: Parts
     recomputed: tuple[str, ...]
     corrected: tuple[str, ...]
+    from_elsewhere: Mapping[str, str]
     kept_description: bool
     warnings: tuple[str, ...]
 
@@ -101,17 +104,27 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     folder.save(provenance=_provenance(request, steps, warnings))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
     sides = [side for side in (parts.left, parts.right) if side.any()]
-    known = all(parts.lobes[side].any() for side in sides)
-    said = tuple(folder.facts("lobes").get("warnings", ())) if known else None
+    known = all(np.count_nonzero(parts.lobes[side]) > 0.5 * np.count_nonzero(side) for side in sides)
     large_mm = 0.0 if "vessels" in steps.given_names else request.large_radius_mm
+    said = tuple(folder.facts("lobes").get("warnings", ())) if known else ()
     text = description_text(
-        request.name, bool(parts.nodule.any()), said, target, thick_mm, steps.accepted, large_mm
+        request.name,
+        has_nodule=bool(parts.nodule.any()),
+        lobes=np.unique(parts.lobes[parts.lobes > 0]).tolist() if known else [],
+        has_fissures=bool(parts.fissures.any()) and (known or "fissures" in steps.from_elsewhere),
+        warnings=said,
+        target_lps=target,
+        thick_slices_mm=thick_mm,
+        accepted=steps.accepted,
+        large_radius_mm=large_mm,
+        sources=steps.from_elsewhere,
     )
     return Segmentation(
         folder=folder.path,
         parts=parts,
         recomputed=tuple(steps.recomputed),
         corrected=tuple(steps.corrected),
+        from_elsewhere=steps.from_elsewhere,
         kept_description=description.finish(text),
         warnings=tuple(warnings),
     )
@@ -156,6 +169,7 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
         "accepted": list(steps.accepted),
         "seed_lps": None if request.seed_lps is None else request.seed_lps.tolist(),
         "corrected": steps.corrected,
+        "from_elsewhere": steps.from_elsewhere,
         "warnings": warnings,
     }
 

@@ -9,7 +9,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.errors import AnatomyError
 from anatomy.records import frozen_record
-from anatomy.segmentation.steps import Parts
+from anatomy.segmentation.parts import Parts
 
 WIDENING = 1.6
 """A bronchus is never so much wider than its parent; a leak is."""

@@ -6,20 +6,14 @@ from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
 
-from anatomy.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.io.files import sha256
-from anatomy.io.images import read_volume
-from anatomy.io.masks import read_masks
-from anatomy.io.totalsegmentator import mask_sources
+from anatomy.io.images import images_in
 from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.box import VOXEL_MM
-from anatomy.segmentation.folder import onto_grid
+from anatomy.segmentation.given import ROLES, GivenImages, read_given
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM
 from anatomy.typed import Float
-
-_ROLES = {"lumen": "airway", "wall": "airway_wall", "vessels": "vessels", "lung": "lungs"}
-"""Which image of the folder a role of TotalSegmentator's output stands for."""
 
 
 @frozen_value
@@ -29,11 +23,18 @@ class Given:
     Parameters
     ----------
     lungs : Path
-        Label map (1 right, 2 left; or lobes 1 to 5, as lungmask writes them) or one mask of both lungs.
+        Label map (1 right, 2 left; or lobes, see `lobes`) or one mask of both lungs.
     airway, airway_wall, vessels : Path
-        Masks.
+        Masks, label maps that name their labels, `file#1,2` for some labels, or folders of TotalSegmentator.
+    lobes : Path
+        Label map: see `anatomy.segmentation.labels.lobe_numbers`; or a folder of TotalSegmentator.
+    fissures : Path
+        Mask; or 1 where a fissure is inferred, and 2 where it is seen.
+    onnx_airway : Path
+        Network for the airway, see `anatomy.segmentation.learned`.
     totalsegmentator : Path
-        Folder with output of TotalSegmentator's tasks lung_vessels and total, or one of them.
+        Folder with output of TotalSegmentator's tasks lung_vessels and total, or one of them: all that it
+        holds is taken.
     nodule_contours : Path
         Contours of radiologists, see `anatomy.segmentation.nodules.nodule_from_contours`.
     nodule_mask : Path
@@ -46,61 +47,31 @@ class Given:
     airway: Path | None = None
     airway_wall: Path | None = None
     vessels: Path | None = None
+    lobes: Path | None = None
+    fissures: Path | None = None
+    onnx_airway: Path | None = None
     totalsegmentator: Path | None = None
     nodule_contours: Path | None = None
     nodule_mask: Path | None = None
     target: str | None = None
 
-    def images(self, grid: Grid) -> dict[str, Volume]:
-        """Read the masks that replace steps, by the name of the image they replace.
+    def files(self) -> dict[str, Path]:
+        """Return the files that were named one by one, by the image they replace."""
+        named = {image: getattr(self, image) for image in ROLES}
+        return {image: path for image, path in named.items() if path is not None}
 
-        Raises
-        ------
-        FileError
-            If a file is missing or damaged, or the folder holds no output of TotalSegmentator.
-        GridMismatchError
-            If a mask does not fit the CT.
-        """
-        found = {} if self.totalsegmentator is None else _totalsegmentator_images(self.totalsegmentator, grid)
-        for name in _ROLES.values():
-            path = getattr(self, name)
-            if path is not None:
-                found[name] = onto_grid(read_volume(path), grid, path.name)
-        return found
+    def images(self, grid: Grid) -> GivenImages:
+        """Read the masks that replace steps; the errors are those of `read_given`."""
+        return read_given(self.files(), self.totalsegmentator, grid)
 
     def hashes(self) -> dict[str, str]:
-        """Return the SHA-256 of the files that were named one by one."""
-        paths = (self.lungs, self.airway, self.airway_wall, self.vessels)
-        return {str(path): sha256(path) for path in (*paths, self.nodule_contours, self.nodule_mask) if path}
-
-
-def _totalsegmentator_images(folder: Path, grid: Grid) -> dict[str, Volume]:
-    if not folder.is_dir():
-        raise FileError(
-            f"There is no folder {folder}",
-            expected="a folder with output of TotalSegmentator",
-            remedy="Check the name and the folder",
-        )
-    sources, _ = mask_sources(folder)
-    roles = {"lung" if source.role == "lobes" else source.role for source in sources}
-    # The task total knows the trachea alone; only the task lung_vessels shows the airways.
-    if not roles & {"wall", "vessels"}:
-        roles.discard("lumen")
-    if not roles & set(_ROLES):
-        raise FileError(
-            f"{folder} holds no lobes, airways or vessels of TotalSegmentator",
-            expected="output of the tasks lung_vessels or total, such as lung_vessels.nii.gz",
-            remedy="Run its task lung_vessels, or give masks one by one: --airway, --vessels, --lungs",
-        )
-    read = read_masks(sources)
-    masks = dict(read.masks)
-    if read.lobes is not None:
-        masks["lung"] = (read.lobes > 0) | masks.get("lung", False)
-    return {
-        image: onto_grid(Volume(grid=read.grid, array=masks[role]), grid, f"{role} of {folder.name}")
-        for role, image in _ROLES.items()
-        if role in roles
-    }
+        """Return the SHA-256 of the files that were named one by one, and of those in folders."""
+        named = (self.totalsegmentator, self.onnx_airway, self.nodule_contours, self.nodule_mask)
+        found: dict[str, str] = {}
+        for path in (path for path in (*self.files().values(), *named) if path is not None):
+            file = path if path.exists() else path.with_name(path.name.rpartition("#")[0])
+            found |= {str(each): sha256(each) for each in (images_in(file) if file.is_dir() else [file])}
+        return found
 
 
 @frozen_record

@@ -14,7 +14,6 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.cost_maps import OBSTACLE_COST, as_stored, from_stored
 from anatomy.io.files import sha256
 from anatomy.io.images import read_volume
-from anatomy.records import frozen_record
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.description import Description
 from anatomy.segmentation.folder import IMAGES, SegmentationFolder, digest_of, grid_digest, key_of
@@ -23,11 +22,13 @@ from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.larynx import without_larynx
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
+from anatomy.segmentation.misplaced import misplaced
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
+from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.segmentation.scan_warnings import scan_warnings
 from anatomy.segmentation.wall import wall_around
-from anatomy.typed import Array, Float32, Mask, UInt8
+from anatomy.typed import Array, Float32, Mask
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
@@ -36,68 +37,9 @@ Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
 Progress = Callable[[str], None]
 
-VERSION = 5
+VERSION = 6
 """Raise it when a step makes other images from the same input."""
 _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
-
-
-@frozen_record
-class Parts:
-    """The images of a segmentation, `(ni, nj, nk)` on the voxels of its box, and the airway's tree or why
-    there is none.
-
-    `ct` is the CT on these voxels, in Hounsfield units.
-
-    The nodule is empty if none was given.  Lobes have numbers of `anatomy.lobes.LOBES`; fissures are 1 where
-    they are inferred and 2 where they are seen; both are 0 where nothing is known.  Vesselness is in [0, 1],
-    cost too, or infinite in obstacles, which the large vessels are.
-    """
-
-    ct: Volume
-    left: Mask
-    right: Mask
-    central_airway: Mask
-    lumen: Mask
-    wall: Mask
-    tree: AirwayTree | AnatomyError
-    nodule: Mask
-    vesselness: Float32
-    large_vessels: Mask
-    all_vessels: Mask
-    lobes: UInt8
-    fissures: UInt8
-    cost: Float32
-
-    @classmethod
-    def begun(
-        cls, ct: Volume, lungs: Lungs, lumen: Mask, wall: Mask, tree: AirwayTree | AnatomyError
-    ) -> Parts:
-        """Return the images of a segmentation that ended with the airway."""
-        none = np.zeros(lumen.shape, dtype=np.bool_, order="F")
-        return cls(
-            ct=ct,
-            left=lungs.left,
-            right=lungs.right,
-            central_airway=lungs.central_airway,
-            lumen=lumen,
-            wall=wall,
-            tree=tree,
-            nodule=none,
-            vesselness=none.astype(np.float32),
-            large_vessels=none,
-            all_vessels=none,
-            lobes=none.astype(np.uint8),
-            fissures=none.astype(np.uint8),
-            cost=none.astype(np.float32),
-        )
-
-
-class RefusedError(AnatomyError):
-    """What was segmented cannot be the lungs and airways of a patient; `parts` show why."""
-
-    def __init__(self, error: AnatomyError, parts: Parts) -> None:
-        super().__init__(error.found, expected=error.expected, remedy=error.remedy)
-        self.parts = parts
 
 
 class Steps:
@@ -121,12 +63,16 @@ class Steps:
         self.warnings: list[str] = []
         self.accepted: tuple[str, ...] = ()
         self._tree: tuple[Mask, AirwayTree | AnatomyError] | None = None
-        self._sources = request.given.images(request.ct.grid)
+        given = request.given.images(request.ct.grid)
+        self.warnings += given.warnings
+        self.from_elsewhere = dict(given.sources)
+        self._sources = dict(given.images)
         for name in IMAGES:
             path = folder.correction(name)
             if path is not None:
                 self._sources[name] = read_volume(path)
                 self.corrected.append(name)
+                self.from_elsewhere.pop(name, None)
 
     @property
     def grid(self) -> Grid:
@@ -206,8 +152,17 @@ class Steps:
         )
 
     def _airway(self, lungs: Lungs) -> Images:
+        names = ("airway", "airway_wall")
+        model = None if "airway" in self._sources else self._request.given.onnx_airway
+        network = None
+        if model is not None:
+            from anatomy.segmentation.learned import learned_airway, read_network
+
+            network = read_network(model)
+            self.from_elsewhere["airway"] = network.words
+        digest = "" if network is None else network.digest
         key = self._key(
-            "airway", sources=("airway", "airway_wall"), of=("lungs", "central_airway"), ct=self._ct_digest
+            "airway", sources=names, of=("lungs", "central_airway"), ct=self._ct_digest, network=digest
         )
 
         def compute() -> tuple[Images, dict[str, Any]]:
@@ -217,6 +172,9 @@ class Steps:
             grid = self._folder.grid
             lumen, wall = self._source_mask("airway"), self._source_mask("airway_wall")
             warnings: tuple[str, ...] = ()
+            if network is not None:
+                self._tell("airway: network")
+                lumen = learned_airway(self._ct, network)
             if lumen is None:
                 found = segment_airway(self._ct, lungs, progress=self._tell)
                 lumen, cut_mm = without_larynx(found.lumen, lungs.trachea_seed_ijk, grid)
@@ -230,7 +188,7 @@ class Steps:
             said = airway_warnings(self._tree_of(lumen), lungs.left, lungs.right, grid)
             return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": [*said, *warnings]}
 
-        return self._bring_up_to_date("airway", ("airway", "airway_wall"), key, compute)[0]
+        return self._bring_up_to_date("airway", names, key, compute)[0]
 
     def _tree_of(self, lumen: Mask) -> AirwayTree | AnatomyError:
         """Return the tree of the lumen, which is made once, or why there is none."""
@@ -247,7 +205,11 @@ class Steps:
             return
         self._tell("checking lungs and airway")
         failed, warnings = plausibility(self._ct, lungs, tree)
-        self.warnings += [*warnings, *scan_warnings(self._request.ct, self._box.on_ct(lungs.mask))]
+        on_ct = {name: self._box.on_ct(mask) for name, mask in (("lungs", lungs.mask), *airway.items())}
+        given = {n: self._sources[n].array if n in self._sources else on_ct[n] for n in self.from_elsewhere}
+        wrong, doubts = misplaced(self._request.ct, given, on_ct["lungs"], on_ct["airway"])
+        failed, warnings = (*failed, *wrong), (*warnings, *doubts)
+        self.warnings += [*warnings, *scan_warnings(self._request.ct, on_ct["lungs"])]
         try:
             self.accepted = require_plausible(failed, self._request.accept)
         except AnatomyError as error:
@@ -306,18 +268,24 @@ class Steps:
         self, lungs: Lungs, airway: Images, vessels: Images, tree: AirwayTree | AnatomyError
     ) -> Images:
         names = ("lobes", "fissures")
-        key = self._key(
-            "lobes", sources=names, of=("lungs", "airway", "airway_wall", "all_vessels"), ct=self._ct_digest
-        )
+        made_of = ("lungs", "airway", "airway_wall", "all_vessels")
+        by_hand = "lobes" in self.corrected
+        key = self._key("lobes", sources=names, of=made_of, ct=self._ct_digest, by_hand=by_hand)
 
         def compute() -> tuple[Images, dict[str, Any]]:
-            from anatomy.segmentation.lobes import lobes_given, segment_lobes
+            from anatomy.segmentation.lobes import BORDER, SEEN, confirmed_lobes, lobes_given, segment_lobes
 
             given = {name: self._source(name).astype(np.uint8) for name in names if name in self._sources}
-            if "lobes" in given:
+            if "fissures" in given and given["fissures"].max() == BORDER:
+                given["fissures"] = given["fissures"] * np.uint8(SEEN)
+            if "lobes" in given and ("fissures" in given or by_hand):
                 return lobes_given(given["lobes"], given.get("fissures")), {}
             self._tell("lobes and fissures")
-            found = segment_lobes(self._ct, lungs, _airways(airway), vessels["all_vessels"], tree)
+            parts = (self._ct, lungs, _airways(airway), vessels["all_vessels"])
+            if "lobes" in given:
+                found = confirmed_lobes(*parts, given["lobes"])
+            else:
+                found = segment_lobes(*parts, tree)
             images = {"lobes": found.lobes, "fissures": found.fissures, **given}
             return images, {"seen": dict(found.seen), "warnings": list(found.warnings)}
 

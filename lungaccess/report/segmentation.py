@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds
-from anatomy.segmentation.steps import Parts
+from anatomy.segmentation.parts import Parts
 from anatomy.typed import Array, Float, Mask
 from lungaccess.report import style
 

@@ -54,6 +54,8 @@ class CtLook:
         Thickness of airway walls where the patient has no mask of them.
     fissure_mm : float
         Thickness of the sheet between lobes.
+    convex : bool
+        The body is convex in every axial slice; for lungs too far apart for the tissue around them to meet.
     seed : int
         Of noise and texture.
 
@@ -74,6 +76,7 @@ class CtLook:
     dose: float = 1.0
     wall_mm: float = 0.8
     fissure_mm: float = 0.5
+    convex: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -129,7 +132,7 @@ def render_ct(images: PatientImages, look: CtLook | None = None) -> SyntheticCt:
     lumen_mask, spacing = images.lumen.array, images.grid.spacing_mm
     lung_share = share(images.lung.array & ~_central(lumen_mask, spacing))
     lung = lung_share >= HALF
-    image = _body(lung, look.spacing_mm)
+    image = _body(lung, look.spacing_mm, convex=look.convex)
     tissue = look.parenchyma_hu + _texture(rng, grid.shape, look)
     _mix(image, lung_share, tissue)
     del tissue, lung_share
@@ -210,14 +213,16 @@ def _mix(image: Float32, share: Float32, hu: float | Float32) -> None:
     image += share * (np.float32(hu) - image if isinstance(hu, float) else hu - image)
 
 
-def _body(lung: Mask, spacing_mm: float) -> Float32:
+def _body(lung: Mask, spacing_mm: float, *, convex: bool) -> Float32:
     """Return tissue around the lungs, fat around it, and air; between the lungs is tissue alone."""
     from scipy.ndimage import binary_fill_holes
+    from skimage.morphology import convex_hull_image
 
     distance = _distance_mm(~lung, (spacing_mm,) * 3)
     image = np.full(lung.shape, TISSUE_HU, dtype=np.float32, order="F")
     for k in range(lung.shape[2]):
-        outside = ~binary_fill_holes(distance[:, :, k] <= BODY_MM - FAT_MM)
+        near = distance[:, :, k] <= BODY_MM - FAT_MM
+        outside = ~(convex_hull_image(near) if convex and near.any() else binary_fill_holes(near))
         image[:, :, k][outside] = FAT_HU
         image[:, :, k][outside & (distance[:, :, k] > BODY_MM)] = AIR_HU
     return image

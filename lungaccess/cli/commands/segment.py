@@ -52,6 +52,9 @@ def segment(
     airway: Path | None = None,
     airway_wall: Path | None = None,
     vessels: Path | None = None,
+    lobes: Path | None = None,
+    fissures: Path | None = None,
+    onnx_airway: Path | None = None,
     totalsegmentator: Path | None = None,
     name: str = "",
     pictures: bool = True,
@@ -86,21 +89,29 @@ def segment(
     accept : tuple[str, ...]
         A check that failed and is overruled, by the name in its message: axes, sides, airway, bronchi,
         one-lung,
-        volume or density. It is recorded in patient.toml.
+        volume, density or masks. It is recorded in patient.toml.
     seed : str
         A point in the trachea, ras:x,y,z or lps:x,y,z, if it is not found by itself.
     voxel_mm : float
         Where the CT has larger voxels, as between thick slices, it is interpolated to about this size.
     lungs : Path
-        Lungs from elsewhere: label map (1 right, 2 left; or lobes 1 to 5) or one mask.
+        Lungs from elsewhere: label map (1 right, 2 left; or lobes) or one mask. This and the next five may
+        also be FILE#1,2 for some labels of a label map, or a folder of TotalSegmentator.
     airway : Path
         Mask of the airway lumen from elsewhere.
     airway_wall : Path
         Mask of the airway wall from elsewhere.
     vessels : Path
         Mask of the vessels to avoid from elsewhere.
+    lobes : Path
+        Lobes from elsewhere: label map of lungmask, TotalSegmentator or this program.
+    fissures : Path
+        Mask of the fissures from elsewhere.
+    onnx_airway : Path
+        Your own network for the airway, with its settings in a TOML file of the same name beside it.
     totalsegmentator : Path
-        Folder with output of TotalSegmentator's tasks lung_vessels or total, used in place of these steps.
+        Folder with output of TotalSegmentator's tasks lung_vessels or total: all that it holds is used in
+        place of these steps.
     name : str
         How reports call the patient.
     pictures : bool
@@ -142,6 +153,9 @@ def segment(
                 airway=airway,
                 airway_wall=airway_wall,
                 vessels=vessels,
+                lobes=lobes,
+                fissures=fissures,
+                onnx_airway=onnx_airway,
                 totalsegmentator=totalsegmentator,
                 nodule_contours=nodule_contours,
                 nodule_mask=nodule_mask,
@@ -175,7 +189,7 @@ def segment(
 
 def _show_refused(ct: Volume, error: AnatomyError, path: Path) -> None:
     """Draw the CT with what was found in it until it was refused."""
-    from anatomy.segmentation.steps import RefusedError
+    from anatomy.segmentation.parts import RefusedError
     from lungaccess.report.segmentation import segmentation_png
 
     segmentation_png(ct, error.parts if isinstance(error, RefusedError) else None, path)
@@ -196,6 +210,7 @@ def _tables(result: Segmentation, quality: Quality) -> list[Table]:
     done = [
         ("done now", ", ".join(result.recomputed) or "nothing: all was up to date"),
         ("corrected by hand", ", ".join(result.corrected) or "nothing"),
+        ("from elsewhere", "; ".join(f"{k}: {v}" for k, v in result.from_elsewhere.items()) or "nothing"),
     ]
     return [
         terminal.table("Volumes", ("structure", "litres"), volumes),

@@ -18,15 +18,15 @@ from anatomy.errors import AnatomyError, FileError, GridMismatchError, SettingsE
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume
-from anatomy.lobes import LOBES
+from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, LOBES
 from anatomy.phantom import LABELS, Phantom
 from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, digest_of
 from anatomy.segmentation.labels import sides_of
 from anatomy.segmentation.lobes import SEEN
+from anatomy.segmentation.parts import RefusedError
 from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
 from anatomy.segmentation.quality import quality_of
 from anatomy.segmentation.request import Given, SegmentationRequest
-from anatomy.segmentation.steps import RefusedError
 from experiments.support.segmentation.hard_images import phantom_image, turned
 
 ALL = ("lungs", "airway", "nodule", "vessels", "lobes", "cost map")
@@ -275,14 +275,15 @@ def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentat
     truth = patient.images
     assert truth.wall is not None
     x = np.indices(truth.lung.array.shape)[0] > truth.lung.array.shape[0] / 2
-    lobes = truth.lung.array & ~truth.lumen.array & ~truth.vessels.array
+    lobes = patient.lobes.array * (truth.lung.array & ~truth.lumen.array)
     parts = {
         "lung_airways": truth.lumen.array,
         "lung_airways_wall": truth.wall.array,
         "lung_arteries": truth.vessels.array & x,
         "lung_veins": truth.vessels.array & ~x,
-        "lung_upper_lobe_left": lobes & x,
-        "lung_upper_lobe_right": lobes & ~x,
+        "lung_upper_lobe_left": lobes == LEFT_UPPER,
+        "lung_lower_lobe_left": lobes == LEFT_LOWER,
+        "lung_lower_lobe_right": (lobes > 0) & (lobes < LEFT_UPPER),
     }
     for name, mask in parts.items():
         write_volume(folder / f"{name}.nii.gz", Volume(grid=patient.grid, array=mask))
@@ -292,6 +293,17 @@ def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentat
     lung = _in_box(patient, result, truth.lung.array)
     both = np.count_nonzero((result.parts.left | result.parts.right) & lung)
     assert both > 0.95 * np.count_nonzero(truth.lung.array)
+    assert (result.parts.lobes[lobes == LEFT_LOWER] == LEFT_LOWER).all()
+    assert (result.parts.fissures[patient.mask("fissure") & (lobes >= LEFT_UPPER)] == SEEN).mean() > 0.8
+    assert set(result.from_elsewhere) == {"airway", "airway_wall", "vessels", "lungs", "lobes"}
+    images = load_patient(tmp_path / "out")
+    assert images.lobes is not None and images.fissures is not None
+    assert any("took the place" in said and "lung_airways" in said for said in images.warnings)
+    wrong = truth.lumen.array[:, :, ::-1]
+    write_volume(folder / "lung_airways.nii.gz", Volume(grid=made.grid, array=np.roll(wrong, 6, axis=0)))
+    with pytest.raises(RefusedError, match="mask of the airway is not of this CT.*--accept"):
+        segment(_request(patient, tmp_path / "out", totalsegmentator=folder))
+    assert not (tmp_path / "out" / "patient.toml").exists()
     with pytest.raises(FileError, match="holds no lobes"):
         segment(_request(patient, tmp_path / "out", totalsegmentator=tmp_path))
 
@@ -301,8 +313,9 @@ def test_label_maps_of_lungs_are_understood(made: Segmentation) -> None:
     ours = Volume(grid=made.grid, array=left * np.uint8(2) + right * np.uint8(1))
     lobes = ours.array.copy()
     middle = lobes.shape[2] // 2
-    lobes[..., :middle][left[..., :middle]] = 1
-    lobes[right] = 4
+    lobes[left] = 1  # upper and lower by the numbers of lungmask
+    lobes[..., :middle][left[..., :middle]] = 2
+    lobes[right] = 3
     lobes[..., :middle][right[..., :middle]] = 5
     one = Volume(grid=made.grid, array=left | right)
     for volume in (ours, Volume(grid=made.grid, array=lobes), one):

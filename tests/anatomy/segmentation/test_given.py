@@ -123,6 +123,19 @@ def test_lobes_of_lungmask_are_told_from_our_own(tmp_path: Path, ct: Volume, tru
         sides_of(Volume(grid=ct.grid, array=swapped), "lungs.nii.gz")
 
 
+def test_lungs_are_told_by_their_labels_or_their_shape(ct: Volume, truth: dict[str, Array]) -> None:
+    left, right = truth["lobes"] > 3, (truth["lobes"] > 0) & (truth["lobes"] < 4)
+    ours = left * np.uint8(2) + right * np.uint8(1)
+    for array in (ours, left | right):
+        found = sides_of(Volume(grid=ct.grid, array=array), "lungs")
+        for side, true in zip(found, (left, right), strict=True):
+            assert np.count_nonzero(side != true) < 0.01 * np.count_nonzero(true)
+    with pytest.raises(AnatomyError, match="values"):
+        sides_of(Volume(grid=ct.grid, array=ours * np.uint8(9)), "lungs")
+    with pytest.raises(AnatomyError, match="no lung"):
+        sides_of(Volume(grid=ct.grid, array=np.zeros_like(ours)), "lungs")
+
+
 def test_cases_of_aeropath_and_atm(tmp_path: Path, ct: Volume, truth: dict[str, Array]) -> None:
     case = tmp_path / "7"
     _write(case / "7_CT_HR.nii.gz", ct, truth["lungs"])

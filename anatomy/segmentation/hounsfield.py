@@ -18,6 +18,8 @@ GREATEST_OFFSET_HU = 25.0
 GREATEST_SCATTER_HU = 45.0
 """Scatter and contrast medium raise the air in the trachea by up to 40 HU, so it tells less where it is
 alone."""
+LEAST_SCATTER_HU = -10.0
+"""Noise of the difference: scatter only ever raises the air in the trachea."""
 AROUND_HU = (-1099.0, -880.0)
 """Air around the patient, shifted or not: lower values are padding, higher ones table and clothes."""
 LEAST_AROUND_SHARE = 0.01
@@ -31,6 +33,8 @@ def air_offset_hu(coarse: CoarseCt, airway: Mask) -> float:
     around = offset_around_hu(coarse)
     if around is None:
         return inside if abs(inside) > GREATEST_SCATTER_HU else 0.0
+    if LEAST_SCATTER_HU <= inside - around <= GREATEST_SCATTER_HU:
+        return around if abs(around) > GREATEST_OFFSET_HU else 0.0
     smaller = inside if abs(inside) < abs(around) else around
     return smaller if inside * around > 0.0 and abs(smaller) > GREATEST_OFFSET_HU else 0.0
 

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm
-from anatomy.typed import Float, Mask
+from anatomy.typed import Float, Int, Mask
 
 SAMPLE_MM = 4.0
 """The shape of the chest is looked at on voxels of this size."""
@@ -22,6 +22,14 @@ TOP_SHARE, BASE_SHARE = 0.1, 0.3
 """Of the height: the shoulders narrow the chest above, and the diaphragm rises below."""
 ABOVE_CARINA_MM = -10.0
 """Below this, the heart takes part of the front."""
+LEAST_BACK, LEAST_BASE = 0.24, 0.48
+"""Of the width of both lungs: so far behind and below the carina each reaches.  In healthy phantoms these are
+0.33 and 0.58 at least; with fluid at the back 0.13, and with the lower third gone 0.39."""
+TILTS_DEG = tuple(float(t) for t in range(-20, 21, 4))
+"""Patients who lie askew lean to a side by as much."""
+LEAST_GAIN = 0.05
+"""Of both lungs: so much more must be alike on both sides for the patient to lie askew; missing lobes make
+less difference."""
 SOLID_HU, SOLID_RADIUS_MM, LEAST_SOLID_ML = -200.0, 6.0, 10.0
 """A mass of 27 mm has 10 ml; vessels and nodules into which no ball of 12 mm fits are not counted."""
 
@@ -29,7 +37,8 @@ SOLID_HU, SOLID_RADIUS_MM, LEAST_SOLID_ML = -200.0, 6.0, 10.0
 def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tuple[str, ...]:
     """Warn of zones of the chest that hold hardly any lung.
 
-    In every axial section the chest is the convex hull of both lungs and their mirror images.
+    In every section across the chest this is the convex hull of both lungs and their mirror images.  What is
+    missing on both sides alike is told by how far the lungs reach back and down.
 
     Parameters
     ----------
@@ -38,21 +47,47 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
         In the order of voxels of `canonical`.
     carina_lps : (3,) float64
     """
-    return tuple(
+    points = _sampled(left | right, grid)
+    chest, first = _on_cubes(untilted(points, carina_lps))
+    zones = tuple(
         f"About {lost_ml / 1000.0:.2f} l of lung are missing in the {name}: only {100 * share:.0f} % of "
         "what lies there in a healthy chest is lung. It may be solid, full of fluid or collapsed. Its "
         f"airways and vessels are not seen, it counts as outside the lung, and reach in the {name} is "
         "understated."
-        for name, share, lost_ml in _zones(left, right, grid, carina_lps)
+        for name, share, lost_ml in _zones(chest, first, carina_lps)
         if share < LEAST_FILLED
     )
+    return zones or tuple(_short(left, right, grid, carina_lps))
 
 
-def _zones(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> Iterator[tuple[str, float, float]]:
+def _short(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> Iterator[str]:
+    """Yield warnings of lungs that end too early at the back or at the base."""
+    sides = {"right": _sampled(right, grid), "left": _sampled(left, grid)}
+    width = float(np.subtract(*np.percentile(np.concatenate([*sides.values()])[:, 0], [98.0, 2.0])))
+    for name, points in sides.items():
+        lower = points[points[:, 2] < carina_lps[2]]
+        if not len(lower):
+            continue
+        whole = not (left if name == "left" else right)[:, :, 0].any()
+        back = (float(np.percentile(lower[:, 1], 97.0)) - carina_lps[1]) / width
+        base = (carina_lps[2] - float(np.percentile(lower[:, 2], 1.0))) / width
+        for place, share, least, counts in (
+            ("back", back, LEAST_BACK, True),
+            ("base", base, LEAST_BASE, whole),
+        ):
+            if counts and share < least:
+                yield (
+                    f"Lung seems to be missing at the {place} of the {name} lung, which ends "
+                    f"{share * width:.0f} mm from the carina: {least * width:.0f} mm and more are usual in a "
+                    "chest of this width. It may be solid, under fluid or collapsed, or not breathed in; "
+                    "reach there is understated."
+                )
+
+
+def _zones(chest: Mask, first: Float, carina_lps: Float) -> Iterator[tuple[str, float, float]]:
     """Yield the name of each zone, the share of it that is lung, and the volume that is not, ml."""
     from skimage.morphology import convex_hull_image
 
-    chest, first = _sampled(left, right, grid)
     n = chest.shape
     across = SAMPLE_MM * (np.arange(n[0]) - 0.5 * (n[0] - 1))
     beside = np.abs(across) > FROM_MIDDLE_SHARE * np.abs(across).max()
@@ -80,13 +115,45 @@ def _zones(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> Iterator[t
                 yield f"{part} of the {name} lung", float(lung / whole), float(lost_ml)
 
 
-def _sampled(left: Mask, right: Mask, grid: Grid) -> tuple[Mask, Float]:
-    """Return both lungs on cubes along LPS whose middle is that of the chest, and the first cube's LPS mm."""
+def _sampled(mask: Mask, grid: Grid) -> Float:
+    """Return about one point of a mask in each cube of `SAMPLE_MM`, LPS mm `(N, 3)`."""
+    step = np.maximum(1, np.rint(SAMPLE_MM / grid.spacing_mm)).astype(np.int64)
+    return np.asarray(grid.lps(np.argwhere(mask[tuple(slice(None, None, int(s)) for s in step)]) * step))
+
+
+def untilted(points: Float, carina_lps: Float) -> Float:
+    """Return points of both lungs turned about the carina so that left and right are most alike.
+
+    The patient may lean to a side; in the axial sections of a tilted chest left and right differ.
+    """
+    best, most = points, _alike(points) + LEAST_GAIN
+    for degrees in TILTS_DEG:
+        c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+        turned = (points - carina_lps) @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) + carina_lps
+        alike = _alike(turned)
+        if alike > most:
+            best, most = turned, alike
+    return best
+
+
+def _alike(points: Float) -> float:
+    """Return the share of cubes with lung whose mirror images hold lung, too."""
+    middle = 0.5 * float(np.percentile(points[:, 0], [2.0, 98.0]).sum())
+    cubes = np.floor((points - [middle, 0.0, 0.0]) / (2.0 * SAMPLE_MM)).astype(np.int64)
+    cubes[:, 1:] -= cubes[:, 1:].min(axis=0)
+    size = cubes[:, 1:].max(axis=0) + 1
+    half = int(np.abs(cubes[:, 0]).max()) + 1
+
+    def number(i: Int) -> Int:
+        return np.asarray(((i + half) * size[0] + cubes[:, 1]) * size[1] + cubes[:, 2])
+
+    return float(np.isin(np.unique(number(cubes[:, 0])), number(-1 - cubes[:, 0])).mean())
+
+
+def _on_cubes(points: Float) -> tuple[Mask, Float]:
+    """Return points on cubes along LPS whose middle is that of the chest, and the first cube's LPS mm."""
     from scipy.ndimage import binary_closing
 
-    step = np.maximum(1, np.rint(SAMPLE_MM / grid.spacing_mm)).astype(np.int64)
-    sampled = (left | right)[tuple(slice(None, None, int(s)) for s in step)]
-    points = grid.lps(np.argwhere(sampled) * step)
     low, high = points.min(axis=0) - 2.0 * SAMPLE_MM, points.max(axis=0) + 2.0 * SAMPLE_MM
     shape = np.ceil((high - low) / SAMPLE_MM).astype(np.int64) + 1
     chest = np.zeros(shape, dtype=np.bool_)

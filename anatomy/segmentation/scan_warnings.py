@@ -57,23 +57,34 @@ def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
 
 
 def noise_hu(ct: Volume, near: Mask) -> float:
-    """Return the standard deviation of the noise in soft tissue of the box around the lungs; 0 if unknown."""
+    """Return the noise in soft tissue of the box around the lungs, HU; 0 if unknown.
+
+    It is the standard deviation of noise without correlation that leaves as much in the mean of a pixel and
+    its four neighbours, which airways are searched in.  Correlated noise leaves more there than its own
+    deviation tells.
+    """
     box = window(*bounds(near))
     side = np.maximum(2, np.rint(PATCH_MM / ct.grid.spacing_mm)).astype(np.int64)
     patches = _cubes(ct.array[box], side)
-    middles = patches.mean(axis=1)
+    middles = patches.mean(axis=(1, 2, 3))
     patches = patches[(middles > TISSUE_HU[0]) & (middles < TISSUE_HU[1])]
-    if len(patches) < LEAST_PATCHES:
+    if len(patches) < LEAST_PATCHES or side[:2].min() < 3:
         return 0.0
-    return float(np.quantile(patches.std(axis=1), QUIET_SHARE))
+    deviation = float(np.quantile(patches.std(axis=(1, 2, 3)), QUIET_SHARE))
+    inner = patches[:, 1:-1, 1:-1]
+    beside = patches[:, 2:, 1:-1] + patches[:, :-2, 1:-1] + patches[:, 1:-1, 2:] + patches[:, 1:-1, :-2]
+    mean_of_five = (inner + beside) / np.float32(5.0)
+    left = float(np.quantile(mean_of_five.std(axis=(1, 2, 3)), QUIET_SHARE))
+    return max(deviation, float(np.sqrt(5.0)) * left)
 
 
 def _cubes(values: Array, side: Array) -> Array:
-    """Return the voxels of cubes spread evenly over an image, `(N, M)` float32."""
+    """Return cubes spread evenly over an image, `(N, *side)` float32."""
     counts = np.array(values.shape) // side
     total = int(counts.prod())
     chosen = np.unique(np.linspace(0, total - 1, min(total, MOST_PATCHES)).astype(np.int64))
     low = np.stack(np.unravel_index(chosen, tuple(counts)), axis=1) * side
     inside = np.stack(np.meshgrid(*(np.arange(n) for n in side), indexing="ij"), axis=-1).reshape(-1, 3)
     at = low[:, None, :] + inside[None]
-    return np.asarray(values[at[..., 0], at[..., 1], at[..., 2]], dtype=np.float32)
+    found = values[at[..., 0], at[..., 1], at[..., 2]].reshape(-1, *side)
+    return np.asarray(found, dtype=np.float32)

@@ -4,11 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from anatomy.lobes import LEFT_LOWER, RIGHT_LOWER, RIGHT_UPPER
+from experiments.support.segmentation.hard_changes import (
+    INF,
+    abdomen,
+    belly,
+    blanket,
+    contrast,
+    head,
+    moved,
+    pelvis,
+    pet,
+    pneumothorax,
+    rings,
+    scattered,
+    shifted,
+    solid,
+    streaks,
+    with_lung_hu,
+)
 from experiments.support.segmentation.hard_images import (
     AIR_HU,
     FLUID_HU,
@@ -25,104 +43,8 @@ from experiments.support.segmentation.hard_images import (
 )
 from experiments.support.segmentation.hard_runs import LEFT_LUNG, RIGHT_LUNG, HardCase, of_lobes
 
-INF = np.inf
-
-
-def _solid(image: HardImage, lobes: tuple[int, ...], hu: float, *, airways: bool) -> HardImage:
-    """Fill lobes; their airways stay open, or are filled as well."""
-    return image.filled(of_lobes(image, lobes) & ~(image.lumen if airways else False), hu)
-
-
-def _lung_hu(image: HardImage, shift: float) -> HardImage:
-    lung = ndimage.gaussian_filter((image.lung & ~image.lumen).astype(np.float32), 0.6)
-    share = np.clip((-300.0 - image.hu) / 400.0, 0.0, 1.0) * lung
-    return image.with_hu(image.hu + shift * share)
-
-
-def _pneumothorax(image: HardImage, depth_mm: float) -> HardImage:
-    right = of_lobes(image, RIGHT_LUNG)
-    depth = ndimage.distance_transform_edt(right, sampling=image.grid.spacing_mm)
-    x, y, z = image.coordinates()
-    return image.filled(right & (depth < depth_mm) & (x < -35.0) & (z > -60.0) & (y < 40.0), AIR_HU)
-
-
-def _abdomen(image: HardImage, hu: float, *, below: float = -55.0) -> HardImage:
-    """Return the image below a height, with 200 mm of abdomen that holds bowel of some HU."""
-    part = cropped(image, (-INF, -INF, -INF), (INF, INF, below))
-    return _belly(part, hu)
-
-
-def _belly(part: HardImage, hu: float) -> HardImage:
-    floor = float(part.coordinates()[2].min())
-    tall = padded(part, (0.0, 0.0, 150.0), (0.0, 0.0, 0.0))
-    x, y, z = tall.coordinates()
-    body = ((x / 106.0) ** 2 + (y / 75.0) ** 2 < 1.0) & (z < floor)
-    tall = tall.filled(body, TISSUE_HU)
-    column = (np.hypot(x - 20.0, y + 20.0) < 9.0) & (z < floor - 15.0) & (z > floor - 135.0)
-    made = tall.filled(column, AIR_HU)
-    for x0, height in ((-60.0, 25.0), (60.0, 35.0), (0.0, 110.0)):
-        loop = ball(tall, (x0, -25.0, floor - height - 25.0), (35.0, 30.0, 42.0 if x0 else 20.0))
-        made = made.filled(loop & (z < floor - 4.0), hu, noise_hu=15.0 if hu < -950 else 150.0)
-    return made
-
-
-def _head(image: HardImage) -> HardImage:
-    empty = image.filled(np.ones(image.hu.shape, bool), AIR_HU)
-    made = empty.filled(ball(empty, (0, 0, -20), (70, 74, 90)), TISSUE_HU)
-    made = made.filled(
-        ball(empty, (0, 0, -10), (64, 68, 84)) & ~ball(empty, (0, 0, -10), (58, 62, 78)), 900.0
-    )
-    for x0, y0, z0, r in ((-22, -45, -40, 14), (22, -45, -40, 14), (0, -40, -45, 10), (0, -20, -85, 11)):
-        made = made.filled(ball(empty, (x0, y0, z0), (r, r, 1.6 * r)), AIR_HU)
-    return made
-
-
-def _without_chest(image: HardImage) -> HardImage:
-    x, y, z = image.coordinates()
-    return image.filled(((x / 100.0) ** 2 + (y / 70.0) ** 2 < 1.0) & (z < INF), TISSUE_HU)
-
-
-def _pelvis(image: HardImage) -> HardImage:
-    made = _without_chest(image)
-    _, _, z = made.coordinates()
-    x, y, _ = made.coordinates()
-    return made.filled((np.hypot(x, y - 40.0) < 13.0) & (np.abs(z) < 45.0), AIR_HU)
-
-
-def _streaks(image: HardImage) -> HardImage:
-    metal = ball(image, (30.0, 20.0, -40.0), 6.0)
-    x, y, z = image.coordinates()
-    angle = np.arctan2(y - 20.0, x - 30.0)
-    streak = 350.0 * np.sign(np.sin(13.0 * angle)) * (np.abs(z + 40.0) < 6.0)
-    return image.with_hu(image.hu + streak).filled(metal, 3071.0)
-
-
-def _rings(image: HardImage, height_hu: float) -> HardImage:
-    x, y, z = image.coordinates()
-    return image.with_hu(image.hu + height_hu * np.sin(2.0 * np.hypot(x, y)) * (z < INF))
-
-
-def _moved(image: HardImage) -> HardImage:
-    """Return an image of a patient who breathed: two positions 8 mm apart, mixed."""
-    steps = round(8.0 / float(image.grid.spacing_mm[2]))
-    return image.with_hu(0.5 * (image.hu + np.roll(image.hu, steps, axis=2)))
-
-
-def _contrast(image: HardImage) -> HardImage:
-    heart = ball(image, (17.0, -19.0, -55.0), (36.0, 26.0, 32.0)) & (image.hu > 0.0)
-    return image.filled(heart, 320.0)
-
-
-def _blanket(image: HardImage) -> HardImage:
-    return tabled(image, clothes=True)
-
-
-def _pet(image: HardImage) -> HardImage:
-    return resampled(_belly(tabled(image, arms=True), AIR_HU), (1.4, 1.4, 3.0))
-
-
-def _shifted(image: HardImage, shift: float, *, clip: bool = False) -> HardImage:
-    return image.with_hu(np.maximum(image.hu + shift, -1024.0 if clip else -2000.0))
+MISSING = "missing (in|at) the"
+"""How lung is said to be missing."""
 
 
 def _cases() -> list[HardCase]:
@@ -131,11 +53,11 @@ def _cases() -> list[HardCase]:
     found: list[HardCase] = []
 
     def add(
-        group: str, name: str, make: Callable[[HardImage], HardImage], words: str = "", **more: bool
+        group: str, name: str, make: Callable[[HardImage], HardImage], words: str = "", **more: Any
     ) -> None:
         found.append(HardCase(name=name, group=group, make=make, words=words, **more))
 
-    add("axes", "as it is", lambda i: i)
+    add("axes", "as it is", lambda i: i, never=MISSING)
     for name, order, flips in (
         ("turned by 180 degrees about the body", (0, 1, 2), (0, 1)),
         ("turned by 180 degrees, head first to feet first", (0, 1, 2), (1, 2)),
@@ -164,8 +86,9 @@ def _cases() -> list[HardCase]:
         )
     add("pose", "rolled by 10 degrees", lambda i: rotated(i, 10.0, (0, 1)))
     add("pose", "rolled by 25 degrees", lambda i: rotated(i, 25.0, (0, 1)))
-    add("pose", "tilted sideways by 12 degrees", lambda i: rotated(i, 12.0, (0, 2)))
-    add("pose", "nodding by 15 degrees", lambda i: rotated(i, 15.0, (1, 2)))
+    add("pose", "tilted sideways by 12 degrees", lambda i: rotated(i, 12.0, (0, 2)), never=MISSING)
+    add("pose", "tilted to the other side by 8 degrees", lambda i: rotated(i, -8.0, (0, 2)), never=MISSING)
+    add("pose", "nodding by 15 degrees", lambda i: rotated(i, 15.0, (1, 2)), never=MISSING)
     add(
         "pose",
         "lying on the belly, on a table",
@@ -174,10 +97,10 @@ def _cases() -> list[HardCase]:
     add("around", "table of foam", tabled)
     add("around", "table and arms", lambda i: tabled(i, arms=True))
     add("around", "table, arms and clothes", lambda i: tabled(i, arms=True, clothes=True))
-    add("around", "blanket", _blanket)
-    add("around", "CT of a PET: table, arms, belly, 3 mm", _pet, "thick|3.0 mm")
-    add("around", "belly with gas below the chest", lambda i: _belly(i, AIR_HU))
-    add("around", "belly with stool below the chest", lambda i: _belly(i, -700.0))
+    add("around", "blanket", blanket)
+    add("around", "CT of a PET: table, arms, belly, 3 mm", pet, "thick|3.0 mm")
+    add("around", "belly with gas below the chest", lambda i: belly(i, AIR_HU))
+    add("around", "belly with stool below the chest", lambda i: belly(i, -700.0))
     add(
         "around",
         "stomach bubble below the diaphragm",
@@ -187,19 +110,19 @@ def _cases() -> list[HardCase]:
         add(
             "part",
             f"abdomen with bases of the lungs, bowel with {name}",
-            lambda i, h=hu: _abdomen(i, h),
+            lambda i, h=hu: abdomen(i, h),
             no_chest,
             refuse=True,
         )
         add(
             "part",
             f"abdomen, bowel with {name}",
-            lambda i, h=hu: _abdomen(i, h, below=-112.0),
+            lambda i, h=hu: abdomen(i, h, below=-112.0),
             no_chest,
             refuse=True,
         )
-    add("part", "head", _head, no_chest, refuse=True)
-    add("part", "pelvis", _pelvis, no_chest, refuse=True)
+    add("part", "head", head, no_chest, refuse=True)
+    add("part", "pelvis", pelvis, no_chest, refuse=True)
     add(
         "part",
         "neck and tops of the lungs",
@@ -246,15 +169,22 @@ def _cases() -> list[HardCase]:
         refuse=True,
     )
     for shift in (-60, -30, -15, 15, 30, 60):
-        add("shift", f"{shift:+d} HU", lambda i, s=shift: _shifted(i, s), "HU")
-    add("shift", "-60 HU, cut at -1024", lambda i: _shifted(i, -60.0, clip=True), "HU")
+        add("shift", f"{shift:+d} HU", lambda i, s=shift: shifted(i, s), "HU")
+    for shift in (-60, 60):
+        add(
+            "shift",
+            f"{shift:+d} HU, scatter in the trachea",
+            lambda i, s=shift: scattered(shifted(i, s)),
+            "HU",
+        )
+    add("shift", "-60 HU, cut at -1024", lambda i: shifted(i, -60.0, clip=True), "HU")
     for extra in (20, 40, 60, 80):
         add("noise", f"{extra} HU more", lambda i, e=extra: noisy(i, e), "noise")
     add("noise", "40 HU, correlated over a voxel", lambda i: noisy(i, 40.0, 1.0), "noise")
     add(
         "noise",
         "low dose of a thin lung: 40 HU, lung at -950",
-        lambda i: noisy(_lung_hu(i, -90.0), 40.0),
+        lambda i: noisy(with_lung_hu(i, -90.0), 40.0),
         "noise|thin",
     )
     for mm, plane in ((0.7, 0.7), (1.0, 1.0), (2.0, 0.8), (2.5, 0.8), (3.0, 0.8), (5.0, 0.8)):
@@ -297,55 +227,55 @@ def _cases() -> list[HardCase]:
         accepted=("one-lung",),
     )
     add("cut", "a lesion alone", lambda i: cropped(i, (-INF, -50, -60), (-12, 55, 45)), no_chest, refuse=True)
-    add("lung", "thin, -950 HU", lambda i: _lung_hu(i, -90.0), "thin|dens")
-    add("lung", "after breathing out, -700 HU", lambda i: _lung_hu(i, 160.0), "dens")
-    add("lung", "dense, -550 HU", lambda i: _lung_hu(i, 310.0), "dens")
+    add("lung", "thin, -950 HU", lambda i: with_lung_hu(i, -90.0), "thin|dens")
+    add("lung", "after breathing out, -700 HU", lambda i: with_lung_hu(i, 160.0), "dens")
+    add("lung", "dense, -550 HU", lambda i: with_lung_hu(i, 310.0), "dens")
     add(
         "lung",
         "left one filled with fluid",
-        lambda i: _solid(i, LEFT_LUNG, FLUID_HU, airways=False),
+        lambda i: solid(i, LEFT_LUNG, FLUID_HU, airways=False),
         "one lung|no left lung",
         refuse=True,
     )
     add(
         "lung",
         "left one filled with fluid, accepted",
-        lambda i: _solid(i, LEFT_LUNG, FLUID_HU, airways=False),
+        lambda i: solid(i, LEFT_LUNG, FLUID_HU, airways=False),
         "one lung|no left lung",
         accepted=("one-lung",),
     )
     add(
         "lung",
         "right one taken out",
-        lambda i: _solid(i, RIGHT_LUNG, FLUID_HU, airways=False),
+        lambda i: solid(i, RIGHT_LUNG, FLUID_HU, airways=False),
         "one lung|no right lung",
         refuse=True,
     )
     add(
         "lung",
         "right one taken out, accepted",
-        lambda i: _solid(i, RIGHT_LUNG, FLUID_HU, airways=False),
+        lambda i: solid(i, RIGHT_LUNG, FLUID_HU, airways=False),
         "one lung|no right lung",
         accepted=("one-lung",),
     )
     add(
         "lung",
         "right lower lobe solid",
-        lambda i: _solid(i, (RIGHT_LOWER,), TISSUE_HU, airways=False),
+        lambda i: solid(i, (RIGHT_LOWER,), TISSUE_HU, airways=False),
         "solid|missing",
         warn=True,
     )
     add(
         "lung",
         "left lower lobe solid, airways open",
-        lambda i: _solid(i, (LEFT_LOWER,), TISSUE_HU, airways=True),
+        lambda i: solid(i, (LEFT_LOWER,), TISSUE_HU, airways=True),
         "solid|missing",
         warn=True,
     )
     add(
         "lung",
         "right upper lobe solid, airways open",
-        lambda i: _solid(i, (RIGHT_UPPER,), TISSUE_HU, airways=True),
+        lambda i: solid(i, (RIGHT_UPPER,), TISSUE_HU, airways=True),
         "solid|missing",
         warn=True,
     )
@@ -353,7 +283,17 @@ def _cases() -> list[HardCase]:
         "lung",
         "fluid at the back of both",
         lambda i: i.filled(i.lung & (i.coordinates()[1] > 25.0), FLUID_HU),
+        "missing at the back of the (left|right) lung",
+        warn=True,
     )
+    for side, lobes in (("both", (*RIGHT_LUNG, *LEFT_LUNG)), ("right", RIGHT_LUNG)):
+        add(
+            "lung",
+            f"base solid: {side}",
+            lambda i, k=lobes: i.filled(of_lobes(i, k) & (i.coordinates()[2] < -60.0), TISSUE_HU),
+            "missing at the base of the right lung|missing in the lower part at the back of the right",
+            warn=True,
+        )
     add(
         "lung",
         "fluid at the back of the right one",
@@ -361,8 +301,8 @@ def _cases() -> list[HardCase]:
         "missing",
         warn=True,
     )
-    add("lung", "pneumothorax of 15 mm", lambda i: _pneumothorax(i, 15.0), "gas|pneumothorax", warn=True)
-    add("lung", "pneumothorax of 30 mm", lambda i: _pneumothorax(i, 30.0), "gas|pneumothorax", warn=True)
+    add("lung", "pneumothorax of 15 mm", lambda i: pneumothorax(i, 15.0), "gas|pneumothorax", warn=True)
+    add("lung", "pneumothorax of 30 mm", lambda i: pneumothorax(i, 30.0), "gas|pneumothorax", warn=True)
     add(
         "lung",
         "bulla of 50 mm",
@@ -382,10 +322,10 @@ def _cases() -> list[HardCase]:
         "nodule of 20 mm",
         lambda i: i.filled(ball(i, (-50, 0, 10), 10.0) & i.lung, TISSUE_HU, lung=True),
     )
-    add("scan", "contrast medium", _contrast)
-    add("scan", "metal with streaks", _streaks, "metal|noise")
-    add("scan", "rings of 40 HU", lambda i: _rings(i, 40.0), "noise|rings")
-    add("scan", "breathing while scanned", _moved, "blurred by breathing")
+    add("scan", "contrast medium", contrast)
+    add("scan", "metal with streaks", streaks, "metal|noise")
+    add("scan", "rings of 40 HU", lambda i: rings(i, 40.0), "noise|rings")
+    add("scan", "breathing while scanned", moved, "blurred by breathing")
     return found
 
 

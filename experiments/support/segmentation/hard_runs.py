@@ -39,13 +39,14 @@ class HardCase:
     """One input: how it is made, and the words, a pattern, of the warning or refusal that would be pertinent.
 
     Without words only the right result counts. `refuse` says that only a refusal counts, `warn` that nothing
-    counts without a warning.
+    counts without a warning. `never` is a pattern of words that would be wrong.
     """
 
     name: str
     group: str
     make: Callable[[HardImage], HardImage]
     words: str = ""
+    never: str = ""
     refuse: bool = False
     warn: bool = False
     thick: bool = False
@@ -91,6 +92,8 @@ def run(case: HardCase, image: HardImage, plain: float) -> Outcome:
     good = min(right, left) >= LEAST_DICE and tree >= LEAST_TREE and not (case.refuse or case.warn)
     warned = bool(case.words) and re.search(case.words, said) is not None and not case.refuse
     verdict = "right" if good else "warned" if warned else "SILENTLY WRONG"
+    if case.never and re.search(case.never, said):
+        verdict = "warned wrongly"
     return Outcome(verdict=verdict, right=right, left=left, tree=tree, said=said)
 
 

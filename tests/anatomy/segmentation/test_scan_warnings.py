@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom
-from anatomy.segmentation.missing_lung import missing_lung, solid_tissue
+from anatomy.segmentation.missing_lung import missing_lung, solid_tissue, untilted
 from anatomy.segmentation.scan_warnings import noise_hu, scan_warnings
 from anatomy.typed import Mask
 
@@ -28,6 +29,15 @@ def test_noise_is_measured_in_soft_tissue(noise: float) -> None:
     assert noise_hu(ct, near) == pytest.approx(noise, rel=0.1)
     said = " ".join(scan_warnings(ct, near))
     assert ("The noise is" in said) == (noise > 30.0)
+
+
+def test_correlated_noise_counts_by_what_averaging_leaves_of_it() -> None:
+    """Noise that is smooth over a voxel: 20 HU hide more than 20 HU that are not."""
+    ct, near = _tissue(0.0)
+    noise = gaussian_filter(np.random.default_rng(1).standard_normal(ct.grid.shape), 1.0)
+    values = ct.array + np.rint(20.0 / noise.std() * noise)
+    correlated = noise_hu(Volume(grid=ct.grid, array=values.astype(np.int16)), near)
+    assert 23.0 < correlated < 40.0
 
 
 def test_no_noise_is_claimed_where_there_is_no_tissue() -> None:
@@ -64,6 +74,26 @@ def test_a_lobe_that_is_missing_is_named(patient: Phantom, lobe: int, place: str
     gone = lobes == lobe
     (warning,) = missing_lung(left & ~gone, right & ~gone, patient.grid, CARINA)
     assert place in warning and "understated" in warning
+
+
+def test_what_is_missing_on_both_sides_alike_is_told_by_its_extent(patient: Phantom) -> None:
+    lobes, points = patient.lobes.array, np.indices(patient.lobes.array.shape).reshape(3, -1).T
+    _, y, z = patient.grid.lps(points).T
+    for place, gone in (("back", y > 25.0), ("base", z < -60.0)):
+        kept = lobes * ~gone.reshape(lobes.shape)
+        said = " ".join(missing_lung(kept >= 4, (kept > 0) & (kept < 4), patient.grid, CARINA))
+        assert f"missing at the {place} of the left lung" in said and f"{place} of the right lung" in said
+
+
+def test_a_patient_who_lies_askew_is_put_upright() -> None:
+    rng = np.random.default_rng(0)
+    ball = rng.uniform(-1.0, 1.0, (40_000, 3))
+    ball = ball[(ball**2).sum(axis=1) < 1.0] * [40.0, 70.0, 110.0]
+    lungs = np.concatenate([ball - [60.0, 0, 0], ball + [60.0, 0, 0]])
+    c, s = np.cos(np.deg2rad(12.0)), np.sin(np.deg2rad(12.0))
+    tilted = lungs @ np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+    assert np.abs(untilted(tilted, CARINA) - lungs).max() < 1e-6
+    assert untilted(lungs, CARINA) is lungs
 
 
 def test_a_mass_is_warned_of_and_vessels_are_not(patient: Phantom) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -30,6 +31,8 @@ FITTED_NODES = 2
 """A fit is evaluated so many nodes beyond its lung, which is slow; farther out it is continued."""
 INVERSE_STEPS = 60
 """Of the fixed point that brings a field to the masks' phase; it converges as a lung's motion contracts."""
+LEAST_EMPTY = 0.01
+"""More displacements of exactly 0 than this are not measured but left out."""
 SIDES = {RIGHT: "right", LEFT: "left"}
 
 At = Callable[[Float], Float]
@@ -146,6 +149,7 @@ def _of_field(
 ) -> tuple[Float, dict[str, float]]:
     """Bring a field to the masks' phase, and continue that of each lung beyond it."""
     _require_covered(source, np.concatenate(list(lungs.values())))
+    source = _filled(source)
     own, smooth = _field_at(source, 0.0), _field_at(source, NODE_MM)
     d, rest_mm = _at_masks(source, smooth, at)
 
@@ -181,6 +185,18 @@ def _require_covered(source: MotionSource, places: Float) -> None:
             expected="a field over both lungs, LPS mm of the masks",
             remedy="Export the field on the whole image; check that it and the masks come from the same one",
         )
+
+
+def _filled(source: MotionSource) -> MotionSource:
+    """Return a field whose voxels without a displacement, as outside of a mask, have the nearest one's."""
+    vectors = source.vectors
+    if vectors is None:
+        return source
+    empty = ~vectors.any(axis=-1)
+    if not LEAST_EMPTY < float(empty.mean()) < 1.0:
+        return source
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return replace(source, vectors=vectors[tuple(nearest)])
 
 
 def _field_at(source: MotionSource, smooth_mm: float) -> At:

@@ -172,6 +172,20 @@ def test_the_population_warns_and_moves_each_height_as_it_says(small_lung: Lung)
     assert np.abs(motion.displacements_mm(at, RIGHT)[:, 2] - expected).max() < 0.5
 
 
+def test_a_field_of_the_lungs_alone_is_continued_beyond_them(
+    source: MotionSource, motion: Motion, small_lung: Lung
+) -> None:
+    grid, vectors = source.grid, source.vectors
+    assert grid is not None and vectors is not None
+    at = np.rint(small_lung.grid.ijk(grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1)))).astype(int)
+    at = np.clip(at, 0, np.array(small_lung.labels.shape) - 1)
+    inside = (small_lung.labels[tuple(np.moveaxis(at, -1, 0))] & OUTSIDE) == 0
+    other = prepared(replace(source, vectors=vectors * inside[..., None]), small_lung)
+    places_left = places(small_lung, LEFT)
+    gap = other.displacements_mm(places_left, LEFT) - motion.displacements_mm(places_left, LEFT)
+    assert np.percentile(np.linalg.norm(gap, axis=1), 95) < 0.5
+
+
 def test_a_field_that_jumps_between_the_lungs_is_continued() -> None:
     values = np.zeros((12, 5, 5, 3))
     values[6:, ..., 2] = -20.0

@@ -38,6 +38,7 @@ OUR_OWN = (
     "success_planning",
     "rare_events",
     "lobes",
+    "slice_thickness",
     "growth",
 )
 SETTINGS = ("full", "quick")

@@ -14,6 +14,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.records import frozen_record
+from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.description import Description, description_text
 from anatomy.segmentation.folder import SegmentationFolder, digest_of, grid_digest, key_of
@@ -28,8 +29,10 @@ from anatomy.typed import Float
 
 Progress = Callable[[str], None]
 
-BYTES_PER_VOXEL = 40
-"""Peak memory over the voxels of the CT."""
+BYTES_PER_CT_VOXEL, BYTES_PER_VOXEL = 12, 30
+"""Peak memory over the voxels of the CT, and over those of the box."""
+LARGEST_BOX_MM3 = 30e6
+"""The box of the lungs of a very tall man: 350 x 260 x 330 mm."""
 
 
 @frozen_record
@@ -55,9 +58,11 @@ class Segmentation:
         return self.parts.ct.grid
 
 
-def memory_estimate_gib(grid: Grid) -> float:
+def memory_estimate_gib(grid: Grid, voxel_mm: float = VOXEL_MM) -> float:
     """Return about how much memory the segmentation of a CT on this grid needs at most, in GiB."""
-    return float(np.prod(grid.shape)) * BYTES_PER_VOXEL / 2**30
+    finer = Box.whole(grid, voxel_mm).lattice
+    voxels = min(float(np.prod(finer.shape)), LARGEST_BOX_MM3 / finer.voxel_volume_mm3)
+    return (float(np.prod(grid.shape)) * BYTES_PER_CT_VOXEL + voxels * BYTES_PER_VOXEL) / 2**30
 
 
 def segment(request: SegmentationRequest, progress: Progress | None = None) -> Segmentation:

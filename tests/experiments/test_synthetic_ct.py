@@ -10,6 +10,7 @@ import pytest
 from anatomy.errors import AnatomyError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
+from experiments.support.segmentation.slices import thickened
 from experiments.support.segmentation.synthetic_ct import CtLook, render_ct
 
 SILENT = CtLook(noise_hu=0.0, texture_hu=0.0, spacing_mm=1.0)
@@ -131,3 +132,13 @@ class TestRefusals:
     def test_impossible_looks(self, wrong: dict[str, float]) -> None:
         with pytest.raises(SettingsError, match=next(iter(wrong))):
             CtLook(**wrong)
+
+
+def test_thicker_slices_are_means_at_their_middle() -> None:
+    grid = Grid.from_spacing((2, 3, 10), (0.8, 0.8, 1.0), (0.0, 0.0, 5.0))
+    ct = Volume(grid=grid, array=np.broadcast_to(100 * np.arange(10, dtype=np.int16), grid.shape).copy())
+    thick = thickened(ct, 2.5)
+    assert thick.grid.shape == (2, 3, 4)
+    assert thick.grid.spacing_mm[2] == pytest.approx(2.5)
+    assert thick.grid.lps((0, 0, 0)) == pytest.approx((0.0, 0.0, 5.75))
+    np.testing.assert_array_equal(thick.array[0, 0], [80, 320, 580, 820])

@@ -133,7 +133,7 @@ def segment(
     require_writable_folder(out)
     with progress(f"reading {ct}") as shown:
         volume, sources = read_ct(ct, series)
-        estimate = f"{memory_estimate_gib(volume.grid):.1f} GiB"
+        estimate = f"{memory_estimate_gib(volume.grid, voxel_mm):.1f} GiB"
         terminal.progress_console.print(
             f"{volume.grid.describe()}; up to about {estimate} of memory", highlight=False
         )

@@ -43,6 +43,8 @@ LEAST_WIDTH = 2.0**-11
 """A stretch of phases that is not divided any further: 0.05 % of the breath."""
 MOST_LEAVES = 4096
 """More stretches than there are of the least width."""
+HAZARD_WIDTH = 2.0**-7
+"""In a part of a wider stretch a tube may come free of the wall, and what lies behind it does not count."""
 FIRST_HOP = 8
 """Points along the devices by which the search for where a rule is broken begins: 0.4 mm."""
 BEGIN, END, KIND, KEPT, RADIUS = range(5)
@@ -303,7 +305,8 @@ def divide(
             if at >= 0:
                 state = UNDECIDED
                 blocked, at = _surely(tissue, breath, rigid, stretch, points, sections, at, reason)
-                if blocked:
+                in_airway = reason != LEAVES_LUMEN and sections[_row_of(sections, at), KIND] <= BEFORE_WALL
+                if blocked and not (in_airway and end - begin > HAZARD_WIDTH):
                     state = BLOCKED
         if state == UNDECIDED and end - begin > LEAST_WIDTH:
             middle = 0.5 * (begin + end)

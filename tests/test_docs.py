@@ -14,6 +14,7 @@ import pytest
 import lungaccess as la
 from anatomy.facade import public_names
 from anatomy.io.own_masks import PatientFile
+from anatomy.segmentation.learned import NetworkSettings
 from anatomy.settings import parse
 from lungaccess.cli.app import app
 from lungaccess.cli.examples import EXAMPLES
@@ -29,6 +30,7 @@ LEAST_RUN_SHARE = 0.9
 READERS = {
     "errors.toml": load_errors,
     "my-device.toml": load_system,
+    "network.toml": lambda path: parse(NetworkSettings, tomllib.loads(path.read_text()), path.name),
     "study.toml": read_study,
     "success.toml": read_study,
     "tubes.toml": load_tubes,

@@ -91,3 +91,8 @@ class Lung(Organ):
         nearest = int(np.argmin(distance))
         number = int(self.lobes.array[tuple(voxels[nearest])])
         return LOBES[number] if distance[nearest] <= NEAREST_LOBE_MM else ""
+
+    def branch_words(self, branch: int) -> str:
+        """Return the number of an airway branch, with the lobe in which it ends if that is known."""
+        lobe = self.lobe_at(self.tree.points_lps[self.tree.branch_points(branch)[-1]])
+        return f"{branch} ({lobe})" if lobe else f"{branch}"

@@ -50,7 +50,7 @@ def plan_record(
         "clearance_mm": {device: dict(values) for device, values in plan.clearance_mm.items()},
         "iterations": plan.iterations,
         "timing": dict(plan.timing),
-        "scope_motion": motion_record(plan, lung.tree),
+        "scope_motion": motion_record(plan, lung),
     }
 
 
@@ -72,7 +72,7 @@ def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
 
     what = "the tubes beyond the lumen" if plan.needle is None else "the needle"
     return [
-        terminal.table("The stages", ("stage", "what to do"), _stage_rows(plan)),
+        terminal.table("The stages", ("stage", "what to do"), _stage_rows(plan, lung)),
         steps_table(plan, lung),
         terminal.table(
             f"Costs of {what} (made small: {Objective.of(plan.objective).words})",
@@ -98,8 +98,9 @@ def steps_table(plan: Plan, lung: Lung) -> Table:
     return made
 
 
-def _stage_rows(plan: Plan) -> list[terminal.Row]:
-    scope, tube = plan.scope, plan.tube
+def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
+    scope, tube, lobe = plan.scope, plan.tube, lung.lobe_at(plan.target_lps)
+    way = plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"
     return [
         (
             "scope",
@@ -109,9 +110,9 @@ def _stage_rows(plan: Plan) -> list[terminal.Row]:
         (
             "tubes",
             f"{plan.rotations}, {plan.insertions} beyond the scope; "
-            f"through the wall of branch {tube.exit.branch}",
+            f"through the wall of branch {lung.branch_words(tube.exit.branch)}",
         ),
-        ("needle", plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"),
+        ("needle", way + (f" in the {lobe}" if lobe else "")),
     ]
 
 

@@ -8,6 +8,7 @@ from dataclasses import asdict
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
 from lungaccess.plans.insertion import scope_motion
@@ -136,11 +137,14 @@ def handle_words(plan: Plan) -> str:
     )
 
 
-def motion_record(plan: Plan, tree: AirwayTree) -> dict[str, object]:
+def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
     """Return a plan's motion of the bronchoscope as plain values: steps for hands, all states for motors."""
     advance, (twist, bend) = plan.scope.states[:, 0], np.degrees(plan.scope.states[:, 1:]).T
     return {
-        "steps": [one.as_json() for one in scope_steps(scope_motion(plan), tree)],
+        "steps": [
+            one.as_json() | {"branch_in_words": lung.branch_words(one.branch)}
+            for one in scope_steps(scope_motion(plan), lung.tree)
+        ],
         "states": [
             {"advance_mm": float(a), "twist_deg": float(t), "bend_deg": float(b)}
             for a, t, b in zip(advance, twist, bend, strict=True)

@@ -28,16 +28,17 @@ def key_numbers(plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> l
 def figures_of_plan(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
     """Return headed rows of what the plan does and costs, without its limits."""
     costs = costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None))
-    return [("Plan", _general_rows(plan)), *_stage_rows(plan), ("Cost", costs)]
+    return [("Plan", _general_rows(plan, lung)), *_stage_rows(plan, lung), ("Cost", costs)]
 
 
-def _general_rows(plan: Plan) -> list[Row]:
+def _general_rows(plan: Plan, lung: Lung) -> list[Row]:
     x, y, z = (float(c) for c in plan.target_lps)
     return [
         ("patient", plan.patient_name),
         ("system", plan.system.name),
         ("target, LPS mm", f"{x:.1f}, {y:.1f}, {z:.1f}"),
         ("target, RAS mm", f"{-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}"),
+        *((("lobe of the target", lobe),) if (lobe := lung.lobe_at(plan.target_lps)) else ()),
         ("fissures", _fissures(plan)),
         ("breath hold", plan.breath_hold or "not stated"),
         ("method, seed", f"{plan.method}, {plan.seed}"),
@@ -50,7 +51,7 @@ def _fissures(plan: Plan) -> str:
     return "may be crossed" if plan.system.fissures_allowed else "not checked: no mask"
 
 
-def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
+def _stage_rows(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
     scope, tube, tubes = plan.scope, plan.tube, plan.system.tubes
     names = " / ".join(name for name, _tube in tubes.named) if tubes.outer is not None else "length"
     insertions = " / ".join(f"{length:.1f}" for length in tube.insertions_mm(tubes)) + " mm"
@@ -63,7 +64,7 @@ def _stage_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
     tube_rows = [
         ("rotation", turned),
         (f"{names} beyond scope", insertions),
-        ("pierced branch", f"{tube.exit.branch}"),
+        ("pierced branch", lung.branch_words(tube.exit.branch)),
     ]
     return [("Scope", scope_rows), ("Tube", tube_rows), *_needle_rows(plan)]
 

@@ -112,6 +112,7 @@ def _template(name: str) -> Callable[[Path], None]:
 def _text_targets() -> dict[str, Target]:
     from anatomy.io.frames import read_points, read_pose
     from anatomy.io.label_names import stored_names
+    from anatomy.io.motion_files import read_landmarks
     from anatomy.io.own_masks import _read_description, thick_slices_mm
     from anatomy.segmentation.nodules import nodule_from_contours
     from lungaccess.one_stage.tour import read_lesions
@@ -134,6 +135,9 @@ def _text_targets() -> dict[str, Target]:
     def points(folder: Path) -> None:
         (folder / "points.txt").write_text("1.5 -20 30\n-4e1 5 -6.25\n")
 
+    def pairs(folder: Path) -> None:
+        (folder / "pairs.csv").write_text("x,y,z,x,y,z\n1.5,-20,30,1.6,-21,36\n-4e1,5,-6.25,-40,6.5,-6\n")
+
     def labelled(folder: Path) -> None:
         _image("labels.nii.gz", True)(folder)
         (folder / "labels.json").write_text('{"labels": {"lung_airways": 1, "lung_vessels": 2}}')
@@ -149,6 +153,7 @@ def _text_targets() -> dict[str, Target]:
         "tubes": Target("tubes.toml", _template("tubes.toml"), lambda f: load_tubes(f / "tubes.toml")),
         "pose": Target("pose.txt", _template("pose.txt"), lambda f: read_pose(f / "pose.txt", "ras")),
         "points": Target("points.txt", points, lambda f: read_points(f / "points.txt", "lps")),
+        "landmarks": Target("pairs.csv", pairs, lambda f: read_landmarks(f / "pairs.csv", "ras")),
         "lesions": Target("lesions.txt", _template("lesions.txt"), lambda f: read_lesions(f / "lesions.txt")),
         "contours": Target(
             "contours.json",

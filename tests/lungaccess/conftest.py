@@ -98,6 +98,8 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         tree=_tree(trunk),
         breath_hold=None,
         motion=None,
+        lobe_at=lambda point_lps: "left lower lobe" if point_lps[0] > 0.0 else "",
+        branch_words=lambda branch: f"{branch} (left lower lobe)",
         warnings=("The toy is [made by hand].",),
     )
 

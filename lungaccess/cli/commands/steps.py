@@ -17,7 +17,7 @@ def steps(plan: PlanFile, patient: PatientOfPlan, *, output: PatientOptions = Pa
     lung = output.load(patient)
     stored.require_lung(lung)
     if output.json:
-        terminal.show_json(motion_record(stored, lung.tree))
+        terminal.show_json(motion_record(stored, lung))
     else:
         terminal.show([steps_table(stored, lung)])
     return ExitCode.OK

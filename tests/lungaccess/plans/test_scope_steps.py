@@ -109,7 +109,7 @@ def test_the_handle_makes_up_for_the_tubes(toy_plan: Plan) -> None:
 
 
 def test_programs_get_every_state(toy_plan: Plan, toy_lung: Any) -> None:
-    record = motion_record(toy_plan, toy_lung.tree)
+    record = motion_record(toy_plan, toy_lung)
     states = [[each["advance_mm"], each["twist_deg"], each["bend_deg"]] for each in record["states"]]
     assert np.allclose(np.array(states) * [1.0, np.pi / 180.0, np.pi / 180.0], toy_plan.scope.states)
     assert record["steps"][-1]["branch"] == toy_plan.scope.branches[-1]

@@ -17,7 +17,7 @@ from lungaccess.coupled.search.separated_arcs import separated_candidates
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import System
+from lungaccess.problem.system import System, require_own_name
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from stages.needle import DEFAULT, Objective
@@ -96,6 +96,7 @@ def alternatives(
         If the target lies outside the lung or inside an obstacle.
     """
     weighed = objective_of(lung, objective)
+    require_own_name(system)
     task = Task(lung=lung, system=system, target=target, objective=weighed, method="alternatives")
     if atlas is not None:
         require_same(atlas, lung, system)

@@ -18,7 +18,7 @@ from lungaccess.coupled.search.kuntz2015 import KuntzSearch
 from lungaccess.coupled.search.tube_search import TubeSearch
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import System
+from lungaccess.problem.system import System, require_own_name
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from stages.needle import DEFAULT, Objective, require_planner
@@ -145,6 +145,7 @@ def plan(
         system.require_needle(f"The needle planner {needle_planner}")
     if method in NEED_A_NEEDLE:
         system.require_needle(f"The method {method}")
+    require_own_name(system)
     tell = on_progress or (lambda _event: None)
     task = Task(
         lung=lung,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from anatomy.lung import Lung
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
-from lungaccess.problem.system import System, require_own_name
+from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
 from stages.needle import DEFAULT, Objective
 
@@ -15,8 +15,7 @@ class Task:
     """What a search for plans is asked: they keep the objective small, and state the search's name, `method`.
 
     `needle_planner` is one of `stages.needle.NEEDLE_PLANNERS`, or "" for the method's own.  TargetError is
-    raised if the target lies outside the lung or inside an obstacle, SettingsError if a changed preset keeps
-    its name.
+    raised if the target lies outside the lung or inside an obstacle.
     """
 
     lung: Lung
@@ -28,7 +27,6 @@ class Task:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        require_own_name(self.system)
         require_free(self.lung, self.target.lps_mm)
 
     @property

@@ -11,7 +11,7 @@ from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.planner import Clock, ProgressEvent, atlas_event
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import System
+from lungaccess.problem.system import System, require_own_name
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from lungaccess.procedure import Procedure, ProcedureReport, load_procedure
@@ -96,6 +96,7 @@ def plan_for_success(
         If the target lies outside the lung or inside an obstacle.
     """
     system.require_needle("Planning for the chance of success")
+    require_own_name(system)
     tell = on_progress or (lambda _event: None)
     if atlas is not None:
         require_same(atlas, lung, system)

@@ -13,6 +13,7 @@ from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Positive
 from lungaccess.cli.options import OutputOptions
 from lungaccess.cli.progress import progress
 
@@ -44,10 +45,10 @@ def segment(
     series: str | None = None,
     ex_vivo: bool = False,
     thick_slices: bool = False,
-    large_radius_mm: float = LARGE_RADIUS_MM,
+    large_radius_mm: Positive = LARGE_RADIUS_MM,
     accept: tuple[str, ...] = (),
     seed: str | None = None,
-    voxel_mm: float = VOXEL_MM,
+    voxel_mm: Positive = VOXEL_MM,
     lungs: Path | None = None,
     airway: Path | None = None,
     airway_wall: Path | None = None,

@@ -140,13 +140,13 @@ def test_bad_input(small_lung: Lung, atlas: la.Atlas) -> None:
     for wrong in ({"count": 0}, {"separation_mm": 0.0}, {"objective": "beauty"}):
         with pytest.raises(SettingsError):
             alternatives(small_lung, SYSTEM, target, atlas=atlas, **wrong)
-    other = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=2.9))
+    other = replace(SYSTEM, name="other", scope=replace(SYSTEM.scope, outer_diameter_mm=2.9))
     with pytest.raises(SettingsError, match="atlas"):
         alternatives(small_lung, other, target, atlas=atlas)
 
 
 def test_an_atlas_serves_another_needle(small_lung: Lung, atlas: la.Atlas) -> None:
-    other = replace(SYSTEM, needle=replace(SYSTEM.needle, max_curvature_per_mm=1.0 / 40.0))
+    other = replace(SYSTEM, name="other", needle=replace(SYSTEM.needle, max_curvature_per_mm=1.0 / 40.0))
     target = la.resolve_target(small_lung)
     assert alternatives(small_lung, other, target, atlas=atlas, count=1)[0].plan.system == other
 

@@ -195,7 +195,7 @@ class TestBadInput:
     def test_an_atlas_of_another_device_or_patient(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
-        other = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=2.5))
+        other = replace(SYSTEM, name="other", scope=replace(SYSTEM.scope, outer_diameter_mm=2.5))
         with pytest.raises(SettingsError, match="build_atlas"):
             la.plan(small_lung, other, target, atlas=atlas)
         with pytest.raises(SettingsError, match="build_atlas"):

@@ -161,7 +161,7 @@ def test_without_errors_every_candidate_is_certain(
 
 
 def test_where_there_is_no_plan_it_says_why(small_lung: Lung, atlas: la.Atlas, targets: list[Target]) -> None:
-    short = replace(SYSTEM, needle=replace(SYSTEM.needle, max_length_mm=1.0))
+    short = replace(SYSTEM, name="short", needle=replace(SYSTEM.needle, max_length_mm=1.0))
     with pytest.raises(la.NoPlan) as failure:
         next(la.plan_for_success(small_lung, short, targets[0], atlas=atlas, counterfactuals=False))
     assert failure.value.reasons

@@ -100,7 +100,10 @@ def test_the_result_is_repeatable(patient: Phantom, lungs: Lungs) -> None:
     assert (again.central_airway == lungs.central_airway).all()
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+_ORDERS = [(2, 0, 1), *(pytest.param(each, marks=pytest.mark.slow) for each in ((0, 1, 2), (1, 2, 0)))]
+
+
+@pytest.mark.parametrize("order", _ORDERS)
 def test_the_way_voxels_are_stored_does_not_matter(
     patient: Phantom, lungs: Lungs, order: tuple[int, int, int]
 ) -> None:
@@ -160,7 +163,7 @@ def test_lungs_that_touch_are_parted(patient: Phantom) -> None:
     assert dice(parted.right, right) > 0.97
 
 
-@pytest.mark.parametrize("radius_mm", [4.0, 8.0])
+@pytest.mark.parametrize("radius_mm", [pytest.param(4.0, marks=pytest.mark.slow), 8.0])
 def test_a_nodule_on_the_pleura_stays_inside(patient: Phantom, lungs: Lungs, radius_mm: float) -> None:
     grid = patient.ct.grid
     depth = distance_mm(lungs.left, grid.spacing_mm)

@@ -174,6 +174,7 @@ def test_a_corrected_mask_is_kept_and_only_what_follows_is_done_again(
     assert settled.corrected == ("airway",)
 
 
+@pytest.mark.slow
 def test_taking_a_correction_back_restores_what_was_made(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:
@@ -222,7 +223,7 @@ class _Killed(BaseException):
 
 
 @pytest.mark.parametrize(
-    "moment", [3, 9, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 6, 14, 20))]
+    "moment", [9, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 3, 6, 14, 20))]
 )
 def test_a_killed_run_leaves_no_patient_and_is_made_good(
     patient: Phantom, made: Segmentation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int

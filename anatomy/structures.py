@@ -6,7 +6,10 @@ voxels, the number of its branch.  The bits themselves stand in `anatomy.kernels
 
 from __future__ import annotations
 
+import numpy as np
+
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
+from anatomy.typed import Labels
 
 __all__ = [
     "AIRWAY",
@@ -19,6 +22,7 @@ __all__ = [
     "OBSTACLES",
     "OUTSIDE",
     "VESSEL",
+    "close_border",
     "obstacle_bits",
 ]
 
@@ -50,3 +54,10 @@ FIELD_BITS: dict[str, int] = {
 def obstacle_bits(with_fissures: bool) -> int:
     """Return the bits of the structures that a needle must avoid, fissures among them or not."""
     return OBSTACLES | FISSURE if with_fissures else OBSTACLES
+
+
+def close_border(labels: Labels) -> None:
+    """Make the outermost voxels OUTSIDE: distances know nothing of what lies beyond the grid."""
+    for axis in range(3):
+        layers = np.moveaxis(labels, axis, 0)
+        layers[[0, -1]] |= OUTSIDE

@@ -15,7 +15,7 @@ from anatomy.kernels.field import EXACT_REACH_MM
 from anatomy.margins import Margins
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
-from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, obstacle_bits
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, close_border, obstacle_bits
 from anatomy.typed import Float, Int, Labels
 from stages.needle.device import Needle
 from stages.needle.kernels import scan
@@ -96,11 +96,13 @@ def environment_of_labels(
     labels : (ni, nj, nk) uint16
         See `anatomy.structures`.
     bits : int
-        Structures that are obstacles.  Space beyond the grid is OUTSIDE.
+        Structures that are obstacles.
     required_clearance_mm : float
         Distance that the needle's axis keeps from obstacles.
     obstacles_as : float
-        `SOLID`: the clearance is measured to voxels as solid boxes; `CENTRES`: to voxel centres.
+        `SOLID`: the clearance is measured to voxels as solid boxes, and the outermost voxels count as
+        OUTSIDE, since what lies beyond the grid is not known; `CENTRES`: to voxel centres, and the axis alone
+        stays in the grid.
     goal_tolerance_mm : float
         How far from the target a path may end.
     cost_map : Volume, optional
@@ -121,7 +123,9 @@ def environment_of_labels(
         raise SettingsError(
             f"Obstacles cannot be taken as {obstacles_as}", expected=f"{SOLID} (boxes) or {CENTRES} (centres)"
         )
-    labels = np.asfortranarray(labels, dtype=np.uint16)
+    labels = np.array(labels, dtype=np.uint16, order="F")
+    if obstacles_as == SOLID:
+        close_border(labels)
     clearance = distance_field("obstacle", (labels & bits) != 0, grid, obstacles_as)
     return _environment(
         grid, needle, required_clearance_mm, clearance, read_only(labels), bits, cost_map, goal_tolerance_mm

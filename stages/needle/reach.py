@@ -38,12 +38,15 @@ class Reached:
         Lower bound of its clearance beyond the exempt length; 0 where there is none.
     entries : (N,) int64
         Its start pose; -1 where there is none.
+    window_share : (N,) float64 or None
+        Share of the breath in which it is proved, where phases of the breath are asked for.
     """
 
     kinds: UInt8
     cost: Float
     clearance_mm: Float
     entries: Int
+    window_share: Float | None = None
 
 
 DEFAULT_ARCS = 4

@@ -88,7 +88,7 @@ class NoPathProof:
     -----
     Among the limits, those of curvature and of the angle from the reference count; those of length and of
     accumulated turn count only in so far as together they forbid turning by more than 180 degrees in all.
-    Without that, nothing is proved.  Where the exit may touch a pierced branch, that branch is no obstacle.
+    Without that, nothing is proved.
     """
 
     def __init__(self, environment: NeedleEnvironment, query: Query, *, max_bytes: int = MAX_BYTES) -> None:
@@ -103,8 +103,6 @@ class NoPathProof:
         self._environment = environment
         self._query = query
         self._max_bytes = max_bytes
-        self._required = environment.limits.required_mm
-        self._exempt_mm = environment.limits.exempt_mm - query.inserted_mm
         self._kappa = max(environment.limits.kappa * (1.0 + ROUNDING), LEAST_KAPPA)
         self._tolerance = environment.goal_tolerance_mm + bounds.SPARE
         self._planes: list[Plane] = []
@@ -195,8 +193,9 @@ class NoPathProof:
         if 5 * size > self._max_bytes or size >= 1 << 31:
             return False
         return not cubes.flood(
-            self._environment.obstacles, self._required, self._query.branch, self._exempt_mm, self._scale,
-            self._paths.ends, self._frame, side, np.array([-before, -beside, -beside]),
+            self._environment.obstacles, self._environment.limits, self._query.branch,
+            self._query.inserted_mm, self._scale, self._paths.ends, self._frame, side,
+            np.array([-before, -beside, -beside]),
             np.zeros(shape, dtype=np.bool_), np.zeros(size, dtype=np.int32),
         )  # fmt: skip
 
@@ -373,20 +372,16 @@ class NoPathProof:
         blocked.mark_probed(plane.bits, plane.window, self._scale, probes, probed, corners)
         grades = np.zeros((len(probes), rows, 64 * words), dtype=np.uint8)
         across = self._frame[2:] * self.cell_mm
+        limits = self._environment.limits
         for n, probe in enumerate(probes):
             depth = here + float(probe)
             # A path at this depth is at least as long, so beyond the exempt length nothing is spared.
-            exempt = self._query.branch if depth < self._exempt_mm else -1
+            inserted = self._query.inserted_mm + max(depth, 0.0)
+            exempt = self._query.branch if inserted < limits.exempt_mm else -1
             tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
             origin = self._frame[0] + depth * (self._frame[1] + tangent) + corners[n] @ across
             blocked.grade_clearance(
-                self._environment.obstacles,
-                self._required,
-                exempt,
-                origin,
-                across,
-                probed[n],
-                slacks,
+                self._environment.obstacles, limits, exempt, inserted, origin, across, probed[n], slacks,
                 grades[n],
-            )
+            )  # fmt: skip
         blocked.keep_clear(plane.bits, plane.window, self._scale, probes, corners, grades, slacks)

@@ -79,6 +79,21 @@ def _blocker_by_lookup(obstacles, step, pose, bend, length):
     return 0
 
 
+@inner_kernel
+def kept_from_lumen(limits, inserted):
+    """Return the distance in mm that the axis keeps from every lumen in the exit, and its growth a mm.
+
+    The distance is negative where the lumen of the pierced branch does not count.
+    """
+    if limits.leaving_sine > 0.0:
+        if inserted < WALL_ZONE_MM - TINY:
+            return -1.0, 0.0
+        risen = limits.leaving_sine * (inserted - WALL_ZONE_MM)
+        if risen < limits.radius_mm:
+            return max(risen, 0.0), limits.leaving_sine
+    return limits.radius_mm, 0.0
+
+
 @numba.njit(cache=True)
 def exact_gap(obstacles, limits, inserted, x, y, z, branch):
     """Tell how far a needle may go on from a point where it is `inserted` mm long: the rule at the exit.
@@ -104,11 +119,8 @@ def exact_gap(obstacles, limits, inserted, x, y, z, branch):
     distance, label = exact_distance(labels, geometry, x, y, z, bits, branch if in_exit else -1, reach)
     needed = limits.required_mm
     gap = distance - needed
-    if in_exit and not (limits.leaving_sine > 0.0 and inserted < WALL_ZONE_MM - TINY):
-        kept, rate = limits.radius_mm, 0.0
-        beyond = inserted - WALL_ZONE_MM
-        if limits.leaving_sine > 0.0 and limits.leaving_sine * beyond < kept:
-            kept, rate = max(limits.leaving_sine * beyond, 0.0), limits.leaving_sine
+    kept, rate = kept_from_lumen(limits, inserted)
+    if in_exit and kept >= 0.0:
         lumen, lumen_label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
         # The distance falls by 1 a mm at most, while what is kept grows by `rate`.
         if (lumen - kept) / (1.0 + rate) < gap:

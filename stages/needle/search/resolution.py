@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from enum import StrEnum
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -362,8 +363,9 @@ def _doubled(array: NDArray[T]) -> NDArray[T]:
     return larger
 
 
+@lru_cache(maxsize=8)
 def _words(resolution: Resolution, kappa: float) -> Words:
-    """Return what the kernel has to know of a resolution, see `search_words`."""
+    """Return what the kernel has to know of a resolution, see `search_words`; it only reads the arrays."""
     lengths = resolution.fine_mm * np.arange(resolution.steps + 1)
     arcs = [
         (
@@ -391,6 +393,8 @@ def _rates(objective: ObjectiveArrays, environment: NeedleEnvironment) -> tuple[
     The former counts the largest clearance that there is, where an objective knows none.
     """
     least = objective.least_rate
+    if objective.inverse_clearance == 0.0:
+        return least, least
     largest = max(float(environment.obstacles.clearance.max()) / UNITS_PER_MM, CLEARANCE_FLOOR_MM)
     gain = objective.inverse_clearance * (1.0 / largest - 1.0 / MAX_CLEARANCE_MM)
     return least + max(gain, 0.0), least

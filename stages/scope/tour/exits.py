@@ -105,14 +105,14 @@ def exits_of(
         points = np.array([point for point in points.tolist() if accepts(number, point)], dtype=np.int64)
     if not len(points):
         raise TargetError(
-            f"The lesion at LPS ({', '.join(f'{x:.1f}' for x in lesion)}) cannot be reached from the airway: "
+            f"The lesion at LPS ({', '.join(f'{x:.1f}' for x in lesion)}) has no exit: "
             + (
-                f"the nearest point is {distance[nearest]:.1f} mm away"
-                if accepts is None
-                else "no coupled plan leads there"
+                f"the nearest point of the airway is {distance[nearest]:.1f} mm away"
+                if distance[nearest] > rule.reach_mm
+                else "no point of the airway within reach is accepted"
             ),
             expected=f"a point of the airway within {rule.reach_mm:g} mm"
-            + ("" if accepts is None else " from where a coupled plan exists"),
+            + ("" if accepts is None else " that is accepted"),
             remedy="Leave the lesion out, or allow a longer reach",
         )
     line = offset[points] / np.maximum(distance[points], 1e-12)[:, None]

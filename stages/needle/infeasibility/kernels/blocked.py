@@ -9,6 +9,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import exact_distance, interpolate_squared
+from anatomy.kernels.labels import LUMEN
 from stages.needle.infeasibility.kernels.bitmaps import ONE, and_shifted, find_box, or_shifted
 from stages.needle.infeasibility.kernels.bounds import (
     CELL,
@@ -19,6 +20,11 @@ from stages.needle.infeasibility.kernels.bounds import (
     slope_of,
     steepest_sine,
 )
+from stages.needle.kernels.proof import kept_from_lumen
+
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+_LUMEN = np.int64(LUMEN)
 
 FIELD_STEP_MM = 0.005
 """What a clearance field rounds off is less."""
@@ -35,7 +41,7 @@ def _probed_at(v, u, window, scale, depth):
     return y, x, abs(move_y - y) * scale[CELL], abs(move_x - x) * scale[CELL]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def mark_probed(states, window, scale, depths, probed, corners):
     """Set the bits of the cells that the tangents of a plane's states meet at some depths.
 
@@ -61,12 +67,16 @@ def mark_probed(states, window, scale, depths, probed, corners):
                     )
 
 
-@numba.njit(cache=True)
-def clearance_above(obstacles, required, spare, exempt_branch, x, y, z):
+@numba.njit(cache=True, nogil=True)
+def clearance_above(obstacles, limits, spare, exempt_branch, inserted, x, y, z):
     """Return a clearance in mm that the true one of a point is never above, as far as it is worth knowing.
 
-    Where the clearance is at least `required - spare` and the field says so, `required` is returned.
+    A needle is at least `inserted` mm long there.  Where the clearance is at least the required one less
+    `spare` and the field says so, the required one is returned.  In the exit, where airway voxels of
+    `exempt_branch` (-1: none) do not count, it is less by what is missing from the distance to every lumen
+    (`stages.needle.kernels.proof.exact_gap`), which never needs to be less where the needle is longer.
     """
+    required = limits.required_mm
     squared, spread2 = interpolate_squared(obstacles.clearance, obstacles.geometry, x, y, z)
     least = max(required - spare, 0.0)
     if squared > 0.0 and squared - spread2 >= least * least:
@@ -74,9 +84,13 @@ def clearance_above(obstacles, required, spare, exempt_branch, x, y, z):
     above = math.sqrt(squared) + math.sqrt(spread2) + FIELD_STEP_MM
     if exempt_branch < 0 and squared > 0.0 and above < 0.5 * required:
         return above
-    return exact_distance(
-        obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, exempt_branch, required
-    )[0]
+    labels, geometry = obstacles.labels, obstacles.geometry
+    clearance = exact_distance(labels, geometry, x, y, z, obstacles.bits, exempt_branch, required)[0]
+    kept = min(kept_from_lumen(limits, inserted)[0], required)
+    if exempt_branch >= 0 and kept > 0.0:
+        lumen = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, kept)[0]
+        clearance = min(clearance, required - (kept - lumen))
+    return clearance
 
 
 @inner_kernel
@@ -88,14 +102,14 @@ def _grade_of(slacks, value):
     return slacks.shape[0]
 
 
-@numba.njit(cache=True)
-def grade_clearance(obstacles, required, exempt_branch, origin, across, probed, slacks, grades):
+@numba.njit(cache=True, nogil=True)
+def grade_clearance(obstacles, limits, exempt_branch, inserted, origin, across, probed, slacks, grades):
     """Fill `grades` (Y, 64 W) uint8 with the first of the `slacks` that a cell's lack of clearance is within.
 
     Of the cells of one plane only those are looked at that are set in `probed` (Y, W).  A lack is required
     clearance less the clearance at the cell's centre; one beyond all of the Q `slacks` (rising) gets Q.
     `origin` is the first cell's centre, `across` (2, 3) are the steps from row to row and column to column.
-    Airway voxels of `exempt_branch` (-1: none) do not count.
+    See `clearance_above` for `exempt_branch` and `inserted`.
     """
     rows, words = probed.shape
     for y in range(rows):
@@ -103,15 +117,15 @@ def grade_clearance(obstacles, required, exempt_branch, origin, across, probed, 
             if not (probed[y, x // 64] >> np.uint64(x % 64)) & ONE:
                 continue
             above = clearance_above(
-                obstacles, required, slacks[0], exempt_branch,
+                obstacles, limits, slacks[0], exempt_branch, inserted,
                 origin[0] + y * across[0, 0] + x * across[1, 0],
                 origin[1] + y * across[0, 1] + x * across[1, 1],
                 origin[2] + y * across[0, 2] + x * across[1, 2],
             )  # fmt: skip
-            grades[y, x] = _grade_of(slacks, required - above - SPARE)
+            grades[y, x] = _grade_of(slacks, limits.required_mm - above - SPARE)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def keep_clear(states, window, scale, depths, corners, grades, slacks):
     """Remove the states from which half a slab behind or ahead is blocked for every path.
 

@@ -11,8 +11,8 @@ from stages.needle.infeasibility.kernels.bounds import SPARE, TOLERANCE, TOTAL
 from stages.needle.infeasibility.kernels.reachability_pruning import place_margin
 
 
-@numba.njit(cache=True)
-def flood(obstacles, required, exempt_branch, exempt_mm, scale, ends, frame, side, corner, seen, queue):
+@numba.njit(cache=True, nogil=True)
+def flood(obstacles, limits, exempt_branch, inserted, scale, ends, frame, side, corner, seen, queue):
     """Fill the cubes that may be passed, from that of the start on; return whether one of the goal's is met.
 
     A path goes from one cube to another through a point of both, so to one of its 26 neighbours.
@@ -20,9 +20,11 @@ def flood(obstacles, required, exempt_branch, exempt_mm, scale, ends, frame, sid
     Parameters
     ----------
     obstacles : Obstacles
-    required : float
-    exempt_branch : int, exempt_mm : float
-        Branch whose airway voxels do not count less than so many mm away from the start.
+    limits : Limits
+    exempt_branch : int
+        Branch whose wall is exempt in the exit; -1 for none.
+    inserted : float
+        Length of the needle at the start, mm.
     scale, ends : (SCALE_SIZE,), (ENDS_SIZE,) float64
     frame : (4, 3) float64
         Position of the start; the planes' normal, row and column direction.
@@ -59,14 +61,15 @@ def flood(obstacles, required, exempt_branch, exempt_mm, scale, ends, frame, sid
                     h, y, x = (a + corner[0]) * side, (b + corner[1]) * side, (c + corner[2]) * side
                     if place_margin(h, y, x, scale, ends) + half < 0.0:
                         continue
-                    exempt = exempt_branch if math.sqrt(h * h + y * y + x * x) - half < exempt_mm else -1
+                    length = inserted + max(math.sqrt(h * h + y * y + x * x) - half, 0.0)
+                    exempt = exempt_branch if length < limits.exempt_mm else -1
                     above = clearance_above(
-                        obstacles, required, half, exempt,
+                        obstacles, limits, half, exempt, length,
                         frame[0, 0] + h * frame[1, 0] + y * frame[2, 0] + x * frame[3, 0],
                         frame[0, 1] + h * frame[1, 1] + y * frame[2, 1] + x * frame[3, 1],
                         frame[0, 2] + h * frame[1, 2] + y * frame[2, 2] + x * frame[3, 2],
                     )  # fmt: skip
-                    if above + half >= required:
+                    if above + half >= limits.required_mm:
                         queue[end] = (a * ny + b) * nx + c
                         end += 1
     return False

@@ -164,7 +164,7 @@ def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: 
         inside |= box.cut(images.nodules.array)
     labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
     labels[~inside] = structures.OUTSIDE
-    close_border(labels)
+    structures.close_border(labels)
     labels[_septum(lung, airway, box.grid, warnings)] |= structures.OUTSIDE
     labels[vessels] |= structures.VESSEL
     if images.fissures is not None:
@@ -172,13 +172,6 @@ def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: 
         labels[fissures] |= structures.FISSURE
     _label_airway(labels, airway, lumen, tree, box.grid)
     return labels
-
-
-def close_border(labels: UInt16) -> None:
-    """Make the outermost voxels OUTSIDE: a vessel or nodule may run on beyond the grid."""
-    for axis in range(3):
-        layers = np.moveaxis(labels, axis, 0)
-        layers[[0, -1]] |= structures.OUTSIDE
 
 
 def _septum(lung: Mask, airway: Mask, grid: Grid, warnings: list[str]) -> Mask:

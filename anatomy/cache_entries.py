@@ -16,23 +16,21 @@ import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from anatomy.cache import BUILDING, LUNG_FILE, REMOVED
 from anatomy.errors import FileError
+from anatomy.io.files import DAMAGE
 from anatomy.records import frozen_value
+from anatomy.unfinished import SECONDS_PER_DAY, is_abandoned, locked
 
-ABANDONED_AFTER_DAYS = 1.0
-"""No anatomy takes so long to prepare: what is older and unfinished was left behind."""
 ARRAYS_PATTERN = re.compile(r"(atlas|shapes)-[0-9a-f]{64}\.npz")
 """Files of arrays: deployment atlases, and the shapes of tubes."""
 KEY_PATTERN = re.compile(r"[0-9a-f]{24}")
 UNFINISHED_PATTERN = re.compile(
     rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}-{ARRAYS_PATTERN.pattern}"
 )
-SECONDS_PER_DAY = 24 * 3600.0
 
 
 @frozen_value
@@ -73,7 +71,10 @@ class CacheEntry:
     @property
     def abandoned(self) -> bool:
         """Whether it was left behind by a process that was killed."""
-        return self.kind == "unfinished" and self.days_unused > ABANDONED_AFTER_DAYS
+        try:
+            return self.kind == "unfinished" and is_abandoned(self.path)
+        except FileNotFoundError:
+            return False
 
 
 def cache_entries(cache: Path, formats: Mapping[str, int]) -> tuple[CacheEntry, ...]:
@@ -100,7 +101,7 @@ def _entry(path: Path, formats: Mapping[str, int]) -> CacheEntry | None:
     if KEY_PATTERN.fullmatch(path.name) and path.is_dir():
         told = path / LUNG_FILE
         stated: dict[str, Any] = {}
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(*DAMAGE):
             stated = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
         used = told.stat().st_mtime if told.is_file() else path.stat().st_mtime
         return _made(path, "anatomy", stated, used, formats)
@@ -110,7 +111,7 @@ def _entry(path: Path, formats: Mapping[str, int]) -> CacheEntry | None:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    with contextlib.suppress(ValueError, KeyError, EOFError, BadZipFile), np.load(path) as stored:
+    with contextlib.suppress(*DAMAGE), path.open("rb") as stream, np.load(stream) as stored:
         return dict(json.loads(str(stored["rest"])))
     return {}
 
@@ -138,7 +139,7 @@ def note_use(path: Path) -> None:
 
 
 def remove_entry(entry: CacheEntry) -> None:
-    """Remove an entry; one that another process has removed is no error.
+    """Remove an entry; one that another process has removed, or fills, is no error.
 
     Raises
     ------
@@ -148,11 +149,12 @@ def remove_entry(entry: CacheEntry) -> None:
     try:
         if entry.path.is_dir():
             doomed = entry.path.with_name(f"{REMOVED}{uuid.uuid4().hex}")
-            os.replace(entry.path, doomed)
+            with locked(entry.path):
+                os.replace(entry.path, doomed)
             shutil.rmtree(doomed, ignore_errors=True)
         else:
             entry.path.unlink(missing_ok=True)
-    except FileNotFoundError:
+    except (FileNotFoundError, BlockingIOError):
         return
     except OSError as error:
         raise FileError(

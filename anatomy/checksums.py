@@ -35,11 +35,14 @@ def array_checksum(array: Array) -> list[Any]:
 
 
 def file_states(folder: Path, names: Iterable[str]) -> dict[str, list[int]]:
-    """Return size, time of change (ns) and CRC-32 of files by name."""
+    """Return size, time of change (ns) and CRC-32 of files by name.
+
+    The time is `st_ctime_ns`, which cannot be set back as that of the content can.
+    """
     found = {}
     for name in names:
         state = (folder / name).stat()
-        found[name] = [state.st_size, state.st_mtime_ns, _file_checksum(folder / name)]
+        found[name] = [state.st_size, state.st_ctime_ns, _file_checksum(folder / name)]
     return found
 
 
@@ -52,7 +55,7 @@ def are_unchanged(folder: Path, states: Mapping[str, list[int]]) -> bool:
     for name, (size, time_ns, checksum) in states.items():
         state = (folder / name).stat()
         if state.st_size != size or (
-            state.st_mtime_ns != time_ns and _file_checksum(folder / name) != checksum
+            state.st_ctime_ns != time_ns and _file_checksum(folder / name) != checksum
         ):
             return False
     return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Self
 
 import numpy as np
@@ -133,6 +134,11 @@ class Grid:
         """Map LPS mm `(..., 3)` to fractional indices."""
         return transform_points(self.ijk_from_lps, lps)
 
+    @property
+    def corners_lps(self) -> Float:
+        """The middles of the eight voxels in the corners, `(8, 3)`."""
+        return self.lps(list(product(*[(0, n - 1) for n in self.shape])))
+
     def contains(self, lps: ArrayLike) -> Bool:
         """Tell which points `(..., 3)` lie in a voxel of the grid."""
         ijk = np.floor(self.ijk(lps) + 0.5)
@@ -164,8 +170,7 @@ class Grid:
         """Tell whether every voxel of the two grids agrees to `tolerance_mm`."""
         if self.shape != other.shape:
             return False
-        corners = np.stack(np.meshgrid(*[(0, n - 1) for n in self.shape]), axis=-1).reshape(-1, 3)
-        return bool(np.abs(self.lps(corners) - other.lps(corners)).max() <= tolerance_mm)
+        return bool(np.abs(self.corners_lps - other.corners_lps).max() <= tolerance_mm)
 
     def require_same(self, other: Grid, name: str) -> None:
         """Raise `GridMismatchError` unless `other`, the grid of `name`, is this grid."""

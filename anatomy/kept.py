@@ -11,9 +11,10 @@ import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from anatomy.checksums import values_checksum
+from anatomy.checksums import values_checksum, warn_of_damage
 from anatomy.errors import FileError
 from anatomy.io.files import DAMAGE, write_text
+from anatomy.unfinished import clear_place
 
 if TYPE_CHECKING:
     from anatomy.organ import Organ
@@ -36,17 +37,26 @@ def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
     path = lung.folder / f"{name}.json"
     try:
         stored = json.loads(path.read_text(encoding="ascii"))
-        if stored["version"] == version and stored["checksum"] == values_checksum(stored["values"]):
+        current = stored["version"] == version
+        if current and stored["checksum"] == _checksum(lung, name, stored["values"]):
             return stored["values"]
+        damaged = current
+    except FileNotFoundError:
+        damaged = False
     except DAMAGE:
-        pass
-    values = make()
+        damaged = True
+    if damaged:
+        warn_of_damage(path)
+    plain = json.loads(json.dumps(values := make()))
     # A cache may be read-only, and another process may just have removed the lung.
     with contextlib.suppress(FileError):
-        write_text(path, json.dumps(_sealed(version, values)))
+        if path.is_dir():
+            clear_place(path)
+        seal = {"version": version, "checksum": _checksum(lung, name, plain)}
+        write_text(path, json.dumps({**seal, "values": plain}))
     return values
 
 
-def _sealed(version: int, values: Any) -> dict[str, Any]:
-    plain = json.loads(json.dumps(values))
-    return {"version": version, "checksum": values_checksum(plain), "values": plain}
+def _checksum(lung: Organ, name: str, values: Any) -> str:
+    """Return what binds values to the lung and the name under which they are kept."""
+    return values_checksum({"lung": lung.key, "name": name, "values": values})

@@ -16,6 +16,7 @@ from anatomy.checksums import array_checksum, values_checksum, warn_of_damage
 from anatomy.errors import FileError, LungaccessError
 from anatomy.grid import read_only
 from anatomy.io.files import DAMAGE, atomic_write
+from anatomy.unfinished import clear_place
 
 T = TypeVar("T")
 
@@ -60,7 +61,7 @@ def kept_record(
     """
     text = json.dumps({"format": version, **depends_on}, sort_keys=True, default=list)
     path = (cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
-    stored = _stored(path, rebuilt) if path.is_file() else None
+    stored = _stored(path, rebuilt) if path.exists() else None
     if stored is not None:
         note_use(path)
         return stored
@@ -74,7 +75,7 @@ def kept_record(
 def _stored(path: Path, rebuilt: Callable[[dict[str, Any]], T]) -> T | None:
     """Return the record in a file; None if it is damaged, or belongs elsewhere."""
     try:
-        with np.load(path) as stored:
+        with path.open("rb") as stream, np.load(stream) as stored:
             arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
             rest = json.loads(str(stored["rest"]))
         if rest.pop("checksum") == _checksum(path, rest, arrays):
@@ -98,6 +99,8 @@ def _save(kind: str, values: Mapping[str, Any], path: Path) -> None:
     rest["checksum"] = _checksum(path, rest, arrays)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            clear_place(path)
         with atomic_write(path) as temporary, open(temporary, "wb") as stream:
             np.savez(stream, rest=np.array(json.dumps(rest)), **arrays)
     except OSError as error:

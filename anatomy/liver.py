@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.build import WorkingBox, clearance_fields, close_border, lung_key
+from anatomy.build import WorkingBox, clearance_fields, lung_key
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
 from anatomy.records import frozen_record
-from anatomy.structures import AIRWAY, BRANCH_SHIFT, OUTSIDE, VESSEL
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, OUTSIDE, VESSEL, close_border
 from anatomy.typed import Float, Mask
 
 ENTRY_BRANCH = 0

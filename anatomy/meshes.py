@@ -167,6 +167,40 @@ class MeshDistance:
         return max(float(found), 0.0)
 
 
+FIRST_NEIGHBOURS = 16
+"""Nearest triangles asked for at first: mostly enough to be sure of the nearest."""
+
+
+def point_distances_mm(mesh: SurfaceMesh, points_lps: ArrayLike, at_most_mm: float) -> Float:
+    """Return the exact `(N,)` distances in mm from points `(N, 3)`, LPS mm, to a surface, up to a bound.
+
+    Without FCL, and for many points at once much faster: the nearest triangle is among those whose middle is
+    nearer than it plus the largest reach of a triangle; neighbours are added until that is sure.
+    """
+    from scipy.spatial import cKDTree
+    from trimesh.triangles import closest_point
+
+    points = np.asarray(points_lps, dtype=np.float64).reshape(-1, 3)
+    out, left, count = np.full(len(points), at_most_mm), np.arange(len(points)), FIRST_NEIGHBOURS
+    if not len(mesh.faces):
+        return out
+    corners = mesh.vertices_lps[mesh.faces]
+    middles = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3.0
+    reach = float(np.sqrt(((corners - middles[:, None]) ** 2).sum(axis=2).max()))
+    # For a few hundred queries a rough tree is made and asked faster than a good one is made.
+    tree = cKDTree(middles, balanced_tree=False, compact_nodes=False)
+    while len(left):
+        count = min(count, len(middles))
+        away, index = tree.query(points[left], k=np.arange(1, count + 1))
+        places = np.repeat(points[left], count, axis=0)
+        nearest = closest_point(corners[index.ravel()], places)
+        gap = np.linalg.norm(nearest - places, axis=1).reshape(-1, count).min(axis=1)
+        out[left] = np.minimum(out[left], gap)
+        left = left[(away[:, -1] - reach < out[left]) & (count < len(middles))]
+        count *= 4
+    return out
+
+
 def _fcl_object(vertices: Float, faces: Int) -> Any:
     import fcl
 

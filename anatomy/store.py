@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
-import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import fields as dataclass_fields
 from pathlib import Path
@@ -16,7 +14,7 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.build import FORMAT, build_lung, lung_key
-from anatomy.cache import BUILDING, LUNG_FILE, cache_limit_bytes, default_cache
+from anatomy.cache import LUNG_FILE, cache_limit_bytes, default_cache
 from anatomy.cache_entries import make_room, note_use, remove_abandoned
 from anatomy.checksums import are_unchanged, file_states, values_checksum, warn_of_damage
 from anatomy.errors import FileError, LungaccessError
@@ -28,6 +26,7 @@ from anatomy.motion.motion import stored_motion
 from anatomy.patient import PatientImages
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.typed import Array, Float
+from anatomy.unfinished import clear_place, filled_folder
 
 META = LUNG_FILE
 REPORT_RECORDS: dict[str, Any] = {
@@ -104,40 +103,40 @@ def _build_into(
 @contextlib.contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder beside `folder` and rename it on success."""
-    # The name is known before the folder is made: an interrupt between the two leaves nothing behind.
-    work = folder.parent / f"{BUILDING}{uuid.uuid4().hex}"
-    try:
-        _make_folder(work)
+    with _unfinished(folder.parent) as work:
+        try:
+            yield work
+            _publish(work, folder)
+        except OSError as error:
+            raise FileError(
+                f"The lung could not be stored in {folder}: {error}",
+                remedy="Free some disk space (about 1.5 GB a patient) or choose another cache folder",
+                expected="a folder that may be written to, with room on the disk",
+            ) from error
+
+
+@contextlib.contextmanager
+def _unfinished(cache: Path) -> Iterator[Path]:
+    """Yield a folder that is this process's own, after those of killed processes were removed."""
+    with contextlib.ExitStack() as stack:
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            remove_abandoned(cache)
+            work = stack.enter_context(filled_folder(cache))
+        except OSError as error:
+            raise FileError(
+                f"The cache folder {cache} cannot be written: {error}",
+                remedy="Choose another with --cache or LUNGACCESS_CACHE",
+                expected="a folder that may be written to",
+            ) from error
         yield work
-        _publish(work, folder)
-    except OSError as error:
-        raise FileError(
-            f"The lung could not be stored in {folder}: {error}",
-            remedy="Free some disk space (about 1.5 GB a patient) or choose another cache folder",
-            expected="a folder that may be written to, with room on the disk",
-        ) from error
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-
-
-def _make_folder(work: Path) -> None:
-    try:
-        work.parent.mkdir(parents=True, exist_ok=True)
-        remove_abandoned(work.parent)
-        work.mkdir(mode=0o700)
-    except OSError as error:
-        raise FileError(
-            f"The cache folder {work.parent} cannot be written: {error}",
-            remedy="Choose another with --cache or LUNGACCESS_CACHE",
-            expected="a folder that may be written to",
-        ) from error
 
 
 def _publish(work: Path, folder: Path) -> None:
     """Give a complete folder its name, unless another process was first."""
     if _load(folder) is not None:
         return
-    shutil.rmtree(folder, ignore_errors=True)
+    clear_place(folder)
     try:
         os.replace(work, folder)
     except OSError:
@@ -183,7 +182,7 @@ def _save_rest(lung: Lung, folder: Path) -> None:
 
 def _load(folder: Path, *, warn: bool = False) -> Lung | None:
     """Read a stored lung; None if there is none of the present format under its own key, or it is damaged."""
-    if not folder.is_dir():
+    if not folder.exists():
         return None
     try:
         meta = json.loads((folder / META).read_text())
@@ -247,7 +246,7 @@ def _frozen(values: list[Any]) -> Float:
 
 
 def _load_tree(folder: Path, report: dict[str, Any]) -> AirwayTree:
-    with np.load(folder / "tree.npz") as arrays:
+    with open(folder / "tree.npz", "rb") as stream, np.load(stream) as arrays:
         return AirwayTree(**dict(arrays), report=_report_from_json(report))
 
 

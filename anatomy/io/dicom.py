@@ -87,7 +87,7 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
         _require_uniform([header for _, header in headers], where)
         _require_grey_values(headers[0][1], where)
         paths, grid = _geometry(headers, where)
-        return Volume(grid=grid, array=_pixels(paths, grid, where))
+        return Volume(grid=grid, array=_pixels(paths, grid))
 
 
 @contextmanager
@@ -280,20 +280,14 @@ def _require_no_tilt(positions: Float, normal: Float, where: str) -> None:
         )
 
 
-def _pixels(paths: Sequence[Path], grid: Grid, where: str) -> Any:
+def _pixels(paths: Sequence[Path], grid: Grid) -> Any:
     """Read the slices in order; the reader applies slope and intercept of each file."""
     import SimpleITK
 
     values: Any = None
     for k, path in enumerate(paths):
-        try:
+        with reading(path):
             plane = SimpleITK.GetArrayViewFromImage(image := SimpleITK.ReadImage(str(path)))
-        except RuntimeError as error:
-            raise FileError(
-                f"{path} of {where} cannot be read: {str(error).strip().splitlines()[-1]}",
-                expected="a complete DICOM file",
-                remedy="Export the series again",
-            ) from error
         if values is None:
             values = np.zeros(grid.shape, dtype=plane.dtype, order="F")
         values[:, :, k] = plane.reshape(plane.shape[-2:]).T

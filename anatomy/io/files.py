@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -213,8 +214,9 @@ def write_json(path: str | Path, value: object) -> None:
 
 
 def _unwritable(path: Path, error: OSError) -> FileError:
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return FileError(
         f"{path} cannot be written: {error.strerror or error}",
         expected="an existing folder that may be written to, with room on the disk",
-        remedy="Choose another folder, or change its permissions",
+        remedy=f"{'Make room on the disk' if full else 'Change its permissions'}, or choose another folder",
     )

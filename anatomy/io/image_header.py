@@ -23,6 +23,16 @@ MOST_HEADER_BYTES = 1 << 22
 MOST_COORDINATE_MM = 1e5
 """Farthest place of a voxel from the origin: no scanner or tracker has a frame of 100 m."""
 
+ONE_NUMBER = (
+    "one image of three dimensions with one number a voxel",
+    "Split the file into one image for each time, channel or overlapping segment",
+)
+A_FIELD = (
+    "a displacement field: three dimensions, three numbers a voxel",
+    "Export the displacement field, not the deformed image",
+)
+"""What is expected of an image or a field, and the remedy."""
+
 
 @frozen_record
 class ImageHeader:
@@ -38,6 +48,12 @@ class ImageHeader:
         The value of a voxel is `slope * stored + intercept`.
     labels : mapping of int to str
         Names of label values, empty if there are none.
+    components : int
+        Numbers a voxel: 1, or 3 for a displacement field.
+    components_first : bool
+        Whether the numbers of a voxel follow each other in the file, instead of one image after the other.
+    vectors_are_ras : bool
+        Whether vectors have the axes of RAS instead of LPS.
     """
 
     grid: Grid
@@ -46,6 +62,9 @@ class ImageHeader:
     slope: float = 1.0
     intercept: float = 0.0
     labels: Mapping[int, str] = field(default_factory=dict)
+    components: int = 1
+    components_first: bool = False
+    vectors_are_ras: bool = False
 
     @property
     def is_scaled(self) -> bool:
@@ -53,14 +72,24 @@ class ImageHeader:
         return (self.slope, self.intercept) != (1.0, 0.0)
 
     @property
-    def n_voxels(self) -> int:
-        """Number of voxels."""
+    def n_values(self) -> int:
+        """Number of stored numbers."""
         ni, nj, nk = self.grid.shape
-        return ni * nj * nk
+        return ni * nj * nk * self.components
+
+    @property
+    def stored_shape(self) -> tuple[int, ...]:
+        """Shape of the stored numbers, the index that runs fastest first."""
+        if self.components == 1:
+            return self.grid.shape
+        n = (self.components,)
+        return n + self.grid.shape if self.components_first else self.grid.shape + n
 
 
 def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes: int) -> tuple[int, int, int]:
     """Return the shape of an image of three dimensions that a file of `stored_bytes` can hold.
+
+    `itemsize` is the number of bytes of a voxel.
 
     Raises
     ------
@@ -69,9 +98,7 @@ def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes:
     """
     if len(sizes) != 3 or min(sizes) < 1:
         raise FileError(
-            f"{path} has the dimensions {sizes[:8]}",
-            expected="one image of three dimensions with one number a voxel",
-            remedy="Split the file into one image for each time, channel or overlapping segment",
+            f"{path} has the dimensions {sizes[:8]}", expected=ONE_NUMBER[0], remedy=ONE_NUMBER[1]
         )
     promised = sizes[0] * sizes[1] * sizes[2] * itemsize
     if promised > MOST_IMAGE_BYTES:
@@ -83,6 +110,12 @@ def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes:
     if promised > stored_bytes * MOST_INFLATION:
         raise truncated(path, f"{stored_bytes} bytes cannot hold {promised // itemsize} voxels")
     return sizes[0], sizes[1], sizes[2]
+
+
+def not_of_components(path: Path, found: int | str, components: int) -> FileError:
+    """Make the error for an image that has not as many numbers a voxel as it must have."""
+    expected, remedy = ONE_NUMBER if components == 1 else A_FIELD
+    return FileError(f"{path} has {found} numbers a voxel", expected=expected, remedy=remedy)
 
 
 def truncated(path: Path, why: str) -> FileError:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import FileError
+from anatomy.errors import FileError, LungaccessError
 from anatomy.grid import Grid, Volume
-from anatomy.io.files import atomic_write, reading, require_file
+from anatomy.io.files import DAMAGE, atomic_write, reading, reason, require_file
 from anatomy.io.frames import Frame
 from anatomy.io.image_header import ImageHeader
 from anatomy.io.metaimage import open_metaimage
 from anatomy.io.nifti import begins_as_nifti, open_nifti
 from anatomy.io.nrrd import open_nrrd
-from anatomy.io.voxels import read_nonzero, read_values
+from anatomy.io.voxels import read_nonzero, read_values, require_whole
+from anatomy.typed import Array
+
+if TYPE_CHECKING:
+    import SimpleITK
 
 NIFTI, NRRD, METAIMAGE = (".nii.gz", ".nii", ".gz"), (".seg.nrrd", ".nrrd"), (".mha", ".mhd")
 
@@ -47,7 +53,7 @@ def read_grid(path: str | Path, *, frame: Frame | None = None) -> Grid:
     """Read the grid of an image from its header alone; parameters and errors as `read_volume`."""
     path = require_file(path)
     with reading(path):
-        return _open(path, frame)[0].grid
+        return open_image(path, frame)[0].grid
 
 
 def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
@@ -74,7 +80,7 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
     """
     path = require_file(path)
     with reading(path):
-        return read_values(*_open(path, frame), path)
+        return read_values(*open_image(path, frame), path)
 
 
 def read_mask(path: str | Path, *, frame: Frame | None = None) -> Volume:
@@ -89,7 +95,7 @@ def read_mask(path: str | Path, *, frame: Frame | None = None) -> Volume:
     """
     path = require_file(path)
     with reading(path):
-        return read_nonzero(*_open(path, frame), path)
+        return read_nonzero(*open_image(path, frame), path)
 
 
 def read_labels(path: str | Path) -> Mapping[int, str]:
@@ -103,24 +109,39 @@ def read_labels(path: str | Path) -> Mapping[int, str]:
     """
     path = require_file(path)
     with reading(path):
-        return _open(path, "lps")[0].labels
+        return open_image(path, "lps")[0].labels
 
 
-def _open(path: Path, frame: Frame | None) -> tuple[ImageHeader, Iterator[bytes]]:
-    """Read the header of a file of any format, and return it with the bytes of the voxels."""
+def open_image(path: Path, frame: Frame | None, components: int = 1) -> tuple[ImageHeader, Iterator[bytes]]:
+    """Read the header of a file of any format, and return it with the bytes of the voxels.
+
+    `components` is how many numbers a voxel must have.
+    """
     suffix = image_suffix(path)
     with np.errstate(invalid="ignore", over="ignore"):  # Grids refuse what is not finite.
         if suffix in NIFTI:
-            return open_nifti(path, frame)
+            return open_nifti(path, frame, components)
         if suffix in NRRD:
-            return open_nrrd(path, frame)
+            return open_nrrd(path, frame, components)
         if suffix in METAIMAGE:
-            return open_metaimage(path)
+            return open_metaimage(path, components)
     raise FileError(
         f"{path} is of an unknown kind",
         expected="an image ending in " + ", ".join(SUFFIXES),
         remedy="Convert the image to NIfTI (.nii.gz) with the program that wrote it",
     )
+
+
+def itk_image(array: Array, grid: Grid) -> SimpleITK.Image:
+    """Return the image of ITK with the numbers, or the vectors, of the voxels of a grid."""
+    import SimpleITK
+
+    image = SimpleITK.GetImageFromArray(np.moveaxis(array, (0, 2), (2, 0)), isVector=array.ndim == 4)
+    spacing = grid.spacing_mm
+    image.SetSpacing(spacing.tolist())
+    image.SetOrigin(grid.lps_from_ijk[:3, 3].tolist())
+    image.SetDirection((grid.lps_from_ijk[:3, :3] / spacing).ravel().tolist())
+    return image
 
 
 def write_volume(
@@ -145,8 +166,6 @@ def write_volume(
     FileError
         If the ending is unknown or the folder cannot be written to.
     """
-    import SimpleITK
-
     path = Path(path)
     if image_suffix(path) not in (".nii", ".nii.gz", ".nrrd", ".seg.nrrd"):
         raise FileError(
@@ -155,17 +174,32 @@ def write_volume(
     if header and path.suffix != ".nrrd":
         raise FileError(f"{path} cannot hold a header of keys and values", expected="a name ending in .nrrd")
     array = volume.array.view(np.uint8) if volume.array.dtype == np.bool_ else volume.array
-    image = SimpleITK.GetImageFromArray(array.T)
-    spacing = volume.grid.spacing_mm
-    image.SetSpacing(spacing.tolist())
-    image.SetOrigin(volume.grid.lps_from_ijk[:3, 3].tolist())
-    image.SetDirection((volume.grid.lps_from_ijk[:3, :3] / spacing).ravel().tolist())
+    image = itk_image(array, volume.grid)
     if note:
         image.SetMetaData("ITK_FileNotes", note[:MOST_NOTE])
     for key, value in (header or {}).items():
         image.SetMetaData(key, value)
+    write_image(image, path)
+
+
+def write_image(image: SimpleITK.Image, path: Path, components: int = 1) -> None:
+    """Write an image of ITK with so many numbers a voxel, all of it or nothing.
+
+    ITK says nothing where the disk is full: what was written is read through once, up to its checksum.
+
+    Raises
+    ------
+    FileError
+        If the folder cannot be written to, or the disk is full.
+    """
+    import SimpleITK
+
     with atomic_write(path) as temporary:
         try:
             SimpleITK.WriteImage(image, str(temporary), useCompression=path.suffix != ".nii")
         except RuntimeError as error:
-            raise OSError(str(error).strip().splitlines()[-1]) from error
+            raise OSError(reason(error)) from error
+        try:
+            require_whole(*open_image(temporary, None, components), temporary)
+        except (*DAMAGE, LungaccessError) as error:
+            raise OSError(errno.ENOSPC, "not all of it could be written") from error

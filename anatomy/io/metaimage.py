@@ -13,19 +13,28 @@ import numpy as np
 
 from anatomy.errors import FileError, FrameError
 from anatomy.io.compressed import inflate, plain_pieces
-from anatomy.io.image_header import MOST_HEADER_BYTES, ImageHeader, image_shape, not_begun, right_handed_grid
+from anatomy.io.image_header import (
+    MOST_HEADER_BYTES,
+    ImageHeader,
+    image_shape,
+    not_begun,
+    not_of_components,
+    right_handed_grid,
+)
 from anatomy.typed import Float
 
 _DTYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",
     "MET_UINT": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
 }  # fmt: skip
-_PLAIN = {"BinaryData": "true", "HeaderSize": "0", "ElementNumberOfChannels": "1"}
+_PLAIN = {"BinaryData": "true", "HeaderSize": "0"}
 """Fields that may be missing, and the only value that is read."""
 
 
-def open_metaimage(path: Path) -> tuple[ImageHeader, Iterator[bytes]]:
+def open_metaimage(path: Path, components: int = 1) -> tuple[ImageHeader, Iterator[bytes]]:
     """Read the header of a file, and return it with the bytes of the voxels; the frame is LPS by definition.
+
+    `components` is how many numbers a voxel must have.
 
     Raises
     ------
@@ -36,13 +45,23 @@ def open_metaimage(path: Path) -> tuple[ImageHeader, Iterator[bytes]]:
     """
     fields, offset = _text(path)
     _require_plain(fields, path)
+    channels = fields.get("ElementNumberOfChannels", "1")
+    if channels != str(components):
+        raise not_of_components(path, channels[:40], components)
     dtype = np.dtype((">" if _big_endian(fields) else "<") + _DTYPES[fields["ElementType"]])
     data_path, at = _data_file(fields, path, offset)
     sizes = tuple(int(n) for n in fields.get("DimSize", "").split()[:8])
-    shape = image_shape(sizes, dtype.itemsize, path, data_path.stat().st_size)
+    shape = image_shape(sizes, dtype.itemsize * components, path, data_path.stat().st_size)
     grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path), path)
     compressed = fields.get("CompressedData", "false").lower() == "true"
-    return ImageHeader(grid=grid, is_reversed=is_reversed, dtype=dtype), _stream(data_path, at, compressed)
+    header = ImageHeader(
+        grid=grid,
+        is_reversed=is_reversed,
+        dtype=dtype,
+        components=components,
+        components_first=components > 1,
+    )
+    return header, _stream(data_path, at, compressed)
 
 
 def _text(path: Path) -> tuple[dict[str, str], int]:
@@ -68,7 +87,7 @@ def _require_plain(fields: Mapping[str, str], path: Path) -> None:
         said = ", ".join(f"{key} = {value[:40]}" for key, value in odd.items())
         raise FileError(
             f"{path} says {said}",
-            expected="one image of three dimensions with one number a voxel, stored as binary data",
+            expected="one image of three dimensions, stored as binary data",
             remedy="Save the image again, as 3D Slicer or ITK do",
         )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,13 +10,14 @@ from pydantic import Field
 
 from anatomy.errors import AnatomyError, FileError, FrameError, SettingsError
 from anatomy.grid import Grid, transform_points
-from anatomy.io.files import atomic_write, read_text, require_file, unreadable
-from anatomy.io.frames import LPS_FROM
-from anatomy.io.image_header import MOST_HEADER_BYTES, right_handed_grid
-from anatomy.io.images import NRRD, SUFFIXES, image_suffix
+from anatomy.io.files import read_text, reading, require_file
+from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS
+from anatomy.io.image_header import right_handed_grid
+from anatomy.io.images import SUFFIXES, image_suffix, itk_image, open_image, read_mask, write_image
+from anatomy.io.voxels import read_array
 from anatomy.motion.source import MotionSource
 from anatomy.settings import quantity, settings, switch, text
-from anatomy.typed import Float
+from anatomy.typed import Array, Float
 
 TRANSFORMS = (".h5", ".hdf5", ".tfm", ".txt", ".mat", ".xfm")
 LANDMARKS = ".csv"
@@ -25,7 +25,6 @@ SAMPLE_MM = 4.0
 """Spacing of the points at which a transform is evaluated: finer than the nodes of a motion."""
 MEDIAN_MOTION_MM = 17.3
 """Median of the population's 95 % motion (exp 2.85)."""
-LPS_WORDS = ("left-posterior-superior", "lps")
 
 
 @settings
@@ -51,6 +50,18 @@ class MotionFile:
     amplitude: Annotated[
         float, quantity("Share of the source's motion that the patient has", at_least=0.0, at_most=3.0)
     ] = 1.0
+    hysteresis: Annotated[
+        float,
+        quantity("How far places stray against each other, by their distance", at_least=0.0, at_most=0.1),
+    ] = 0.0
+    other_lungs: Annotated[
+        str, text("Mask of the lungs at the end of the breath farther from the masks'", may_be_empty=True)
+    ] = ""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that are named, some of them empty."""
+        return (self.file, self.end_exhale, self.end_inhale, self.other_lungs)
 
 
 def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
@@ -86,6 +97,9 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
             remedy='Write for instance file = "field.nrrd", maps_from = "end-exhale"',
         )
     common: dict[str, Any] = {"masks_phase": phase, "amplitude": keys.amplitude}
+    common["hysteresis"] = keys.hysteresis
+    if keys.other_lungs:
+        common["other_lungs"] = read_mask(folder / keys.other_lungs)
     if keys.population:
         words = f"population: other people's motion by height, {keys.population_motion_mm:g} mm"
         return MotionSource(description=words, population_motion_mm=keys.population_motion_mm, **common)
@@ -175,41 +189,18 @@ def read_vectors(path: Path) -> tuple[Grid, Float]:
     Raises
     ------
     FileError
-        If it is no image of three dimensions with three numbers a voxel.
+        If it is no complete image of three dimensions with three numbers a voxel.
     FrameError
-        If its axes are not LPS, or not perpendicular.
+        If it states no frame, its vectors may not be LPS, or its axes are not perpendicular.
     AnatomyError
         If a number is not finite.
     """
-    import SimpleITK
-
-    if image_suffix(path) in NRRD:
-        _require_lps(path)
-    try:
-        image = SimpleITK.ReadImage(str(path), SimpleITK.sitkVectorFloat64)
-    except RuntimeError as error:
-        raise unreadable(path, RuntimeError(str(error).strip().splitlines()[-1])) from error
-    if (image.GetDimension(), image.GetNumberOfComponentsPerPixel()) != (3, 3):
-        raise FileError(
-            f"{path} has {image.GetDimension()} dimensions and {image.GetNumberOfComponentsPerPixel()} "
-            "numbers a voxel",
-            expected="a displacement field: three dimensions, three numbers a voxel",
-            remedy="Export the displacement field, not the deformed image",
-        )
-    return _grid_and_vectors(image, path)
-
-
-def _require_lps(path: Path) -> None:
-    """Refuse a NRRD file of another frame: ITK turns its axes to LPS, but not its vectors."""
-    with path.open("rb") as stream:
-        stated = re.search(rb"^space: *([\w-]+)", stream.read(MOST_HEADER_BYTES), re.MULTILINE)
-    space = stated[1].decode("ascii", errors="replace") if stated else ""
-    if space.lower() not in LPS_WORDS:
-        raise FrameError(
-            f"{path} states the space {space!r}, in which the frame of its vectors is not certain",
-            expected="space: left-posterior-superior",
-            remedy="Write the field with ITK, SimpleITK or 3D Slicer",
-        )
+    with reading(path):
+        header, stream = open_image(path, None, components=3)
+        vectors = read_array(header, stream, path)
+    if header.vectors_are_ras:
+        vectors = vectors * LPS_FROM_RAS.diagonal()[:3].astype(vectors.dtype)
+    return header.grid, _finite(vectors, path)
 
 
 def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
@@ -229,12 +220,9 @@ def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
             f"({', '.join(TRANSFORMS)}) or landmark pairs ({LANDMARKS})",
             remedy="Export the registration in one of them",
         )
-    try:
+    with reading(path):
         transform = SimpleITK.ReadTransform(str(path))
-    except RuntimeError as error:
-        raise unreadable(path, RuntimeError(str(error).strip().splitlines()[-1])) from error
-    corners = masks.lps(np.array(np.meshgrid(*[(0, n - 1) for n in masks.shape])).reshape(3, -1).T)
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = masks.corners_lps.min(axis=0), masks.corners_lps.max(axis=0)
     size = [int(n) for n in np.ceil((high - low) / SAMPLE_MM) + 1]
     spacing = (SAMPLE_MM,) * 3
     image = SimpleITK.TransformToDisplacementField(
@@ -252,14 +240,18 @@ def _grid_and_vectors(image: Any, path: Path) -> tuple[Grid, Float]:
     ni, nj, nk = image.GetSize()
     grid, is_reversed = right_handed_grid((ni, nj, nk), matrix, path)
     vectors = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0, 3)
-    vectors = np.ascontiguousarray(vectors[::-1] if is_reversed else vectors, dtype=np.float64)
+    return grid, _finite(vectors[::-1] if is_reversed else vectors, path)
+
+
+def _finite(vectors: Array, path: Path) -> Float:
+    vectors = np.ascontiguousarray(vectors, dtype=np.float64)
     if not np.isfinite(vectors).all():
         raise AnatomyError(
             f"{path} holds displacements that are not finite",
             expected="finite numbers in mm",
             remedy="Register again, or fill what is missing",
         )
-    return grid, vectors
+    return vectors
 
 
 def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
@@ -270,12 +262,4 @@ def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
     FileError
         If the folder cannot be written to.
     """
-    import SimpleITK
-
-    image = SimpleITK.GetImageFromArray(vectors.transpose(2, 1, 0, 3).astype(np.float32), isVector=True)
-    spacing = grid.spacing_mm
-    image.SetSpacing(spacing.tolist())
-    image.SetOrigin(grid.lps_from_ijk[:3, 3].tolist())
-    image.SetDirection((grid.lps_from_ijk[:3, :3] / spacing).ravel().tolist())
-    with atomic_write(path) as temporary:
-        SimpleITK.WriteImage(image, str(temporary), useCompression=True)
+    write_image(itk_image(vectors.astype(np.float32), grid), Path(path), components=3)

@@ -20,18 +20,25 @@ from anatomy.errors import FileError, FrameError
 from anatomy.grid import transform_points
 from anatomy.io.compressed import pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
-from anatomy.io.image_header import MOST_HEADER_BYTES, ImageHeader, image_shape, not_begun, right_handed_grid
+from anatomy.io.image_header import (
+    MOST_HEADER_BYTES,
+    ImageHeader,
+    image_shape,
+    not_begun,
+    not_of_components,
+    right_handed_grid,
+)
 from anatomy.typed import Float
 
 _VERSION_1: dict[str, tuple[int, str]] = {
     "dim": (40, "8h"), "datatype": (70, "2h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),
     "slope": (112, "2f"), "units": (123, "B"), "codes": (252, "2h"), "quatern": (256, "6f"),
-    "srow": (280, "12f"),
+    "srow": (280, "12f"), "intent": (68, "h"), "intent_name": (328, "16s"),
 }  # fmt: skip
 _VERSION_2: dict[str, tuple[int, str]] = {
     "dim": (16, "8q"), "datatype": (12, "2h"), "pixdim": (104, "8d"), "vox_offset": (168, "q"),
     "slope": (176, "2d"), "units": (500, "i"), "codes": (344, "2i"), "quatern": (352, "6d"),
-    "srow": (400, "12d"),
+    "srow": (400, "12d"), "intent": (504, "i"), "intent_name": (508, "16s"),
 }  # fmt: skip
 _LAYOUTS = {348: _VERSION_1, 540: _VERSION_2}
 _DTYPES = {
@@ -40,6 +47,8 @@ _DTYPES = {
 _MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
 _TRANSFORM_TOLERANCE_MM = 1.0
 _HEADER_BYTES = 540
+_RAS_VECTORS, _LPS_VECTORS = 1006, 1007
+"""Intent codes of fields: displacements with the axes of RAS, and vectors as ITK writes them."""
 
 
 def begins_as_nifti(path: Path) -> bool:
@@ -54,7 +63,9 @@ def begins_as_nifti(path: Path) -> bool:
     return bool(sizes & _LAYOUTS.keys()) and (start[344:347] == b"n+1" or start[4:7] == b"n+2")
 
 
-def open_nifti(path: Path, frame: Frame | None = None) -> tuple[ImageHeader, Iterator[bytes]]:
+def open_nifti(
+    path: Path, frame: Frame | None = None, components: int = 1
+) -> tuple[ImageHeader, Iterator[bytes]]:
     """Read everything before the voxels, and return it with the bytes of the voxels.
 
     Parameters
@@ -63,6 +74,8 @@ def open_nifti(path: Path, frame: Frame | None = None) -> tuple[ImageHeader, Ite
         A plain or compressed file.
     frame : "ras" or "lps", optional
         The frame to assume if the file states none (both transform codes 0).
+    components : int
+        Numbers a voxel: 1, or 3 for a displacement field, which has five dimensions (ni, nj, nk, 1, 3).
 
     Raises
     ------
@@ -76,7 +89,7 @@ def open_nifti(path: Path, frame: Frame | None = None) -> tuple[ImageHeader, Ite
     fields = _fields(start, path)
     offset = _data_offset(fields, path)
     start = _at_least(start, offset, stream)
-    return _header(fields, start[:offset], path, frame), chain([start[offset:]], stream)
+    return _header(fields, start[:offset], path, frame, components), chain([start[offset:]], stream)
 
 
 def _at_least(start: bytes, n_bytes: int, stream: Iterator[bytes]) -> bytes:
@@ -86,10 +99,12 @@ def _at_least(start: bytes, n_bytes: int, stream: Iterator[bytes]) -> bytes:
 
 
 def _header(
-    fields: dict[str, tuple[Any, ...]], before_voxels: bytes, path: Path, frame: Frame | None
+    fields: dict[str, tuple[Any, ...]], before_voxels: bytes, path: Path, frame: Frame | None, components: int
 ) -> ImageHeader:
-    dtype = _dtype(fields, path)
-    shape = image_shape(_sizes(fields["dim"]), dtype.itemsize, path, path.stat().st_size)
+    dtype, sizes = _dtype(fields, path), _sizes(fields["dim"])
+    if components > 1:
+        sizes = _sizes_of_field(fields, sizes, path, components)
+    shape = image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
     slope, intercept = _scale(fields["slope"], path)
     grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path, shape, frame), path)
     return ImageHeader(
@@ -99,7 +114,25 @@ def _header(
         slope=slope,
         intercept=intercept,
         labels=_labels(before_voxels[fields["size"][0] :], fields["order"][0]),
+        components=components,
+        vectors_are_ras=components > 1 and fields["intent"][0] == _RAS_VECTORS,
     )
+
+
+def _sizes_of_field(
+    fields: dict[str, tuple[Any, ...]], sizes: tuple[int, ...], path: Path, components: int
+) -> tuple[int, ...]:
+    """Return the three sizes of a field whose vectors have a known frame."""
+    if len(sizes) != 5 or sizes[3:] != (1, components):
+        raise not_of_components(path, f"the dimensions {sizes}, not {components}", components)
+    code, name = fields["intent"][0], fields["intent_name"][0].rstrip(b"\0").decode("ascii", "replace")
+    if code not in (_RAS_VECTORS, _LPS_VECTORS) or name.startswith("NREG"):
+        raise FrameError(
+            f"{path} has the intent code {code} and name {name!r}, which leave the frame of its vectors open",
+            expected=f"{_LPS_VECTORS} without a name (LPS, as ITK and ANTs write), or {_RAS_VECTORS} (RAS)",
+            remedy="Read the field with the program that wrote it, and save it by SimpleITK as .nrrd, in LPS",
+        )
+    return sizes[:3]
 
 
 def _data_offset(fields: dict[str, tuple[Any, ...]], path: Path) -> int:

@@ -15,12 +15,20 @@ import numpy as np
 from anatomy.errors import FileError, FrameError
 from anatomy.io.compressed import inflate, plain_pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
-from anatomy.io.image_header import MOST_HEADER_BYTES, ImageHeader, image_shape, not_begun, right_handed_grid
+from anatomy.io.image_header import (
+    MOST_HEADER_BYTES,
+    ImageHeader,
+    image_shape,
+    not_begun,
+    not_of_components,
+    right_handed_grid,
+)
 from anatomy.typed import Float
 
 _LPS_FROM_LAS = np.diag([1.0, -1.0, 1.0, 1.0])
+_LPS_WORDS = ("left-posterior-superior", "lps")
 _LPS_FROM_SPACE: Mapping[str, Float] = {
-    "left-posterior-superior": np.eye(4), "lps": np.eye(4),
+    **dict.fromkeys(_LPS_WORDS, np.eye(4)),
     "right-anterior-superior": LPS_FROM_RAS, "ras": LPS_FROM_RAS,
     "left-anterior-superior": _LPS_FROM_LAS, "las": _LPS_FROM_LAS,
 }  # fmt: skip
@@ -42,23 +50,61 @@ _NUMBER = r"\s*([-+0-9.eE]{1,40})\s*"
 _VECTOR = re.compile(rf"\({_NUMBER},{_NUMBER},{_NUMBER}\)")
 
 
-def open_nrrd(path: Path, frame: Frame | None) -> tuple[ImageHeader, Iterator[bytes]]:
+def open_nrrd(path: Path, frame: Frame | None, components: int = 1) -> tuple[ImageHeader, Iterator[bytes]]:
     """Read the header of a file, and return it with the bytes of the voxels.
+
+    `components` is how many numbers a voxel must have; those of a displacement field stand on the first axis
+    or on the last, which has no direction.
 
     Raises
     ------
     FileError
         If it is no NRRD file of three dimensions, or its data lie in another file or in an unknown encoding.
     FrameError
-        If it states no frame and none is given, or its axes are not perpendicular.
+        If it states no frame and none is given, its axes are not perpendicular, or vectors may not be LPS.
     """
     fields, keys, offset = _text(path)
     dtype = _dtype(fields, path)
     sizes = tuple(int(n) for n in fields.get("sizes", "").split()[:8])
-    shape = image_shape(sizes, dtype.itemsize, path, path.stat().st_size)
+    is_first = False
+    if components > 1:
+        is_first = _is_first_axis(fields, sizes, path, components)
+        _require_lps_vectors(fields, path)
+        sizes = sizes[1:] if is_first else sizes[:-1]
+    shape = image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
     grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path, frame), path)
-    header = ImageHeader(grid=grid, is_reversed=is_reversed, dtype=dtype, labels=_labels(keys))
+    header = ImageHeader(
+        grid=grid,
+        is_reversed=is_reversed,
+        dtype=dtype,
+        labels=_labels(keys),
+        components=components,
+        components_first=is_first,
+    )
     return header, _stream(path, offset, _encoding(fields, path))
+
+
+def _is_first_axis(fields: Mapping[str, str], sizes: tuple[int, ...], path: Path, components: int) -> bool:
+    """Tell whether the numbers of a vector stand on the first axis and not on the last."""
+    axes = re.findall(r"none|\([^)]*\)", fields.get("space directions", "")[:1000])
+    without = [n for n, axis in enumerate(axes) if axis == "none"]
+    if len(sizes) != 4 or len(axes) != 4 or without not in ([0], [3]) or sizes[without[0]] != components:
+        stated = f"the sizes {sizes} and the directions {' '.join(axes)[:120] or 'missing'}, not {components}"
+        raise not_of_components(path, stated, components)
+    return without == [0]
+
+
+def _require_lps_vectors(fields: Mapping[str, str], path: Path) -> None:
+    """Refuse vectors of another frame: programs turn axes to LPS, but not all of them turn vectors."""
+    space = fields.get("space", "").lower()
+    measured = _vectors(fields.get("measurement frame", "(1,0,0) (0,1,0) (0,0,1)"))
+    if space not in _LPS_WORDS or measured != np.eye(3).tolist():
+        raise FrameError(
+            f"{path} states the space {space!r} and the measurement frame {measured}, in which the frame of "
+            "its vectors is not certain",
+            expected="space: left-posterior-superior, without another measurement frame",
+            remedy="Write the field with ITK, SimpleITK or 3D Slicer",
+        )
 
 
 def _text(path: Path) -> tuple[dict[str, str], dict[str, str], int]:

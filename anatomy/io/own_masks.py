@@ -102,7 +102,7 @@ def load_own_masks(description: Path) -> PatientImages:
         hashes[keys.cost] = sha256(cost_path)
     motion = None
     if keys.motion is not None:
-        for name in filter(None, (keys.motion.file, keys.motion.end_exhale, keys.motion.end_inhale)):
+        for name in filter(None, keys.motion.files):
             hashes[name] = sha256(_named_file(folder, name))
         motion = read_motion(keys.motion, folder, masks.grid)
     return assemble(

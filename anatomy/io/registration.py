@@ -9,7 +9,8 @@ import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Grid
-from anatomy.io.images import read_volume
+from anatomy.io.files import reason
+from anatomy.io.images import itk_image, read_volume
 from anatomy.typed import Float
 
 WORKING_MM = 4.0
@@ -66,8 +67,7 @@ def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
         method.Execute(fixed, moving)
     except RuntimeError as error:
         raise AnatomyError(
-            f"{exhale.name} and {inhale.name} could not be registered "
-            f"({str(error).strip().splitlines()[-1]})",
+            f"{exhale.name} and {inhale.name} could not be registered ({reason(error)})",
             expected="two images of the same lungs that overlap",
             remedy="Register them by a program of your own, and name its displacement field in file",
         ) from error
@@ -82,7 +82,6 @@ def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
 
 def _image(path: Path) -> tuple[Any, bool]:
     """Return an image on voxels of `WORKING_MM` along LPS, and whether it is a mask."""
-    import SimpleITK
     from scipy import ndimage
 
     volume = read_volume(path)
@@ -91,8 +90,7 @@ def _image(path: Path) -> tuple[Any, bool]:
         raise AnatomyError(f"{path} has one value everywhere", expected="a CT, or a mask of the lungs")
     is_mask = bool(np.isin(values, (0, values.max())).all())
     grid = volume.grid
-    corners = grid.lps(np.array(np.meshgrid(*[(0, n - 1) for n in grid.shape])).reshape(3, -1).T)
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = grid.corners_lps.min(axis=0), grid.corners_lps.max(axis=0)
     coarse = Grid.from_spacing(np.ceil((high - low) / WORKING_MM).astype(int) + 1, (WORKING_MM,) * 3, low)
     smooth = ndimage.gaussian_filter(values.astype(np.float32), 0.4 * WORKING_MM / grid.spacing_mm)
     index = grid.ijk(coarse.lps(np.moveaxis(np.indices(coarse.shape), 0, -1)))
@@ -101,7 +99,4 @@ def _image(path: Path) -> tuple[Any, bool]:
         inside = out > 0.5 * float(values.max())
         out = ndimage.distance_transform_edt(inside, sampling=WORKING_MM)
         out = np.clip(out - ndimage.distance_transform_edt(~inside, sampling=WORKING_MM), -DEPTH_MM, DEPTH_MM)
-    image = SimpleITK.GetImageFromArray(out.astype(np.float32).T)
-    image.SetOrigin(low.tolist())
-    image.SetSpacing((WORKING_MM,) * 3)
-    return image, is_mask
+    return itk_image(out.astype(np.float32), coarse), is_mask

@@ -21,12 +21,24 @@ def read_values(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Vol
     FileError
         If there are fewer or many more bytes than the header says, or they are damaged.
     """
-    values = np.zeros(header.grid.shape, np.float32 if header.is_scaled else header.dtype, order="F")
+    return Volume(grid=header.grid, array=read_array(header, stream, path))
+
+
+def require_whole(header: ImageHeader, stream: Iterator[bytes], path: Path) -> None:
+    """Read all voxels and keep none; errors as `read_values`."""
+    for _ in _chunks(header, stream, path):
+        pass
+
+
+def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Array:
+    """Read the voxels `(ni, nj, nk)`, or the vectors `(ni, nj, nk, components)`, as `read_values` does."""
+    values = np.zeros(header.stored_shape, np.float32 if header.is_scaled else header.dtype, order="F")
     flat = values.reshape(-1, order="F")
     for at, chunk in _chunks(header, stream, path):
         flat[at : at + chunk.size] = chunk
     native = values.astype(values.dtype.newbyteorder("="), copy=False)
-    return Volume(grid=header.grid, array=native[::-1] if header.is_reversed else native)
+    native = np.moveaxis(native, 0, -1) if header.components_first else native
+    return native[::-1] if header.is_reversed else native
 
 
 def read_nonzero(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume:
@@ -62,20 +74,20 @@ def _chunks(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Iterato
 
     Draining proves the checksum, which stands at the end of a compressed file.
     """
-    n_voxels, size, at, tail = header.n_voxels, header.dtype.itemsize, 0, b""
+    n_values, size, at, tail = header.n_values, header.dtype.itemsize, 0, b""
     for piece in stream:
         data = tail + piece if tail else piece
-        count = min(len(data) // size, n_voxels - at)
+        count = min(len(data) // size, n_values - at)
         if count:
             stored = np.frombuffer(data, dtype=header.dtype, count=count)
             yield at, stored * header.slope + header.intercept if header.is_scaled else stored
             at += count
         tail = data[count * size :]
-        if at == n_voxels and tail:
+        if at == n_values and tail:
             raise FileError(
-                f"{path} holds more data than the {n_voxels} voxels of its header",
+                f"{path} holds more data than the {n_values} voxels of its header",
                 expected="as many voxels as the header says",
                 remedy="Copy or export the file again",
             )
-    if at < n_voxels:
-        raise truncated(path, f"it holds {at} of {n_voxels} voxels")
+    if at < n_values:
+        raise truncated(path, f"it holds {at} of {n_values} voxels")

@@ -26,7 +26,8 @@ RIGHT, LEFT = 0, 1
 class Motion:
     """Motion between end-exhale (phase 0) and end-inhale (phase 1), linear in the phase, in LPS mm.
 
-    A place X of the masks is at `X + amplitude (phase - masks_phase) d(X)`; d is trilinear between nodes.
+    A place X of the masks is at `X + amplitude (phase - masks_phase) d(X)`, up to the hysteresis; d is
+    trilinear between nodes.
 
     Parameters
     ----------
@@ -47,6 +48,9 @@ class Motion:
     figures : mapping of str to float
         What was measured of it, such as residuals; units are in the names.
     warnings : tuple of str
+    hysteresis : float
+        How far two places may be, against each other, from where the motion puts them, as a share of their
+        distance: inhaling and exhaling take different ways.
     """
 
     grid: Grid
@@ -58,6 +62,7 @@ class Motion:
     warning_only: bool
     figures: Mapping[str, float]
     warnings: tuple[str, ...] = ()
+    hysteresis: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
@@ -79,6 +84,7 @@ class Motion:
         """SHA-256 of all that places depend on."""
         digest = hashlib.sha256(np.ascontiguousarray(self.nodes).tobytes())
         numbers = [*self.frame, *self.nodes.shape, self.middle_x_mm, self.masks_phase, self.amplitude]
+        numbers += [self.hysteresis] if self.hysteresis else []
         digest.update(np.array(numbers, dtype=np.float64).tobytes())
         return digest.hexdigest()
 
@@ -121,7 +127,8 @@ class Motion:
 
     def record(self) -> dict[str, Any]:
         """Return everything but the nodes as plain values, from which `stored_motion` restores it."""
-        names = ("middle_x_mm", "masks_phase", "amplitude", "source", "warning_only", "warnings")
+        names = ["middle_x_mm", "masks_phase", "amplitude", "source", "warning_only", "warnings"]
+        names.append("hysteresis")
         return {
             **{name: getattr(self, name) for name in names},
             "figures": dict(self.figures),

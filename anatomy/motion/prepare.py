@@ -13,6 +13,7 @@ from anatomy.grid import Grid
 from anatomy.motion.continuation import continued, continued_unfolded
 from anatomy.motion.landmarks import Fitted, fit_landmarks
 from anatomy.motion.motion import LEFT, RIGHT, Motion
+from anatomy.motion.onto_lungs import require_onto_lungs
 from anatomy.motion.plausible import require_plausible
 from anatomy.motion.population import POPULATION_ERROR_MM, shares_of_motion
 from anatomy.motion.source import MotionSource
@@ -52,7 +53,8 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
     Raises
     ------
     AnatomyError
-        If the motion folds tissue, leads to the head on inhalation, or too few landmarks lie in a lung.
+        If the motion folds tissue, leads to the head on inhalation or the lungs away from the other lungs,
+        or too few landmarks lie in a lung.
     FrameError
         If a field does not cover the lungs.
     """
@@ -79,11 +81,16 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
         middle_x_mm=middle_x_mm,
         masks_phase=source.masks_phase,
         amplitude=source.amplitude,
+        hysteresis=source.hysteresis,
         source=source.description,
         warning_only=source.population_motion_mm is not None,
         figures=figures,
     )
-    return require_plausible(motion, lungs)
+    motion = require_plausible(motion, lungs)
+    if source.other_lungs is None:
+        return motion
+    onto = require_onto_lungs(motion, labels, grid, source.other_lungs)
+    return replace(motion, figures={**motion.figures, **onto})
 
 
 def _places(labels: Labels, grid: Grid) -> Float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from anatomy.grid import Grid
+from anatomy.grid import Grid, Volume
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 
@@ -34,6 +34,10 @@ class MotionSource:
         The same places of tissue at both ends.
     population_motion_mm : float
         95 % motion of the patient.
+    hysteresis : float
+        See `Motion`.
+    other_lungs : Volume of bool
+        The lungs at the end of the breath that is farther from the phase of the masks, to compare with.
     """
 
     description: str
@@ -45,3 +49,5 @@ class MotionSource:
     exhale_lps: Float | None = None
     inhale_lps: Float | None = None
     population_motion_mm: float | None = None
+    hysteresis: float = 0.0
+    other_lungs: Volume | None = None

@@ -24,6 +24,8 @@ BOX_MARGIN_MM = 3.0
 """More than the wall reaches beyond the lumen."""
 EDGE_MM = 3.0
 """How far the wall may lie from the rough central airway."""
+IN_PLANE = np.array([0, 1, 0])[:, None, None]
+"""Neighbours in an axial section alone, of (k, j, i)."""
 AROUND_MM, WIDE_MM = 15.0, 2.0
 """So near to it, air in which a ball of this radius fits belongs to it: the middle of a trachea has no walls
 around it to be seen by, and the tissue of the lung is nowhere so dark."""
@@ -146,6 +148,7 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
     reach = int(np.ceil(EDGE_MM / ground.spacing_mm.min()))
     inner = window(*bounds(certain, np.ceil(AROUND_MM / ground.spacing_mm).astype(np.int64)))
     wide = distance_mm(air[inner].T, ground.spacing_mm[::-1]).T >= WIDE_MM
+    wide &= ~_reaching_sides(wide)
     pieces, count = ndimage.label(wide | certain[inner])
     kept = np.bincount(pieces.ravel(), weights=certain[inner].ravel(), minlength=count + 1) > 0
     kept[0] = False
@@ -159,6 +162,18 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
             remedy="Give another seed",
         )
     return np.asarray(labels == label)
+
+
+def _reaching_sides(air: Mask) -> Mask:
+    """Return the pieces of air `(nk, nj, ni)` that reach a side of the window in their axial section.
+
+    What goes on beside the trachea is air around the patient, or outside of the image that was scanned.
+    """
+    from scipy import ndimage
+
+    labels, _ = ndimage.label(air, structure=ndimage.generate_binary_structure(3, 1) * IN_PLANE)
+    sides = np.concatenate([labels[:, [0, -1]].ravel(), labels[:, :, [0, -1]].ravel()])
+    return np.isin(labels, np.unique(sides[sides > 0]))
 
 
 def _filled(lumen: Mask) -> Mask:

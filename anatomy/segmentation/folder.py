@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.checksums import values_checksum
+from anatomy.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.grid import Grid, Volume
 from anatomy.io import cost_maps
-from anatomy.io.files import DAMAGE, atomic_write, read_text, require_writable_folder, sha256, write_text
+from anatomy.io.files import atomic_write, read_json, require_writable_folder, sha256, write_text
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
 from anatomy.lobes import LOBES
 from anatomy.segmentation.canonical import canonical
@@ -58,7 +59,7 @@ class SegmentationFolder:
     AnatomyError
         If the folder holds corrections made for another CT.
     FileError
-        If the folder cannot be written to.
+        If the folder cannot be written to, or its record is damaged.
     """
 
     def __init__(self, folder: str | Path, grid: Grid, ct_digest: str) -> None:
@@ -131,8 +132,9 @@ class SegmentationFolder:
 
     def save(self, **others: Any) -> None:
         """Write the record, with further entries if given."""
-        self._record.update(others)
-        write_text(self.path / STATE, json.dumps(self._record, indent=1) + "\n")
+        self._record = json.loads(json.dumps(self._record | others))
+        sealed = self._record | {"checksum": values_checksum(self._record)}
+        write_text(self.path / STATE, json.dumps(sealed, indent=1) + "\n")
 
     def recorded(self, entry: str) -> Any:
         """Return an entry of the record, or None."""
@@ -155,15 +157,21 @@ class SegmentationFolder:
 
 
 def _read_record(path: Path) -> dict[str, Any]:
-    """Return the record of a folder; empty if there is none, or of another format."""
+    """Return the record of a folder; empty if there is none, or of another format.
+
+    Raises
+    ------
+    FileError
+        If it is damaged: nothing else tells which images a person corrected.
+    """
     if not path.is_file():
         return {"format": FORMAT}
-    try:
-        record = json.loads(read_text(path))
-    except DAMAGE:
-        return {"format": FORMAT}
-    usable = isinstance(record, dict) and record.get("format") == FORMAT
-    return record if usable else {"format": FORMAT}
+    remedy = "Restore it; or remove it, and with it every image in the folder that you did not correct"
+    expected = "the record that segment wrote"
+    record = read_json(path, expected=expected, remedy=remedy)
+    if not isinstance(record, dict) or record.pop("checksum", None) not in (None, values_checksum(record)):
+        raise FileError(f"{path} is damaged or was changed", expected=expected, remedy=remedy)
+    return record if record.get("format") == FORMAT else {"format": FORMAT}
 
 
 def digest_of(array: Array) -> str:

@@ -37,7 +37,7 @@ Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
 Progress = Callable[[str], None]
 
-VERSION = 6
+VERSION = 7
 """Raise it when a step makes other images from the same input."""
 _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 
@@ -205,11 +205,15 @@ class Steps:
             return
         self._tell("checking lungs and airway")
         failed, warnings = plausibility(self._ct, lungs, tree)
-        on_ct = {name: self._box.on_ct(mask) for name, mask in (("lungs", lungs.mask), *airway.items())}
-        given = {n: self._sources[n].array if n in self._sources else on_ct[n] for n in self.from_elsewhere}
-        wrong, doubts = misplaced(self._request.ct, given, on_ct["lungs"], on_ct["airway"])
-        failed, warnings = (*failed, *wrong), (*warnings, *doubts)
-        self.warnings += [*warnings, *scan_warnings(self._request.ct, on_ct["lungs"])]
+        lungs_on_ct = self._box.on_ct(lungs.mask)
+        if self.from_elsewhere:
+            on_ct = {"lungs": lungs_on_ct} | {name: self._box.on_ct(mask) for name, mask in airway.items()}
+            given = {
+                n: self._sources[n].array if n in self._sources else on_ct[n] for n in self.from_elsewhere
+            }
+            wrong, doubts = misplaced(self._request.ct, given, lungs_on_ct, on_ct["airway"])
+            failed, warnings = (*failed, *wrong), (*warnings, *doubts)
+        self.warnings += [*warnings, *scan_warnings(self._request.ct, lungs_on_ct)]
         try:
             self.accepted = require_plausible(failed, self._request.accept)
         except AnatomyError as error:

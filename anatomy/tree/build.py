@@ -13,6 +13,7 @@ from anatomy.tree.branches import Strand, assemble, divide
 from anatomy.tree.cavities import around_cavities
 from anatomy.tree.coverage import complete
 from anatomy.tree.lumen import PreparedLumen, prepare_lumen
+from anatomy.tree.noise import require_few_tunnels
 from anatomy.tree.parallel import unite_parallel
 from anatomy.tree.resample import strands_along
 from anatomy.tree.skeleton import prune, spanning_tree, thin
@@ -44,7 +45,7 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
     Raises
     ------
     AnatomyError
-        If the mask is empty or has no trachea.
+        If the mask is empty, has no trachea, or is noise.
 
     References
     ----------
@@ -52,7 +53,9 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
     """
     prepared = prepare_lumen(lumen, max_gap_mm)
     grid = prepared.grid
-    ijk = complete(thin(prepared.solid), prepared)
+    thinned = thin(prepared.solid)
+    require_few_tunnels(thinned)
+    ijk = complete(thinned, prepared)
     depth = prepared.solid_depth_mm[tuple(ijk.T)].astype(np.float64)
     skeleton, rings = spanning_tree(ijk, prepared.lumen, depth, grid.spacing_mm)
     spurs = prune(skeleton, grid.spacing_mm)

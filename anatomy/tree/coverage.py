@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.tree.lumen import CONNECT_26, PreparedLumen
+from anatomy.tree.noise import require_at_most
 from anatomy.typed import Bool, Float, Float32, Int
 
 SIDE_RADII = 2.0
@@ -25,7 +26,13 @@ MOST_PATHS = 500
 
 
 def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
-    """Return the skeleton voxels `(M, 3)` with paths to all parts of the mask that they do not reach."""
+    """Return the skeleton voxels `(M, 3)` with paths to all parts of the mask that they do not reach.
+
+    Raises
+    ------
+    AnatomyError
+        If more than `MOST_PATHS` parts are not reached.
+    """
     from scipy import ndimage
 
     if len(skeleton) == 0:
@@ -39,12 +46,12 @@ def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
     marks[tuple((missed - low).T)] = True
     labels, count = ndimage.label(marks, CONNECT_26)
     label = labels[tuple((missed - low).T)]
+    paths = 0
     for part in range(1, count + 1):
         open_voxels = missed[label == part]
-        for _ in range(MOST_PATHS):
-            open_voxels = open_voxels[~_reached(open_voxels, skeleton, prepared)]
-            if len(open_voxels) == 0:
-                break
+        while len(open_voxels := open_voxels[~_reached(open_voxels, skeleton, prepared)]):
+            paths += 1
+            require_at_most(paths, MOST_PATHS, "bulges beyond its middle line")
             skeleton = np.concatenate((skeleton, _way_to_farthest(open_voxels, skeleton, prepared)))
     return skeleton[np.lexsort(skeleton.T[::-1])]
 

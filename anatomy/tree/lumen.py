@@ -8,6 +8,7 @@ from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.records import frozen_record
 from anatomy.tree.bridge import Piece, join_pieces
+from anatomy.tree.noise import MOST_PIECES, require_at_most
 from anatomy.tree_report import GapBridged
 from anatomy.typed import Bool, Float, Float32, Int, Int32
 
@@ -52,7 +53,7 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     Raises
     ------
     AnatomyError
-        If the mask is empty.
+        If the mask is empty, or falls into thousands of pieces.
     """
     from scipy import ndimage
 
@@ -65,6 +66,7 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     gaps: list[GapBridged] = []
     if count > 1:
         pieces = _pieces(labels, sizes, main, grid.spacing_mm)
+        require_at_most(len(pieces), MOST_PIECES, "separate pieces")
         for join in join_pieces(np.argwhere(lumen), pieces, grid.spacing_mm, max_gap_mm):
             lumen[tuple(join.voxels.T)] = True
             bridges[tuple(join.bridge.T)] = True

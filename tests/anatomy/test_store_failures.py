@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy import store
+from anatomy import store, unfinished
 from anatomy.build import build_lung, lung_key
+from anatomy.cache_entries import cache_entries, remove_abandoned
 from anatomy.checksums import DamagedCacheWarning
 from anatomy.errors import AnatomyError, FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.store import META, open_lung
+from anatomy.unfinished import filled_folder
 from tests.anatomy import toys
 from tests.anatomy.stored_toy import KEY, SOURCES, no_reading, require_same
 from tests.anatomy.toys import toy
@@ -173,7 +175,7 @@ def test_what_a_patient_may_not_be_is_not_stored(tmp_path: Path) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from anatomy import store
+from anatomy import store, unfinished
 from tests.anatomy.toys import toy
 
 def die(*_args):
@@ -195,14 +197,8 @@ def test_a_killed_build_is_not_taken_for_a_lung(tmp_path: Path) -> None:
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".building-")
     assert (left / "labels.npy").is_file()
-    calls: list[int] = []
-
-    def read() -> PatientImages:
-        calls.append(1)
-        return toy()
-
-    open_lung(SOURCES, read, cache=tmp_path)
-    assert calls == [1]
+    assert open_lung(SOURCES, toy, cache=tmp_path).labels.any()
+    assert [path.name for path in tmp_path.iterdir()] == [KEY], "what was left is gone"
 
 
 def test_two_builds_at_once_end_with_one_lung(tmp_path: Path) -> None:
@@ -261,14 +257,31 @@ def test_a_stored_lung_is_read_from_a_cache_that_cannot_be_written(cache: Path) 
         cache.chmod(0o700)
 
 
-def test_what_a_killed_build_left_is_removed_a_day_later(tmp_path: Path) -> None:
-    images = toy()
-    old, new = tmp_path / ".building-old", tmp_path / ".building-new"
-    for folder in (old, new):
-        folder.mkdir()
-        (folder / "labels.npy").write_bytes(b"half")
-    long_ago = time.time() - 2 * 24 * 3600
-    os.utime(old, (long_ago, long_ago))
-    open_lung(dict(images.sources), lambda: images, cache=tmp_path)
-    assert not old.exists()
-    assert new.exists()
+def test_what_killed_builds_left_is_removed_and_what_is_being_built_stays(tmp_path: Path) -> None:
+    """Whether its process lives is told by the lock of a folder, not by its age."""
+    left = tmp_path / ".building-left"
+    left.mkdir()
+    (left / "labels.npy").write_bytes(b"half")
+    with filled_folder(tmp_path) as alive:
+        long_ago = time.time() - 2 * 24 * 3600
+        os.utime(alive, (long_ago, long_ago))
+        open_lung(SOURCES, toy, cache=tmp_path)
+        assert not left.exists() and alive.exists()
+        assert not any(entry.abandoned for entry in cache_entries(tmp_path, {}))
+    assert not alive.exists()
+
+
+def test_a_folder_lost_before_its_lock_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process takes the folder for abandoned in the moment between making and locking it."""
+    lock, lost = unfinished.locked, []
+
+    def late(folder: Path) -> Any:
+        if not lost:
+            lost.append(folder)
+            remove_abandoned(tmp_path)
+        return lock(folder)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(unfinished, "locked", late)
+        with filled_folder(tmp_path) as folder:
+            assert lost and folder != lost[0] and [*tmp_path.iterdir()] == [folder]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
@@ -63,6 +65,23 @@ def _image_target(name: str, header: Callable[[bytes], int] | None, compressed: 
         return read_volume(folder / name)
 
     return Target(file=name, make=_image(name, compressed), read=read, header_bytes=header)
+
+
+def _field_target(name: str, header: Callable[[bytes], int] | None) -> Target:
+    """Return a displacement field; what is read of it is one number for each vector."""
+
+    def make(folder: Path) -> None:
+        from anatomy.io.motion_files import write_vectors
+
+        write_vectors(folder / name, GRID, np.stack([_voxels() + n for n in range(3)], axis=-1))
+
+    def read(folder: Path) -> Volume:
+        from anatomy.io.motion_files import read_vectors
+
+        grid, vectors = read_vectors(folder / name)
+        return Volume(grid=grid, array=vectors[..., 0])
+
+    return Target(file=name, make=make, read=read, header_bytes=header)
 
 
 def _after(mark: bytes) -> Callable[[bytes], int]:
@@ -167,9 +186,83 @@ def _text_targets() -> dict[str, Target]:
     }
 
 
+def _results(folder: Path) -> None:
+    from lungaccess.problem.system import load_system
+    from lungaccess.study.patients import Patient
+    from lungaccess.study.results import ResultsFile
+    from lungaccess.study.runs import Problem, Run
+    from lungaccess.study.settings import PlannerChoice
+    from tests.lungaccess.study.toys import toy_answer
+
+    patient = Patient(anatomy="phantom", seed=1, size="small", spacing_mm=None, sources=(("a", "0" * 64),))
+    problem = Problem(
+        case="toy", patient=patient, system=load_system("ultrathin"), objective="inverse_clearance", target=1,
+        target_lps=(1.0, 2.0, 3.0), origin="stated", start=0, rotations=4, stop_spacing_mm=8.0,
+        site_spacing_mm=4.0, iterations=2, time_s=None,
+    )  # fmt: skip
+    with ResultsFile(folder / "results.db", create=True) as results:
+        for seed in range(3):
+            run = Run(problem=problem, planner=PlannerChoice(name="atlas"), seed=seed)
+            results.add(run, toy_answer(run))
+    shutil.copy(folder / "results.db", folder / "intact.db")
+
+
+def _read_results(folder: Path) -> None:
+    from lungaccess.study.compare import differences
+    from lungaccess.study.results import ResultsFile
+    from lungaccess.study.summary import summarise
+    from lungaccess.study.tables import QUERIES, table
+
+    for left in folder.glob("results.db-*"):
+        left.unlink()
+    summarise(folder / "results.db")
+    differences(folder / "results.db", folder / "intact.db")
+    with ResultsFile(folder / "results.db") as results:
+        for name in QUERIES:
+            list(table(results, name).rows)
+
+
+def _record(folder: Path) -> None:
+    from anatomy.segmentation.folder import SegmentationFolder
+
+    made = SegmentationFolder(folder, GRID, "0" * 64)
+    for name in ("airway", "lungs"):
+        made.write(name, _voxels() > 1, key=name)
+        made.note(name, {"voxels": 5})
+    made.save()
+
+
+def _read_record(folder: Path) -> None:
+    from anatomy.segmentation.folder import SegmentationFolder
+
+    made = SegmentationFolder(folder, GRID, "0" * 64)
+    for name in ("airway", "lungs"):
+        made.correction(name)
+        made.facts(name)
+        made.digest_if_made_from(name, name)
+
+
+def _peer(folder: Path) -> None:
+    run = {
+        "patient": 1, "start": 2, "radius_mm": 50.0, "start_exemption_mm": 3.0, "planner": "rrt",
+        "threads": 1, "valid_problem": True, "solved": True, "first_cpu_s": 0.5, "length_end_mm": 40.0,
+        "goal_error_mm": None,
+    }  # fmt: skip
+    (folder / "peer.json").write_text(json.dumps({"runs": [run, run | {"solved": False}]}))
+
+
+def _read_peer(folder: Path) -> None:
+    from lungaccess.benchmark.peer import read_peer
+
+    read_peer(folder / "peer.json")
+
+
 def targets() -> dict[str, Target]:
     """Return all targets by name."""
     return {
+        "results": Target("results.db", _results, _read_results),
+        "record": Target("segmentation.json", _record, _read_record),
+        "peer": Target("peer.json", _peer, _read_peer),
         "nifti": _image_target("a.nii", lambda content: 352),
         "nifti-gzip": _image_target("a.nii.gz", None, compressed=True),
         "nrrd": _image_target("a.nrrd", _after(b"\n\n")),
@@ -177,6 +270,9 @@ def targets() -> dict[str, Target]:
         "metaimage": _image_target("a.mha", _after(b"LOCAL\n")),
         "metaimage-zlib": _image_target("a.mha", _after(b"LOCAL\n"), compressed=True),
         "metaimage-two-files": _image_target("a.mhd", len),
+        "field-nrrd": _field_target("a.nrrd", _after(b"\n\n")),
+        "field-metaimage": _field_target("a.mha", _after(b"LOCAL\n")),
+        "field-nifti": _field_target("a.nii", lambda content: 352),
         "dicom": Target("slice.dcm", _series, _read_series, _before_pixels),
         **{
             f"centerlines-{name[0]}": Target(name, _centerlines, _read_centerlines(name))

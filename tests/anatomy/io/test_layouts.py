@@ -321,6 +321,7 @@ def test_a_case_of_atm_is_a_file_in_one_of_two_folders(tmp_path, landmark, masks
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_the_respiratory_part_loads_and_its_lobes_are_a_lung_apart(data_dir):
     patient = load_patient(data_dir / "med-rad-respiratory" / "Patient2")
     counts = np.bincount(patient.lobes.array.ravel())

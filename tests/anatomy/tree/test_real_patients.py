@@ -37,7 +37,7 @@ def test_tree_of_a_patient(data_dir: Path, patient: str, generations: int):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("patient", ["Patient1", "Patient2"])
+@pytest.mark.parametrize("patient", ["Patient1", pytest.param("Patient2", marks=pytest.mark.slow)])
 def test_every_part_of_the_lumen_is_near_its_tree(data_dir: Path, patient: str):
     from scipy.spatial import KDTree
 

@@ -17,9 +17,10 @@ from lungaccess.study.compare import differences
 from lungaccess.study.driver import run_study
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.settings import read_study
+from tests.lungaccess.cli.killing import require_gone
 from tests.lungaccess.study.test_study_command import TOML, command, stored
 
-RUNS, KILLS = 200, 20
+RUNS, KILLS = 400, 40
 STUDY = TOML.replace("[0, 1]", str(list(range(RUNS // 4)))).replace(
     'targets = ["lps:-81.25,51,-33.5", "lps:300,0,0"]',
     'targets = ["lps:-81.25,51,-33.5", "lps:300,0,0"]\nperipheral = {per_lung = 1, seed = 1}',
@@ -27,12 +28,15 @@ STUDY = TOML.replace("[0, 1]", str(list(range(RUNS // 4)))).replace(
 
 
 def killed_at_random(words: list[str], path: Path, rng: random.Random) -> bool:
-    """Start a study and kill all its processes at a random moment; return whether it was still running.
+    """Start a study and kill it at a random moment; return whether it was still running.
 
+    Of three kills, one is of all its processes and one of the first alone, which leaves the others to end by
+    themselves; the third is a request to end (SIGTERM).
     The moment is counted in runs stored since the start, and then in time, so that it falls anywhere: while
     workers start, while a run is made, while it is written.
     """
     more, later_s = rng.choice((0, 1, 3, 8, 15)), rng.uniform(0.0, 2.0)
+    kind = rng.choice(("all", "first", "end"))
     before = stored(path)
     with subprocess.Popen(
         words, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -41,13 +45,17 @@ def killed_at_random(words: list[str], path: Path, rng: random.Random) -> bool:
             time.sleep(0.005)
         time.sleep(later_s)
         running = process.poll() is None
-        if running:
+        if running and kind == "all":
             os.killpg(process.pid, signal.SIGKILL)
+        elif running:
+            process.send_signal(signal.SIGKILL if kind == "first" else signal.SIGTERM)
+        process.wait()
+        require_gone(process.pid)
     return running
 
 
 @pytest.mark.slow
-def test_killed_twenty_times_and_resumed(tmp_path: Path, cache: Path) -> None:
+def test_killed_forty_times_and_resumed(tmp_path: Path, cache: Path) -> None:
     file, path, quiet = tmp_path / "study.toml", tmp_path / "killed.db", tmp_path / "quiet.db"
     file.write_text(STUDY)
     words, rng, kills = command(file, path, cache), random.Random(20), 0

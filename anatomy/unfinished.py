@@ -1,0 +1,95 @@
+"""Folders that a process is filling: a lock tells whether that process still lives."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from anatomy.cache import BUILDING
+
+ABANDONED_AFTER_DAYS = 1.0
+"""No anatomy takes so long to prepare: what is older and bears no lock was left behind."""
+SECONDS_PER_DAY = 24 * 3600.0
+
+
+@contextlib.contextmanager
+def filled_folder(parent: Path) -> Iterator[Path]:
+    """Make a folder and hold its lock, which the system takes back when this process ends, however it ends.
+
+    What is left of the folder at the end of the block is removed.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made.
+    """
+    while True:
+        # The name is known before the folder is made: an interrupt between the two leaves nothing behind.
+        folder = parent / f"{BUILDING}{uuid.uuid4().hex}"
+        with contextlib.ExitStack() as stack:
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            folder.mkdir(mode=0o700)
+            if _is_taken(folder, stack):
+                yield folder
+                return
+
+
+def _is_taken(folder: Path, stack: contextlib.ExitStack) -> bool:
+    """Lock a new folder, unless another process removes it meanwhile as one that nobody fills."""
+    with contextlib.suppress(FileNotFoundError, BlockingIOError):
+        stack.enter_context(locked(folder))
+        return folder.is_dir()
+    return False
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[bool]:
+    """Hold the lock of a folder; yield whether there is one: some file systems have none.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process holds it.
+    FileNotFoundError
+        If there is no such folder.
+    """
+    handle, there = os.open(folder, os.O_RDONLY), True
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise
+        except OSError:
+            there = False
+        yield there
+    finally:
+        os.close(handle)
+
+
+def is_abandoned(path: Path) -> bool:
+    """Tell whether nobody fills or empties a file or folder any longer.
+
+    Of a folder the lock tells.  Files are abandoned after a day, as are folders where there are no locks.
+    """
+    aged = time.time() - path.stat().st_mtime > ABANDONED_AFTER_DAYS * SECONDS_PER_DAY
+    if not path.is_dir():
+        return aged
+    try:
+        with locked(path) as there:
+            return there or aged
+    except BlockingIOError:
+        return False
+
+
+def clear_place(path: Path) -> None:
+    """Remove what stands where something is to be stored, a folder or a file."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

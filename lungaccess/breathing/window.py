@@ -20,6 +20,7 @@ from lungaccess.plans.window import BreathingWindow, WindowLimit
 
 TOLERANCE_MM = 2.0
 """How far from the moving target the devices may end: half of the smallest nodules that are biopsied."""
+WHOLE_BREATH = (0.0, 1.0)
 TIP_BALL_MM = 10.0
 """Radius of the tissue whose mean gradient turns the scope's tip: a segmental bronchus is about so long."""
 TIP_STEP_MM = 2.5
@@ -56,24 +57,48 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
         raise SettingsError(
             f"The tolerance of the window is {tolerance_mm} mm", expected=f"0 to {TOLERANCE_MM:g} mm"
         )
+    leaves, devices = _leaves(plan, lung, float(tolerance_mm), WHOLE_BREATH, all_of_it=True)
+    found = _window(motion, float(tolerance_mm), leaves, devices)
+    beside = float(np.linalg.norm(plan.end_lps - plan.target_lps))
+    return replace(found, beside_target_mm=beside)
+
+
+def first_limit(plan: Plan, lung: Lung, phases: tuple[float, float]) -> WindowLimit | None:
+    """Return what ends the window of a plan first between two phases; None if it is proved in all of them.
+
+    The stretches are those of `breathing_window`, which then holds these phases, without a gap.
+    """
+    leaves, devices = _leaves(plan, lung, TOLERANCE_MM, phases, all_of_it=False)
+    last = leaves[-1]
+    return None if last[2] == rules.CLEAR else _limit(last, max(float(last[0]), phases[0]), devices)
+
+
+def _leaves(
+    plan: Plan, lung: Lung, tolerance_mm: float, phases: tuple[float, float], *, all_of_it: bool
+) -> tuple[Float, DevicePoints]:
+    """Return the stretches of `divide` between two phases, and the devices that they speak of."""
+    motion = require_motion(lung)
     side, devices = motion.side_of(plan.target_lps), device_points(plan)
+    tip = plan.scope.lps_from_scope_tip[:3, 3]
     leaves = np.zeros((MOST_LEAVES, 5))
     count = divide(
         tissue_of(plan, lung),
-        rules.Breath(motion.nodes[side], motion.frame, motion.cells[side]),
-        carrier(motion, plan.scope.lps_from_scope_tip[:3, 3], side),
+        breath_of(motion, side),
+        carrier(motion, tip, side),
         devices.points,
         devices.arc_mm,
         devices.sections,
         np.array(plan.target_lps),
-        float(tolerance_mm),
+        miss_allowed(motion, tolerance_mm, distance_mm(devices.points[-1], tip)),
         devices.hole_lps,
-        devices.hole_mm,
+        miss_allowed(motion, devices.hole_mm, distance_mm(devices.hole_lps, tip)),
         float(motion.amplitude),
         float(motion.masks_phase),
+        phases,
+        all_of_it,
         leaves,
     )
-    return _window(motion, float(tolerance_mm), leaves[:count], devices)
+    return leaves[:count], devices
 
 
 def with_window(plan: Plan, lung: Lung) -> Plan:
@@ -91,6 +116,24 @@ def require_motion(lung: Lung) -> Motion:
             "population = true for a warning without data; docs/explanation/breathing.md says more",
         )
     return lung.motion
+
+
+def miss_allowed(motion: Motion, limit_mm: float, lever_mm: float) -> float:
+    """Return the distance by the motion that stays within a limit wherever tissue strays, mm.
+
+    A place of tissue so far from a point of the devices is at most `lever_mm` and this from the scope's tip.
+    """
+    return (limit_mm - motion.hysteresis * lever_mm) / (1.0 + motion.hysteresis)
+
+
+def distance_mm(point: Float, other: Float) -> float:
+    """Return the distance of two points `(3,)`."""
+    return float(np.linalg.norm(np.asarray(point) - other))
+
+
+def breath_of(motion: Motion, side: int) -> rules.Breath:
+    """Return the motion of one lung for the kernels."""
+    return rules.Breath(motion.nodes[side], motion.frame, motion.cells[side], float(motion.hysteresis))
 
 
 def carrier(motion: Motion, tip_lps: Float, side: int) -> Rigid:
@@ -145,6 +188,7 @@ def _window(motion: Motion, tolerance_mm: float, leaves: Float, devices: DeviceP
         phases=np.stack([leaves[first, 0], leaves[last, 1]], axis=1),
         undecided_share=float((undecided[:, 1] - undecided[:, 0]).sum()),
         limits=tuple(limits),
+        hysteresis=float(motion.hysteresis),
     )
 
 

@@ -48,7 +48,7 @@ def check_tubes_at_target(
     if tube_tip is None:
         return
     check_target(plan, environment.lung, tube_tip[:3, 3], found)
-    miss, detail = float(np.linalg.norm(tube_tip[:3, 3] - plan.target_lps)), "tip of the tubes to the target"
+    miss, detail = float(np.linalg.norm(tube_tip[:3, 3] - plan.end_lps)), "tip of the tubes to the target"
     found.at_most("tube.at_target", miss, POSITION_TOLERANCE_MM, "mm", detail)
     curve = integrate(plan.scope.lps_from_scope_tip, tube_pieces(plan))
     way_out = plan.tube.exit
@@ -57,9 +57,16 @@ def check_tubes_at_target(
 
 
 def check_target(plan: Plan, lung: Lung, end: Float, found: Findings) -> None:
-    """The needle, or the tubes, end at the target, which lies in the lung and in no obstacle."""
-    miss = float(np.linalg.norm(end - plan.target_lps))
-    if plan.target_origin.startswith("nodule"):
+    """The needle, or the tubes, end at the target, which lies in the lung and in no obstacle.
+
+    Devices with an aim end there instead: how near that is to the target, its window says.
+    """
+    miss = float(np.linalg.norm(end - plan.end_lps))
+    if plan.aim is not None:
+        found.at_most("target.aim", miss, POSITION_TOLERANCE_MM, "mm", "end of the devices to the aim")
+        if plan.target_origin.startswith("nodule"):
+            found.true("target.in_nodule", _in_nodule(lung, plan.target_lps[None]), "the target is nodule")
+    elif plan.target_origin.startswith("nodule"):
         ends = np.stack([end, plan.target_lps])
         found.true("target.in_nodule", _in_nodule(lung, ends), "end of the devices and target are nodule")
     else:

@@ -22,7 +22,7 @@ from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.outcome import forbidden_bits
 from lungaccess.checking.shapes import Curve, Piece, cut_at, integrate
-from lungaccess.checking.space import Select, airway_except, has, labels_at
+from lungaccess.checking.space import Select, airway_except, has, labels_at, not_lumen
 from lungaccess.plans.plan import Plan
 
 LARGEST_TOLERANCE_MM = 2.0
@@ -37,14 +37,12 @@ NEAR_MM = 0.5
 """Voxels are meshed that come nearer than what is required and this in any phase."""
 CORNER_MM = 0.06
 """An axis in the airway cuts corners by 0.05 mm; a sample may see a little more."""
-LIMIT_MM = 0.1
-"""At an end of the window the structure that is named has no more than this to spare."""
-LIMIT_PHASE = 0.01
-"""So far outside of a window what ends it is looked for."""
 FLATTEST_DEG = 10.0
 """A wall that is pierced at less counts as pierced at this angle."""
 HOLE_TOLERANCE_MM = 0.02
 """The point of the exit is known to this."""
+VARIES_MM = 0.01
+"""What is to be kept from straying tissue is taken as equal along pieces over which it varies by this."""
 ROUNDING = 1e-9
 
 
@@ -61,6 +59,8 @@ class Part:
 def check_window(plan: Plan, environment: Environment, found: Findings) -> None:
     """Record whether the stated window holds; a patient without motion has none, and needs none."""
     window, motion = plan.window, environment.lung.motion
+    if plan.aim is not None:
+        _check_aim(plan, found)
     if window is None and motion is None:
         return
     if window is None or motion is None:
@@ -71,8 +71,11 @@ def check_window(plan: Plan, environment: Environment, found: Findings) -> None:
             found.unchecked("window", f"the plan states {what}")
         return
     found.true("window.motion", window.motion_key == motion.key, "the motion is that of the patient")
-    same = (window.motion_source, window.masks_phase, window.amplitude, window.warning_only)
-    own = (motion.source, motion.masks_phase, motion.amplitude, motion.warning_only)
+    beside = float(np.linalg.norm(np.asarray(plan.end_lps) - np.asarray(plan.target_lps)))
+    found.agrees("window.beside_target", window.beside_target_mm, beside, ROUNDING, "mm")
+    names = ("masks_phase", "amplitude", "warning_only", "hysteresis")
+    same = (window.motion_source, *(getattr(window, name) for name in names))
+    own = (motion.source, *(getattr(motion, name) for name in names))
     detail = f"{window.motion_source}; phase of the masks {window.masks_phase:g}"
     found.true("window.source", same == own, detail)
     detail = "largest distance to the moving target that is promised"
@@ -112,6 +115,10 @@ class _Devices:
     def end(self) -> Float:
         """Where the devices end, `(3,)`."""
         return np.asarray((self.needle or self.tube).end[:3, 3])
+
+    def from_tip_mm(self, points: Float) -> Float:
+        """Return the distances of points from the tip of the scope."""
+        return np.asarray(np.linalg.norm(points - self._plan.scope.lps_from_scope_tip[:3, 3], axis=-1))
 
     def in_airway(self) -> Curve:
         """Return the tubes up to their exit."""
@@ -160,6 +167,16 @@ def _between(curve: Curve, begin: float, end: float) -> Float:
     return curve.points[inside]
 
 
+def _check_aim(plan: Plan, found: Findings) -> None:
+    """Devices may end beside the target only if a window holds, without a gap, what was asked for."""
+    held = np.zeros((0, 2)) if plan.window is None else plan.window.phases
+    asked = np.zeros((0, 2)) if plan.aim is None else plan.aim.phases
+    found.true("window.of_aim", len(held) > 0, "a plan that ends at an aim has a window")
+    for begin, end in asked:
+        whole = bool(((held[:, 0] <= begin) & (held[:, 1] >= end)).any())
+        found.true("window.asked", whole, f"the window holds the phases {begin:g} to {end:g}")
+
+
 def _check_ends(plan: Plan, found: Findings) -> None:
     """Every end of the window within the breath has a limit, in order; without a window one says why."""
     window = plan.window
@@ -180,11 +197,13 @@ def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings
     phases = np.concatenate([np.linspace(a, b, TARGET_STEPS) for a, b in window.phases])
     most = max(_miss(plan, breath, devices, float(phase)) for phase in phases)
     detail = f"end of the devices to the moving target, at {len(phases)} phases of the window"
+    most += window.hysteresis * (float(devices.from_tip_mm(devices.end)) + most)
     found.at_most("window.target", most, window.tolerance_mm, "mm", detail, ROUNDING)
     hole = np.asarray(plan.tube.exit.point_lps)[None]
     shifts = [breath.carried(hole, float(phase)) - breath.moved(hole, float(phase)) for phase in phases]
     most = float(np.linalg.norm(np.concatenate(shifts), axis=1).max())
     detail = "shift of the tubes in the hole in the airway wall; at most their radius"
+    most += window.hysteresis * (float(devices.from_tip_mm(hole[0])) + most)
     found.at_most("window.hole", most, devices.hole_mm, "mm", detail, HOLE_TOLERANCE_MM)
 
 
@@ -207,12 +226,14 @@ def _check_clear(
     ]
     spare, worst, inside, airway = np.inf, "", 0, 0
     for part in devices.parts():
-        mesh = _surface(part, environment, breath, phases)
+        lever = devices.from_tip_mm(part.points)
+        kept = _kept_mm(part.required_mm, window.hysteresis, lever)
+        mesh = _surface(part, environment, breath, phases, float(np.max(kept)))
         for phase in phases:
             points = breath.carried(part.points, phase)
             within = part.select(labels_at(environment.lung, breath.pulled_back(points, phase)))
             inside += int(within.sum())
-            left = _deformed(mesh, breath, phase).polyline_distance_mm(points) - part.required_mm
+            left = _least_spare(_deformed(mesh, breath, phase), points, kept)
             if left < spare:
                 spare, worst = left, f"{part.name} at phase {phase:.3f}"
     for phase in phases:
@@ -232,41 +253,74 @@ def _deformed(mesh: SurfaceMesh, breath: Breath, phase: float) -> MeshDistance:
     return MeshDistance(replace(mesh, vertices_lps=breath.moved(mesh.vertices_lps, phase)))
 
 
-def _surface(part: Part, environment: Environment, breath: Breath, phases: list[float]) -> SurfaceMesh:
+def _surface(
+    part: Part, environment: Environment, breath: Breath, phases: list[float], required: float
+) -> SurfaceMesh:
     """Return the surface of the voxels that come near a part in any of the phases, as in the masks."""
     spread = [min(phases), max(phases), 0.5 * (min(phases) + max(phases))]
     places = [breath.pulled_back(breath.carried(part.points, phase), phase) for phase in spread]
     slack = max(float(np.linalg.norm(each - places[2], axis=1).max()) for each in places[:2])
-    boxes = environment.boxes(part.select, part.required_mm)
-    return boxes.surface_near(np.concatenate(places), 1.5 * (part.required_mm + NEAR_MM) + 0.3 * slack)
+    boxes = environment.boxes(part.select, required)
+    return boxes.surface_near(np.concatenate(places), 1.5 * (required + NEAR_MM) + 0.3 * slack)
 
 
 def _out_of_airway(
     plan: Plan, environment: Environment, breath: Breath, devices: _Devices, phase: float
 ) -> int:
     """Return how many samples before the exit leave the lumen, or touch its wall with something behind it."""
-    curve = devices.in_airway()
-    places = breath.pulled_back(breath.carried(curve.points, phase), phase)
+    curve, share = devices.in_airway(), plan.window.hysteresis if plan.window else 0.0
+    points = breath.carried(curve.points, phase)
+    strays = _kept_mm(np.zeros(len(points)), share, devices.from_tip_mm(curve.points))
     before = curve.arc_mm <= plan.tube.exit.arc_length_mm - devices.zone_mm
-    out = environment.boxes(has(structures.LUMEN), 1.0).distance_mm(places[before])
-    return int((out > CORNER_MM).sum()) + _touching(plan, environment, breath, curve, phase)
+    places = breath.pulled_back(points, phase)[before]
+    out = environment.boxes(has(structures.LUMEN), 1.0).distance_mm(places)
+    broken = int((out > CORNER_MM).sum()) + _touching(plan, environment, breath, curve, phase, strays)
+    if share and len(places):
+        most = float(strays.max())
+        wall = environment.boxes(not_lumen, most).surface_near(places, 1.5 * (most + NEAR_MM))
+        depth = _gaps(_deformed(wall, breath, phase), points[before])
+        broken += int((depth < strays[before] - CORNER_MM).sum())
+    return broken
 
 
-def _touching(plan: Plan, environment: Environment, breath: Breath, curve: Curve, phase: float) -> int:
+def _kept_mm(required: Float | float, share: float, lever_mm: Float) -> Float:
+    """Return the clearances by the motion `(N,)` that leave what is required wherever tissue strays.
+
+    What is c mm from a point is at most `lever + c` from the tip of the scope, and strays by a share of this.
+    """
+    return np.asarray((required + share * lever_mm) / (1.0 - share))
+
+
+def _least_spare(mesh: MeshDistance, points: Float, kept: Float) -> float:
+    """Return the least of distance less `kept` `(N,)` along points, by pieces over which it hardly varies."""
+    pieces = 1 + int(np.ptp(kept) / VARIES_MM)
+    ends = np.linspace(0, len(points) - 1, pieces + 1).astype(int)
+    return min(
+        mesh.polyline_distance_mm(points[a : b + 1]) - float(kept[a : b + 1].min())
+        for a, b in zip(ends[:-1], ends[1:], strict=True)
+    )
+
+
+def _gaps(mesh: MeshDistance, points: Float) -> Float:
+    return np.array([mesh.polyline_distance_mm(point[None]) for point in points])
+
+
+def _touching(
+    plan: Plan, environment: Environment, breath: Breath, curve: Curve, phase: float, strays: Float
+) -> int:
     """Return how many samples from the last contact with the wall on have an obstacle behind it too near."""
     phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
     radius = shapes.radius_at(plan, curve.arc_mm)
     frames = curve.frames[:, None, :3]
     across = np.cos(phi)[:, None] * frames[..., 0] + np.sin(phi)[:, None] * frames[..., 1]
-    rim = (frames[..., 3] + radius[:, None, None] * across).reshape(-1, 3)
+    rim = (frames[..., 3] + (radius + strays)[:, None, None] * across).reshape(-1, 3)
     labels = labels_at(environment.lung, breath.pulled_back(breath.carried(rim, phase), phase))
     wet = ((labels & structures.LUMEN) != 0).reshape(len(radius), RIM_POINTS).all(axis=1)
     first = int(np.flatnonzero(wet)[-1]) if wet.any() else 0
     points = breath.carried(curve.points[first:], phase)
-    needed = radius[first:] + plan.system.margins.total_mm + plan.tube.clearance_loss_mm
+    needed = radius[first:] + plan.system.margins.total_mm + plan.tube.clearance_loss_mm + strays[first:]
     boxes = environment.boxes(has(forbidden_bits(plan) & ~structures.AIRWAY), float(needed.max()))
     places = breath.pulled_back(points, phase)
     mesh = boxes.surface_near(places, 1.5 * (float(needed.max()) + NEAR_MM))
-    moved = _deformed(mesh, breath, phase)
-    gap = np.array([moved.polyline_distance_mm(point[None]) for point in points])
+    gap = _gaps(_deformed(mesh, breath, phase), points)
     return int((gap < needed - MESH_TOLERANCE_MM).sum())

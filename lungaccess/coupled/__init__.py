@@ -47,5 +47,6 @@ if TYPE_CHECKING:
     )
     from lungaccess.coupled.search.kuntz2015 import KuntzSearch
     from lungaccess.coupled.search.settings import SearchSettings
+    from lungaccess.coupled.window_planner import plan_for_window
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

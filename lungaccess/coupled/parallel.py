@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from multiprocessing.connection import Connection
 
+from anatomy.child_process import end_with_parent
 from anatomy.errors import AnatomyError, SettingsError
 from lungaccess.coupled.search.base import ParallelSearch, Step
 
@@ -86,7 +86,7 @@ def _work(search: ParallelSearch, number: int, processes: int, end: Connection) 
 
     An interruption from the keyboard reaches every process; only the one that holds the best heeds it.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     search.take_part(number, processes)
     steps = search.further_steps()
     while True:

@@ -17,6 +17,8 @@ from lungaccess.coupled.search.base import ParallelSearch, PlanSearch, SearchFac
 from lungaccess.coupled.search.kuntz2015 import KuntzSearch
 from lungaccess.coupled.search.tube_search import TubeSearch
 from lungaccess.plans.assemble import assemble
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, require_own_name
 from lungaccess.problem.target import Target
@@ -161,12 +163,18 @@ def plan(
     atlas = atlas or build_atlas(lung, system, progress=lambda share: tell(atlas_event(share)))
     search = METHODS[method](task, atlas)
     steps = search.steps() if processes == 1 else _parallel(search, method, processes)
-    limits = Limits(
-        iterations=iterations,
-        time_s=math.inf if time_s is None else time_s,
-        first_plan_s=math.inf if first_plan_s is None else first_plan_s,
-    )
-    return _run(task, atlas, search, steps, limits, counterfactuals, tell)
+
+    def made(candidate: Candidate, iteration: int, elapsed_s: float) -> Plan:
+        timing = {"planning_s": elapsed_s, "atlas_s": atlas.build_s}
+        return assemble(task, candidate, iteration=iteration, timing=timing)
+
+    def no_plan(iteration: int) -> NoPlan:
+        from lungaccess.coupled.explanation import explain
+
+        return explain(task, atlas, search.blocked, iteration, counterfactuals=counterfactuals)
+
+    limits = Limits.of(iterations, time_s, first_plan_s)
+    return drive(steps, limits, tell, made, no_plan)
 
 
 @frozen_value
@@ -176,6 +184,12 @@ class Limits:
     iterations: int | None
     time_s: float
     first_plan_s: float
+
+    @classmethod
+    def of(cls, iterations: int | None, time_s: float | None, first_plan_s: float | None = None) -> Limits:
+        """Return limits as a caller states them; None is no limit."""
+        whole, first = (math.inf if each is None else each for each in (time_s, first_plan_s))
+        return cls(iterations=iterations, time_s=whole, first_plan_s=first)
 
     def are_reached(self, iteration: int, elapsed_s: float, found: bool) -> bool:
         """Tell whether the search ends; never without a plan before the direct arcs have been tried."""
@@ -208,18 +222,22 @@ def atlas_event(share: float) -> ProgressEvent:
     )
 
 
-def _run(
-    task: Task,
-    atlas: Atlas,
-    search: PlanSearch,
+def drive(
     steps: Iterator[Step],
     limits: Limits,
-    counterfactuals: bool,
     tell: Callable[[ProgressEvent], None],
+    made: Callable[[Candidate, int, float], Plan],
+    no_plan: Callable[[int], NoPlan],
 ) -> Iterator[Plan]:
-    """Drive a search within its budget."""
-    from lungaccess.coupled.explanation import explain
+    """Drive a search within its budget; yield what `made` makes of its candidates.
 
+    Parameters
+    ----------
+    made : callable
+        Gets a candidate, its iteration and the planning time in seconds.
+    no_plan : callable
+        Returns what is raised after so many iterations without a candidate.
+    """
     clock = Clock()
     best: float | None = None
     iteration = 0
@@ -229,8 +247,7 @@ def _run(
         iteration = step.iteration
         if step.candidate is not None:
             best = step.cost
-            timing = {"planning_s": clock.elapsed_s, "atlas_s": atlas.build_s}
-            yield assemble(task, step.candidate, iteration=iteration, timing=timing)
+            yield made(step.candidate, iteration, clock.elapsed_s)
         if limits.are_reached(iteration, clock.elapsed_s, best is not None):
             break
         if clock.due():
@@ -240,7 +257,7 @@ def _run(
                 )
             )
     if best is None:
-        raise explain(task, atlas, search.blocked, iteration, counterfactuals=counterfactuals)
+        raise no_plan(iteration)
 
 
 class Clock:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -79,6 +80,18 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         iterations=iteration,
         timing=timing,
     )
+
+
+def with_devices(task: Task, candidate: Candidate, model: Plan) -> Plan:
+    """Return a plan whose scope tip, tubes and needle are those of a candidate.
+
+    What takes long to state is that of another plan: clearances, costs and the margin of the scope's motion.
+    """
+    frame, deployment = candidate.tip.lps_from_scope_tip, candidate.deployment
+    tube, needle = tube_part(task, frame, deployment), needle_part(candidate.path)
+    exemption = replace(model.exemption, branch=deployment.branch, exit_point_lps=tube.exit.point_lps)
+    scope = replace(model.scope, lps_from_scope_tip=frame)
+    return replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption)
 
 
 def required_clearance_mm(system: System) -> dict[str, float]:

@@ -91,9 +91,21 @@ class CandidateEvaluator:
 
     def evaluate(self, candidate: Candidate) -> float:
         """Return the cost of a candidate, infinite if its proof fails."""
-        if not self.proves(candidate.deployment, candidate.path):
+        if not self.accepts(candidate):
             return math.inf
         return self.cost(candidate.path, wall_in_path_mm(self.task.system, candidate.deployment))
+
+    def aim(self, tip: ScopeTip) -> Float:
+        """Return where the needle is to end, `(3,)` LPS mm, if it starts from a scope tip: at the target."""
+        return self.task.target.lps_mm
+
+    def end_of(self, path: ArcPath) -> Float:
+        """Return where a path has to end, `(3,)` LPS mm: at the target."""
+        return self.task.target.lps_mm
+
+    def accepts(self, candidate: Candidate) -> bool:
+        """Tell whether a candidate is proved; its cost does not matter."""
+        return self.proves(candidate.deployment, candidate.path)
 
     def proves(self, deployment: Deployment, path: ArcPath) -> bool:
         """Tell whether a path ends at the target, keeps all limits, is clear, and enters no infinite cost.
@@ -101,12 +113,12 @@ class CandidateEvaluator:
         Without a needle the deployment is proved clear by its own validation.  A voxel of infinite cost may
         not be entered, whatever the objective is, but in the wall that the tubes pierce.
         """
-        needle, target = self.task.system.needle, self.task.target.lps_mm
+        needle, end = self.task.system.needle, self.end_of(path)
         if needle is None:
-            kept = np.abs(deployment.lps_from_tip[:3, 3] - target).max() <= TIP_OFF_MM
+            kept = np.abs(deployment.lps_from_tip[:3, 3] - end).max() <= TIP_OFF_MM
         else:
             kept = path.arcs[:, CURVATURE].max() <= needle.max_curvature_per_mm
-            kept = kept and not violation(self.environment, self.query(deployment), path)
+            kept = kept and not violation(self.environment, self.query(deployment, end), path)
         if not kept:
             return False
         beyond = path_beyond(path, wall_in_path_mm(self.task.system, deployment))
@@ -145,7 +157,7 @@ class CandidateEvaluator:
         deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm, shape)
         if isinstance(deployment, str):
             return None
-        path = direct_path(deployment.lps_from_tip, self.task.target.lps_mm)
+        path = direct_path(deployment.lps_from_tip, self.aim(tip))
         return Candidate(tip=tip, deployment=deployment, path=path)
 
     def reaches(self, lps_from_tip: Float) -> bool:
@@ -155,11 +167,10 @@ class CandidateEvaluator:
         )
         return bool(np.isfinite(length[0]))
 
-    def query(self, deployment: Deployment) -> Query:
-        """Return what is asked of the needle's searches from the tip of the tubes."""
-        return Query(
-            lps_from_start=deployment.lps_from_tip, target=self.task.target.lps_mm, branch=deployment.branch
-        )
+    def query(self, deployment: Deployment, end: Float | None = None) -> Query:
+        """Return what is asked of the needle's searches from the tubes' tip; to the target if no end."""
+        goal = self.task.target.lps_mm if end is None else end
+        return Query(lps_from_start=deployment.lps_from_tip, target=goal, branch=deployment.branch)
 
     def count_blockers(self, blockers: Int) -> None:
         """Add to `blocked` what stopped direct arcs, by their labels `(N,)`."""

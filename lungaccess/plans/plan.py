@@ -27,7 +27,7 @@ from lungaccess.plans.curves import (
 )
 from lungaccess.plans.parts import Exemption, NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.plans.record import Record, shaped
-from lungaccess.plans.window import BreathingWindow
+from lungaccess.plans.window import BreathingAim, BreathingWindow
 from lungaccess.problem.system import System
 
 if TYPE_CHECKING:
@@ -79,6 +79,8 @@ class Plan(Record):
         that count it; None for any other.
     window : BreathingWindow or None
         The phases of the breath in which it is proved clear and on target; None where no motion was known.
+    aim : BreathingAim or None
+        Where the devices end, of a plan made for its window; None for any other, which ends at the target.
     """
 
     schema: str = plan_file.SCHEMA
@@ -108,6 +110,7 @@ class Plan(Record):
     system_choice: tuple[str, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
     chance: Chance | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     window: BreathingWindow | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
+    aim: BreathingAim | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
@@ -115,6 +118,11 @@ class Plan(Record):
 
         heading = f"Plan for {self.patient_name}, {self.system.name}"
         return plan_html(heading, self.figures(), self.curves(), self.tube.exit.point_lps, self.target_lps)
+
+    @property
+    def end_lps(self) -> Float:
+        """Where the devices are to end in the masks' phase, `(3,)` LPS mm: at the target, or at the aim."""
+        return self.target_lps if self.aim is None else self.aim.point_lps
 
     @property
     def insertions(self) -> str:

@@ -9,7 +9,7 @@ from dataclasses import field
 import numpy as np
 
 from anatomy.errors import PlanFileError
-from anatomy.records import frozen_record
+from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.typed import Float
 from lungaccess.plans.record import Record, shaped
 
@@ -41,16 +41,50 @@ class WindowLimit(Record):
     place_lps: Float = field(metadata=shaped(3))
 
     @property
-    def words(self) -> str:
-        """What ends the window, in words."""
-        what = {
+    def what(self) -> str:
+        """What ends the window, in words, without the place."""
+        return {
             "target": "the devices end too far from the target",
             "hole": "the tubes shift by more than their radius in the hole in the airway wall",
             "lumen": "the tubes leave the lumen before their exit",
             "airway": f"the {self.device} comes too near to an airway",
             "outside": f"the {self.device} comes too near to the pleura",
         }.get(self.reason, f"the {self.device} comes too near to a {self.reason}")
-        return f"{what}, {self.arc_length_mm:.1f} mm along the {self.device}"
+
+    @property
+    def words(self) -> str:
+        """What ends the window, in words."""
+        return f"{self.what}, {self.arc_length_mm:.1f} mm along the {self.device}"
+
+
+@frozen_record
+class BreathingAim(Record):
+    """Where devices end that were planned for a window: beside the target of the masks' phase.
+
+    Parameters
+    ----------
+    point_lps : (3,) float64, LPS mm
+        Where tubes and needle end in the masks' phase.
+    phases : (N, 2) float64
+        First and last of the phases that were asked for, all of which the window holds; N is 0 or 1.
+
+    Raises
+    ------
+    PlanFileError
+        If the phases are not one stretch within 0 to 1.
+    """
+
+    point_lps: Float = field(metadata=shaped(3))
+    phases: Float = field(metadata=shaped(None, 2))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.phases) > 1 or not all(0.0 <= a < b <= 1.0 for a, b in self.phases):
+            raise PlanFileError(
+                f"The aim of a plan is made for the phases {self.phases.tolist()}",
+                expected="one stretch within 0 to 1, or none",
+                remedy="Run `lungaccess plan` again",
+            )
 
 
 @frozen_record
@@ -76,6 +110,11 @@ class BreathingWindow(Record):
     limits : tuple of WindowLimit
         What ends the stretches within the breath, in their order; without any, what forbids a phase near
         that of the masks.
+    hysteresis : float
+        How far tissue may stray from where the motion puts it, as a share of its distance from the scope's
+        tip; all of the above holds for any such way.
+    beside_target_mm : float
+        How far beside the target devices with an aim end in the masks' phase; 0 for others, which end there.
 
     Raises
     ------
@@ -92,6 +131,8 @@ class BreathingWindow(Record):
     phases: Float = field(metadata=shaped(None, 2))
     undecided_share: float
     limits: tuple[WindowLimit, ...]
+    hysteresis: float = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
+    beside_target_mm: float = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,13 +155,27 @@ class BreathingWindow(Record):
 
     @property
     def words(self) -> str:
-        """The window in a sentence."""
+        """The window in sentences, where an aim is, and whether it is a warning only."""
+        beside = self.beside_target_mm
+        aim = (
+            f" In the phase of the masks the devices end {beside:.1f} mm beside the target." if beside else ""
+        )
+        return f"{self._stretches}{aim}" + (f" {WARNING}" if self.warning_only else "")
+
+    @property
+    def _stretches(self) -> str:
         if not len(self.phases):
             return f"No phase of the breath is proved: {self.limits[0].words if self.limits else 'unknown'}."
         parts = [f"{_percent(a, math.ceil)} and {_percent(b, math.floor)}" for a, b in self.phases]
         ends = "; ".join(f"at {100.0 * each.phase:.1f} % {each.words}" for each in self.limits)
         said = f"Insert between {', or '.join(parts)} of the breath (0 % is end-exhale, 100 % end-inhale)."
+        if self.hysteresis:
+            percent = f"{100.0 * self.hysteresis:g} %"
+            said += f" It holds for tissue that strays by {percent} of its distance from the tip."
         return f"{said} {ends[:1].upper()}{ends[1:]}." if ends else said
+
+
+WARNING = "The motion is that of other people's lungs: this is a warning, not a promise."
 
 
 def _percent(phase: float, inwards: Callable[[float], int]) -> str:

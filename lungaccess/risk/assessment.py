@@ -12,6 +12,7 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
+from lungaccess.risk.breathing import model_for
 from lungaccess.risk.error_files import load_errors
 from lungaccess.risk.errors import ErrorModel
 from lungaccess.risk.rare import RARE, Luck, RareShare, rare_share
@@ -97,7 +98,8 @@ def assess(
     Parameters
     ----------
     model : ErrorModel, optional
-        The preset `breath-hold` if None.
+        The preset `breath-hold` if None.  Where the patient's own breathing is known, it is that which is
+        drawn: `lungaccess.risk.breathing.model_for` says how.
     samples : int
         Number of deviated plans.
     seed : int
@@ -113,7 +115,7 @@ def assess(
     PlanFileError, SettingsError
         See `RiskAssessor`; also if there are no samples.
     """
-    stated = model or load_errors()
+    stated = model_for(model or load_errors(), plan, lung)
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
     draws = assessor.draws(samples, seed)
     outcomes = assessor.outcomes(draws.deviations(stated))
@@ -179,5 +181,5 @@ def safest(
     for each in plans:
         assessor = RiskAssessor(each, lung, radius_mm=radius_mm)
         draws = assessor.draws(samples, seed)
-        assessed.append((each, assessor.success(draws, stated)))
+        assessed.append((each, assessor.success(draws, model_for(stated, each, lung))))
     return tuple(sorted(assessed, key=lambda pair: -pair[1].value))

@@ -17,6 +17,7 @@ from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
+from lungaccess.risk.breathing import PatientMotion
 from lungaccess.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations
 from lungaccess.risk.draws import Draws
 from lungaccess.risk.errors import OF_NEEDLE, UNITS, ErrorModel
@@ -87,6 +88,8 @@ class RiskAssessor:
         tip = np.asarray(plan.scope.lps_from_scope_tip)[:3, 3]
         heights = (lung.height_share(np.asarray(plan.target_lps)), lung.height_share(tip))
         self.stretch = share_of_motion(heights[0]) - share_of_motion(heights[1])
+        known = lung.motion if lung.motion is not None and not lung.motion.warning_only else None
+        self._motion = None if known is None else PatientMotion(plan, known)
         self.radius_mm, self.radius_origin = goal_radius(lung, plan.target_lps, radius_mm)
         self._deviated, self._judging = DeviatedPlan(plan), judging(plan, lung)
         self.structures = {
@@ -106,7 +109,9 @@ class RiskAssessor:
         They are for the arcs of the plan if `n_arcs` is None.
         """
         arcs = self.n_arcs if n_arcs is None else n_arcs
-        return Draws(count, arcs, seed, self._n_twisted, stretch=self.stretch, attempt=attempt)
+        return Draws(
+            count, arcs, seed, self._n_twisted, stretch=self.stretch, motion=self._motion, attempt=attempt
+        )
 
     def no_deviations(self, count: int) -> dict[str, Float]:
         """Return the fields of `Deviations` for `count` sets without any error."""

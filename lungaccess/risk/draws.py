@@ -6,9 +6,9 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.typed import Float
-from lungaccess.risk.breathing import phase
+from lungaccess.risk.breathing import PatientMotion, phase
 from lungaccess.risk.deviations import FIELD_OF, Deviations, no_deviations
-from lungaccess.risk.errors import BOUNDED, BREATHING, CURVATURE, UNITS, ErrorModel
+from lungaccess.risk.errors import BOUNDED, BREATHING, CURVATURE, IN_WINDOW, UNITS, ErrorModel
 
 PATIENT, ATTEMPT = 0, 1
 """Levels at which errors are drawn."""
@@ -34,7 +34,10 @@ class Draws:
     n_twisted : int
         See `no_deviations`.
     stretch : float
-        By how much of the patient's motion by breathing the target moves farther than the scope's tip.
+        By how much of the patient's motion by breathing the target moves farther than the scope's tip, where
+        the patient's own motion is not known.
+    motion : PatientMotion, optional
+        The patient's own.
     attempt : int
         Number of the attempt on the same N patients: what is drawn for each attempt has other numbers.
 
@@ -52,6 +55,7 @@ class Draws:
         n_twisted: int = 0,
         *,
         stretch: float = 0.0,
+        motion: PatientMotion | None = None,
         attempt: int = 0,
     ) -> None:
         if count < 1:
@@ -62,7 +66,7 @@ class Draws:
             )
         self.count = count
         self._seed, self._n_arcs, self._n_twisted = seed, n_arcs, n_twisted
-        self._stretch, self._attempt = stretch, attempt
+        self._stretch, self._motion, self._attempt = stretch, motion, attempt
         self._made: dict[tuple[str, int], Float] = {}
 
     def deviations(self, model: ErrorModel) -> Deviations:
@@ -76,21 +80,26 @@ class Draws:
                 error = self._error(kind, values[own].shape, term.distribution, term.patient, term.attempt)
                 values[own] = np.radians(error) if UNITS[kind] == "deg" else error
         values["factor"] = self._factors(model)
-        if model.breathing.size and self._stretch:
-            values["target_mm"] = values["target_mm"] + self._breathed_mm(model)[:, None] * DOWN
+        if model.breathing.size and (self._motion or self._stretch):
+            values["target_mm"] = values["target_mm"] + self._breathed_mm(model)
         return Deviations(**values)
 
     def numbers(self, model: ErrorModel) -> dict[tuple[str, int], Float]:
         """Return the standard normal numbers `(N, ...)` that a model uses, by kind and level."""
-        own = Draws(self.count, self._n_arcs, self._seed, self._n_twisted, stretch=self._stretch)
+        own = self._again()
         own.deviations(model)
         return own._made
 
     def with_numbers(self, made: dict[tuple[str, int], Float]) -> Draws:
         """Return draws with other numbers, by kind and level as `numbers` returns them."""
-        own = Draws(self.count, self._n_arcs, self._seed, self._n_twisted, stretch=self._stretch)
+        own = self._again()
         own._made = made
         return own
+
+    def _again(self) -> Draws:
+        return Draws(
+            self.count, self._n_arcs, self._seed, self._n_twisted, stretch=self._stretch, motion=self._motion
+        )
 
     def _error(
         self, kind: str, shape: tuple[int, ...], distribution: str, patient: float, attempt: float
@@ -115,12 +124,19 @@ class Draws:
         return factors
 
     def _breathed_mm(self, model: ErrorModel) -> Float:
-        """Return how far towards the feet the target moves away from the scope, `(N,)`."""
+        """Return how the target moves away from the scope, `(N, 3)`."""
         term, shape = model.breathing, (self.count,)
         motion_mm = term.median_mm * np.exp(term.patient_ln * self._normal(BREATHING, PATIENT, shape))
-        return np.asarray(
-            self._stretch * motion_mm * phase(_uniform(self._normal(BREATHING, ATTEMPT, shape)))
-        )
+        luck, in_window = _uniform(self._normal(BREATHING, ATTEMPT, shape)), term.distribution == IN_WINDOW
+        if self._motion is not None and (self._motion.has_window or not in_window):
+            return self._motion.shifts_mm(motion_mm, luck, in_window=in_window)
+        if in_window:
+            raise SettingsError(
+                f"Errors of breathing are {IN_WINDOW!r}, but no motion of the patient or no window is known",
+                expected="a plan with a window of breathing",
+                remedy="Give the patient a [motion], or write distribution = 'lognormal'",
+            )
+        return np.asarray((self._stretch * motion_mm * phase(luck))[:, None] * DOWN)
 
     def _normal(self, kind: str, level: int, shape: tuple[int, ...]) -> Float:
         """Return the numbers of a kind at a level, the same at each call."""

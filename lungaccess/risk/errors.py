@@ -26,6 +26,8 @@ OF_NEEDLE = (CURVATURE, "needle_roll", "needle_insertion")
 ASSUMPTION = "assumption"
 """What a source begins with where nobody has published a figure."""
 NORMAL, BOUNDED = "normal", "bounded"
+IN_WINDOW = "lognormal-in-window"
+"""Breathing of which the phase is one of the plan's window."""
 
 _Source = Annotated[str, text(f"where the sizes come from, or a text that begins with {ASSUMPTION!r}")]
 _Distribution = Annotated[str, text(f"{NORMAL!r} or {BOUNDED!r}")]
@@ -158,7 +160,8 @@ class BreathingError(_Term):
     Parameters
     ----------
     distribution : str
-        "lognormal", the only one: the logarithm of the patient's motion is normal.
+        "lognormal": the logarithm of the patient's motion is normal, and the procedure is at any time of the
+        cycle.  "lognormal-in-window": it is in the plan's window, which needs the motion of the patient.
     median_mm : float
         Median over patients of A, the motion from end-exhale to end-inhale that 95 % of the points of a lung
         do not exceed; 0 for none.
@@ -167,8 +170,8 @@ class BreathingError(_Term):
     """
 
     unit: ClassVar[str] = "mm"
-    distributions: ClassVar[tuple[str, ...]] = ("lognormal",)
-    distribution: Annotated[str, text("'lognormal'")] = "lognormal"
+    distributions: ClassVar[tuple[str, ...]] = ("lognormal", IN_WINDOW)
+    distribution: Annotated[str, text(f"'lognormal' or {IN_WINDOW!r}")] = "lognormal"
     median_mm: Annotated[
         float, quantity("median of the patients' motion by breathing", at_least=0.0, at_most=60.0)
     ] = 0.0

@@ -77,7 +77,7 @@ def alternatives_for_success(
     Raises
     ------
     NoPlan
-        If no direct arc reaches the target.
+        If no plan was found.
     SettingsError
         If the system has no needle, a number is not above 0, or the atlas belongs to another lung or system.
     TargetError

@@ -11,6 +11,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
 from lungaccess.procedure import DEFAULT_PROCEDURE, Procedure, ProcedureReport, Simulator, simulate_procedure
 from lungaccess.risk import ErrorModel, RiskAssessor, RiskReport, Share, assess, goal_radius
+from lungaccess.risk.breathing import model_for
 
 FRESH_SEED = 1 << 20
 """Added to a search's seed for the draws that it never sees."""
@@ -135,7 +136,8 @@ class ChanceEstimator:
         """Return what counts the successes of a plan; what it prepares serves all draws."""
         if self.procedure.is_open_loop:
             assessor = RiskAssessor(plan, self._lung, radius_mm=self.radius_mm)
-            return lambda samples, seed: assessor.success(assessor.draws(samples, seed), self.errors)
+            errors = model_for(self.errors, plan, self._lung)
+            return lambda samples, seed: assessor.success(assessor.draws(samples, seed), errors)
         simulator = Simulator(plan, self._lung, self.errors, self.procedure, radius_mm=self.radius_mm)
         return lambda samples, seed: simulator.report(samples, seed).succeeds
 

@@ -15,9 +15,9 @@ from anatomy.typed import Int
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.planner import plan
 from lungaccess.coupled.search.direct_arcs import DirectArcs
-from lungaccess.plans.assemble import assemble, needle_part, tube_part
+from lungaccess.coupled.search.variation import SHIFT_MM, SMALLEST, TURN_RAD, varied
+from lungaccess.plans.assemble import assemble, with_devices
 from lungaccess.plans.candidate import Candidate
-from lungaccess.plans.parts import Exemption
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
 from lungaccess.procedure.spread import Spread
@@ -28,11 +28,8 @@ MANY = 10.0
 millimetres or degrees apart, as far as the errors move the tip.  It only ranks."""
 BY_COST = 300
 """Iterations of the search by cost, whose best plan takes part: more make it only a little cheaper."""
-TURN_RAD, SHIFT_MM = math.radians(10.0), 2.0
-"""Standard deviations of the first variations: less than the spacing of the atlas."""
 SHRINK = 0.98
 """Variations become smaller with every one that fails: after 35 they are half as large."""
-SMALLEST = 0.02
 
 
 @frozen_record
@@ -148,17 +145,8 @@ class SuccessSearch:
 
     def _of(self, candidate: Candidate) -> Contender:
         """Return a candidate as a contender without any draws."""
-        task, frame, deployment = self._task, candidate.tip.lps_from_scope_tip, candidate.deployment
-        model = self._model or assemble(task, candidate, iteration=0, timing={})
-        self._model = model
-        tube, needle = tube_part(task, frame, deployment), needle_part(candidate.path)
-        exemption = Exemption(
-            branch=deployment.branch,
-            exit_point_lps=tube.exit.point_lps,
-            needle_length_mm=model.exemption.needle_length_mm,
-        )
-        scope = replace(model.scope, lps_from_scope_tip=frame)
-        made = replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption)
+        self._model = self._model or assemble(self._task, candidate, iteration=0, timing={})
+        made = with_devices(self._task, candidate, self._model)
         return Contender(candidate=candidate, plan=made, counter=self._estimator.counter(made))
 
     def _cheapest(self) -> Contender:
@@ -231,15 +219,8 @@ class SuccessSearch:
         self, candidate: Candidate, turn_rad: float, shifts_mm: Sequence[float]
     ) -> Contender | None:
         """Return a candidate with other rotation and insertions, if it is proved."""
-        old, evaluator = candidate.deployment, self._arcs.evaluator
-        if old.shape is not None:
-            return None
-        outer = max(old.outer_mm + shifts_mm[0], 0.0)
-        inner = max(old.inner_mm + shifts_mm[1], outer)
-        if self._task.system.tubes.outer is None:
-            outer = inner
-        turned = (old.rotation_rad + turn_rad) % (2.0 * math.pi)
-        made = evaluator.direct(candidate.tip, turned, outer, inner)
+        evaluator = self._arcs.evaluator
+        made = varied(evaluator, candidate, turn_rad, shifts_mm)
         if made is None or not evaluator.proves(made.deployment, made.path):
             return None
         return self._of(made)

@@ -5,6 +5,7 @@ What the pictures and the command line show needs no real anatomy.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,10 @@ import pytest
 from scipy import ndimage
 
 from anatomy.grid import Grid, Volume
+from anatomy.lung import Lung
+from anatomy.motion.prepare import prepare_motion
+from anatomy.phantom import Phantom
+from anatomy.phantom.breathing import PhantomBreathing
 from anatomy.structures import BITS
 from lungaccess.cli import terminal
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
@@ -41,6 +46,14 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no line break depend on the terminal of the test."""
     for console in (terminal.console, terminal.error_console):
         monkeypatch.setattr(console, "_width", 200)
+
+
+@pytest.fixture(scope="session")
+def breathing_lung(small_phantom: Phantom, small_lung: Lung) -> Lung:
+    """The lung of the small phantom with its breathing; its masks show end-inhale."""
+    source = PhantomBreathing.of(small_phantom).source(small_phantom)
+    middle_mm = float(small_lung.tree.carina_lps[0])
+    return replace(small_lung, motion=prepare_motion(source, small_lung.labels, small_lung.grid, middle_mm))
 
 
 def _segment(points: np.ndarray, a: list[float], b: list[float], radius: float) -> np.ndarray:

@@ -44,6 +44,8 @@ LEAST_STEP_MM = 0.0005
 """A proof that goes on by less gives up: near its exit a tube moves by so little in 1 % of a breath."""
 BROKEN_MM = 0.001
 """With less than this to spare a rule counts as broken."""
+OVERLAP = 1e-6
+"""By so much a chord is gone on beyond its end, so that its length by the arc is reached."""
 NEAR_MM = 5e-5
 """Taken off every clearance: more than the sagitta between two points, and far more than rounding."""
 
@@ -65,11 +67,15 @@ class Tissue(NamedTuple):
 
 
 class Breath(NamedTuple):
-    """The motion of one lung: nodes `(ni, nj, nk, 3)`, their frame `(4,)` and bounds of their cells."""
+    """The motion of one lung: nodes `(ni, nj, nk, 3)`, their frame `(4,)` and bounds of their cells.
+
+    `hysteresis` is how far tissue may be from where the motion puts it, by its distance from the scope's tip.
+    """
 
     nodes: Float
     frame: Float
     cells: Float
+    hysteresis: float
 
 
 class Stretch(NamedTuple):
@@ -103,6 +109,15 @@ def place(breath, rigid, stretch, point, guess):
 
 
 @numba.njit(cache=True)
+def kept_from_straying(breath, kept, lever):
+    """Return the clearance by the motion that leaves `kept` wherever tissue strays, mm.
+
+    What is at a distance c of a point is at most `lever + c` from the tip, and strays by the share of that.
+    """
+    return (kept + breath.hysteresis * lever) / (1.0 - breath.hysteresis)
+
+
+@numba.njit(cache=True)
 def step_left(stretch, breath, at, rest, speed, lever, reach, kept):
     """Return how far along the device a clearance of `kept` is proved, if `reach` mm about `at` are free.
 
@@ -119,8 +134,8 @@ def step_left(stretch, breath, at, rest, speed, lever, reach, kept):
         return -math.inf
     base = (speed + half * stretch.most_change * lever + rest * norm / least) / slack
     slope = (stretch.most_rate + norm / least + half * stretch.most_change) / slack
-    spare = least * reach - rest - NEAR_MM - half * base - kept
-    return spare / (1.0 + half * slope)
+    spare = least * reach - rest - NEAR_MM - half * base - kept_from_straying(breath, kept, lever)
+    return spare / (1.0 + half * slope + breath.hysteresis / (1.0 - breath.hysteresis))
 
 
 @numba.njit(cache=True)
@@ -139,6 +154,8 @@ def gap_to_voxels(tissue, breath, stretch, at, rest, speed, lever, bits, branch,
 
     The second is a bound of the clearance less `kept` that holds in all phases of the stretch.
 
+    The first three numbers of `at` are X, the others lead to the next point of the devices, in their own
+    frame: up to there a step counts by as much as it leads towards each voxel, and not in full.
     Voxels within `reach` of X are measured as they are deformed in the middle phase; what lies beyond is far
     by the stretch of tissue (`step_left`).
     """
@@ -146,16 +163,29 @@ def gap_to_voxels(tissue, breath, stretch, at, rest, speed, lever, bits, branch,
     least, norm = stretch_near(breath.cells, breath.frame, begin, end, at[0], at[1], at[2], MOST_MM)
     if least <= 0.0:
         return -math.inf, math.inf, 0
-    base, slope = _drift(stretch, speed, lever, kept, norm)
-    reach = min((kept + base + BEYOND_MM) / least, MOST_MM)
+    kept_all = kept_from_straying(breath, kept, lever)
+    base, slope = _drift(stretch, speed, lever, kept_all, norm)
+    reach = min((kept_all + base + BEYOND_MM) / least, MOST_MM)
     far = step_left(stretch, breath, at, rest, speed, lever, reach, kept)
-    low, high, label = deformed_distance(tissue, breath, stretch.share, at, bits, branch, reach)
+    base, slope = _drift(stretch, speed, lever, reach, norm)
+    slope += breath.hysteresis / (1.0 - breath.hysteresis)
+    uncertain = base + rest * (1.0 + norm) + NEAR_MM
+    way = np.zeros(3)
+    chord = 0.0
+    for axis in range(3):
+        chord += at[3 + axis] ** 2
+    chord = math.sqrt(chord) * (1.0 + OVERLAP)
+    if chord > 0.0:
+        for axis in range(3):
+            for other in range(3):
+                way[axis] += stretch.rotation[axis, other] * at[3 + other] / chord
+    low, high, label, along = deformed_distance(
+        tissue, breath, stretch.share, at, bits, branch, reach, least, way, chord, uncertain + kept_all, slope
+    )
     if label == 0:
         return far, math.inf, 0
-    base, slope = _drift(stretch, speed, lever, reach, norm)
-    uncertain = base + rest * (1.0 + norm) + NEAR_MM
-    step = (low - uncertain - kept) / (1.0 + slope)
-    return min(step, far), high + uncertain - kept, label
+    step = max((low - uncertain - kept_all) / (1.0 + slope), along)
+    return min(step, far), high + uncertain - kept_all, label
 
 
 @numba.njit(cache=True)
@@ -166,7 +196,8 @@ def step_clear_of(tissue, breath, stretch, at, rest, speed, lever, bits, branch,
         step = step_left(stretch, breath, at, rest, speed, lever, free, kept)
         if step >= LONG_STEP_MM:
             return step, 0
-    cap = min(1.5 * (kept + stretch.half * speed) + SEARCH_MM, MOST_MM)
+    needed = kept_from_straying(breath, kept, lever) + stretch.half * speed
+    cap = min(1.5 * needed + SEARCH_MM, MOST_MM)
     free, label = exact_distance(tissue.labels, tissue.geometry, at[0], at[1], at[2], bits, branch, cap)
     step = step_left(stretch, breath, at, rest, speed, lever, free, kept)
     if step >= LONG_STEP_MM or free <= 0.0:

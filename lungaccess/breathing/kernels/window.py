@@ -83,12 +83,17 @@ def miss_of_target(breath, rigid, stretch, end, target):
 
 
 @numba.njit(cache=True)
-def _point_at(points, arc, n, s, out):
-    """Fill `out` (3,) with the point at arc length `s`, between the points `n` and `n + 1`."""
+def _point_at(points, arc, n, s, ahead, out, at):
+    """Fill `out` (3,) with the point at arc length `s`, between `n` and `n + 1`, and `at[3:]` with its way.
+
+    The way leads to the point `ahead`; how far that is along the devices is returned.
+    """
     width = arc[n + 1] - arc[n]
     share = (s - arc[n]) / width if width > 0.0 else 0.0
     for axis in range(3):
         out[axis] = points[n, axis] + share * (points[n + 1, axis] - points[n, axis])
+        at[3 + axis] = points[ahead, axis] - out[axis]
+    return abs(arc[ahead] - s)
 
 
 @numba.njit(cache=True)
@@ -102,17 +107,17 @@ def _step_at(tissue, breath, rigid, stretch, point, row, guess):
 
 
 @numba.njit(cache=True)
-def _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, guess):
-    """Return the first point of a section that is not proved, -1 if all are, and the reason."""
-    n, last = int(row[BEGIN]), int(row[END])
+def _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, guess):
+    """Return the first point of a section, from `done` on, that is not proved, -1 if all are, and why."""
+    n, last = max(int(row[BEGIN]), done), int(row[END])
     point = np.zeros(3)
     s = arc[n]
     while True:
         while n < last - 1 and arc[n + 1] <= s:
             n += 1
-        _point_at(points, arc, n, s, point)
+        rest = _point_at(points, arc, n, s, n + 1, point, guess)
         step, reason = _step_at(tissue, breath, rigid, stretch, point, row, guess)
-        if step < LEAST_STEP_MM:
+        if step < min(LEAST_STEP_MM, rest):
             return n, reason
         if s >= arc[last]:
             return -1, 0
@@ -159,11 +164,11 @@ def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
         while True:
             while n > first and arc[n] > s:
                 n -= 1
-            _point_at(points, arc, n, s, point)
+            rest = _point_at(points, arc, n, s, n if arc[n] < s else max(n - 1, first), point, guess)
             step, reason = _hazard_at(tissue, breath, rigid, stretch, point, row, guess)
             if step == math.inf:
                 return -1, 0
-            if step < LEAST_STEP_MM:
+            if step < min(LEAST_STEP_MM, rest):
                 if _comes_free(tissue, breath, rigid, stretch, points, sections, n, guess):
                     return -1, 0
                 return n, reason
@@ -183,25 +188,28 @@ def _row_of(sections, n):
 
 
 @numba.njit(cache=True)
-def refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect):
-    """Return a point at which a stretch is not proved clear, -1 if it is, and the reason.
+def refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect, done):
+    """Return a point at which a stretch is not proved clear, -1 if it is, the reason, and the next `done`.
 
     `suspect`, a point that refused a wider stretch by the rule of its section, is looked at first; -1: none.
+    Points before `done` obey the rules of their sections in a wider stretch, and so in this one.
     """
-    guess = np.zeros(3)
+    guess = np.zeros(6)
     if suspect >= 0:
-        guess[:] = points[suspect]
+        guess[:3] = points[suspect]
         row = sections[_row_of(sections, suspect)]
         step, reason = _step_at(tissue, breath, rigid, stretch, points[suspect], row, guess)
         if step < 0.0:
-            return suspect, reason
-    guess[:] = points[0]
+            return suspect, reason, done
+    guess[:3] = points[min(done, points.shape[0] - 1)]
     for s in range(sections.shape[0]):
-        if int(sections[s, KIND]) != BEFORE_WALL:
-            n, reason = _refusal_in_section(tissue, breath, rigid, stretch, points, arc, sections[s], guess)
+        row = sections[s]
+        if int(row[KIND]) != BEFORE_WALL and done <= int(row[END]):
+            n, reason = _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, guess)
             if n >= 0:
-                return n, reason
-    return _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess)
+                return n, reason, n
+    n, reason = _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess)
+    return n, reason, points.shape[0]
 
 
 @numba.njit(cache=True)
@@ -213,7 +221,8 @@ def _excess(tissue, breath, rigid, stretch, point, row, reason, guess):
         out, _label = exact_distance(
             tissue.labels, tissue.geometry, guess[0], guess[1], guess[2], _LUMEN, _NOBODY, 1.0
         )
-        return -step_left(stretch, breath, guess, rest, speed, lever, out, CORNER_MM)
+        allowed = CORNER_MM - 2.0 * breath.hysteresis * lever
+        return -step_left(stretch, breath, guess, rest, speed, lever, out, allowed)
     bits, branch = tissue.bits, tissue.branch
     if kind == NEEDLE:
         branch = _NOBODY
@@ -239,14 +248,15 @@ def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
     is left.
     """
     row = sections[_row_of(sections, n)]
-    guess = points[n].copy()
+    guess = np.zeros(6)
+    guess[:3] = points[n]
     best = _excess(tissue, breath, rigid, stretch, points[n], row, reason, guess)
     hop = FIRST_HOP
     while hop >= 1 and best >= BROKEN_MM:
         better = False
         for m in (n + hop, n - hop):
             if row[BEGIN] <= m <= row[END]:
-                guess[:] = points[m]
+                guess[:3] = points[m]
                 over = _excess(tissue, breath, rigid, stretch, points[m], row, reason, guess)
                 if over < best:
                     best, n, better = over, m, True
@@ -270,13 +280,17 @@ def divide(
     hole_limit,
     amplitude,
     reference,
+    asked,
+    all_of_it,
     leaves,
 ):
     """Fill `leaves` (MOST_LEAVES, 5) with stretches in order; return how many there are.
 
     Columns: first and last phase; CLEAR, BLOCKED or UNDECIDED; reason, and point, of what is not clear.
+    Stretches without a phase between the two `asked` are left out; `all_of_it` tells whether to go on behind
+    the first that is not clear.
     """
-    stack = np.zeros((64, 3))
+    stack = np.zeros((64, 4))
     top = 0
     for n in range(FIRST_STRETCHES - 1, -1, -1):
         stack[top, 0], stack[top, 1], stack[top, 2] = n / FIRST_STRETCHES, (n + 1) / FIRST_STRETCHES, -1.0
@@ -287,7 +301,9 @@ def divide(
             exit_at = int(sections[s, END])
     while top > 0:
         top -= 1
-        begin, end, suspect = stack[top, 0], stack[top, 1], int(stack[top, 2])
+        begin, end, suspect, done = stack[top, 0], stack[top, 1], int(stack[top, 2]), int(stack[top, 3])
+        if end <= asked[0] or begin >= asked[1]:
+            continue
         stretch = stretch_between(rigid, amplitude, reference, begin, end)
         miss, change = miss_of_target(breath, rigid, stretch, points[last], target)
         shift, shifts = miss_of_target(breath, rigid, stretch, hole, hole)
@@ -301,7 +317,7 @@ def divide(
             if shift - shifts > hole_limit:
                 state = BLOCKED
         else:
-            at, reason = refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect)
+            at, reason, done = refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect, done)
             if at >= 0:
                 state = UNDECIDED
                 blocked, at = _surely(tissue, breath, rigid, stretch, points, sections, at, reason)
@@ -315,11 +331,14 @@ def divide(
                 suspect = -1  # A place where the tube is free may yet make it count no more.
             else:
                 suspect = at if of_point else -1
-            stack[top, 0], stack[top, 1], stack[top, 2] = middle, end, suspect
-            stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = begin, middle, suspect
+            for half, (first, until) in enumerate(((middle, end), (begin, middle))):
+                stack[top + half, 0], stack[top + half, 1] = first, until
+                stack[top + half, 2], stack[top + half, 3] = suspect, done
             top += 2
             continue
         leaves[count, 0], leaves[count, 1], leaves[count, 2] = begin, end, state
         leaves[count, 3], leaves[count, 4] = reason, at
         count += 1
+        if state != CLEAR and not all_of_it:
+            break
     return count

@@ -39,16 +39,18 @@ class AtlasSearch:
         The best candidate so far.
     """
 
-    def __init__(self, task: Task, atlas: Atlas, settings: SearchSettings | None = None) -> None:
+    def __init__(
+        self, task: Task, atlas: Atlas, settings: SearchSettings | None = None, arcs: DirectArcs | None = None
+    ) -> None:
         self.task = task
         self.atlas = atlas
         self.settings = settings or SearchSettings()
-        self.arcs = DirectArcs(task, atlas)
+        self.arcs = arcs or DirectArcs(task, atlas)
         self.evaluator = self.arcs.evaluator
         self.blocked = self.evaluator.blocked
         self.incumbent = Incumbent()
         self._needle_planner = NamedNeedlePlanner(self.evaluator, PLANNER)
-        self._direct = DirectArcSearch(self.arcs, self.incumbent, self.settings)
+        self.direct = DirectArcSearch(self.arcs, self.incumbent, self.settings)
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
         self._share = (0, 1)
         self._refined_cost = math.inf
@@ -74,7 +76,7 @@ class AtlasSearch:
 
     def direct_steps(self) -> Iterator[Step]:
         """Evaluate the direct arcs, nearest first."""
-        return self._direct.steps()
+        return self.direct.steps()
 
     def further_steps(self) -> Iterator[Step]:
         """Continue from the direct arcs without end; each step is an iteration."""
@@ -109,7 +111,7 @@ class AtlasSearch:
     def _starts(self, local_search: LocalSearch) -> Iterator[LocalSearchRun]:
         """Yield local searches from clear direct arcs, different ones by their cost, then any of them."""
         number, parts = self._share
-        clear = self._direct.clear
+        clear = self.direct.clear
         for entry in different(self.atlas.deployments, clear)[number::parts].tolist():
             run = local_search.begin(self.arcs.candidate(entry))
             if run is not None:
@@ -136,6 +138,9 @@ class AtlasSearch:
         if best is None or self.incumbent.cost >= WORTH_REFINING * self._refined_cost:
             return
         before = self.incumbent.cost
-        step = evaluated_step(self.evaluator, "joint refinement", refine(self.task, best))
+        end = replace(self.task.target, lps_mm=self.evaluator.end_of(best.path))
+        step = evaluated_step(
+            self.evaluator, "joint refinement", refine(replace(self.task, target=end), best)
+        )
         self._refined_cost = min(before, step.cost)
         yield step

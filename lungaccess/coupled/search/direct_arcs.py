@@ -16,7 +16,7 @@ from lungaccess.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
-from stages.needle import NeedleEnvironment, direct_arcs
+from stages.needle import NeedleEnvironment, direct_arcs, workspace_lengths
 
 CHUNK = 1000
 """Arcs that are evaluated in one call of a kernel: between two calls the caller can end the search."""
@@ -25,7 +25,16 @@ FINALISTS = 3
 
 
 class DirectArcs:
-    """The single arcs of a needle from the deployments of an atlas to a target.
+    """The single arcs of a needle from the deployments of an atlas to a target, or to aims beside it.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+    evaluator : CandidateEvaluator, optional
+        Made of the task if None.
+    aims : (S, 3) float64, optional
+        Where arcs from each scope tip end, LPS mm, nan for none; at the target if None.
 
     Attributes
     ----------
@@ -34,11 +43,37 @@ class DirectArcs:
         The deployments whose workspace of the needle holds the target, the nearest first.
     """
 
-    def __init__(self, task: Task, atlas: Atlas) -> None:
+    def __init__(
+        self, task: Task, atlas: Atlas, evaluator: CandidateEvaluator | None = None, aims: Float | None = None
+    ) -> None:
         self.task = task
         self.atlas = atlas
-        self.evaluator = CandidateEvaluator(task)
-        self.in_workspace, self._lengths = atlas.index.holding(self.evaluator.environment, task.target.lps_mm)
+        self.evaluator = evaluator or CandidateEvaluator(task)
+        self._aims = aims
+        environment = self.evaluator.environment
+        if aims is None:
+            self.in_workspace, self._lengths = atlas.index.holding(environment, task.target.lps_mm)
+            return
+        entries = atlas.deployments
+        lengths = np.full(entries.count, np.inf)
+        near = np.flatnonzero(np.isfinite(aims[entries.site, 0]))
+        for rows, aim in self._by_aim(near):
+            at = near[rows]
+            lengths[at] = workspace_lengths(environment, entries.positions[at], entries.tangents[at], aim)
+        found = near[np.isfinite(lengths[near])]
+        self.in_workspace = found[np.argsort(lengths[found], kind="stable")]
+        self._lengths = lengths[self.in_workspace]
+
+    def _by_aim(self, chosen: Int) -> Iterator[tuple[Int | slice, Float]]:
+        """Yield rows of chosen deployments (N,) with the point `(3,)` at which their arcs end."""
+        if self._aims is None:
+            yield slice(None), self.task.target.lps_mm
+            return
+        site = self.atlas.deployments.site[chosen]
+        order = np.argsort(site, kind="stable")
+        for rows in np.split(order, np.flatnonzero(np.diff(site[order])) + 1):
+            if len(rows):
+                yield rows, self._aims[site[rows[0]]]
 
     def blockers(self, chosen: Int, environment: NeedleEnvironment | None = None) -> tuple[Int, Float, Float]:
         """Return what blocks the arcs from deployments, their lengths and their integrals of 1 / clearance.
@@ -56,13 +91,19 @@ class DirectArcs:
         lengths, inverse_clearance : (N,) float64
         """
         entries = self.atlas.deployments
-        return direct_arcs(
-            environment or self.evaluator.environment,
-            entries.positions[chosen],
-            entries.tangents[chosen],
-            entries.branch[chosen],
-            self.task.target.lps_mm,
-        )
+        found = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen)), np.zeros(len(chosen))
+        for rows, aim in self._by_aim(chosen):
+            at = chosen[rows]
+            parts = direct_arcs(
+                environment or self.evaluator.environment,
+                entries.positions[at],
+                entries.tangents[at],
+                entries.branch[at],
+                aim,
+            )
+            for whole, part in zip(found, parts, strict=True):
+                whole[rows] = part
+        return found
 
     def clear(self) -> Int:
         """Return the deployments (C,) with a clear arc, the shortest first."""
@@ -72,9 +113,11 @@ class DirectArcs:
 
     def lines(self, chosen: Int, samples: int) -> Float:
         """Return points (N, samples, 3) of the arcs from deployments."""
-        entries, target = self.atlas.deployments, self.task.target.lps_mm
+        entries = self.atlas.deployments
         start, tangent = entries.positions[chosen], entries.tangents[chosen]
-        offset = target - start
+        offset = np.zeros_like(start)
+        for rows, aim in self._by_aim(chosen):
+            offset[rows] = aim - start[rows]
         ahead = (offset * tangent).sum(axis=1, keepdims=True)
         aside = offset - ahead * tangent
         off = np.linalg.norm(aside, axis=1, keepdims=True)
@@ -103,8 +146,7 @@ class DirectArcs:
     def proved(self, entry: int) -> Candidate | None:
         """Return a deployment of the atlas with its arc, None if the proof fails."""
         candidate = self.candidate(entry)
-        proved = candidate is not None and self.evaluator.proves(candidate.deployment, candidate.path)
-        return candidate if proved else None
+        return candidate if candidate is not None and self.evaluator.accepts(candidate) else None
 
     @cached_property
     def by_bound(self) -> tuple[Int, Float]:
@@ -114,16 +156,14 @@ class DirectArcs:
         """
         entries = self.atlas.deployments
         bounds = np.zeros(len(self.in_workspace))
-        positions = np.ascontiguousarray(entries.positions[self.in_workspace])
-        cost_bounds(self.evaluator.needle_arrays, positions, np.array(self._lengths), self._target, bounds)
+        for rows, aim in self._by_aim(self.in_workspace):
+            positions, lengths = entries.positions[self.in_workspace[rows]], self._lengths[rows]
+            part, goal = np.zeros(len(lengths)), tuple(aim.tolist())
+            cost_bounds(self.evaluator.needle_arrays, positions, np.array(lengths), goal, part)
+            bounds[rows] = part
         by_entry = np.zeros(entries.count)
         by_entry[self.in_workspace] = bounds
         return self.in_workspace[np.argsort(bounds, kind="stable")], by_entry
-
-    @property
-    def _target(self) -> tuple[float, float, float]:
-        x, y, z = self.task.target.lps_mm.tolist()
-        return x, y, z
 
     def evaluate(self, chosen: Int, slack: float, best: float = math.inf) -> tuple[Int, Float, float]:
         """Evaluate the arcs from deployments, less and less of them as cheap ones are found.
@@ -145,17 +185,21 @@ class DirectArcs:
         """
         entries = self.atlas.deployments
         blockers, costs = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen))
-        best = evaluate_arcs(
-            self.evaluator.needle_arrays,
-            entries.positions[chosen],
-            entries.tangents[chosen],
-            entries.branch[chosen],
-            self._target,
-            slack,
-            best,
-            blockers,
-            costs,
-        )
+        for rows, aim in self._by_aim(chosen):
+            at = chosen[rows]
+            stopped, cost = np.zeros(len(at), dtype=np.int64), np.zeros(len(at))
+            best = evaluate_arcs(
+                self.evaluator.needle_arrays,
+                entries.positions[at],
+                entries.tangents[at],
+                entries.branch[at],
+                tuple(aim.tolist()),
+                slack,
+                best,
+                stopped,
+                cost,
+            )
+            blockers[rows], costs[rows] = stopped, cost
         return blockers, costs, best
 
 

@@ -6,11 +6,13 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
+from anatomy.lung import Lung
 from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search.aimed_tubes import AimedTubes
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.tube_reach import TubeReachScan
+from lungaccess.coupled.search.window_reach import WindowReachScan
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
@@ -51,14 +53,25 @@ class Scan(Protocol):
         """Try points (N, 3), LPS mm; see `stages.needle.ReachScan.reach`."""
 
 
-def reach_scan(atlas: Atlas, *, arcs: int = DEFAULT_ARCS, trees: int = 0) -> Scan:
+def reach_scan(
+    atlas: Atlas,
+    *,
+    arcs: int = DEFAULT_ARCS,
+    trees: int = 0,
+    during: tuple[Lung, tuple[float, float]] | None = None,
+) -> Scan:
     """Return what tells which points the system of an atlas reaches: by its needle, or by its tubes alone.
 
     Parameters
     ----------
     arcs, trees : int
         See `stages.needle.ReachScan`; without a needle there are no trees, and `arcs` counts deployments.
+    during : tuple of Lung and phases, optional
+        The lung with its motion, and phases in all of which points are to be reached; then all arcs count,
+        and no trees.
     """
+    if during is not None:
+        return WindowReachScan(during[0], atlas, during[1])
     system, entries = atlas.system, atlas.deployments
     if system.needle is None:
         return TubeReachScan(atlas, deployments=arcs)

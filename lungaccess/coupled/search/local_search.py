@@ -102,6 +102,8 @@ class LocalSearchRun:
 
     Parameters
     ----------
+    goal : tuple of 3 floats
+        Where its paths end.
     choice : TubeChoice
     vias : (MAX_VIAS, 3) float64
         The best choice so far; see `lungaccess.coupled.kernels.candidate`.
@@ -114,6 +116,7 @@ class LocalSearchRun:
     """
 
     poses: TipRow
+    goal: tuple[float, float, float]
     choice: TubeChoice
     vias: Float
     count: int
@@ -159,7 +162,8 @@ class LocalSearch:
         poses = self._evaluator.tip_rows.along(candidate.tip, SHIFTS_MM)
         vias = np.zeros((MAX_VIAS, 3))
         vias[: len(points)] = points
-        return LocalSearchRun(poses=poses, choice=choice, vias=vias, count=len(points))
+        x, y, z = self._evaluator.end_of(candidate.path).tolist()
+        return LocalSearchRun(poses=poses, goal=(x, y, z), choice=choice, vias=vias, count=len(points))
 
     def advance(self, run: LocalSearchRun, tries: int) -> None:
         """Evaluate so many variations of a run's choice, and keep the best."""
@@ -172,7 +176,7 @@ class LocalSearch:
             run.choice.x,
             run.vias,
             run.count,
-            self.target,
+            run.goal,
             tries,
             state,
         )
@@ -190,7 +194,7 @@ class LocalSearch:
         deployment = self._evaluator.tubes.choose(tip.lps_from_scope_tip, *run.choice.numbers)
         if isinstance(deployment, str):
             return None
-        path = path_through(deployment, run.vias[: run.count], self._evaluator.task.target.lps_mm)
+        path = path_through(deployment, run.vias[: run.count], np.array(run.goal))
         return Candidate(tip=tip, deployment=deployment, path=path)
 
 

@@ -6,6 +6,7 @@ import math
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from anatomy.typed import Float
 from lungaccess.plans.evaluator import CandidateEvaluator
 from stages.needle import OMPL_PLANNERS, ArcPath
 from stages.tube import Deployment
@@ -37,13 +38,19 @@ class NamedNeedlePlanner:
             seed_ompl(evaluator.task.seed + 1)
 
     def path(
-        self, deployment: Deployment, *, seed: int, iterations: int, cost_limit: float = math.inf
+        self,
+        deployment: Deployment,
+        end: Float | None = None,
+        *,
+        seed: int,
+        iterations: int,
+        cost_limit: float = math.inf,
     ) -> ArcPath | None:
         """Return a path from the tip of the tubes that costs less than a limit, None if none is found.
 
         The planners of OMPL look at no objective and at no seed; what they find may cost more.
         """
-        query = self._evaluator.query(deployment)
+        query = self._evaluator.query(deployment, end)
         return self._problem.plan(
             query, seed=seed, iterations=iterations, method=self._name, cost_limit=cost_limit
         )

@@ -77,5 +77,6 @@ def _with_path(
     seed = int(rng.integers(2**63))
     if candidate is None:
         return None
-    path = planner.path(candidate.deployment, seed=seed, iterations=iterations, cost_limit=cost_limit)
+    end = arcs.evaluator.end_of(candidate.path)
+    path = planner.path(candidate.deployment, end, seed=seed, iterations=iterations, cost_limit=cost_limit)
     return None if path is None else replace(candidate, path=path)

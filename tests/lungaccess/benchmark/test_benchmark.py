@@ -111,7 +111,7 @@ def test_by_the_rules_of_unc_paths_keep_from_voxel_centres(small_phantom: Phanto
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_published_queries_agree_with_the_recorded_peer(data_dir: Path, number: int) -> None:
     """What the peer solves is solved, what it refuses is proved to have no path; paths are resampled."""
     from anatomy.io.med_rad import load_med_rad

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -210,7 +211,7 @@ def toy_scope(lung: Any, system: System, straightened_rad: float) -> ScopeInsert
     advance, twist, bend = led.states[-1]
     bend -= straightened_rad
     motion = replace(led, states=np.append(led.states, [[advance, twist, bend]], axis=0))
-    margin = float(brute_depth(lung, motion).min()) - system.scope.radius_mm
+    margin = least_depth(lung, motion) - system.scope.radius_mm
     points = motion.body(0.05)[:, :3, 3]
     passed = 0.05 * float(np.linalg.norm(points - CARINA, axis=1).argmin())
     return ScopeInsertion(
@@ -224,6 +225,19 @@ def toy_scope(lung: Any, system: System, straightened_rad: float) -> ScopeInsert
         min_lumen_margin_mm=margin - 0.02,
         max_curvature_per_mm=motion.max_curvature_per_mm,
     )
+
+
+_least_depths: dict[tuple[int, ...], float] = {}
+
+
+def least_depth(lung: Any, motion: ScopeMotion) -> float:
+    """The least of `brute_depth`, which is measured once for each lung and motion."""
+    section = np.array(motion.bending_length_mm)
+    known = (lung.labels, lung.grid.lps_from_ijk, motion.lps_from_entry, motion.states, section)
+    key = tuple(zlib.crc32(array.tobytes()) for array in known)
+    if key not in _least_depths:
+        _least_depths[key] = float(brute_depth(lung, motion).min())
+    return _least_depths[key]
 
 
 def brute_depth(lung: Any, motion: ScopeMotion) -> np.ndarray:

@@ -314,7 +314,9 @@ def test_any_number_edited_is_refused(plan: Plan, lung: Any, data: st.DataObject
     except Exception as error:
         raise AssertionError(f"{path} made the file unreadable: {error}") from error
     careful = path[0] == "clearance_mm" and inner[path[-1]] > 20.0
-    assert careful or not check(wrong, lung).accepted, path
+    # The motion begins with a nearly straight scope in the trachea, where another twist is as good a motion.
+    as_good = path == ("scope", "states", 0, 1)
+    assert careful or as_good or not check(wrong, lung).accepted, path
 
 
 def _digest(content: dict[str, Any]) -> str:

@@ -362,3 +362,11 @@ def test_lack_of_memory_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     load_with(monkeypatch, fail)
     assert cli.main(["info", "toy"]) == ExitCode.BAD_INPUT
     assert "not enough memory" in capsys.readouterr().err
+
+
+def test_an_interrupted_loading_of_a_library_is_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(_words: object) -> None:
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setattr(cli, "with_nodule_number", load)
+    assert cli.main(["presets"]) == 130

@@ -1,4 +1,4 @@
-"""Ctrl-C while a command plans."""
+"""Ctrl-C, or SIGTERM, while a command plans."""
 
 from __future__ import annotations
 
@@ -63,11 +63,12 @@ def test_ctrl_c_keeps_the_best_plan(more: tuple[str, ...], patient: Path, tmp_pa
         assert "Estimated to succeed" in out and "Geometry proved and checked." in out
 
 
-def test_ctrl_c_before_the_first_plan_exits_130(patient: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_an_end_before_the_first_plan_exits_130(patient: Path, tmp_path: Path, end: signal.Signals) -> None:
     process = planning(patient, tmp_path / "out", cache=tmp_path / "cache")
     while not list((tmp_path / "cache").glob(".building-*")):
         assert process.poll() is None
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, end)
     _, err = process.communicate(timeout=HANGS_AFTER_S)
     assert process.returncode == ExitCode.INTERRUPTED
     assert "interrupted" in err and "Traceback" not in err

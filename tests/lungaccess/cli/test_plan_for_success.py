@@ -1,4 +1,4 @@
-"""`plan --objective success`: a plan with its chance, and words for what cannot be asked together."""
+"""`plan --objective success` and for a window: a plan with its chance, and what cannot be asked together."""
 
 from __future__ import annotations
 
@@ -20,6 +20,12 @@ from lungaccess.plans.plan import Plan
         (["--objective", "success", "--system", "auto"], "one system"),
         (["--objective", "success", "--procedure", "measured-top"], "measured-tip"),
         (["--objective", "success", "--system", "tubes-only"], "needle"),
+        (["--objective", "window", "--system", "auto"], "one system"),
+        (["--objective", "window"], "masks_phase"),
+        (["--objective", "success", "--phases", "0:0.3"], "--objective window"),
+        (["--phases", "0.3"], "a colon between them"),
+        (["--phases", "0.3:0.1"], "the first before the last"),
+        (["--phases", "0.3:1.1"], "end-inhale"),
     ],
 )
 def test_what_cannot_be_asked_together_is_refused_in_words(

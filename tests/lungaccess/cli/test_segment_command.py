@@ -81,6 +81,7 @@ def test_a_radius_that_no_scale_tells_is_refused(
     assert "1 to 4 mm" in _refused(capsys, *words)
 
 
+@pytest.mark.slow
 def test_planning_on_thick_slices_must_be_allowed(
     small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

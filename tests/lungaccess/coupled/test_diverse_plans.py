@@ -16,7 +16,7 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
-from lungaccess.coupled import Alternative, DirectArcs, alternatives, with_front
+from lungaccess.coupled import Alternative, DirectArcs, alternatives, diverse_plans, with_front
 from lungaccess.coupled.kernels.separation import choose_separated
 from lungaccess.coupled.search.separated_arcs import SAMPLES, _branches_first, _samples
 from stages.needle.path import direct_path
@@ -38,6 +38,17 @@ def test_plans_differ_and_pass_the_check(found: tuple[Alternative, ...], small_l
         assert max(gaps.min(axis=1).max(), gaps.min(axis=0).max()) >= 3.0 - 0.3
     for each in found:
         assert la.check(each.plan, small_lung).accepted
+
+
+def test_where_no_arc_leads_the_planner_searches(
+    small_lung: Lung, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = la.resolve_target(small_lung)
+    monkeypatch.setattr(diverse_plans, "separated_candidates", lambda *_: iter(()))
+    monkeypatch.setitem(diverse_plans.separated_plans.__kwdefaults__, "iterations", 3)
+    (only,) = alternatives(small_lung, SYSTEM, target, atlas=atlas)
+    *_, best = la.plan(small_lung, SYSTEM, target, atlas=atlas, iterations=3)
+    assert only.plan.digest == best.digest and only.on_front
 
 
 def test_each_branch_comes_first_once(found: tuple[Alternative, ...]) -> None:
@@ -122,6 +133,7 @@ def test_lines_are_the_arcs() -> None:
     arcs: Any = SimpleNamespace(
         atlas=SimpleNamespace(deployments=entries),
         task=SimpleNamespace(target=SimpleNamespace(lps_mm=target)),
+        _by_aim=lambda _chosen: [(slice(None), target)],
     )
     lines = DirectArcs.lines(arcs, np.arange(20), SAMPLES)
     for line, position, tangent in zip(lines, entries.positions, tangents, strict=True):

@@ -110,6 +110,7 @@ def test_patient2_plan_is_refused_where_a_vessel_is_put_back(patient2: Lung, pla
         assert not la.check(plan2, replace(patient2, labels=labels)).accepted
 
 
+@pytest.mark.slow
 def test_patient2_plan_is_the_same_again(patient2: Lung, plan2: la.Plan) -> None:
     *_, again = la.plan(
         patient2, la.load_system("lung-default"), la.resolve_target(patient2), iterations=ITERATIONS

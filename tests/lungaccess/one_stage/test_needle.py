@@ -114,7 +114,14 @@ def wall_starts(lung: Lung, reach_mm: float) -> list[np.ndarray]:
     return found
 
 
-@pytest.mark.parametrize("planner", list(PLANNERS))
+@pytest.mark.parametrize(
+    "planner",
+    [
+        "rrt",
+        "decide",
+        *(pytest.param(p, marks=pytest.mark.slow) for p in PLANNERS if p not in ("rrt", "decide")),
+    ],
+)
 def test_a_needle_that_begins_at_the_wall_leaves_the_lumen(
     small_lung: Lung, system: System, planner: str
 ) -> None:

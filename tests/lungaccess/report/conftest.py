@@ -9,7 +9,7 @@ import pytest
 
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
-from tests.lungaccess.report.pages import make_plans, plan_file, report_data
+from tests.lungaccess.report.pages import make_plans, plan_file, report_data, with_stated_window
 
 
 @pytest.fixture(scope="session")
@@ -25,3 +25,9 @@ def page(plans: tuple[Plan, ...], small_lung: Lung, small_phantom: Any, tmp_path
 @pytest.fixture(scope="session")
 def data(page: Path) -> dict[str, Any]:
     return report_data(page)
+
+
+@pytest.fixture(scope="session")
+def breathing_plans(plans: tuple[Plan, ...], breathing_lung: Lung) -> tuple[Plan, ...]:
+    """Those plans with a window that is stated, not computed."""
+    return tuple(with_stated_window(each, breathing_lung) for each in plans)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import lungaccess as la
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.window import BreathingWindow, WindowLimit
 from lungaccess.reachability.reach_map import ReachMap, map_reach
 from lungaccess.report.html import PageOptions, plan_page, reach_page
 
@@ -54,3 +58,31 @@ def report_data(page: Path) -> dict[str, Any]:
     found = re.search(r'<script type="application/json" id="report-data">(.*?)</script>', page.read_text())
     assert found is not None
     return dict(json.loads(found.group(1)))
+
+
+def with_stated_window(plan: Plan, lung: Lung) -> Plan:
+    """Return a plan that states a window of the last 40 % before end-inhale."""
+    motion = lung.motion
+    assert motion is not None
+    return replace(plan, window=replace(WINDOW, motion_key=motion.key, motion_source=motion.source))
+
+
+WINDOW = BreathingWindow(
+    motion_key="",
+    motion_source="stated",
+    warning_only=False,
+    masks_phase=1.0,
+    amplitude=1.0,
+    tolerance_mm=2.0,
+    phases=np.array([[0.6, 1.0]]),
+    undecided_share=0.0,
+    limits=(
+        WindowLimit(
+            phase=0.6,
+            reason="vessel",
+            device="needle",
+            arc_length_mm=12.3,
+            place_lps=np.array([1.0, 2.0, 3.0]),
+        ),
+    ),
+)

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from anatomy import structures
 from anatomy.lung import Lung
+from lungaccess.breathing.moving import Moving
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import volumes
@@ -36,8 +38,9 @@ LUMEN = (14, 58, 87)
 
 
 @pytest.fixture(scope="module")
-def file(plans: tuple[Plan, ...], small_lung: Lung, tmp_path_factory: Any) -> Path:
-    return plan_file(plans, small_lung, None, tmp_path_factory.mktemp("browser"))
+def file(breathing_plans: tuple[Plan, ...], breathing_lung: Lung, tmp_path_factory: Any) -> Path:
+    """A page that breathes, in the phase of the masks at first."""
+    return plan_file(breathing_plans, breathing_lung, None, tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +55,7 @@ def test_it_opens_without_a_word_on_the_console(page: browser.Browser) -> None:
     assert page.messages() == []
     assert state["gl_error"] == 0
     assert state["triangles"] > 5000
-    assert page.run("return document.querySelectorAll('.charts figure:not([hidden]) > svg').length") == 4
+    assert page.run("return document.querySelectorAll('.charts figure:not([hidden]) > svg').length") == 5
 
 
 def test_nothing_is_asked_of_the_network(page: browser.Browser) -> None:
@@ -202,6 +205,47 @@ def pixels(page: browser.Browser, canvas: str, colour: tuple[int, int, int]) -> 
     return np.array(page.run(script, canvas, list(colour)), dtype=float).reshape(-1, 2)
 
 
+def test_everything_breathes_together(
+    page: browser.Browser, breathing_plans: tuple[Plan, ...], breathing_lung: Lung
+) -> None:
+    """Devices and target go where Python has them, inside and outside the window; all pictures change."""
+    plan, canvases = breathing_plans[0], ("scene", "slice-axial", "slice-across", "inside")
+    moving, before = Moving.of(plan, breathing_lung), [page.run(PICTURE, 1, name) for name in canvases]
+    for phase, said in ((0.0, "✗ not proved"), (0.35, "✗ not proved"), (0.8, "✓ proved")):
+        page.run("window.lungaccessReport.set(1); window.lungaccessReport.breathe(arguments[0])", phase)
+        state = page.state()
+        end = moving.carried(np.array(plan.needle.end_lps)[None], phase)[0]
+        np.testing.assert_allclose(state["tip_lps"], end, atol=5e-3)
+        np.testing.assert_allclose(state["needle_lps"][-1], end, atol=5e-3)
+        target = moving.moved(np.array(plan.target_lps)[None], phase)[0]
+        np.testing.assert_allclose(state["target_lps"], target, atol=0.03)
+        words = page.run("return document.getElementById('phase-words').textContent")
+        assert words.startswith(f"{100 * phase:.0f} % of the breath: {said}")
+        if phase == 0.0:
+            assert all(page.run(PICTURE, 1, name) != old for name, old in zip(canvases, before, strict=True))
+            assert state["gl_error"] == 0
+    page.run("window.lungaccessReport.breathe(1)")
+    assert [page.run(PICTURE, 1, name) for name in canvases] == before
+
+
+def test_the_lumen_breathes_in_the_slices(
+    page: browser.Browser, breathing_plans: tuple[Plan, ...], breathing_lung: Lung
+) -> None:
+    """It is painted where Python has moved its voxels."""
+    moving, step_mm = Moving.of(breathing_plans[0], breathing_lung), 140 / 360
+    page.run(CHOOSE, "field", "140")
+    page.run("window.lungaccessReport.set(0.2); window.lungaccessReport.breathe(0)")
+    across, down = pixels(page, "slice-axial", LUMEN).T
+    aside = np.stack([across - 179.5, down - 179.5, np.zeros(len(across))], axis=1)
+    places = np.array(page.state()["tip_lps"]) + step_mm * aside
+    masks = moving.pulled_back(places, 0.0)
+    assert len(places) > 50
+    assert np.linalg.norm(masks - places, axis=1).min() > 0.3
+    index = np.rint(breathing_lung.grid.ijk(masks)).astype(int)
+    assert ((breathing_lung.labels[tuple(index.T)] & structures.LUMEN) != 0).mean() > 0.9
+    page.run("window.lungaccessReport.breathe(1)")
+
+
 def test_playing_moves_the_slider(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.set(0)")
     page.run("document.getElementById('play').click()")
@@ -216,6 +260,20 @@ def test_playing_moves_the_slider(page: browser.Browser) -> None:
     stopped = page.state()["position"]
     page.frame()
     assert page.state()["position"] == stopped
+
+
+def test_the_breath_plays_and_is_held(page: browser.Browser) -> None:
+    page.run("window.lungaccessReport.breathe(0.2); document.getElementById('breathe').click()")
+    frames = 0
+    while page.state()["phase"] == 0.2:
+        page.frame()
+        frames += 1
+        assert frames < 10
+    page.run("document.getElementById('breathe').click()")
+    held = page.state()["phase"]
+    page.frame()
+    assert page.state()["phase"] == held
+    page.run("window.lungaccessReport.breathe(1)")
 
 
 def test_a_phone_needs_no_sideways_scrolling_and_a_dark_page_is_dark(file: Path) -> None:

@@ -27,11 +27,12 @@ from lungaccess.report.html import (
     page_of_no_plan,
     page_of_plan,
     page_of_reach,
+    phase,
     tables,
     words,
 )
 from lungaccess.report.html.page_of_reach import STEPS_PER_MM, packed_map
-from tests.lungaccess.report.pages import SIZE_LIMIT, make_reach, reach_file, report_data
+from tests.lungaccess.report.pages import SIZE_LIMIT, WINDOW, make_reach, reach_file, report_data
 
 NAMESPACE = "http://www.w3.org/2000/svg"
 STRUCTURES = {"airway", "vessel", "pleura", "fissure"}
@@ -97,6 +98,8 @@ def test_scripts_find_only_elements_that_the_page_has() -> None:
         script = document.bundle([*document.SHARED_MODULES, *page.MODULES])
         views = "" if page is page_of_reach else document.TARGET_BUTTON
         html = document.asset(template) + document.scene_figure(more_views=views)
+        if page is page_of_plan:
+            html += phase.player(WINDOW, True) + phase.chart(WINDOW) + phase.clock_svg(WINDOW, True)
         present = set(re.findall(r'id="([\w-]+)"', html + document.asset("frame.html")))
         wanted = set(re.findall(r'(?:byId|getElementById)\("([\w-]+)"\)', script))
         assert {"scene", "slice-place"} <= wanted <= present

@@ -46,7 +46,7 @@ def rated(lengths: list[float], counts: list[int | None], clearances: list[float
     plans: Any = [
         SimpleNamespace(
             clearance_mm={"needle": {"vessel": clearance, "outside": 9.0}}, fissures_are_obstacles=False,
-            tissue_mm=length, costs={"inverse_clearance": 1.0, "cost_map": 0.0},
+            tissue_mm=length, costs={"inverse_clearance": 1.0, "cost_map": 0.0}, window=None,
         )
         for length, clearance in zip(lengths, clearances, strict=True)
     ]  # fmt: skip

@@ -3,9 +3,8 @@
     python -m experiments.hard_inputs [--only PATTERN] [--record FILE] [--page FILE] [--ct FILE]
 
 Each case of `experiments.support.segmentation.hard_cases` is made of the CT of the small phantom, segmented
-up
-to the airways, and compared with the truth.  Cases in the record are not run again, so that a study that was
-stopped goes on.  The page gets the table between its marks.
+up to the airways, and compared with the truth.  Cases in the record are not run again, so that a study that
+was stopped goes on.  The page gets the table between its marks.
 
 With --ct the cases are made of a real CT, as far as they do not need to know where its organs lie.  Its own
 segmentation stands for the truth: what is measured is what the change does.

@@ -40,6 +40,7 @@ OUR_OWN = (
     "lobes",
     "slice_thickness",
     "growth",
+    "breathing",
 )
 SETTINGS = ("full", "quick")
 OUR_TITLE = "Our own studies"

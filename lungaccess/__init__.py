@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         build_atlas,
         open_atlas,
         plan,
+        plan_for_window,
         plan_with_presets,
     )
     from lungaccess.explanation import Explanation, explain_no_plan, save_explanation

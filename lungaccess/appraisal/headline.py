@@ -29,6 +29,10 @@ FAILURES = {
 }
 """What a failed procedure does, by the names of `lungaccess.risk.STRUCTURES` and `NO_PATH`."""
 
+BESIDE_TARGET = (
+    "The plan was made for a window of the breath: in the phase of the masks it ends beside the target."
+)
+
 
 class Geometry(StrEnum):
     """What is known of the geometry of a plan."""
@@ -53,12 +57,15 @@ class Headline:
         The estimate of success, or what the plan states of one; None if there is none, as for a refused plan.
     fissures_unknown : bool
         Whether fissures must not be crossed, and the patient has no mask of them.
+    has_aim : bool
+        Whether the plan was made for a window of the breath, and ends beside the target of the masks' phase.
     """
 
     geometry: Geometry
     refusals: int = 0
     estimate: Estimate | None = None
     fissures_unknown: bool = False
+    has_aim: bool = False
 
     @classmethod
     def of(cls, report: CheckReport | None, estimate: Estimate | None) -> Headline:
@@ -67,8 +74,14 @@ class Headline:
             return cls(geometry=Geometry.UNCHECKED, estimate=estimate)
         geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
         unknown = any(each.name == "patient.fissures" for each in report.unchecked)
-        refusals = len(report.refusals)
-        return cls(geometry=geometry, refusals=refusals, estimate=estimate, fissures_unknown=unknown)
+        has_aim = any(each.name == "target.aim" for each in report.findings)
+        return cls(
+            geometry=geometry,
+            refusals=len(report.refusals),
+            estimate=estimate,
+            fissures_unknown=unknown,
+            has_aim=has_aim,
+        )
 
     @property
     def chance(self) -> Chance | None:
@@ -187,6 +200,7 @@ class Headline:
             f"{drawn}. {chance.corrections}",
             f"Success: the {last} within {chance.radius_mm:.1f} mm of the target "
             f"({chance.radius_origin}) and nothing forbidden is touched.",
+            *((BESIDE_TARGET,) if self.has_aim else ()),
             f"Errors of '{chance.errors}': {chance.sizes}. Assumed, with no published source: "
             f"{assumed or 'none'}.",
         )

@@ -25,6 +25,9 @@ MOTION_WORDS = {
     "least_stretch": "proved: no length becomes shorter than this share of itself",
     "right_volume_factor": "volume of the right lung at end-inhale by that at end-exhale",
     "left_volume_factor": "volume of the left lung at end-inhale by that at end-exhale",
+    "lungs_dice": "Dice of the moved lungs with other_lungs",
+    "lungs_dice_unmoved": "the same of the lungs as they are",
+    "lungs_borders_mm": "distance of the borders of moved and other lungs, mean, mm",
 }
 """What the figures of a motion are, see `anatomy.motion`."""
 
@@ -69,7 +72,7 @@ def _breathing(lung: Organ) -> dict[str, Any]:
     motion = lung.motion if isinstance(lung, Lung) else None
     if motion is None:
         return {}
-    names = ("source", "key", "masks_phase", "amplitude", "warning_only")
+    names = ("source", "key", "masks_phase", "amplitude", "hysteresis", "warning_only")
     stated = {name: getattr(motion, name) for name in names}
     return {"breathing": {**stated, **motion.figures}}
 
@@ -159,6 +162,7 @@ def _motion_tables(lung: Lung) -> list[Table]:
         ("motion", motion.source),
         ("phase of the masks", f"{100.0 * motion.masks_phase:.0f} % (0 % end-exhale, 100 % end-inhale)"),
         ("amplitude", f"{100.0 * motion.amplitude:.0f} % of the source's"),
+        ("hysteresis", f"{100.0 * motion.hysteresis:g} % of the distance from the scope's tip"),
         *((MOTION_WORDS.get(name, name), f"{value:.2f}") for name, value in motion.figures.items()),
     ]
     return [terminal.table("Breathing", ("", ""), rows)]

@@ -6,9 +6,12 @@ refuses it; 2, the input is bad.
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
@@ -129,7 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _termination_as_interruption():
             warnings.showwarning = _show_damage(warnings.showwarning)
             code = _answer(words)
         sys.stdout.flush()
@@ -137,6 +140,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         terminal.give_up_output()
         return ExitCode.PIPE_CLOSED
     return code
+
+
+@contextlib.contextmanager
+def _termination_as_interruption() -> Iterator[None]:
+    """Let SIGTERM do what Ctrl-C does, so that what is half made goes and no process stays."""
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _show_damage(others: Callable[..., None]) -> Callable[..., None]:
@@ -170,9 +189,18 @@ def _answer(words: list[str]) -> int:
     except OSError as error:
         return _explain(_unusable(error), as_json)
     except KeyboardInterrupt:
-        error_console.print("interrupted")
-        return ExitCode.INTERRUPTED
+        return _interrupted()
+    except ImportError as error:
+        # Compiled libraries turn an interruption of their loading into this.
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        return _interrupted()
     return int(code or ExitCode.OK)
+
+
+def _interrupted() -> ExitCode:
+    error_console.print("interrupted")
+    return ExitCode.INTERRUPTED
 
 
 def _explain(error: LungaccessError, as_json: bool) -> ExitCode:

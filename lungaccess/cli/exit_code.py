@@ -15,7 +15,7 @@ class ExitCode(IntEnum):
     BAD_INPUT = 2
     """The input is bad, and the error says how."""
     INTERRUPTED = 130
-    """The user pressed Ctrl-C; shells state the same number."""
+    """The user pressed Ctrl-C, for which shells state the same number, or SIGTERM ended the command."""
     PIPE_CLOSED = 141
     """What reads the output, such as `head`, stopped before its end; shells state the same number."""
 

@@ -44,12 +44,21 @@ PlanFile = Annotated[Path, Parameter(help="The plan.json.")]
 PatientOfPlan = Annotated[Path, Parameter(help="Folder of the patient it was made for.")]
 SUCCESS = "success"
 """The objective that is no cost: the chance of success."""
+WINDOW = "window"
+"""The objective that is no cost: the share of the breath in which the plan is proved."""
 DEFAULT_SYSTEM = "lung-default"
 AUTO = "auto"
 """Stands for the least invasive preset that reaches the target."""
 DEFAULT_BUDGET_S = 10.0
 """Long enough that the best cost of most targets has settled, short enough to wait for."""
 
+PhasesText = Annotated[
+    str | None,
+    Parameter(
+        help="Phases of the breath, 0 end-exhale to 1 end-inhale, in all of which the devices have to be "
+        "clear and on target, such as 0.0:0.3; the patient needs a [motion] in its patient.toml."
+    ),
+]
 STEP_SHARES = {
     "reading images": 0.02,
     "airway tree": 0.12,
@@ -242,9 +251,10 @@ class SearchOptions(BudgetOptions):
             help="What to make small: integral of 1/clearance, integral of the patient's cost map, its sum "
             "over the voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5; default is "
             "the first, and the second too where there is a map.  Or success: the chance that the procedure "
-            "succeeds is made large."
+            "succeeds is made large; or window: the share of the breath in which the plan is proved."
         ),
     ] = DEFAULT
+    phases: PhasesText = None
     method: Annotated[
         Method,
         Parameter(
@@ -262,6 +272,30 @@ class SearchOptions(BudgetOptions):
     processes: Annotated[
         Processes, Parameter(help="How many processes refine the plan at the same time.")
     ] = 1
+
+
+def stated_phases(text: str | None) -> tuple[float, float] | None:
+    """Return first and last phase of a text such as 0.0:0.3; None without one.
+
+    Raises
+    ------
+    SettingsError
+        If it is not two phases from 0 to 1 in order.
+    """
+    from lungaccess.coupled.window_planner import require_phases
+
+    if text is None:
+        return None
+    first, _colon, last = text.partition(":")
+    try:
+        stated = float(first), float(last)
+    except ValueError as error:
+        raise SettingsError(
+            f"--phases is {text!r}",
+            expected="two phases from 0 (end-exhale) to 1 (end-inhale) with a colon between them",
+            remedy="Write --phases 0.0:0.3 for the first 30 % of the breath",
+        ) from error
+    return require_phases(*stated)
 
 
 def require_picture(path: Path) -> None:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from lungaccess.procedure import Procedure
     from lungaccess.report import CostPoint
     from lungaccess.risk import ErrorModel
-    from lungaccess.success import PlannedSuccess
 
 PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
 """The plan, saved as soon as there is one and again when there is a better one; how its cost fell."""
@@ -34,6 +33,8 @@ SUMMARY_FILE = "summary.json"
 """What `--json` prints: headline, limits, costs.  The plan's own file states only the plan."""
 FAILURE = "chance of failure"
 """What a search for success makes small."""
+OUTSIDE = "share of the breath outside the window"
+"""What a search for the widest window makes small."""
 PICTURES = ("overview.png", "tree.png", "cost_over_time.png")
 """Pictures of a found plan, unless the user wants none."""
 
@@ -53,17 +54,10 @@ class Display(AbstractContextManager[Any], Protocol):
 
 @frozen_value
 class Found:
-    """A plan that a search found, and what it makes small: its cost, or its chance of failure.
-
-    Parameters
-    ----------
-    success : PlannedSuccess or None
-        None where a cost is made small.
-    """
+    """A plan that a search found, and how much of what it makes small is left."""
 
     plan: Plan
     cost: float
-    success: PlannedSuccess | None = None
 
 
 class CostHistory:
@@ -99,7 +93,8 @@ class CostHistory:
 class PlanRequest:
     """What to plan and where to; of several systems the least invasive that reaches the target is chosen.
 
-    For success the chance that the procedure succeeds is made large, instead of a cost small.
+    For success the chance that the procedure succeeds is made large, instead of a cost small; for the widest
+    window its share of the breath.  Phases are those that the window of the plan has to hold.
     """
 
     systems: tuple[System, ...]
@@ -111,6 +106,13 @@ class PlanRequest:
     pictures: bool = True
     procedure: Procedure | None = None
     for_success: bool = False
+    phases: tuple[float, float] | None = None
+    widest: bool = False
+
+    @property
+    def made_small(self) -> str:
+        """What the search makes small, in words, where it is not a cost."""
+        return FAILURE if self.for_success else OUTSIDE if self.widest else ""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -154,7 +156,7 @@ def run_search(
 
 def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Found]:
     """Yield better and better plans with the request's system, or with the one that is chosen of several."""
-    from lungaccess.coupled import atlas_event, open_atlas, plan, plan_with_presets
+    from lungaccess.coupled import atlas_event, open_atlas, plan, plan_for_window, plan_with_presets
     from lungaccess.success import plan_for_success
 
     def atlas_of(system: System) -> Atlas:
@@ -175,7 +177,15 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
             lung, system, target, errors=request.errors, procedure=request.procedure,
             atlas=atlas_of(system), counterfactuals=False, **limits,
         ):  # fmt: skip
-            yield Found(plan=each.plan, cost=1.0 - each.succeeds.value, success=each)
+            yield Found(plan=each.plan, cost=1.0 - each.succeeds.value)
+        return
+    if request.phases is not None or request.widest:
+        for made in plan_for_window(
+            lung, system, target, request.phases, widest=request.widest, objective=search.objective,
+            atlas=atlas_of(system), **limits,
+        ):  # fmt: skip
+            outside = 1.0 - (0.0 if made.window is None else made.window.share)
+            yield Found(plan=made, cost=outside if request.widest else made.cost)
         return
     options = limits | {
         "objective": search.objective,
@@ -202,14 +212,14 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
         If no plan was found.
     """
     target, search = request.target.resolve(lung), request.search
-    display = SearchDisplay(search.time_s, search.iterations, FAILURE if request.for_success else "cost")
+    display = SearchDisplay(search.time_s, search.iterations, request.made_small or "cost")
     best, history = run_search(lung, target, request, display)
     # After the search: the first plan does not wait for these.
     from lungaccess.appraisal import appraise
     from lungaccess.breathing.window import with_window
 
-    found = with_window(best.plan, lung)
-    if found.window is not None:
+    found = best.plan if best.plan.window is not None else with_window(best.plan, lung)
+    if found is not best.plan:
         best = replace(best, plan=found)
         found.save(request.out / PLAN_FILE)
 
@@ -259,14 +269,16 @@ def write_history(
     cost_over_time_csv(history, request.out / HISTORY_FILE)
     if request.pictures:
         with progress("drawing the plan"):
-            draw_plan(found, history, lung, appraisal, request.out)
+            draw_plan(found.plan, history, lung, appraisal, request)
 
 
-def draw_plan(found: Found, history: list[CostPoint], lung: Lung, appraisal: Appraisal, out: Path) -> None:
-    """Write the pictures of a plan and of its search into a folder."""
+def draw_plan(
+    plan: Plan, history: list[CostPoint], lung: Lung, appraisal: Appraisal, request: PlanRequest
+) -> None:
+    """Write the pictures of a plan and of its search into the request's folder."""
     from lungaccess.report import cost_over_time_png, overview_png, tree_png
 
-    words = FAILURE if found.success else Objective.of(found.plan.objective).words
-    overview_png(found.plan, lung, out / "overview.png", appraisal)
+    words, out = request.made_small or Objective.of(plan.objective).words, request.out
+    overview_png(plan, lung, out / "overview.png", appraisal)
     tree_png(lung, out / "tree.png")
     cost_over_time_png(history, out / "cost_over_time.png", words)

@@ -14,6 +14,7 @@ from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Float
+from lungaccess.plans.no_plan import NoPlan
 from stages.scope.tour import (
     MOST_COMBINATIONS,
     MOST_LESIONS,
@@ -36,11 +37,14 @@ from stages.scope.tour import (
 
 if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas
+    from lungaccess.problem.target import Target
 
 FARTHEST_MM = 200.0
 """No exit farther from a lesion is of use: a lung is not wider."""
 PROOFS_PER_SITE = 3
 """How many deployments of a site are tried in full before the site counts as refused."""
+ITERATIONS = 100
+"""Of the coupled planner for a lesion that no direct arc reaches: some seconds."""
 
 
 @frozen_record
@@ -53,7 +57,7 @@ class TourAnswer:
     numbers : tuple of int
         Their numbers, from 1, in the order in which the user gave them.
     left_out : mapping of int to str
-        Numbers of lesions that cannot be reached, and why.
+        Numbers of lesions without an exit, and why.
     shortest : Itinerary
         The shortest tour over all choices of exits.
     least_resistance : Itinerary or None
@@ -128,6 +132,7 @@ def plan_tour(
     closed: bool = False,
     tissue_weight: float = 0.0,
     atlas: Atlas | None = None,
+    iterations: int = ITERATIONS,
 ) -> TourAnswer:
     """Plan the shortest tour to all lesions, and the one by least resistance beside it.
 
@@ -143,15 +148,18 @@ def plan_tour(
     tissue_weight : float
         How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the shortest tour.
     atlas : Atlas, optional
-        If given, an exit counts only if a coupled plan from there exists: scope, tubes, and a direct arc
-        of the needle, all proved.
+        If given, an exit counts only if a coupled plan from there was found: scope, tubes and needle, all
+        proved; see `coupled_plan_test`.
+    iterations : int
+        Of the coupled planner for a lesion that no direct arc reaches; 0 for direct arcs alone.
 
-    A lesion without an exit is left out of the tour, and named in the answer.
+    A lesion without an exit is left out of the tour, and named in the answer.  That no plan was found does
+    not prove that there is none.
 
     Raises
     ------
     TargetError
-        If a lesion lies outside the image, or none can be reached.
+        If a lesion lies outside the image, or none has an exit.
     """
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
     for number, inside in enumerate(lung.grid.contains(lesions).tolist(), 1):
@@ -167,16 +175,18 @@ def plan_tour(
     left_out: dict[int, str] = {}
     for number, lesion in enumerate(lesions, 1):
         try:
-            accepts = None if atlas is None else coupled_plan_test(atlas, lesion)
+            accepts = None if atlas is None else coupled_plan_test(atlas, lesion, iterations)
             exits.append(exits_of(lung.tree, len(exits), lesion, chosen, accepts))
             numbers.append(number)
         except TargetError as error:
             left_out[number] = error.found
+        except NoPlan as error:
+            left_out[number] = f"no plan was found in {iterations} iterations: {error.main_reason}"
     if not exits:
         raise TargetError(
-            "No lesion can be reached: " + "; ".join(f"{n}: {why}" for n, why in left_out.items()),
+            "No lesion has an exit: " + "; ".join(f"{n}: {why}" for n, why in left_out.items()),
             remedy="Name other lesions, or plan a tour of the scope alone with --no-require-plan",
-            expected="at least one lesion in reach",
+            expected="at least one lesion with an exit",
         )
     cost = [[tissue_weight * each.distance_mm for each in of_one] for of_one in exits]
     subtree = subtree_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)
@@ -205,30 +215,34 @@ def _rule_of(atlas: Atlas | None) -> ExitRule:
     return ExitRule(reach_mm=min(reach, FARTHEST_MM))
 
 
-def coupled_plan_test(atlas: Atlas, lesion_lps: Float) -> ExitTest:
+def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATIONS) -> ExitTest:
     """Return the test whether a coupled plan leads from a tree point to a lesion, `(3,)` LPS mm.
 
     All deployments of the atlas whose workspace holds the lesion are tried with the direct arc, or without a
     needle those that end nearby, aimed at it; a site counts if one of its best deployments is proved in full.
-    Searches around obstacles are not tried, so that a refused exit may still be possible.
+    Where none is, the coupled planner searches, and the sites of its plans count.  So a refused exit may
+    still be possible.
 
     Raises
     ------
+    NoPlan
+        If no plan was found at all.
     TargetError
         If the lesion lies outside the lung or inside an obstacle.
     """
-    good = _good_points(atlas, lesion_lps)
+    from lungaccess.problem.target import point_target
+
+    target = point_target(atlas.lung, lesion_lps)
+    good = _points_of_arcs(atlas, target) or _points_of_plans(atlas, target, iterations)
     return lambda _lesion, point: point in good
 
 
-def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
-    """Return the tree points from where a lesion can be reached."""
+def _points_of_arcs(atlas: Atlas, target: Target) -> frozenset[int]:
+    """Return the tree points from where a direct arc, or without a needle the tubes, reach a target."""
     from lungaccess.coupled import direct_candidates
-    from lungaccess.problem.target import point_target
     from lungaccess.problem.task import Task
     from stages.needle import SHORTEST
 
-    target = point_target(atlas.lung, lesion)
     task = Task(lung=atlas.lung, system=atlas.system, target=target, objective=SHORTEST)
     direct = direct_candidates(task, atlas)
     clear = direct.clear()
@@ -242,6 +256,16 @@ def _good_points(atlas: Atlas, lesion: Float) -> frozenset[int]:
         if direct.proved(entry) is not None:
             good.add(int(point))
     return frozenset(good)
+
+
+def _points_of_plans(atlas: Atlas, target: Target, iterations: int) -> frozenset[int]:
+    """Return the tree points nearest to the scope tips of the plans that a search finds."""
+    from lungaccess.coupled import plan
+
+    plans = plan(atlas.lung, atlas.system, target, atlas=atlas, iterations=iterations, counterfactuals=False)
+    tips = np.stack([found.scope.lps_from_scope_tip[:3, 3] for found in plans])
+    away = np.linalg.norm(atlas.lung.tree.points_lps[:, None] - tips, axis=2)
+    return frozenset(away.argmin(axis=0).tolist())
 
 
 def tour_record(answer: TourAnswer) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Iterable
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -12,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.child_process import end_with_parent
 from anatomy.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
 from anatomy.typed import Bool, Float, Int
@@ -23,6 +23,7 @@ from lungaccess.procedure.settings import Procedure, load_procedure
 from lungaccess.procedure.truth import ARCS, Attempt
 from lungaccess.risk import MISSES, Deviations, ErrorModel, RiskAssessor, Share, load_errors
 from lungaccess.risk.assessment import MISS_QUANTILES
+from lungaccess.risk.breathing import model_for
 from lungaccess.risk.deviations import deviated_starts
 from lungaccess.risk.kernels import deviation as kernel
 from lungaccess.risk.statistics import share_of
@@ -107,6 +108,7 @@ class Simulator:
         radius_mm: float | None = None,
     ) -> None:
         self.assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
+        errors = model_for(errors, plan, lung)
         self.errors, self.procedure, self._lung = errors, procedure, lung
         self._policy = Policy(self.assessor, lung, errors, procedure)
 
@@ -158,7 +160,7 @@ class _Run:
 
     def _send_part(self, numbers: Int, end: Connection) -> None:
         """Go through some procedures in a process of their own."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        end_with_parent()
         end.send(self._part(numbers))
 
     def _open_loop(self) -> _Found:

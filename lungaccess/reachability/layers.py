@@ -6,12 +6,12 @@ import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from anatomy.checksums import array_checksum, values_checksum, warn_of_damage
 from anatomy.grid import Grid
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.io.files import DAMAGE, atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from anatomy.typed import Float, Float32, Int, Mask, UInt64
@@ -58,12 +58,12 @@ def scan_layers(
 
     Returns
     -------
-    found : (3, ni, nj, nk) float32
-        Kind, cost and clearance, see `stages.needle.reach.Reached`.
+    found : (4, ni, nj, nk) float32
+        Kind, cost, clearance and share of the breath, see `stages.needle.reach.Reached`.
     resumed : int
         Layers taken from the store.
     """
-    found = np.zeros((3, *grid.shape), dtype=np.float32)
+    found = np.zeros((4, *grid.shape), dtype=np.float32)
     done, resumed = 0, 0
 
     def one_layer(k: int) -> None:
@@ -106,7 +106,8 @@ def _earlier_neighbours(counted: Mask) -> Int:
 
 
 def _as_rows(reached: Reached) -> Float32:
-    return np.stack([reached.kinds, reached.cost, reached.clearance_mm]).astype(np.float32)
+    share = np.zeros_like(reached.cost) if reached.window_share is None else reached.window_share
+    return np.stack([reached.kinds, reached.cost, reached.clearance_mm, share]).astype(np.float32)
 
 
 class LayerStore:
@@ -119,18 +120,27 @@ class LayerStore:
         return self._folder / f"layer-{layer:04d}.npz"
 
     def load(self, layer: int, count: int) -> Float32 | None:
-        """Return the rows `(3, count)` of a layer, None if it is not there or not whole."""
+        """Return the rows `(4, count)` of a layer, None if it is not there or not whole."""
         try:
-            with np.load(self._path(layer)) as stored:
-                rows = np.asarray(stored["rows"], dtype=np.float32)
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            with self._path(layer).open("rb") as stream, np.load(stream) as stored:
+                rows, checksum = np.asarray(stored["rows"]), str(stored["checksum"])
+        except FileNotFoundError:
             return None
-        return rows if rows.shape == (3, count) else None
+        except DAMAGE:
+            checksum = ""
+        if checksum and rows.shape == (4, count) and checksum == self._checksum(layer, rows):
+            return rows.astype(np.float32, copy=False)
+        warn_of_damage(self._path(layer))
+        return None
 
     def save(self, layer: int, rows: Float32) -> None:
         """Write a layer, whole or not at all."""
         with atomic_write(self._path(layer)) as temporary:
-            np.savez_compressed(temporary, rows=rows)
+            np.savez_compressed(temporary, rows=rows, checksum=np.array(self._checksum(layer, rows)))
+
+    def _checksum(self, layer: int, rows: Float32) -> str:
+        """Return what binds the rows of a layer to the run and to its place."""
+        return values_checksum({"of": [self._folder.name, layer], "rows": array_checksum(rows)})
 
     def clear(self) -> None:
         """Remove all layers."""

@@ -17,8 +17,10 @@ from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Bool
+from lungaccess.breathing.window import require_motion
 from lungaccess.coupled import reach_scan
 from lungaccess.coupled.atlas import Atlas, build_atlas
+from lungaccess.coupled.window_planner import require_phases
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.reachability.layers import LayerStore, counted_voxels, scan_layers
 from lungaccess.reachability.regions import Regions, lung_regions
@@ -26,7 +28,7 @@ from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, SEARCHED, UNREACHE
 
 DEFAULT_SPACING_MM = 3.0
 """Half the diameter of a small nodule, so that none falls between the points."""
-FORMAT = b"lungaccess-reach-1"
+FORMAT = b"lungaccess-reach-2"
 
 NOT_COUNTED = 0
 KINDS: dict[str, int] = {
@@ -85,6 +87,10 @@ class ReachMap:
         Layers of voxels that an earlier run had finished.
     scan_s, atlas_s : float
         Seconds that the map and the atlas took.
+    phases : tuple of 2 floats or None
+        Phases of the breath in all of which voxels count as reached; None for the masks' alone.
+    window_share : Volume of float32 or None
+        With phases, the share of the breath in which the path found is proved; 0 where there is none.
     """
 
     patient_name: str
@@ -98,6 +104,17 @@ class ReachMap:
     resumed_layers: int
     scan_s: float
     atlas_s: float
+    phases: tuple[float, float] | None = None
+    window_share: Volume | None = None
+
+    @property
+    def words(self) -> str:
+        """What is mapped, in words."""
+        what = f"What {self.system.name} reaches of {self.patient_name}"
+        if self.phases is None:
+            return what
+        first, last = (100.0 * phase for phase in self.phases)
+        return f"{what} from {first:g} % to {last:g} % of the breath"
 
     def by_region(self) -> tuple[RegionReach, ...]:
         """Return what is reached of each lung, of each lobe if they are known, and of all of them last."""
@@ -140,9 +157,10 @@ class ReachMap:
         )
 
     def save(self, folder: str | os.PathLike[str], stem: str = "reach") -> tuple[Path, ...]:
-        """Write the map as three images that 3D Slicer opens in the patient's frame.
+        """Write the map as three images, four with phases, that 3D Slicer opens in the patient's frame.
 
-        `STEM.nrrd` holds the kinds as labels, `STEM-cost.nrrd` and `STEM-clearance.nrrd` the rest.
+        `STEM.nrrd` holds the kinds as labels, `STEM-cost.nrrd` and `STEM-clearance.nrrd` the rest,
+        `STEM-window.nrrd` the share of the breath.
 
         Raises
         ------
@@ -151,6 +169,7 @@ class ReachMap:
         """
         place = require_writable_folder(Path(folder))
         volumes = {"": self.kinds, "-cost": self.cost, "-clearance": self.clearance_mm}
+        volumes |= {} if self.window_share is None else {"-window": self.window_share}
         written = tuple(place / f"{stem}{end}.nrrd" for end in volumes)
         for path, volume in zip(written, volumes.values(), strict=True):
             write_volume(path, volume)
@@ -187,6 +206,7 @@ def map_reach(
     spacing_mm: float = DEFAULT_SPACING_MM,
     arcs: int = DEFAULT_ARCS,
     trees: int = 0,
+    phases: tuple[float, float] | None = None,
     atlas: Atlas | None = None,
     work: str | os.PathLike[str] | None = None,
     progress: Callable[[float], None] | None = None,
@@ -203,6 +223,9 @@ def map_reach(
         Side of the map's voxels.
     arcs, trees : int
         See `stages.needle.reach.ReachScan`.
+    phases : tuple of 2 floats, optional
+        Phases of the breath in all of which a voxel has to be reached, by single arcs; a voxel takes a
+        hundred times as long, so that a spacing of 10 mm is apt.
     atlas : Atlas, optional
         Made with `build_atlas` beforehand; made here if None.
     work : path, optional
@@ -229,9 +252,12 @@ def map_reach(
     began = time.perf_counter()
     if trees:
         system.require_needle("A search with random trees")
-    scan = reach_scan(made, arcs=arcs, trees=trees)
+    asked = None if phases is None else require_phases(*phases)
+    if asked is not None:
+        require_motion(lung)
+    scan = reach_scan(made, arcs=arcs, trees=trees, during=None if asked is None else (lung, asked))
     counted = counted_voxels(lung, grid, made.with_fissures)
-    store = None if work is None else LayerStore(Path(work), _key(made, spacing_mm, arcs, trees))
+    store = None if work is None else LayerStore(Path(work), _key(lung, made, spacing_mm, arcs, trees, asked))
     found, resumed = scan_layers(scan, grid, counted, store, progress)
     return ReachMap(
         patient_name=lung.name,
@@ -245,6 +271,8 @@ def map_reach(
         resumed_layers=resumed,
         scan_s=time.perf_counter() - began,
         atlas_s=made.build_s,
+        phases=asked,
+        window_share=None if asked is None else Volume(grid=grid, array=found[3]),
     )
 
 
@@ -255,6 +283,7 @@ def compare_reach(
     spacing_mm: float = DEFAULT_SPACING_MM,
     arcs: int = DEFAULT_ARCS,
     trees: int = 0,
+    phases: tuple[float, float] | None = None,
     work: str | os.PathLike[str] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[ReachMap, ...]:
@@ -262,7 +291,7 @@ def compare_reach(
 
     Parameters
     ----------
-    lung, spacing_mm, arcs, trees, work
+    lung, spacing_mm, arcs, trees, phases, work
         See `map_reach`.
     progress : callable, optional
         Told the name of the system and the share of its layers done.
@@ -276,16 +305,29 @@ def compare_reach(
                 progress(name, share)
 
         maps.append(
-            map_reach(lung, system, spacing_mm=spacing_mm, arcs=arcs, trees=trees, work=work, progress=tell)
+            map_reach(
+                lung,
+                system,
+                spacing_mm=spacing_mm,
+                arcs=arcs,
+                trees=trees,
+                phases=phases,
+                work=work,
+                progress=tell,
+            )
         )
     return tuple(maps)
 
 
-def _key(atlas: Atlas, spacing_mm: float, arcs: int, trees: int) -> str:
+def _key(
+    lung: Lung, atlas: Atlas, spacing_mm: float, arcs: int, trees: int, phases: tuple[float, float] | None
+) -> str:
     """Return a hash of everything that a map depends on."""
     digest = hashlib.sha256(FORMAT)
     digest.update(f"{atlas.lung.key} {system_fingerprint(atlas.system)} {atlas.with_fissures}".encode())
     digest.update(f"{spacing_mm!r} {arcs} {trees}".encode())
+    if phases is not None:
+        digest.update(f"{phases!r} {require_motion(lung).key}".encode())
     entries = atlas.deployments
     for array in (entries.positions, entries.tangents, entries.branch):
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.report.clock import window_png
     from lungaccess.report.cost_points import CostPoint, cost_over_time_csv
     from lungaccess.report.motion import motion_png
     from lungaccess.report.needle import needle_png

@@ -206,3 +206,18 @@ def target_mark(axes: Axes, uv: Float, order: int = 12) -> None:
         uv[0], uv[1], marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2.0, zorder=order,
         path_effects=halo(3.5), ls="none",
     )  # fmt: skip
+
+
+def aim_mark(axes: Axes, uv: Float, order: int = 13) -> None:
+    """Mark where devices end that were planned for a moving target."""
+    axes.plot(
+        uv[0],
+        uv[1],
+        marker="x",
+        ms=7,
+        mec=style.AIM,
+        mew=2.0,
+        zorder=order,
+        path_effects=halo(3.5),
+        ls="none",
+    )

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from anatomy.organ import Organ
 
 
-PROJECTIONS_VERSION = 1
+PROJECTIONS_VERSION = 2
 SEEN_THROUGH = ("lung", "fissure", "vessel", "airway", "lumen", "nodule")
 """The masks that pictures show from a standard view, or count."""
 LUNG_POINTS = 3_000_000

@@ -7,7 +7,6 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -59,7 +58,7 @@ def overview_png(
     panels.clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
     panels.text_panel(style.panel(figure, TEXT_IN), plan, lung, appraisal)
     _heading(figure, plan, appraisal)
-    _legend(figure, layers, with_needle=plan.needle is not None)
+    _legend(figure, layers, plan)
     return style.save_png(figure, path)
 
 
@@ -71,7 +70,7 @@ def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
     drawing.fit_around(axes, frame, scope)
     _nodule(axes, layers, view)
     _stages(axes, plan, view, scope)
-    drawing.target_mark(axes, view.project(np.asarray(plan.target_lps)))
+    zoom.goal_marks(axes, plan, view)
     drawing.dress(axes, view, ticks=True)
     drawing.title(axes, view.name)
 
@@ -106,23 +105,26 @@ def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
     )
 
 
-def _legend(figure: Figure, layers: Layers, *, with_needle: bool) -> None:
+def _legend(figure: Figure, layers: Layers, plan: Plan) -> None:
+    entries = _legend_entries(layers, plan)
     figure.legend(
-        handles=_legend_entries(layers, with_needle), loc="lower left",
-        bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN), ncols=12, fontsize=9, frameon=False,
+        handles=entries, loc="lower left",
+        bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN), ncols=len(entries), fontsize=9, frameon=False,
         handlelength=1.8, columnspacing=1.3,
     )  # fmt: skip
 
 
-def _legend_entries(layers: Layers, with_needle: bool) -> list[Line2D | Patch]:
+def _legend_entries(layers: Layers, plan: Plan) -> list[Line2D | Patch]:
     entries: list[Line2D | Patch] = [
         Line2D([], [], color=style.SCOPE, lw=4, label="bronchoscope"),
         Line2D([], [], color=style.TUBE, lw=4, label="tubes"),
-        *([Line2D([], [], color=style.NEEDLE, lw=3, label="needle")] if with_needle else []),
+        *([Line2D([], [], color=style.NEEDLE, lw=3, label="needle")] if plan.needle is not None else []),
         Line2D([], [], color=style.INK, lw=0.9, ls=(0, (3, 2)), label="required clearance"),
         Line2D([], [], ls="none", marker="D", mfc="white", mec=style.INK, label="exit"),
         Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2, label="target"),
     ]
+    if plan.aim is not None:
+        entries.append(Line2D([], [], ls="none", marker="x", ms=7, mec=style.AIM, mew=2, label="aim"))
     if layers.has("nodule"):
         entries.append(Patch(color=style.NODULE, alpha=0.6, label="nodule"))
     entries.append(Patch(facecolor=style.LUMEN, edgecolor=style.AIRWAY, label="airway lumen"))

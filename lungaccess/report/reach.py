@@ -158,8 +158,7 @@ def _text(figure: Figure, reach: ReachMap) -> None:
     from lungaccess.reachability import KINDS
 
     system = reach.system
-    heading = f"What {system.name} reaches of {reach.patient_name}"
-    style.heading(figure, heading, size=15)
+    style.heading(figure, reach.words, size=15)
     total = reach.total
     figure.legend(
         handles=[

@@ -81,8 +81,15 @@ def _cut_panel(
     drawing.fit(axes, uv.min(axis=0) - margin_mm, uv.max(axis=0) + margin_mm)
     paint_cut(axes, layers, view, through)
     draw_devices_true_to_width(axes, plan, view)
-    drawing.target_mark(axes, view.project(np.asarray(plan.target_lps)))
+    goal_marks(axes, plan, view)
     drawing.dress(axes, view, ticks=False)
+
+
+def goal_marks(axes: Axes, plan: Plan, view: View) -> None:
+    """Mark the target, and the aim of a plan that ends beside it because it moves."""
+    drawing.target_mark(axes, view.project(np.asarray(plan.target_lps)))
+    if plan.aim is not None:
+        drawing.aim_mark(axes, view.project(np.asarray(plan.aim.point_lps)))
 
 
 def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:

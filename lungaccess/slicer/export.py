@@ -16,8 +16,9 @@ from lungaccess.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurves
 from lungaccess.plans.plan import Plan
 from lungaccess.risk import proved_body, safe_start_region, tried_body
+from lungaccess.slicer.breathing import write_breathing
 from lungaccess.slicer.custusx import route_text
-from lungaccess.slicer.markups import TARGET_COLOUR, curve_markup, points_of_interest
+from lungaccess.slicer.markups import TARGET_COLOUR, aim_point, curve_markup, points_of_interest
 from lungaccess.slicer.models import device_surface, structure_surface, write_ply
 from lungaccess.slicer.readme import readme
 from lungaccess.slicer.scene import Item, scene
@@ -25,6 +26,7 @@ from lungaccess.slicer.segments import write_segmentation
 
 SCENE_FILE, README_FILE, ROUTE_FILE, PLAN_FILE = "scene.mrml", "README.txt", "route_custusx.txt", "plan.json"
 SEGMENTATION_FILE, TREE_FILE, POINTS_FILE = "anatomy.seg.nrrd", "airway_tree.vtp", "points.mrk.json"
+AIM_FILE = "aim.mrk.json"
 
 STRUCTURES: dict[str, tuple[tuple[float, float, float], float]] = {
     "lung": ((0.77, 0.64, 0.58), 0.12),
@@ -40,6 +42,9 @@ PROVED_COLOUR, TRIED_COLOUR = (0.0, 0.45, 0.7), (0.94, 0.89, 0.26)
 
 STEP_MM = 1.0
 """Spacing of the control points of tubes and needle: fine enough to measure, few enough to read."""
+
+BREATHING_SHARE = 0.9
+"""Of the work before it."""
 
 Progress = Callable[[str, float], None]
 
@@ -68,6 +73,8 @@ def export_slicer(
     plan: Plan, lung: Lung, folder: str | Path, *, progress: Progress | None = None
 ) -> Exported:
     """Write a plan and its patient into a folder that 3D Slicer opens by its `scene.mrml`.
+
+    If the patient breathes, `breathing.mrml` moves anatomy and devices with the phase.
 
     Everything is in LPS mm and says so; every file appears complete or not at all.  A plan that the
     independent check refuses is written too, and named so in the scene.
@@ -101,7 +108,9 @@ def export_slicer(
     write_text(target / SCENE_FILE, scene(items))
     write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
     plan.save(target / PLAN_FILE)
-    files = (SCENE_FILE, *(item.file for item in items), ROUTE_FILE, PLAN_FILE, README_FILE)
+    tell("breathing", BREATHING_SHARE)
+    moving = write_breathing(plan, lung, items, target) if lung.motion is not None else ()
+    files = (SCENE_FILE, *moving, *(item.file for item in items), ROUTE_FILE, PLAN_FILE, README_FILE)
     write_text(target / README_FILE, readme(plan, report, files, why_none))
     tell("done", 1.0)
     return Exported(files=files, report=report)
@@ -118,9 +127,13 @@ def _write_devices(plan: Plan, devices: DeviceCurves, folder: Path, *, refused: 
         name = f"{prefix}{curve.name}"
         items.append(Item(kind="MarkupsCurve", name=name, file=curve_file, colour=curve.colour))
         items.append(Item(kind="Model", name=f"{name} surface", file=model_file, colour=curve.colour))
-    _write_json(folder / POINTS_FILE, _named(points_of_interest(plan), prefix))
-    points = Item(kind="MarkupsFiducial", name=f"{prefix}points", file=POINTS_FILE, colour=TARGET_COLOUR)
-    return [*items, points]
+    fiducials = {"points": (POINTS_FILE, points_of_interest(plan))}
+    if plan.aim is not None:
+        fiducials["aim"] = (AIM_FILE, aim_point(plan.aim))
+    for name, (file, content) in fiducials.items():
+        _write_json(folder / file, _named(content, prefix))
+        items.append(Item(kind="MarkupsFiducial", name=f"{prefix}{name}", file=file, colour=TARGET_COLOUR))
+    return items
 
 
 def _write_start_region(plan: Plan, lung: Lung, folder: Path) -> tuple[list[Item], str]:

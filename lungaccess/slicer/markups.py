@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from anatomy.typed import Float
 from lungaccess.plans.curves import DeviceCurve
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.window import BreathingAim
 from stages.scope.advisor import MARKUPS_SCHEMA
 
 TARGET_COLOUR = (0.17, 0.63, 0.17)
@@ -37,13 +39,22 @@ def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
 
 def points_of_interest(plan: Plan) -> dict[str, Any]:
     """Return the content of a `.mrk.json` file: scope tip, exit through the wall and target, LPS mm."""
-    places = (
-        ("scope tip", plan.scope.lps_from_scope_tip[:3, 3]),
-        ("exit through the wall", plan.tube.exit.point_lps),
-        ("target", plan.target_lps),
-    )
-    points = [_point(number, name, place) for number, (name, place) in enumerate(places, start=1)]
-    return _file("Fiducial", "points", points, TARGET_COLOUR, labels=True, measurements=[])
+    places = {
+        "scope tip": plan.scope.lps_from_scope_tip[:3, 3],
+        "exit through the wall": plan.tube.exit.point_lps,
+        "target": plan.target_lps,
+    }
+    return _fiducials("points", places)
+
+
+def aim_point(aim: BreathingAim) -> dict[str, Any]:
+    """Return the content of a `.mrk.json` file: where devices end that were planned for a window, LPS mm."""
+    return _fiducials("aim", {"aim of the devices": aim.point_lps})
+
+
+def _fiducials(name: str, places: Mapping[str, Float]) -> dict[str, Any]:
+    points = [_point(number, label, place) for number, (label, place) in enumerate(places.items(), start=1)]
+    return _file("Fiducial", name, points, TARGET_COLOUR, labels=True, measurements=[])
 
 
 def _point(number: int, label: str, place: Float) -> dict[str, Any]:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import textwrap
+
 from lungaccess.checking import CheckReport
 from lungaccess.plans.plan import Plan
 
 _MEANING = {
     "scene.mrml": "drag this into 3D Slicer (5.0 or later): it loads everything below it",
+    "breathing.mrml": "the same for 3D Slicer (5.0 or later), moving with the breath: see BREATHING",
+    "breathing_tissue.seq.mrb": "how the lung is displaced in each phase",
+    "breathing_devices.seq.mrb": "how tubes and needle are carried in each phase",
     "scope.mrk.json": "the bronchoscope: curve, pose and radius at every point",
     "tubes.mrk.json": "the tubes beyond the scope: curve, pose and radius at every point",
     "needle.mrk.json": "the needle: curve, pose and radius at every point",
     "points.mrk.json": "scope tip, exit through the airway wall, target",
+    "aim.mrk.json": "where the devices end in the masks' phase, of a plan for a window of breathing",
     "scope.ply": "the bronchoscope, true to its radius",
     "tubes.ply": "the tubes, true to their radius",
     "needle.ply": "the needle, true to its radius",
@@ -52,9 +58,25 @@ def readme(plan: Plan, report: CheckReport, files: tuple[str, ...], no_region: s
         "POSES. The orientation of a control point holds a rotation row by row; its columns are the x, y and",
         "z axes of the device, and z points the way it moves.",
         "",
+        *_breathing(plan, files),
         "MODELS are for display: those of the anatomy are simplified. Measure on anatomy.seg.nrrd.",
         "",
         *(f"{name.ljust(width)}  {_MEANING.get(name, 'surface of ' + name.split('.')[0])}" for name in files),
         "",
     ]
     return "\n".join(lines)
+
+
+def _breathing(plan: Plan, files: tuple[str, ...]) -> tuple[str, ...]:
+    """Return how to see the breath, and the window of the plan."""
+    if "breathing.mrml" not in files:
+        return ()
+    window = plan.window
+    said = "The plan has no window: lungaccess window computes it." if window is None else window.words
+    return (
+        *textwrap.wrap(f"BREATHING. {said}", 104),
+        "Drag breathing.mrml into 3D Slicer instead of scene.mrml. The sequence browser in the toolbar",
+        "chooses the phase, or replays the breath. Anatomy, scope and points move with the tissue, tubes and",
+        "needle rigidly with the tip of the scope. The start region, of the masks' phase alone, stays.",
+        "",
+    )

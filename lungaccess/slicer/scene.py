@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Literal
 from xml.sax.saxutils import quoteattr
 
@@ -48,21 +49,27 @@ class Item:
     visible: bool = True
 
 
-def scene(items: Iterable[Item]) -> str:
-    """Return the text of a scene; each item has a node, its display and its storage, stated to be LPS."""
-    lines = ['<MRML version="Slicer5" userTags="">']
+def scene(
+    items: Iterable[Item], transforms: Mapping[str, str] = MappingProxyType({}), more: Sequence[str] = ()
+) -> str:
+    """Return the text of a scene; each item has a node, its display and its storage, stated to be LPS.
+
+    `transforms` names the node of the transform that moves an item, by its file; `more` are further elements.
+    """
+    lines = ['<MRML version="Slicer5" userTags="">', *more]
     for number, item in enumerate(items, start=1):
         display, storage = (f"vtkMRML{tags[item.kind]}Node{number}" for tags in (_DISPLAY, _STORAGE))
+        moved = f"transform:{transforms[item.file]};" if item.file in transforms else ""
         node = {
             "id": f"vtkMRML{item.kind}Node{number}",
             "name": item.name,
             "selectable": "true",
-            "references": f"display:{display};storage:{storage};",
+            "references": f"display:{display};storage:{storage};{moved}",
         }
         lines += [
-            _element(_DISPLAY[item.kind], {"id": display, **_look(item)}),
-            _element(_STORAGE[item.kind], {"id": storage, **_place(item)}),
-            _element(item.kind, node | _own(item)),
+            element(_DISPLAY[item.kind], {"id": display, **_look(item)}),
+            element(_STORAGE[item.kind], {"id": storage, **_place(item)}),
+            element(item.kind, node | _own(item)),
         ]
     return "\n".join([*lines, "</MRML>", ""])
 
@@ -99,6 +106,7 @@ def _own(item: Item) -> dict[str, str]:
     return {"curveType": "linear", "locked": "1"} if item.kind == "MarkupsCurve" else {}
 
 
-def _element(tag: str, attributes: dict[str, str]) -> str:
+def element(tag: str, attributes: Mapping[str, str]) -> str:
+    """Return an element of a scene without content."""
     words = " ".join(f"{key}={quoteattr(value)}" for key, value in attributes.items())
     return f" <{tag} {words}></{tag}>"

@@ -25,6 +25,7 @@ COUNT_WORKERS_EVERY_S = 5.0
 CONNECT_S = 20.0
 """A scheduler that does not answer for so long is taken to be absent."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
 DASK_CONFIG = {
     # Dask would warn whenever this process is busy with a patient.
     "distributed.admin.tick.limit": "1h",
@@ -96,7 +97,7 @@ def _interruptions_ignored() -> Iterator[None]:
 
 @contextlib.contextmanager
 def interruptions_noted() -> Iterator[Callable[[], None]]:
-    """Yield a function that raises KeyboardInterrupt if Ctrl-C was pressed in the meantime.
+    """Yield a function that raises KeyboardInterrupt if Ctrl-C was pressed, or SIGTERM came, in the meantime.
 
     Python drops exceptions that are raised while an object is being deleted, as dask's futures are all the
     time: such an interruption would be lost.
@@ -111,15 +112,17 @@ def interruptions_noted() -> Iterator[Callable[[], None]]:
         pressed.set()
         raise KeyboardInterrupt
 
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is not signal.default_int_handler:
+    if threading.current_thread() is not threading.main_thread():
         yield stop_if_interrupted
         return
-    signal.signal(signal.SIGINT, note)
+    ours = [each for each in INTERRUPTIONS if signal.getsignal(each) is signal.default_int_handler]
+    for each in ours:
+        signal.signal(each, note)
     try:
         yield stop_if_interrupted
     finally:
-        signal.signal(signal.SIGINT, before)
+        for each in ours:
+            signal.signal(each, signal.default_int_handler)
 
 
 class Backlog:

@@ -7,6 +7,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+from anatomy.io.files import DAMAGE
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.tables import QUERIES, TIMES, table
 
@@ -48,12 +49,13 @@ def differences(first: Path, second: Path) -> list[str]:
 
 
 def _plain(column: str, value: Any) -> Any:
-    """Return a value without the times in it."""
+    """Return a value without the times in it; a plan that is damaged, as its text."""
     if column != "plan":
         return value
-    content = json.loads(value)
-    content.pop("timing", None)
-    return content
+    try:
+        return {key: part for key, part in json.loads(value).items() if key != "timing"}
+    except DAMAGE:
+        return value
 
 
 def _short(row: tuple[Any, ...]) -> str:

@@ -18,6 +18,8 @@ def file_errors(path: Path) -> Iterator[None]:
     """Turn what SQLite raises into a FileError that says what to do."""
     try:
         yield
+    except UnicodeDecodeError as error:
+        raise damaged(path, str(error)) from error
     except sqlite3.Error as error:
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         if code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):

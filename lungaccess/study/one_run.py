@@ -20,6 +20,7 @@ import numba
 import numpy as np
 import psutil
 
+from anatomy.child_process import end_with_parent
 from anatomy.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
 from lungaccess.checking import Checker
@@ -226,6 +227,7 @@ def _in_own_process(run: Run, cache: Path | None) -> Answer:
 
 def main(words: list[str]) -> int:
     """Make the run on standard input; an error goes to standard error."""
+    end_with_parent()
     try:
         made = _here(Run.from_json(sys.stdin.read()), Path(words[0]) if words else None)
     except LungaccessError as error:

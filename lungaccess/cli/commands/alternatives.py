@@ -9,19 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative
 from lungaccess.cli.options import (
     SUCCESS,
+    WINDOW,
     ErrorOptions,
     ObjectiveText,
     PatientFolder,
     PatientOptions,
+    PhasesText,
     SystemOptions,
     TargetOptions,
     require_map,
+    stated_phases,
 )
 from lungaccess.cli.plan_search import system_of
 from lungaccess.cli.progress import progress
@@ -34,7 +38,10 @@ if TYPE_CHECKING:
     from lungaccess.problem.system import System
 
 PICTURE = "trade_off.svg"
-COLUMNS = ("plan", "succeeds", "branch", "gen.", "clear", "pleura", "tissue", "1/clear", "map", "front")
+COLUMNS = (
+    *("plan", "succeeds", "window", "branch", "gen."),
+    *("clear", "pleura", "tissue", "1/clear", "map", "front"),
+)
 NOTE = (
     "succeeds: of 100; gen.: generation of the scope's tip; clear, pleura: least distance of tubes and "
     "needle from any obstacle and from the pleura, mm, as the plan states it; tissue: way in tissue, mm; "
@@ -42,6 +49,7 @@ NOTE = (
     "and as good in the others.  The plan that succeeds most often of several owes part of it to luck, which "
     "its interval does not count"
 )
+WINDOW_NOTE = "window: share of the breath in which the plan is proved, %; the front counts it, too"
 
 
 def alternatives(
@@ -56,8 +64,12 @@ def alternatives(
     ] = 5.0,
     objective: Annotated[
         ObjectiveText,
-        Parameter(help="By what the best come first, as for `plan`; success: the likeliest to succeed."),
+        Parameter(
+            help="By what the best come first, as for `plan`; success: the likeliest to succeed; window: as "
+            "default, with aims for the widest window."
+        ),
     ] = DEFAULT,
+    phases: PhasesText = None,
     errors: ErrorOptions = ErrorOptions(),
     out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on, and trade_off.svg.")] = Path(
         "lungaccess-alternatives"
@@ -75,8 +87,12 @@ def alternatives(
     from lungaccess.report.html import trade_off_svg
     from lungaccess.success import alternatives_for_success
 
-    for_success = objective == SUCCESS
-    objective = DEFAULT if for_success else objective
+    for_success, widest, asked = objective == SUCCESS, objective == WINDOW, stated_phases(phases)
+    if for_success and asked is not None:
+        raise SettingsError(
+            "--phases is asked for with --objective success", expected="one of them", remedy="Leave one out"
+        )
+    objective = DEFAULT if for_success or widest else objective
     Objective.of(objective)
     stated = target.stated()
     model, procedure = errors.load(), errors.given_procedure()
@@ -98,7 +114,9 @@ def alternatives(
                 return alternatives_for_success(
                     lung, device, aim, errors=model, procedure=procedure, progress=shown.share, **shared
                 )
-            return find_alternatives(lung, device, aim, objective=objective, **shared)
+            return find_alternatives(
+                lung, device, aim, objective=objective, phases=asked, widest=widest, **shared
+            )
 
     found = search(systems[0]) if len(systems) == 1 else _of_the_least_invasive(lung, systems, search)
     chosen = system_of(found[0].plan, systems)
@@ -157,13 +175,16 @@ def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal
     terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")
     show_headline(appraisals[best].headline)
     has_map = lung.cost is not None
-    columns = [name for name in COLUMNS if has_map or name != "map"]
+    has_window = lung.motion is not None
+    columns = [name for name in COLUMNS if (has_map or name != "map") and (has_window or name != "window")]
     rows = [
         _row(number, each, appraisal, has_map)
         for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True), start=1)
     ]
     terminal.show([terminal.table(f"Plans to the target in {lung.name}", columns, rows)])
     terminal.say(NOTE)
+    if has_window:
+        terminal.say(WINDOW_NOTE)
 
 
 def _success(appraisal: Appraisal) -> float:
@@ -198,6 +219,7 @@ def _row(number: int, each: Alternative, appraisal: Appraisal, has_map: bool) ->
     return (
         f"{number:02d}",
         "refused" if success is None else of_hundred(success.value),
+        *([] if each.plan.window is None else [f"{100.0 * each.plan.window.share:.0f}"]),
         str(each.plan.tube.exit.branch),
         str(each.plan.scope.generation),
         f"{each.criteria['clearance_mm']:.2f}",

@@ -16,6 +16,7 @@ from lungaccess.cli.numbers import NotNegative
 from lungaccess.cli.options import (
     AUTO,
     SUCCESS,
+    WINDOW,
     ErrorOptions,
     PatientFolder,
     PatientOptions,
@@ -23,6 +24,7 @@ from lungaccess.cli.options import (
     SystemOptions,
     TargetOptions,
     require_map,
+    stated_phases,
 )
 from lungaccess.cli.plan_search import PlanRequest, plan_and_report
 from stages.needle import Objective
@@ -55,14 +57,24 @@ def plan(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
+    from lungaccess.breathing.window import require_motion
     from lungaccess.cli.no_plan_output import explain_and_report
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
 
-    for_success = search.objective == SUCCESS
-    if for_success:
-        _require_plain(search, system)
+    for_success, widest = search.objective == SUCCESS, search.objective == WINDOW
+    phases = stated_phases(search.phases)
+    if for_success or widest:
+        _require_plain(f"--objective {search.objective}", search, system)
         search = replace(search, objective=SearchOptions().objective)
+    if phases is not None:
+        _require_plain("--phases", search, system)
+    if phases is not None and for_success:
+        raise SettingsError(
+            "--phases is asked for with --objective success",
+            expected="a cost, or the widest window that holds the phases",
+            remedy="Choose --objective window, or leave one of them out",
+        )
     Objective.of(search.objective)
     stated = target.stated()
     model, procedure = errors.load(), errors.given_procedure()
@@ -70,14 +82,16 @@ def plan(
     systems = system.candidates()
     lung = output.load(patient, thick_slices=thick_slices)
     require_map(lung, search.objective)
+    if widest or phases is not None:
+        require_motion(lung)
     request = PlanRequest(
         systems=systems, target=stated, search=search, errors=model, out=out, output=output,
-        pictures=pictures, procedure=procedure, for_success=for_success,
+        pictures=pictures, procedure=procedure, for_success=for_success, phases=phases, widest=widest,
     )  # fmt: skip
     try:
         return plan_and_report(lung, request)
     except NoPlan as failure:
-        if explain_time != 0.0:
+        if explain_time != 0.0 and not (widest or phases):
             record = explain_and_report(lung, request, failure, explain_time)
         elif output.json:
             record = no_plan_record(failure)
@@ -88,18 +102,18 @@ def plan(
         return ExitCode.NEGATIVE
 
 
-def _require_plain(search: SearchOptions, system: SystemOptions) -> None:
-    """Raise SettingsError unless the search is one that can be made for the chance of success."""
+def _require_plain(asked: str, search: SearchOptions, system: SystemOptions) -> None:
+    """Raise SettingsError unless the search is one that can be made for success or a window."""
     plain = SearchOptions()
     if (search.method, search.needle_planner, search.processes) != (plain.method, None, plain.processes):
         raise SettingsError(
-            f"--objective {SUCCESS} is asked for with another search",
+            f"{asked} is asked for with another search",
             expected="neither --method nor --needle-planner nor --processes",
             remedy="Leave them out",
         )
     if system.system == AUTO:
         raise SettingsError(
-            f"--objective {SUCCESS} is asked for with --system {AUTO}",
+            f"{asked} is asked for with --system {AUTO}",
             expected="one system",
             remedy="Name a system; `lungaccess presets` lists them",
         )

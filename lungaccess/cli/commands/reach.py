@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, Spacing
-from lungaccess.cli.options import PatientFolder, PatientOptions, SystemOptions
+from lungaccess.cli.options import PatientFolder, PatientOptions, PhasesText, SystemOptions, stated_phases
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def reach(
     compare: Annotated[
         str | None, Parameter(help="Further presets or TOML files to compare with, separated by commas.")
     ] = None,
+    phases: PhasesText = None,
     out: Annotated[Path, Parameter(help="Folder for the volumes, the pictures and reach.json.")] = Path(
         "lungaccess-reach"
     ),
@@ -53,13 +55,18 @@ def reach(
 
     names = [system.system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
     systems = [load_system(name, fissures_allowed=system.allow_fissures) for name in dict.fromkeys(names)]
+    asked = stated_phases(phases)
+    if asked is not None and search:
+        raise SettingsError(
+            "--search is asked for with --phases", expected="single arcs only", remedy="Leave out --search"
+        )
     folder = require_writable_folder(out)
     if page is not None:
         require_writable_folder(page.parent)
     lung = output.load(patient)
     with progress("scanning") as shown:
         maps = compare_reach(
-            lung, systems, spacing_mm=spacing, trees=search, work=folder, progress=shown.step
+            lung, systems, spacing_mm=spacing, trees=search, phases=asked, work=folder, progress=shown.step
         )
     stems = _stems(maps)
     for stem, each in zip(stems, maps, strict=True):
@@ -77,7 +84,8 @@ def reach(
     terminal.show([_region_table(each) for each in maps])
     if len(maps) > 1:
         terminal.show([_comparison_table(maps)])
-    files = ", ".join(f"{stem}.nrrd, {stem}-cost.nrrd, {stem}-clearance.nrrd, {stem}.png" for stem in stems)
+    ends = (".nrrd", "-cost.nrrd", "-clearance.nrrd", *(("-window.nrrd",) if asked else ()), ".png")
+    files = ", ".join(f"{stem}{end}" for stem in stems for end in ends)
     also = "" if page is None else f"; {page}"
     terminal.say(f"Written to {out}: {files}, reach.json{also}")
     return ExitCode.OK
@@ -105,6 +113,7 @@ def record(reach: ReachMap) -> dict[str, object]:
         "deployments": reach.entries,
         "lungs_are_separate": reach.regions.lungs_are_separate,
         "regions": [_plain(row) for row in reach.by_region()],
+        "phases": None if reach.phases is None else list(reach.phases),
         "resumed_layers": reach.resumed_layers,
         "timing": {"scan_s": reach.scan_s, "atlas_s": reach.atlas_s},
     }
@@ -136,7 +145,8 @@ def _region_table(reach: ReachMap) -> Table:
         for row in reach.by_region()
     ]
     headings = ("", "mL", *(f"{name}, %" for name in KINDS), "median cost", "median clearance, mm")
-    return terminal.table(f"{reach.system.name} in {reach.patient_name}", headings, rows)
+    during = "" if reach.phases is None else ", phases {:g} to {:g}".format(*reach.phases)
+    return terminal.table(f"{reach.system.name} in {reach.patient_name}{during}", headings, rows)
 
 
 def _comparison_table(maps: tuple[ReachMap, ...]) -> Table:

@@ -96,7 +96,11 @@ def report(
 
 
 def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple[Plan, ...]:
-    """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it."""
+    """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it.
+
+    Of a patient that breathes they have their windows.
+    """
+    from lungaccess.breathing.window import with_window
     from lungaccess.coupled import alternatives as find
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import Target
@@ -107,4 +111,4 @@ def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple
         found = find(lung, plan.system, target, objective=plan.objective, count=count, atlas=atlas)
     except NoPlan:
         return ()
-    return tuple(each.plan for each in found)
+    return tuple(with_window(each.plan, lung) for each in found)

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from anatomy.io.files import require_writable_folder, write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import NotNegative, Positive
+from lungaccess.cli.numbers import CountOrNone, NotNegative, Positive
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
 
@@ -34,8 +34,13 @@ def tour(
     ] = DEFAULT_SYSTEM,
     require_plan: Annotated[
         bool,
-        Parameter(help="Count an exit only if a coupled plan of scope, tubes and needle from there exists."),
+        Parameter(
+            help="Count an exit only if a coupled plan of scope, tubes and needle from there was found."
+        ),
     ] = True,
+    iterations: Annotated[
+        CountOrNone, Parameter(help="Of the planner, for a lesion that no direct arc of the needle reaches.")
+    ] = 100,
     closed: Annotated[
         bool, Parameter(help="Return to the root of the airway after the last lesion.")
     ] = False,
@@ -84,6 +89,7 @@ def tour(
             closed=closed,
             tissue_weight=tissue_weight,
             atlas=atlas,
+            iterations=iterations,
         )
     write_json(out / "tour.json", tour_record(answer))
     tour_png(answer, lung, out / "tour.png")

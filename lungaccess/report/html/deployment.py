@@ -49,6 +49,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
         "name": name,
         "digest": plan.digest,
         "target_lps": plan.target_lps.tolist(),
+        **({} if plan.aim is None else {"aim_lps": plan.aim.point_lps.tolist()}),
         "radius_mm": {
             "scope": plan.system.scope.radius_mm,
             "outer": plan.system.tubes.outermost.radius_mm,
@@ -166,16 +167,10 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     `CAP_MM`; for "airway" the pierced branch is passed over as long as it is exempt, and up to the exit
     there is only `NOT_MEASURED`.  "margin_mm" is the least of them against "required_mm" on the needle.
     """
-    (_scope, tube, needle), device = plan.curves(), plan.system.needle
-    start = float(tube.arc_length_mm[-1])
-    points = np.concatenate([tube.points_lps, needle.points_lps[1:]])
-    along = np.concatenate([tube.arc_length_mm, start + needle.arc_length_mm[1:]])
+    device, (points, along, start) = plan.system.needle, profile_points(plan)
     clearances = _clearances(plan, lung, points, along <= start + plan.exemption.needle_length_mm)
     clearances["airway"][along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
-    needed, beside_mm = plan.required_clearance_mm, plan.tube.clearance_loss_mm
-    tubes = plan.system.tubes
-    of_tube = tube_radii(plan.tube, tubes, along) + plan.system.margins.total_mm + beside_mm
-    required = np.where(along <= start, of_tube, needed.get("needle", 0.0))
+    required = required_mm(plan, along, start)
     limited = [v for k, v in clearances.items() if k != "fissure" or plan.fissures_are_obstacles]
     margin = np.min(limited, axis=0) - required
     return {
@@ -187,11 +182,30 @@ def profile(plan: Plan, lung: Lung) -> Packed:
         "cap_mm": CAP_MM,
         "clearance_mm": {name: pack(values, "f4") for name, values in clearances.items()},
         "required_mm": pack(required, "f4"),
-        "margin_mm": pack(margin[-len(needle.arc_length_mm) :], "f4"),
+        "margin_mm": pack(margin[-len(plan.curves().needle.arc_length_mm) :], "f4"),
         "curvature_per_mm": pack(_curvature(plan, along), "f4"),
         "most_curvature_per_mm": 0.0 if device is None else device.max_curvature_per_mm,
         **_cost_so_far(plan, lung),
     }
+
+
+def profile_points(plan: Plan) -> tuple[Float, Float, float]:
+    """Return points `(N, 3)`, LPS mm, of tubes and needle, their lengths, and where the needle begins.
+
+    Lengths in mm `(N,)` count from the tip of the scope.
+    """
+    _scope, tube, needle = plan.curves()
+    start = float(tube.arc_length_mm[-1])
+    points = np.concatenate([tube.points_lps, needle.points_lps[1:]])
+    return points, np.concatenate([tube.arc_length_mm, start + needle.arc_length_mm[1:]]), start
+
+
+def required_mm(plan: Plan, along: Float, start: float) -> Float:
+    """Return the clearance in mm `(N,)` that the axis needs at points of `profile_points`."""
+    tubes = plan.system.tubes
+    extra = plan.system.margins.total_mm + plan.tube.clearance_loss_mm
+    of_tube = tube_radii(plan.tube, tubes, along) + extra
+    return np.where(along <= start, of_tube, plan.required_clearance_mm.get("needle", 0.0))
 
 
 def _clearances(plan: Plan, lung: Lung, points: Float, exempt: Bool) -> dict[str, Float]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.needle import StartRegion
 
 
-SURFACES_VERSION = 1
+SURFACES_VERSION = 2
 STEPS = 65535
 SMOOTHINGS = 6
 SHRINK, GROW = 0.5, -0.53

@@ -17,7 +17,7 @@ from lungaccess.appraisal import Appraiser
 from lungaccess.coupled import with_front
 from lungaccess.plans.chance import Chance
 from lungaccess.procedure import load_procedure, procedure_names
-from lungaccess.report.html import tables, words
+from lungaccess.report.html import breathing, phase, tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
 from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, write_page
 from lungaccess.report.html.meshes import start_meshes, structure_meshes
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from lungaccess.risk import ErrorModel
     from stages.needle import StartRegion
 
-MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "plan.js")
+MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "breath.js", "plan.js")
 NO_REGION = "No safe start region"
 THICKER = "; seen from afar, devices are drawn thicker than they are"
 
@@ -101,11 +101,16 @@ def plan_page(
     first = appraisals[0]
     region = start_region_of(plan, lung) if first.accepted else "Not computed for a refused plan"
     drawn, told = (None, region) if isinstance(region, str) else (region, region.words)
+    window = breathing.shown_window(plan, lung)
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
         "headline": words.headline(first.headline),
+        "breathing": phase.window_headline(plan, lung, first.accepted),
+        "phase_player": phase.player(window, first.accepted),
+        "phase_chart": phase.chart(window),
+        "phase_slices": phase.slices_note(window),
         "limits": tables.limits_section(first),
-        "summary": _summary(plan),
+        "summary": summary(plan),
         "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),
         "image_source": words.text(image_source(lung, chosen.ct_name if chosen.ct is not None else "")),
         "made_small": words.text(made_small(plan).capitalize()),
@@ -182,6 +187,7 @@ def page_data(
         **page_image(lung, near, options.ct),
         "cost_over_time": cost_history(options.cost_over_time),
         "made_small": made_small(plans[0]),
+        **breathing.packed_breath(plans, lung),
     }
 
 
@@ -206,7 +212,8 @@ def cost_history(path: Path | None) -> list[list[float]]:
     return [[float(row["elapsed_s"]), float(row["best_cost"])] for row in rows if row.get("best_cost")]
 
 
-def _summary(plan: Plan) -> str:
+def summary(plan: Plan) -> str:
+    """Return system, scope, tubes, needle and target of a plan in words."""
     x, y, z = (float(c) for c in plan.target_lps)
     needle = plan.needle
     of_needle = "no needle: the tip of the tubes is at the target"
@@ -216,7 +223,19 @@ def _summary(plan: Plan) -> str:
         f"{plan.system.name}; scope to generation {plan.scope.generation}, "
         f"{plan.scope.length_from_carina_mm:.0f} mm beyond the carina; {plan.insertions}; "
         f"{of_needle}; target at LPS "
-        f"{x:.1f}, {y:.1f}, {z:.1f} mm"
+        f"{x:.1f}, {y:.1f}, {z:.1f} mm{_aim_words(plan)}"
     )
     # Why this system, if it was chosen among several: the last sentence of its choice.
     return words.text(". ".join((facts, *plan.system_choice[-1:])))
+
+
+def _aim_words(plan: Plan) -> str:
+    """Say where the devices end that were planned for a window; "" if they end at the target."""
+    if plan.aim is None:
+        return ""
+    x, y, z = (float(c) for c in plan.aim.point_lps)
+    beside = float(np.linalg.norm(plan.aim.point_lps - plan.target_lps))
+    return (
+        f", which moves: in the phase of the masks the devices end {beside:.1f} mm beside it, at their aim, "
+        f"LPS {x:.1f}, {y:.1f}, {z:.1f} mm"
+    )

@@ -116,7 +116,7 @@ def _value(finding: Finding) -> str:
 
 def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal]) -> str:
     """Return a table that compares plans, each with its chance of success; those on the front are marked."""
-    rows = []
+    rows, breathe = [], any(each.plan.window is not None for each in found)
     for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True)):
         headline, tightest, plan = appraisal.headline, appraisal.limits[:1], each.plan
         rows.append(
@@ -132,6 +132,7 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
                 words.text(plan.tube.exit.branch),
                 words.text(plan.scope.generation),
                 words.number(plan.costs["inverse_clearance"], 4),
+                *([] if not breathe else [_window(plan)]),
             )
         )
     headings = (
@@ -139,7 +140,12 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
         "check", "nearest limit", "branch pierced", "generation of the scope's tip",
         "integral of 1/clearance",
     )  # fmt: skip
-    return words.table("Plans to this target", headings, rows)
+    more = ("share of the breath in the window",) if breathe else ()
+    return words.table("Plans to this target", (*headings, *more), rows)
+
+
+def _window(plan: Plan) -> str:
+    return "not computed" if plan.window is None else f"{100.0 * plan.window.share:.0f} %"
 
 
 def plan_name(number: int) -> str:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 CODES = {"outside": 0, "lung": 1, "airway wall": 2, "lumen": 3, "vessel": 4, "fissure": 5, "nodule": 6}
-LABELS_VERSION = 1
+LABELS_VERSION = 2
 COARSE_VOXELS, FINE_VOXELS = 3_000_000, 3_000_000
 """Voxels at most of the coarse and the fine volume, so that the page stays small."""
 LEAST_COARSE_MM = 1.5
@@ -177,8 +177,7 @@ def resampled(volume: Volume, grid: Grid, order: int, beyond: float) -> Array:
 def _ct_bytes(ct: Volume, grid: Grid) -> UInt8:
     from scipy.ndimage import uniform_filter
 
-    corners = grid.lps(np.stack(np.meshgrid(*[(0, n - 1) for n in grid.shape]), axis=-1).reshape(-1, 3))
-    places = np.rint(ct.grid.ijk(corners)).astype(np.int64)
+    places = np.rint(ct.grid.ijk(grid.corners_lps)).astype(np.int64)
     size = np.maximum(np.floor(grid.spacing_mm.mean() / ct.grid.spacing_mm + 0.3), 1).astype(int)
     start = np.clip(places.min(axis=0) - 4, 0, np.array(ct.grid.shape) - 1)
     stop = np.clip(places.max(axis=0) + 5, start + 1, ct.grid.shape)

@@ -13,6 +13,7 @@ export class AnatomyPage {
     this.structures = shownFirst
       ? data.structures.map((packed) => ({ ...packed, shown: shownFirst.includes(packed.key) }))
       : data.structures;
+    this.breath = null;
     this.redraw = oncePerFrame(() => this.draw());
   }
 
@@ -27,7 +28,7 @@ export class AnatomyPage {
       return false;
     }
     // One after the other: the order in which surfaces are added is that in which they are drawn.
-    for (const packed of this.structures) await this.scene.addSurface(packed);
+    for (const packed of this.structures) await this.scene.addSurface(packed, this.breath);
     const box = this.structures.find(({ key }) => key === "lung") || this.structures[0];
     const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
     this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redraw);
@@ -91,5 +92,11 @@ export function openPage(page) {
       page.moveTo(place);
       page.redraw.now();
     },
+    ...(page.data.breath && {
+      breathe: (phase) => {
+        page.breathe(phase);
+        page.redraw.now();
+      },
+    }),
   };
 }

@@ -40,8 +40,8 @@ export class Motion {
     return this.ends.needle > 0;
   }
 
-  // Return everything at a place of the slider, 0 to 1.
-  at(position) {
+  // Return everything at a place of the slider, 0 to 1; the needle is coloured by what it has to spare.
+  at(position, margin = this.margin) {
     const { starts, ends } = this;
     const share = STAGES.map((_, n) => clamp((position - starts[n]) / Math.max(starts[n + 1] - starts[n], 1e-9)));
     let stage = STAGES.length - 1;
@@ -56,7 +56,7 @@ export class Motion {
     state.camera = this.camera(moved);
     [state.outer, state.middle, state.inner] = share[0] < 1 ? [[], [], []] : this.tube(innerMm);
     state.needle = needleMm > 0 ? cut(this.needle, this.needleMm, needleMm) : [];
-    state.needleColours = state.needle.map((_, n) => marginColour(this.margin[Math.min(n, this.margin.length - 1)]));
+    state.needleColours = state.needle.map((_, n) => marginColour(margin[Math.min(n, margin.length - 1)]));
     const line = [state.needle, state.inner, state.middle, state.outer].find((points) => points.length > 1);
     state.tip = line ? line[line.length - 1] : state.scope[state.scope.length - 1];
     state.direction = line ? unit(minus(line[line.length - 1], line[line.length - 2])) : state.camera.forward;

@@ -1,5 +1,6 @@
 // The page of a plan.
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
+import { Breath } from "./breath.js";
 import { Bronchoscopy } from "./bronchoscopy.js";
 import { lineChart } from "./charts.js";
 import { reportData, unpack } from "./decode.js";
@@ -14,6 +15,7 @@ const DEVICES = [
   { key: "tubes", name: "Tubes", colour: "#E69F00", shown: true },
   { key: "needle", name: "Needle, coloured by clearance", colour: "linear-gradient(90deg, #D81B60, #56B4E9)", shown: true },
   { key: "target", name: "Target", colour: "#39E0B0", shown: true },
+  { key: "aim", name: "Aim of the devices, beside the moving target", colour: "#FFD23F", shown: true },
 ];
 const OUTER = "#E69F00", MIDDLE = "#EDB42E", INNER = "#F4C95D", OTHER = "#8A8F98", NEEDLE_INK = "#D81B60";
 const CHART = {
@@ -21,8 +23,9 @@ const CHART = {
   pleura: ["pleura", "#B8860B", "3 4"], fissure: ["fissure", "#785EF0", "12 4 3 4"],
 };
 const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
-const PLAY_S = 14;
+const PLAY_S = 14, BREATH_S = 5, MOST_STEP_S = 0.25;
 const LEAST_WIDTH = 0.0016;
+const TARGET_MM = 1.6, TARGET = "#39E0B0", AIM_MM = 1.1, AIM = "#FFD23F";
 
 class PlanPage extends AnatomyPage {
   constructor(data) {
@@ -31,9 +34,16 @@ class PlanPage extends AnatomyPage {
     this.shown = Object.fromEntries(DEVICES.map(({ key, shown }) => [key, shown]));
     this.cursors = [];
     this.playing = null;
+    this.breathing = null;
+    this.phase = 0;
+    this.exhaling = false;
   }
 
   async open() {
+    if (this.data.breath) {
+      this.breath = await Breath.of(this.data.breath);
+      this.phase = this.breath.masksPhase;
+    }
     this.motions = await Promise.all(this.data.plans.map((plan) => Motion.of(plan)));
     this.shownPlans = this.motions.map((_, n) => n === 0);
     this.followed = 0;
@@ -41,6 +51,7 @@ class PlanPage extends AnatomyPage {
     this.connectControls();
     if (await this.openScene(distanceOfAll)) this.addTarget();
     this.image = await VoxelImage.of(this.data);
+    this.image.breath = this.breath;
     this.openSlices([...Object.keys(STANDARD), "across"]);
     byId("ct-controls").hidden = !this.image.hasCt;
     await this.drawCharts();
@@ -55,14 +66,14 @@ class PlanPage extends AnatomyPage {
     const target = this.data.plans[0].target_lps;
     byId("view-target").addEventListener("click", () => this.orbit.approach(target, 170));
     this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"));
-    this.targetBall = new Solids();
-    this.targetBall.ball(target, 1.6, rgb("#39E0B0"));
   }
 
   listSwitches() {
     const hasNeedle = this.motions.some((motion) => motion.hasNeedle);
     for (const element of document.querySelectorAll("[data-needle]")) element.hidden = !hasNeedle;
-    for (const device of DEVICES.filter(({ key }) => key !== "needle" || hasNeedle)) {
+    const hasAim = this.data.plans.some((plan) => plan.aim_lps);
+    const present = { needle: hasNeedle, aim: hasAim };
+    for (const device of DEVICES.filter(({ key }) => present[key] !== false)) {
       addSwitch(byId("devices"), device, (on) => {
         this.shown[device.key] = on;
         this.redraw();
@@ -97,7 +108,43 @@ class PlanPage extends AnatomyPage {
         this.moveTo(this.motion.starts[Number(button.dataset.stage)]);
       });
     }
+    if (this.breath) this.connectBreath();
     for (const id of ["field", "window", "tint"]) byId(id).addEventListener("change", () => this.redraw());
+  }
+
+  connectBreath() {
+    byId("phase").addEventListener("input", () => {
+      this.holdBreath();
+      this.breathe(Number(byId("phase").value) / 1000);
+      this.redraw();
+    });
+    byId("breathe").addEventListener("click", () => (this.breathing === null ? this.breatheOn() : this.holdBreath()));
+  }
+
+  // Show a phase of the breath.
+  breathe(phase, exhaling = false) {
+    this.phase = phase;
+    this.exhaling = exhaling;
+    byId("phase").value = Math.round(1000 * phase);
+  }
+
+  breatheOn() {
+    let angle = this.exhaling ? 2 * Math.PI - Math.acos(1 - 2 * this.phase) : Math.acos(1 - 2 * this.phase);
+    const step = paced((seconds) => {
+      if (this.breathing === null) return;
+      angle += (2 * Math.PI * seconds) / BREATH_S;
+      this.breathe((1 - Math.cos(angle)) / 2, Math.sin(angle) < 0);
+      this.draw();
+      this.breathing = requestAnimationFrame(step);
+    });
+    byId("breathe").textContent = "Hold";
+    this.breathing = requestAnimationFrame(step);
+  }
+
+  holdBreath() {
+    if (this.breathing !== null) cancelAnimationFrame(this.breathing);
+    this.breathing = null;
+    byId("breathe").textContent = "Breathe";
   }
 
   moveTo(position) {
@@ -106,15 +153,15 @@ class PlanPage extends AnatomyPage {
   }
 
   play() {
-    const from = Number(this.slider.value) >= 1000 ? 0 : Number(this.slider.value) / 1000;
-    const began = performance.now();
-    const step = (now) => {
-      const position = Math.min(from + (now - began) / (1000 * PLAY_S), 1);
+    let position = Number(this.slider.value) >= 1000 ? 0 : Number(this.slider.value) / 1000;
+    const step = paced((seconds) => {
+      if (this.playing === null) return;
+      position = Math.min(position + seconds / PLAY_S, 1);
       this.slider.value = 1000 * position;
       this.draw();
       if (position >= 1) this.stop();
-      else if (this.playing !== null) this.playing = requestAnimationFrame(step);
-    };
+      else this.playing = requestAnimationFrame(step);
+    });
     byId("play").textContent = "Pause";
     this.playing = requestAnimationFrame(step);
   }
@@ -126,7 +173,8 @@ class PlanPage extends AnatomyPage {
   }
 
   draw() {
-    const state = this.motion.at(Number(this.slider.value) / 1000);
+    if (this.breath) this.drawBreath();
+    const state = this.stateOf(this.followed, Number(this.slider.value) / 1000);
     this.state = state;
     const words = this.motion.words(state);
     this.slider.setAttribute("aria-valuetext", words);
@@ -137,6 +185,44 @@ class PlanPage extends AnatomyPage {
     if (this.scene) this.drawDevices(state);
     if (this.slices) this.drawSlices(state);
     for (const move of this.cursors) move(this.motion.alongMm(state));
+  }
+
+  // Return what is where at a place of the slider, in the phase of the breath.
+  stateOf(number, position) {
+    const motion = this.motions[number];
+    if (this.share === 0) return motion.at(position);
+    const { n } = this.breath.sample(number, this.phase);
+    return this.breath.carried(motion.at(position, this.breath.plans[number].samples.margin[n]), number, this.phase);
+  }
+
+  get share() {
+    return this.breath ? this.breath.share(this.phase) : 0;
+  }
+
+  get target() {
+    const { target_lps: target } = this.motion.plan;
+    return this.share === 0 ? target : this.breath.moved(target, this.share);
+  }
+
+  // Where the devices of a plan for a window are to end: rigid with them.
+  get aim() {
+    const { aim_lps: aim } = this.motion.plan;
+    return aim && this.share !== 0 ? this.breath.rigid(this.followed, this.phase).place(aim) : aim;
+  }
+
+  // Bring words, clock, charts, surfaces and slices to the phase.
+  drawBreath() {
+    const { breath, followed, phase, share } = this;
+    const words = breath.words(followed, phase, this.data.plans[followed].accepted), { n } = breath.sample(followed, phase);
+    byId("phase-words").textContent = words;
+    byId("phase").setAttribute("aria-valuetext", words);
+    const half = this.exhaling ? -phase : phase;
+    byId("clock-hand").setAttribute("transform", `rotate(${180 * (half - breath.masksPhase)} 100 92)`);
+    if (this.scene) this.scene.share = share;
+    if (this.image) this.image.share = share;
+    if (this.moveOverBreath) this.moveOverBreath(100 * phase);
+    const shown = share === 0 ? null : n;
+    if (this.drawClearance && shown !== this.clearanceAt) this.drawClearance(shown);
   }
 
   drawDevices(state) {
@@ -154,7 +240,8 @@ class PlanPage extends AnatomyPage {
     put("inner", followed && shown.tubes, (s) => s.tube(state.inner, radius.inner, rgb(INNER)));
     put("needle", followed && shown.needle, (s) => s.tube(state.needle, radius.needle, state.needleColours));
     put("others", true, (s) => this.otherPlans(s));
-    scene.setSolids("target", shown.target ? this.targetBall : null);
+    put("aim", shown.aim && this.aim, (s) => s.ball(this.aim, AIM_MM, rgb(AIM)));
+    put("target", shown.target, (s) => s.ball(this.target, TARGET_MM, rgb(TARGET)));
     scene.fit();
     this.bronchoscopy.draw(state, this.motion);
     this.drawScene();
@@ -163,7 +250,7 @@ class PlanPage extends AnatomyPage {
   otherPlans(solids) {
     this.motions.forEach((motion, n) => {
       if (n === this.followed || !this.shownPlans[n]) return;
-      const end = motion.at(1);
+      const end = this.stateOf(n, 1);
       const radius = thickened(motion.plan.radius_mm, this.orbit.distance);
       if (this.shown.scope) solids.tube(end.scope, 0.6 * radius.scope, rgb(OTHER));
       if (this.shown.tubes) solids.tube([...end.outer, ...end.middle, ...end.inner], 0.8 * radius.inner, rgb("#C9A24A"));
@@ -172,7 +259,7 @@ class PlanPage extends AnatomyPage {
   }
 
   drawSlices(state) {
-    const { radius_mm: radius, target_lps: target } = this.motion.plan;
+    const { target } = this, { radius_mm: radius } = this.motion.plan;
     this.image.tint = byId("tint").checked;
     this.image.setWindow(byId("window").value);
     const lines = [
@@ -189,6 +276,21 @@ class PlanPage extends AnatomyPage {
     byId("slice-place").textContent = `Through the foremost tip, at LPS ${state.tip.map((v) => v.toFixed(1)).join(", ")} mm.`;
   }
 
+  // Draw what is to spare over the breath, from 0 on: what is nearer than required, or too far, is on the floor.
+  drawOverBreath() {
+    if (!this.breath) return;
+    const { samples, window } = this.breath.plans[this.followed];
+    const xs = samples.phases.map((phase) => 100 * phase), kept = (values) => values.map((mm) => Math.max(mm, 0));
+    const series = Object.entries(samples.spare_mm).map(([key, values]) =>
+      ({ name: CHART[key][0], colour: CHART[key][1], dash: CHART[key][2], xs, ys: kept(values) }));
+    const target = samples.target_mm.map((mm) => samples.allowed_mm - mm);
+    series.push({ name: "target", colour: "#009E73", dash: "1 3", width: 3, xs, ys: kept(target) });
+    this.moveOverBreath = lineChart(byId("chart-breath"), {
+      x: { name: "% of the breath (0: end-exhale, 100: end-inhale)" }, y: { name: "mm to spare" }, series, top: 5,
+      spans: (window || []).map(([from, to]) => ({ from: 100 * from, to: 100 * to })),
+    });
+  }
+
   async drawCharts() {
     const { profile, costs, objective } = this.motion.plan;
     const along = await unpack(profile.arc_length_mm);
@@ -197,7 +299,7 @@ class PlanPage extends AnatomyPage {
     const marks = [{ at: profile.exit_mm, name: "exit" }, ...(hasNeedle ? [{ at: profile.tube_mm, name: "needle" }] : [])];
     const clearances = await Promise.all(Object.entries(profile.clearance_mm).map(async ([key, packed]) => {
       const allowed = key === "fissure" && !profile.fissures_are_obstacles ? " (may be crossed)" : "";
-      return { name: CHART[key][0] + allowed, colour: CHART[key][1], dash: CHART[key][2], xs: along, ys: await unpack(packed) };
+      return { key, name: CHART[key][0] + allowed, colour: CHART[key][1], dash: CHART[key][2], xs: along, ys: await unpack(packed) };
     }));
     const required = { name: "required", colour: "currentColor", xs: along, ys: await unpack(profile.required_mm), stairs: true, width: 1.8 };
     const cost = await Promise.all(Object.entries(profile.cost).map(async ([key, packed], n) => ({
@@ -207,14 +309,24 @@ class PlanPage extends AnatomyPage {
     const bend = { name: "curvature", colour: "#0072B2", xs: along, ys: await unpack(profile.curvature_per_mm), stairs: true };
     const limit = { name: "limit of the needle", colour: "currentColor", dash: "6 4", width: 1.6,
       xs: [profile.tube_mm, along[along.length - 1]], ys: [profile.most_curvature_per_mm, profile.most_curvature_per_mm] };
-    this.cursors = [
-      lineChart(byId("chart-clearance"), {
-        x, y: { name: "mm" }, series: [...clearances, required], top: profile.cap_mm, marks,
+    // At a computed phase of the breath, or of the masks.
+    this.drawClearance = (sample) => {
+      this.clearanceAt = sample;
+      const known = sample === null ? null : this.breath.plans[this.followed].samples;
+      const series = clearances.map((each) => (known ? { ...each, ys: known.clearance[each.key][sample] } : each));
+      this.cursors[0] = lineChart(byId("chart-clearance"), {
+        x: known ? { name: `${x.name}, at ${(100 * known.phases[sample]).toFixed(0)} % of the breath` } : x,
+        y: { name: "mm" }, series: [...series, required], top: profile.cap_mm, marks,
         spans: [{ from: 0, to: Math.max(profile.exempt_to_mm, 0) }],
-      }),
+      });
+    };
+    this.cursors = [];
+    this.drawClearance(this.share === 0 ? null : this.breath.sample(this.followed, this.phase).n);
+    this.drawOverBreath();
+    this.cursors.push(
       lineChart(byId("chart-curvature"), { x, y: { name: "1/mm" }, series: hasNeedle ? [bend, limit] : [bend], marks }),
       lineChart(byId("chart-cost"), { x, y: { name: "cost so far" }, series: cost }),
-    ];
+    );
     byId("cost-total").textContent = `In all ${costs[objective].toPrecision(4)} (${this.motion.plan.objective_words}, as the plan states).`;
     const history = this.data.cost_over_time;
     byId("chart-history").hidden = history.length < 2;
@@ -233,11 +345,22 @@ class PlanPage extends AnatomyPage {
       ...super.report(),
       plan: this.followed, plans: this.shownPlans, position: state.position, stage: STAGES[state.stage],
       scope_mm: state.scopeMm, outer_mm: state.outerMm, inner_mm: state.innerMm, needle_mm: state.needleMm,
-      tip_lps: state.tip, needle_lps: state.needle, camera: state.camera, devices: { ...this.shown },
+      phase: this.phase, target_lps: this.target, tip_lps: state.tip, needle_lps: state.needle, camera: state.camera, devices: { ...this.shown },
       solids: this.scene ? Object.fromEntries([...this.scene.solids].map(([key, s]) => [key, s.count / 3])) : {},
       view: this.orbit ? { yaw: this.orbit.yaw, pitch: this.orbit.pitch, distance: this.orbit.distance, edges: this.orbit.edges() } : null,
     };
   }
+}
+
+// Return a step of an animation that is told the seconds since the one before: on a slow machine it is slower,
+// and does not jump.
+function paced(step) {
+  let last = performance.now();
+  return (now) => {
+    const seconds = Math.min(Math.max(now - last, 0) / 1000, MOST_STEP_S);
+    last = now;
+    step(seconds);
+  };
 }
 
 // Return how far away the whole lung is seen at once, by its size in mm.

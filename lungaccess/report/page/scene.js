@@ -18,10 +18,11 @@ export class Scene {
     this.surfaces = new Map();
     this.solids = new Map();
     this.gain = 1;
+    this.share = 0;
   }
 
-  // Add a packed surface; resolves when it can be drawn.
-  async addSurface(packed) {
+  // Add a packed surface, which moves with the breath if there is one; resolves when it can be drawn.
+  async addSurface(packed, breath = null) {
     const [places, differences] = await Promise.all([unpack(packed.vertices), unpack(packed.faces)]);
     const faces = facesFrom(differences);
     const gl = this.gl;
@@ -29,6 +30,7 @@ export class Scene {
     gl.bindVertexArray(array);
     attribute(gl, 0, places, gl.UNSIGNED_SHORT, true, 3, 0);
     attribute(gl, 1, normalsOf(places, faces, packed.size_mm), gl.BYTE, true, 3, 4);
+    if (breath) attribute(gl, 2, breath.displacements(places, packed), gl.FLOAT, false, 3, 0);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
@@ -40,6 +42,7 @@ export class Scene {
       low: packed.low_lps,
       size: packed.size_mm,
       shown: packed.shown,
+      ofMasks: packed.key.startsWith("start-"),
     });
   }
 
@@ -96,7 +99,8 @@ export class Scene {
 
   // One layer: of each surface only what is nearest, so that nothing depends on the order of its triangles.
   drawLayer(surface, clip, eye) {
-    if (!surface.shown) return;
+    // What is proved in the phase of the masks alone is shown in that phase alone.
+    if (!surface.shown || (surface.ofMasks && this.share !== 0)) return;
     const gl = this.gl;
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.colorMask(false, false, false, false);
@@ -160,6 +164,7 @@ export class Scene {
     const gl = this.gl;
     gl.uniform3fv(places.low, surface.low);
     gl.uniform3fv(places.size, surface.size);
+    gl.uniform1f(places.share, this.share);
     gl.uniform3fv(places.colour, surface.colour);
     const opacity = Math.min(this.gain * surface.opacity, 1);
     gl.uniform1f(places.opacity, opacity);

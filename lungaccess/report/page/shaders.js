@@ -3,11 +3,13 @@
 const SURFACE_VERTEX = `#version 300 es
 layout(location=0) in vec3 place;
 layout(location=1) in vec3 normal;
+layout(location=2) in vec3 displacement;
 uniform mat4 clipFromEye, eyeFromLps;
 uniform vec3 low, size;
+uniform float share;
 out vec3 eye, facing;
 void main() {
-  vec4 there = eyeFromLps * vec4(low + place * size, 1.0);
+  vec4 there = eyeFromLps * vec4(low + place * size + share * displacement, 1.0);
   eye = there.xyz;
   facing = mat3(eyeFromLps) * normal;
   gl_Position = clipFromEye * there;
@@ -79,7 +81,7 @@ function linked(gl, vertex, fragment) {
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
   const places = {};
-  for (const name of ["clipFromEye", "eyeFromLps", "low", "size", "colour", "opacity", "rim"]) {
+  for (const name of ["clipFromEye", "eyeFromLps", "low", "size", "colour", "opacity", "rim", "share"]) {
     places[name] = gl.getUniformLocation(program, name);
   }
   return { program, places };

@@ -11,6 +11,8 @@ const TINTED = ["airway wall", "vessel", "fissure", "nodule"];
 const TINT = 0.45;
 const NEAR_MM = 2;
 const FAINT = 0.5;
+const LATTICE_PIXELS = 8;
+const NOWHERE = [0, 0, 0];
 
 export const WINDOWS = { lung: [-1350, 150], tissue: [-160, 240] };
 export const STANDARD = {
@@ -40,6 +42,8 @@ export class VoxelImage {
     }
     image.hounsfield = data.hounsfield;
     image.overlay = null;
+    image.breath = null;
+    image.share = 0;
     image.tint = true;
     image.setWindow("lung");
     return image;
@@ -122,11 +126,12 @@ export class Slice {
     const pixels = this.pen.createImageData(width, height);
     const step = widthMm / width;
     const across = times(plane.right, step);
+    const shifts = this.shifts(width, height, step);
     for (let row = 0; row < height; row++) {
-      let [x, y, z] = add(centre, add(
-        times(plane.right, (0.5 - width / 2) * step), times(plane.up, (height / 2 - row - 0.5) * step)));
+      let [x, y, z] = this.pixelCentre(0, row, step);
       for (let column = 0, at = 4 * row * width; column < width; column++, at += 4) {
-        this.image.paint(x, y, z, pixels.data, at);
+        const [sx, sy, sz] = shifts ? shifts(column, row) : NOWHERE;
+        this.image.paint(x + sx, y + sy, z + sz, pixels.data, at);
         x += across[0];
         y += across[1];
         z += across[2];
@@ -138,6 +143,34 @@ export class Slice {
     if (marks.cross) this.cross(marks.cross);
     this.letters();
     this.bar(widthMm);
+  }
+
+  pixelCentre(column, row, step) {
+    const { right, up, centre } = this.plane, { width, height } = this.canvas;
+    return add(centre, add(times(right, (column + 0.5 - width / 2) * step), times(up, (height / 2 - row - 0.5) * step)));
+  }
+
+  // Return a function that tells by how much a pixel is pulled back to the masks, null in their phase.
+  // It is computed at every so manieth pixel, and between them it is bilinear.
+  shifts(width, height, step) {
+    const { breath, share } = this.image;
+    if (!breath || share === 0) return null;
+    const columns = Math.ceil(width / LATTICE_PIXELS) + 1, rows = Math.ceil(height / LATTICE_PIXELS) + 1;
+    const known = new Float32Array(3 * columns * rows), out = [0, 0, 0];
+    for (let n = 0; n < columns * rows; n++) {
+      const place = this.pixelCentre((n % columns) * LATTICE_PIXELS, Math.floor(n / columns) * LATTICE_PIXELS, step);
+      known.set(minus(breath.pulledBack(place, share), place), 3 * n);
+    }
+    return (column, row) => {
+      const i = Math.floor(column / LATTICE_PIXELS), j = Math.floor(row / LATTICE_PIXELS);
+      const u = column / LATTICE_PIXELS - i, v = row / LATTICE_PIXELS - j;
+      const a = 3 * (j * columns + i), b = a + 3 * columns;
+      for (let k = 0; k < 3; k++) {
+        const top = known[a + k] + u * (known[a + 3 + k] - known[a + k]);
+        out[k] = top + v * (known[b + k] + u * (known[b + 3 + k] - known[b + k]) - top);
+      }
+      return out;
+    };
   }
 
   // Return column, row and distance from the plane in mm.

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from anatomy.fields import CENTRES, corner_geometry
 from anatomy.grid import Grid, Volume
-from anatomy.structures import OBSTACLES, VESSEL
+from anatomy.structures import VESSEL
 from anatomy.typed import Float
 from stages.needle.costs import (
     inverse_clearance,
@@ -319,17 +319,20 @@ class TestSpaces:
         points = np.random.default_rng(0).uniform([-15, -15, 0], [15, 15, 40], (300, 3))
         found = obstacle_clearance_mm(environment.obstacles, points)
         centres = environment.grid.lps(
-            np.argwhere((environment.obstacles.labels & OBSTACLES) != 0).astype(float)
+            np.argwhere((environment.obstacles.labels & VESSEL) != 0).astype(float)
         )
         gaps = np.maximum(np.abs(points[:, None] - centres) - obstacles_as, 0.0)
         exact = np.linalg.norm(gaps, axis=2).min(axis=1)
-        edge = np.minimum(points - [-20, -20, -5], [20, 20, 45] - points).min(axis=1)
+        # The outermost voxels are obstacles, too.
+        edge = np.minimum(points - [-20, -20, -5], [20, 20, 45] - points).min(axis=1) - 1.0
         near = exact < np.minimum(edge, 8.0)
         far = exact > 8.0
         assert near.sum() > 50 and far.sum() > 50
         assert np.allclose(found[near], exact[near], atol=1e-9)
         assert (found[far] <= exact[far]).all()
-        assert (found[far & (edge > 8.0)] > 0.99 * exact[far & (edge > 8.0)]).all()
+        inner = far & (edge > exact + 1.0)
+        assert inner.sum() >= 20
+        assert (found[inner] > 0.99 * exact[inner]).all()
 
     def test_every_cost_by_its_name(self) -> None:
         environment = scene()

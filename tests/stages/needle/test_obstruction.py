@@ -14,7 +14,7 @@ from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, begun_at_wall, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.kernels.proof import WALL_ZONE_MM, blocker_on_arc, exact_gap
-from stages.needle.obstruction import easiest_obstruction, find_obstruction
+from stages.needle.obstruction import blocked_end, easiest_obstruction, find_obstruction
 from stages.needle.query import Query
 
 GRID = Grid.from_spacing((61, 61, 61), (0.5, 0.5, 0.5), (-15.0, -15.0, -15.0))
@@ -94,6 +94,26 @@ def test_another_branch_counts_unless_it_is_pierced_too() -> None:
     assert straight_blocker(joined, frame, 8.0) == 0
     assert straight_blocker(joined, start(3.0, z=-0.3), 8.0) & LUMEN
     assert (alone.obstacles.labels >> BRANCH_SHIFT == 2).any(), "the environment before is as it was"
+
+
+def test_the_proof_knows_what_is_kept_from_the_lumen_of_the_pierced_branch() -> None:
+    """Its wall is exempt in the exit; a path through its lumen is none."""
+    needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 60, exit_exemption_mm=20.0)
+    from_tube = environment_of_labels(scene(), GRID, needle, required_clearance_mm=1.0)
+    back = start(-90.0, x=4.0)
+    for aim, outcome in (((-12.0, 0.0, -8.0), "no path"), ((-3.2, 0.0, -8.0), "undecided")):
+        query = Query(lps_from_start=back, target=np.array(aim), branch=0)
+        assert blocked_end(from_tube, query) is None
+        assert NoPathProof(from_tube, query).run() == outcome
+        assert (straight_blocker(from_tube, back, 4.0 - aim[0]) == 0) == (outcome == "undecided")
+
+
+def test_a_path_keeps_clear_of_what_lies_beyond_the_grid() -> None:
+    """The outermost voxels count as outside, whatever they hold."""
+    environment = environment_of_labels(scene(), GRID, NEEDLE, required_clearance_mm=1.0)
+    for aside, free in ((1.6, True), (1.2, False)):
+        frame = start(0.0, x=15.25 - aside)
+        assert (straight_blocker(environment, frame, 10.0, -1) == 0) == free
 
 
 def test_start_target_and_path_are_told_apart() -> None:

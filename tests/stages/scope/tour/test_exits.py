@@ -67,7 +67,7 @@ def test_vetting_takes_points_away() -> None:
     (found,) = find_exits(tree, lesion, accepts=accepts)
     assert set(asked) == {0}
     assert not refused & {e.tree_point for e in found}
-    with pytest.raises(TargetError, match="coupled plan"):
+    with pytest.raises(TargetError, match="within reach is accepted"):
         find_exits(tree, lesion, accepts=lambda _number, _point: False)
 
 

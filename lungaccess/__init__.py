@@ -61,7 +61,7 @@ if TYPE_CHECKING:
         resolve_target,
     )
     from lungaccess.procedure import Procedure, load_procedure, simulate_procedure
-    from lungaccess.reachability import UnreachableProof, compare_reach, map_reach
+    from lungaccess.reachability import UnreachableProof, compare_reach, map_reach, plan_to_voxel
     from lungaccess.report.html import plan_page
     from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors, safe_start_region
     from lungaccess.slicer import export_slicer

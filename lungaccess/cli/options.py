@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from anatomy.errors import SettingsError
 from anatomy.io.files import require_writable_folder
 from anatomy.records import frozen_value
-from lungaccess.cli.numbers import Count, Processes, Seconds, Seed, Whole
+from lungaccess.cli.numbers import Count, NotNegative, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS, Objective
 
@@ -272,6 +272,13 @@ class SearchOptions(BudgetOptions):
     processes: Annotated[
         Processes, Parameter(help="How many processes refine the plan at the same time.")
     ] = 1
+    gap: Annotated[
+        NotNegative | None,
+        Parameter(
+            help="Stop once the cost is proved to be at most this share above the least from any scope tip "
+            "of the atlas, such as 0.05; the plan states what is proved."
+        ),
+    ] = None
 
 
 def stated_phases(text: str | None) -> tuple[float, float] | None:

@@ -192,6 +192,7 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
         "method": search.method,
         "needle_planner": search.needle_planner or "",
         "processes": search.processes,
+        "gap": search.gap,
     }
     if len(request.systems) > 1:
         plans = plan_with_presets(lung, target, systems=request.systems, atlas_of=atlas_of, **options)
@@ -254,6 +255,8 @@ def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal) -> None:
     plan_tables.show_appraisal(appraisal)
     if plan.window is not None:
         terminal.say(plan.window.words)
+    if plan.gap is not None:
+        terminal.say(plan.gap_in_words)
     if plan.system_choice:
         terminal.say(" ".join(plan.system_choice))
     terminal.show(plan_tables.plan_tables(plan, lung))

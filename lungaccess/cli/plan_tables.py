@@ -44,6 +44,8 @@ def plan_record(
         "digest": plan.digest,
         "objective": plan.objective,
         "cost": plan.cost,
+        "cost_bound": plan.cost_bound or None,
+        "gap": plan.gap,
         "costs": known_costs(plan.costs, has_map=lung.cost is not None),
         "system": plan.system.name,
         "system_choice": list(plan.system_choice),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 from anatomy.errors import SettingsError
@@ -11,6 +12,7 @@ from anatomy.kernel_clock import working_s
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
+from lungaccess.coupled.cost_bound import CostBound, GapGoal
 from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
 from lungaccess.coupled.search.atlas_search import AtlasSearch
 from lungaccess.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
@@ -80,6 +82,7 @@ def plan(
     first_plan_s: float | None = None,
     atlas: Atlas | None = None,
     processes: int = 1,
+    gap: float | None = None,
     counterfactuals: bool = True,
     on_progress: Callable[[ProgressEvent], None] | None = None,
 ) -> Iterator[Plan]:
@@ -119,6 +122,10 @@ def plan(
     processes : int
         How many processes vary the best candidate at the same time.  The same seed, number of processes and
         `iterations` give the same plans.
+    gap : float, optional
+        Stop once the plan's cost is proved to be at most this share above the best from the scope tips of the
+        atlas.  The last plan then comes once more, with its `cost_bound`, also where a limit ends the search.
+        See `lungaccess.coupled.cost_bound.CostBound`.
     counterfactuals : bool
         Whether a `NoPlan` looks for the change of device that would help, which takes up to some ten seconds.
     on_progress : callable, optional
@@ -131,7 +138,8 @@ def plan(
     SettingsError
         If objective, method or needle planner is unknown, the method takes no needle planner or needs a
         needle that the system does not have, the atlas belongs to another lung or system, there cannot be so
-        many processes, or OMPL was used before in this process.
+        many processes, the gap is negative or no bound is known for the tubes and the needle, or OMPL was
+        used before in this process.
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
@@ -174,7 +182,8 @@ def plan(
         return explain(task, atlas, search.blocked, iteration, counterfactuals=counterfactuals)
 
     limits = Limits.of(iterations, time_s, first_plan_s)
-    return drive(steps, limits, tell, made, no_plan)
+    goal = None if gap is None else GapGoal(CostBound(task, atlas), gap)
+    return drive(steps, limits, tell, made, no_plan, goal)
 
 
 @frozen_value
@@ -228,6 +237,7 @@ def drive(
     tell: Callable[[ProgressEvent], None],
     made: Callable[[Candidate, int, float], Plan],
     no_plan: Callable[[int], NoPlan],
+    goal: GapGoal | None = None,
 ) -> Iterator[Plan]:
     """Drive a search within its budget; yield what `made` makes of its candidates.
 
@@ -237,9 +247,12 @@ def drive(
         Gets a candidate, its iteration and the planning time in seconds.
     no_plan : callable
         Returns what is raised after so many iterations without a candidate.
+    goal : GapGoal, optional
+        Ends the search once it is met; the last plan then comes once more, with its bound.
     """
     clock = Clock()
     best: float | None = None
+    last: Plan | None = None
     iteration = 0
     for step in steps:
         if limits.iterations is not None and step.iteration > limits.iterations:
@@ -247,7 +260,10 @@ def drive(
         iteration = step.iteration
         if step.candidate is not None:
             best = step.cost
-            yield made(step.candidate, iteration, clock.elapsed_s)
+            last = made(step.candidate, iteration, clock.elapsed_s)
+            yield last
+        if goal is not None and best is not None and iteration > 0 and goal.is_met(best):
+            break
         if limits.are_reached(iteration, clock.elapsed_s, best is not None):
             break
         if clock.due():
@@ -258,6 +274,9 @@ def drive(
             )
     if best is None:
         raise no_plan(iteration)
+    if goal is not None and last is not None:
+        timing = dict(last.timing) | {"planning_s": clock.elapsed_s}
+        yield replace(last, cost_bound=goal.bound.value, iterations=iteration, timing=timing)
 
 
 class Clock:

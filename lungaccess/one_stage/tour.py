@@ -80,6 +80,14 @@ class TourAnswer:
     one_by_one_mm: float
     plan_required: bool
 
+    @property
+    def title(self) -> str:
+        """How many of the lesions the tours visit."""
+        visited = len(self.lesions_lps)
+        if not self.left_out:
+            return f"tour to {visited} lesions"
+        return f"tour to {visited} of {visited + len(self.left_out)} lesions"
+
 
 def read_lesions(path: str | Path) -> Float:
     """Read lesions from a text file, one `ras:x,y,z` or `lps:x,y,z` a line; return `(M, 3)` LPS mm.

@@ -81,6 +81,9 @@ class Plan(Record):
         The phases of the breath in which it is proved clear and on target; None where no motion was known.
     aim : BreathingAim or None
         Where the devices end, of a plan made for its window; None for any other, which ends at the target.
+    cost_bound : float
+        Proved lower bound of the cost of every plan from a scope tip of the atlas, where the search was told
+        to find one; 0 for any other.
     """
 
     schema: str = plan_file.SCHEMA
@@ -111,6 +114,7 @@ class Plan(Record):
     chance: Chance | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     window: BreathingWindow | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     aim: BreathingAim | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
+    cost_bound: float = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
@@ -202,6 +206,7 @@ class Plan(Record):
             ("costs", f"{costs}; made small: {self.objective}"),
             ("made by", f"{self.method}, seed {self.seed}, {self.iterations} iterations"),
             ("digest", self.digest[:16]),
+            *((("best possible", self.gap_in_words),) if self.gap is not None else ()),
             *((("window of breathing", self.window.words),) if self.window else ()),
             *((("choice of the system", " ".join(self.system_choice)),) if self.system_choice else ()),
         ]
@@ -234,6 +239,21 @@ class Plan(Record):
     def cost(self) -> float:
         """Cost under the plan's own objective."""
         return float(self.costs[self.objective])
+
+    @property
+    def gap(self) -> float | None:
+        """Proved share by which the cost exceeds the least from the atlas at most; None without a bound."""
+        return max(self.cost / self.cost_bound - 1.0, 0.0) if self.cost_bound > 0.0 else None
+
+    @property
+    def gap_in_words(self) -> str:
+        """What is proved about the best possible cost, "" without a bound."""
+        if self.gap is None:
+            return ""
+        return (
+            f"The cost is proved to be at most {100.0 * self.gap:.1f} % above the least from any scope "
+            f"tip of the atlas, which is {self.cost_bound:.4g} or more."
+        )
 
     @property
     def digest(self) -> str:

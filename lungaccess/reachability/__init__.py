@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.reachability.open_places import OpenPlace
     from lungaccess.reachability.reach_map import (
         DEFAULT_SPACING_MM,
         KINDS,
         NOT_COUNTED,
+        STATES,
         ReachMap,
         RegionReach,
         compare_reach,
@@ -19,5 +21,6 @@ if TYPE_CHECKING:
     )
     from lungaccess.reachability.regions import Regions, lung_regions
     from lungaccess.reachability.unreachable import MOST_BOXES, ReachVerdict, UnreachableProof
+    from lungaccess.reachability.voxel_plan import plan_to_voxel
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -14,10 +14,12 @@ from anatomy.grid import Grid
 from anatomy.io.files import DAMAGE, atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
-from anatomy.typed import Float, Float32, Int, Mask, UInt64
+from anatomy.typed import Float, Float32, Int, Int32, Mask, UInt64
 from lungaccess.coupled import Scan
-from stages.needle import Reached
+from stages.needle import BLOCK_MM, Reached
 
+SLAB_MM = BLOCK_MM
+"""Thickness of the slabs of layers that are tried, and kept on disk, at a time."""
 THREADS = 2
 """The kernels hold no lock, and two cores are the least that a machine of today has."""
 
@@ -44,15 +46,15 @@ def _layer_points(grid: Grid, k: int) -> Float:
 
 def scan_layers(
     scan: Scan, grid: Grid, counted: Mask, store: LayerStore | None, progress: Callable[[float], None] | None
-) -> tuple[Float32, int]:
-    """Try the points of all layers.
+) -> tuple[Float32, Int32, int]:
+    """Try the points of all layers, slab by slab.
 
     Parameters
     ----------
     counted : (ni, nj, nk) bool
         Voxels whose centres are tried.
     store : LayerStore or None
-        Where finished layers are kept; emptied at the end.
+        Where finished slabs are kept; emptied at the end.
     progress : callable or None
         Told the share of the layers done.
 
@@ -60,58 +62,66 @@ def scan_layers(
     -------
     found : (4, ni, nj, nk) float32
         Kind, cost, clearance and share of the breath, see `stages.needle.reach.Reached`.
+    entries : (ni, nj, nk) int32
+        Start pose of what is reached, else -1.
     resumed : int
         Layers taken from the store.
     """
     found = np.zeros((4, *grid.shape), dtype=np.float32)
+    entries = np.full(grid.shape, -1, dtype=np.int32)
     done, resumed = 0, 0
+    thickness = max(int(SLAB_MM / grid.spacing_mm[2] + 1e-9), 1)
 
-    def one_layer(k: int) -> None:
+    def one_slab(first: int) -> None:
         nonlocal done, resumed
-        places = np.argwhere(counted[:, :, k])
-        kept = None if store is None else store.load(k, len(places))
+        slab = counted[:, :, first : first + thickness]
+        places = np.argwhere(slab)
+        kept = None if store is None else store.load(first, len(places))
+        ijk = places + np.array([0, 0, first], dtype=np.int64)
         if kept is None and len(places):
-            ijk = np.concatenate([places, np.full((len(places), 1), k)], axis=1)
-            kept = _as_rows(
-                scan.reach(grid.lps(ijk), _seeds(grid, ijk), _earlier_neighbours(counted[:, :, k]))
-            )
+            kept = _as_rows(scan.reach(grid.lps(ijk), voxel_seeds(grid, ijk), _earlier_neighbours(slab)))
             if store is not None:
-                store.save(k, kept)
+                store.save(first, kept)
         elif kept is not None:
-            resumed += 1
+            resumed += slab.shape[2]
         if kept is not None:
-            found[:, places[:, 0], places[:, 1], k] = kept
-        done += 1
+            found[:, *ijk.T], entries[*ijk.T] = kept
+        done += slab.shape[2]
         if progress:
             progress(done / grid.shape[2])
 
     with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(one_layer, range(grid.shape[2])))
+        list(pool.map(one_slab, range(0, grid.shape[2], thickness)))
     if store is not None:
         store.clear()
-    return found, resumed
+    return found, entries, resumed
 
 
-def _seeds(grid: Grid, ijk: Int) -> UInt64:
-    """Return a seed for each voxel: its number in the grid."""
+def voxel_seeds(grid: Grid, ijk: Int) -> UInt64:
+    """Return the seed of the search to each of voxels (N, 3): its number in the grid."""
     return np.asarray(np.ravel_multi_index(tuple(ijk.T), grid.shape), dtype=np.uint64)
 
 
 def _earlier_neighbours(counted: Mask) -> Int:
-    """Return the indices `(N, 3)` of the neighbours before each True place of a layer, -1 for none."""
-    index = np.full((counted.shape[0] + 1, counted.shape[1] + 2), -1, dtype=np.int64)
-    index[1:, 1:-1][counted] = np.arange(np.count_nonzero(counted))
-    i, j = np.nonzero(counted)
-    return np.stack([index[i + 1, j], index[i, j + 1], index[i, j + 2]], axis=1)
+    """Return the indices `(N, 3)` of the neighbours before each True place along each axis, -1 for none."""
+    index = np.full(tuple(n + 1 for n in counted.shape), -1, dtype=np.int64)
+    index[1:, 1:, 1:][counted] = np.arange(np.count_nonzero(counted))
+    i, j, k = np.nonzero(counted)
+    return np.stack([index[i, j + 1, k + 1], index[i + 1, j, k + 1], index[i + 1, j + 1, k]], axis=1)
 
 
-def _as_rows(reached: Reached) -> Float32:
+Rows = tuple[Float32, Int32]
+"""What was found of N voxels: `(4, N)` and `(N,)`, see `scan_layers`."""
+
+
+def _as_rows(reached: Reached) -> Rows:
     share = np.zeros_like(reached.cost) if reached.window_share is None else reached.window_share
-    return np.stack([reached.kinds, reached.cost, reached.clearance_mm, share]).astype(np.float32)
+    rows = np.stack([reached.kinds, reached.cost, reached.clearance_mm, share]).astype(np.float32)
+    return rows, reached.entries.astype(np.int32)
 
 
 class LayerStore:
-    """Finished layers on disk, in a folder named after what they depend on."""
+    """Finished slabs of layers on disk, in a folder named after what they depend on."""
 
     def __init__(self, work: Path, key: str) -> None:
         self._folder = require_writable_folder(work / f".reach-{key}")
@@ -119,29 +129,34 @@ class LayerStore:
     def _path(self, layer: int) -> Path:
         return self._folder / f"layer-{layer:04d}.npz"
 
-    def load(self, layer: int, count: int) -> Float32 | None:
-        """Return the rows `(4, count)` of a layer, None if it is not there or not whole."""
+    def load(self, layer: int, count: int) -> Rows | None:
+        """Return the rows of the slab that begins with a layer, None if it is not there or not whole."""
         try:
             with self._path(layer).open("rb") as stream, np.load(stream) as stored:
-                rows, checksum = np.asarray(stored["rows"]), str(stored["checksum"])
+                rows, entries = np.asarray(stored["rows"]), np.asarray(stored["entries"])
+                checksum = str(stored["checksum"])
         except FileNotFoundError:
             return None
         except DAMAGE:
             checksum = ""
-        if checksum and rows.shape == (4, count) and checksum == self._checksum(layer, rows):
-            return rows.astype(np.float32, copy=False)
+        whole = checksum and rows.shape == (4, count) and entries.shape == (count,)
+        if whole and checksum == self._checksum(layer, (rows, entries)):
+            return rows.astype(np.float32, copy=False), entries.astype(np.int32, copy=False)
         warn_of_damage(self._path(layer))
         return None
 
-    def save(self, layer: int, rows: Float32) -> None:
-        """Write a layer, whole or not at all."""
+    def save(self, layer: int, found: Rows) -> None:
+        """Write a slab, whole or not at all."""
+        rows, entries = found
         with atomic_write(self._path(layer)) as temporary:
-            np.savez_compressed(temporary, rows=rows, checksum=np.array(self._checksum(layer, rows)))
+            checksum = np.array(self._checksum(layer, found))
+            np.savez_compressed(temporary, rows=rows, entries=entries, checksum=checksum)
 
-    def _checksum(self, layer: int, rows: Float32) -> str:
-        """Return what binds the rows of a layer to the run and to its place."""
-        return values_checksum({"of": [self._folder.name, layer], "rows": array_checksum(rows)})
+    def _checksum(self, layer: int, found: Rows) -> str:
+        """Return what binds the rows of a slab to the run and to its place."""
+        rows, entries = (array_checksum(each) for each in found)
+        return values_checksum({"of": [self._folder.name, layer], "rows": rows, "entries": entries})
 
     def clear(self) -> None:
-        """Remove all layers."""
+        """Remove all slabs."""
         shutil.rmtree(self._folder, ignore_errors=True)

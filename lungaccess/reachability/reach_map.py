@@ -28,16 +28,22 @@ from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, SEARCHED, UNREACHE
 
 DEFAULT_SPACING_MM = 3.0
 """Half the diameter of a small nodule, so that none falls between the points."""
-FORMAT = b"lungaccess-reach-2"
+FORMAT = b"lungaccess-reach-3"
 
 NOT_COUNTED = 0
 KINDS: dict[str, int] = {
     "direct arc": DIRECT,
     "search": SEARCHED,
-    "not reached": UNREACHED,
-    "no clearance": NO_CLEARANCE,
+    "undecided": UNREACHED,
+    "unreachable": NO_CLEARANCE,
 }
 """What the voxels of a map say; `NOT_COUNTED` is outside the lung or in an obstacle."""
+STATES: dict[str, tuple[str, ...]] = {
+    "reachable": ("direct arc", "search"),
+    "unreachable": ("unreachable",),
+    "undecided": ("undecided",),
+}
+"""Reachable: there is a plan.  Unreachable: it is proved that there is none.  Undecided: neither."""
 
 
 @frozen_value
@@ -63,7 +69,15 @@ class RegionReach:
     @property
     def reached(self) -> float:
         """Share reached by an arc or a search."""
-        return self.shares[0] + self.shares[1]
+        return self.share("reachable")
+
+    def state_ml(self, state: str) -> float:
+        """Return the volume of one of `STATES`, mL."""
+        return self.volume_ml * self.share(state)
+
+    def share(self, state: str) -> float:
+        """Return the share of one of `STATES`."""
+        return sum(share for name, share in zip(KINDS, self.shares, strict=True) if name in STATES[state])
 
 
 @frozen_record
@@ -79,10 +93,14 @@ class ReachMap:
     cost, clearance_mm : Volume of float32
         Estimated integral of 1 / clearance of the best path found, and the clearance that it keeps
         beyond the exempt length of the needle; 0 where there is none.
+    deployment : Volume of int32
+        Number of the deployment of the atlas from which that path starts; -1 where there is none.
     regions : Regions
         Side and lobe of each voxel, on the same grid.
     entries : int
         Deployments of the atlas.
+    trees : int
+        Random trees for each point, see `map_reach`.
     resumed_layers : int
         Layers of voxels that an earlier run had finished.
     scan_s, atlas_s : float
@@ -99,8 +117,10 @@ class ReachMap:
     kinds: Volume
     cost: Volume
     clearance_mm: Volume
+    deployment: Volume
     regions: Regions
     entries: int
+    trees: int
     resumed_layers: int
     scan_s: float
     atlas_s: float
@@ -128,7 +148,11 @@ class ReachMap:
     @property
     def reached(self) -> Bool:
         """The voxels that are reached by an arc or a search."""
-        return np.isin(self.kinds.array, (DIRECT, SEARCHED))
+        return self.in_state("reachable")
+
+    def in_state(self, state: str) -> Bool:
+        """Return the voxels of one of `STATES`."""
+        return np.isin(self.kinds.array, [KINDS[name] for name in STATES[state]])
 
     def gained_and_lost_ml(self, other: ReachMap) -> tuple[float, float]:
         """Return the volume that this map reaches and another does not, and the reverse.
@@ -157,10 +181,10 @@ class ReachMap:
         )
 
     def save(self, folder: str | os.PathLike[str], stem: str = "reach") -> tuple[Path, ...]:
-        """Write the map as three images, four with phases, that 3D Slicer opens in the patient's frame.
+        """Write the map as four images, five with phases, that 3D Slicer opens in the patient's frame.
 
-        `STEM.nrrd` holds the kinds as labels, `STEM-cost.nrrd` and `STEM-clearance.nrrd` the rest,
-        `STEM-window.nrrd` the share of the breath.
+        `STEM.nrrd` holds the kinds as labels, `STEM-cost.nrrd`, `STEM-clearance.nrrd` and
+        `STEM-deployment.nrrd` the rest, `STEM-window.nrrd` the share of the breath.
 
         Raises
         ------
@@ -169,6 +193,7 @@ class ReachMap:
         """
         place = require_writable_folder(Path(folder))
         volumes = {"": self.kinds, "-cost": self.cost, "-clearance": self.clearance_mm}
+        volumes["-deployment"] = self.deployment
         volumes |= {} if self.window_share is None else {"-window": self.window_share}
         written = tuple(place / f"{stem}{end}.nrrd" for end in volumes)
         for path, volume in zip(written, volumes.values(), strict=True):
@@ -258,7 +283,7 @@ def map_reach(
     scan = reach_scan(made, arcs=arcs, trees=trees, during=None if asked is None else (lung, asked))
     counted = counted_voxels(lung, grid, made.with_fissures)
     store = None if work is None else LayerStore(Path(work), _key(lung, made, spacing_mm, arcs, trees, asked))
-    found, resumed = scan_layers(scan, grid, counted, store, progress)
+    found, entries, resumed = scan_layers(scan, grid, counted, store, progress)
     return ReachMap(
         patient_name=lung.name,
         system=system,
@@ -266,8 +291,10 @@ def map_reach(
         kinds=Volume(grid=grid, array=found[0].astype(np.uint8)),
         cost=Volume(grid=grid, array=found[1]),
         clearance_mm=Volume(grid=grid, array=found[2]),
+        deployment=Volume(grid=grid, array=entries),
         regions=lung_regions(lung, grid, counted),
         entries=made.deployments.count,
+        trees=trees,
         resumed_layers=resumed,
         scan_s=time.perf_counter() - began,
         atlas_s=made.build_s,

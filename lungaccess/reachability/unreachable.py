@@ -1,11 +1,14 @@
-"""Proof that no deployment of a system has a target in its needle's workspace.
+"""Proof that no deployment of a system reaches a target, or what of the deployments it leaves open.
 
 docs/explanation/unreachable.md derives it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -15,45 +18,58 @@ from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
-from anatomy.typed import Float, Int32, Mask
+from anatomy.typed import Float, Int, Int32, Mask
 from lungaccess.problem.system import System
+from lungaccess.reachability.deployment_space import DeploymentSpace, divided_space, in_tasks
 from lungaccess.reachability.kernels.blocked import ProofEnvironment
-from lungaccess.reachability.kernels.deployment_boxes import BOX_COLUMNS, PLACE_X
-from lungaccess.reachability.kernels.unreachable import (
-    INSERTION_STEP_MM,
-    MOST_WAITING,
-    RULED_OUT,
-    greatest_insertions,
-    rule_out,
-)
+from lungaccess.reachability.kernels.deployment_boxes import BOX_COLUMNS
+from lungaccess.reachability.kernels.unreachable import RULED_OUT, TOO_MANY, UNDECIDED, Found, rule_out
+from lungaccess.reachability.layers import THREADS
+from lungaccess.reachability.open_places import OpenPlace, open_places
 from lungaccess.reachability.tip_places import place_pieces, places_of_tips
 from stages.needle import needle_environment
+from stages.needle.kernels import Limits
 from stages.tube import tube_constants
-from stages.tube.kernels import MAX_EXTENSION
+from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
 
 INSERTION_SPACING_MM = 0.02
 """Spacing of the insertions that are tried; the bound between two of them is loose by about as much."""
-MOST_BOXES = 3_000_000
-"""Boxes looked at for one piece of the airway before it is given up, after about a second."""
+MOST_BOXES = 20_000_000
+"""Boxes looked at for a target before it is given up, after half a minute or so."""
+MORE_LOOKS = 16
+"""A box is given so many times as many looks as in the round before, so that rounds repeat little."""
+TASK_LOOKS = 16384
+"""Looks that a thread may take at a time."""
 
 
 @frozen_record
 class ReachVerdict:
-    """Whether a target is proved unreachable.
+    """Whether a target is proved unreachable, and what is left if not.
 
     Parameters
     ----------
     proved : bool
-        If not, nothing is known.
+        If not, nothing is known of the target.
     boxes : int
         Boxes of deployments that were looked at.
-    open_lps : (3,) float64 or None
-        A place of the scope tip, LPS mm, from which the first deployments start that could not be ruled out.
+    share_ruled_out : float
+        Share of the deployment space that is proved not to reach the target; 1 if all of it is.
+    finished : bool
+        Whether every box is ruled out or has a part that is too small to halve; else the budget was used up.
+    open_places : tuple of OpenPlace
+        Where the deployments start that could not be ruled out, the largest share first.
     """
 
     proved: bool
     boxes: int
-    open_lps: Float | None = None
+    share_ruled_out: float = 0.0
+    finished: bool = False
+    open_places: tuple[OpenPlace, ...] = ()
+
+    @property
+    def open_lps(self) -> Float | None:
+        """A place of the scope tip, LPS mm, from which a deployment starts that could not be ruled out."""
+        return self.open_places[0].tip_lps if self.open_places else None
 
 
 class UnreachableProof:
@@ -63,7 +79,10 @@ class UnreachableProof:
     direction that it can have there (`stages.scope.in_tip_region`), and every rotation and insertion of the
     tubes, such that the tubes leave an airway outside the mediastinum, keep clear of vessels and pleura from
     there on, and sweep little, and a needle from their tip reaches the target.  That needle heeds no
-    obstacle, but its tip and the target must lie in the same free region.
+    obstacle, but its tip and the target must lie in the same free region.  Without a needle the tip of the
+    tubes itself must come to the target.
+
+    Deployments that no target needs to look at are ruled out once, with the first target.
 
     Parameters
     ----------
@@ -83,8 +102,7 @@ class UnreachableProof:
         pause = between or (lambda: None)
         self._lung = lung
         self._tubes = tube_constants(system.tubes, system.margins)
-        needle = system.require_needle("The proof that no needle reaches a target")
-        self._limits = needle_environment(lung, needle, system.margins, with_fissures=with_fissures).limits
+        self._limits = _limits(lung, system, with_fissures)
         longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
         greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)
@@ -104,35 +122,54 @@ class UnreachableProof:
         # Corners are rounded down, and between them a bound lacks at most a diagonal of a voxel: on the half
         # to the nearest corner the distance may grow, and from there on the bound falls.
         self._loss_mm = float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
-        self._free = _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)
+        # The tip of the tubes alone needs no free region.
+        self._free = (
+            None
+            if system.needle is None
+            else _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)
+        )
+        self._passable: dict[bytes, np.ndarray] = {}
         self._least_depth_mm = system.scope.radius_mm + system.scope.lumen_margin_mm
         tips, centres = places_of_tips(lung, self._not_lumen, self._least_depth_mm)
         self._tips = distance_corners(tips, spacing_mm)
         pause()
-        self._pieces = place_pieces(lung, centres, leaving, float(self._insertions.max()))
+        pieces = place_pieces(lung, centres, leaving, float(self._insertions.max()))
+        self._space = divided_space(
+            self._surroundings(self._masks[0]), self._tubes, self._insertions, pieces, between=pause
+        )
+
+    @property
+    def space(self) -> DeploymentSpace:
+        """The deployments that there may be, whatever the target."""
+        return self._space
 
     def prove(
         self,
         target_lps: Float,
         *,
         most_boxes: int = MOST_BOXES,
+        time_s: float | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> ReachVerdict:
-        """Try to prove that no deployment has the target in its workspace.
+        """Try to prove that no deployment reaches the target.
+
+        The places nearest to the target are looked at first.  After one that is left open the search goes on
+        with the others, then with what else can be ruled out around the open ones.
 
         Parameters
         ----------
         target_lps : (3,) float64
             LPS mm.
         most_boxes : int
-            To look at for one piece of the airway before it is given up.
+            To look at, about.
+        time_s : float, optional
+            After so much time nothing more is begun; the same time need not give the same verdict.
         progress : callable, optional
-            Told the share of the pieces that is done.
+            Told the share of the deployment space that is ruled out.
 
         Returns
         -------
         ReachVerdict
-            It ends with the first piece that cannot be ruled out.
 
         Raises
         ------
@@ -141,23 +178,60 @@ class UnreachableProof:
         """
         target = np.asarray(target_lps, dtype=np.float64)
         environment = self._environment(target)
-        boxes = np.zeros((MOST_WAITING, BOX_COLUMNS))
-        looked_at = 0
-        away = [np.linalg.norm(piece.cones[0, :3] - target) for piece in self._pieces]
-        order = np.argsort(away, kind="stable")
-        for done, n in enumerate(order):
-            piece = self._pieces[n]
-            outcome, looked = rule_out(
-                environment, self._tubes, self._insertions, self._limits, target,
-                piece.frame, piece.places, piece.cones, piece.wide, most_boxes, boxes,
-            )  # fmt: skip
-            looked_at += looked
-            if outcome != RULED_OUT:
-                place = boxes[0, PLACE_X : PLACE_X + 3] @ piece.frame
-                return ReachVerdict(proved=False, boxes=looked_at, open_lps=place)
+        space = self._space
+        count = len(space.boxes)
+        found = Found(
+            outcome=np.full(count, TOO_MANY, dtype=np.uint8),
+            share=np.zeros(count),
+            looked=np.zeros(count, dtype=np.int64),
+            left=np.zeros((count, BOX_COLUMNS)),
+        )
+        ends = math.inf if time_s is None else time.monotonic() + time_s
+        shares = space.measures / max(float(space.measures.sum()), 1e-300)
+        looked = 0
+        for rows in self._rounds(environment, target, found):
+            looked += int(found.looked[rows].sum())
             if progress is not None:
-                progress((done + 1) / len(order))
-        return ReachVerdict(proved=True, boxes=looked_at)
+                progress(1.0 - float((1.0 - found.share) @ shares))
+            if looked >= most_boxes or time.monotonic() >= ends:
+                break
+        proved = bool((found.outcome == RULED_OUT).all())
+        return ReachVerdict(
+            proved=proved,
+            boxes=looked,
+            share_ruled_out=1.0 - float((1.0 - found.share) @ shares),
+            finished=bool((found.outcome != TOO_MANY).all()),
+            open_places=() if proved else open_places(self._lung, space, found),
+        )
+
+    def _rounds(self, environment: ProofEnvironment, target: Float, found: Found) -> Iterator[Int]:
+        """Look at all boxes, then longer and longer at what is left; yield rows that were looked at."""
+        space = self._space
+        away = np.array([np.linalg.norm(piece.cones[0, :3] - target) for piece in space.pieces])
+        nearest = np.argsort(away[space.owners], kind="stable")
+        with ThreadPoolExecutor(THREADS) as pool:
+            for left, to_the_end in ((TOO_MANY, False), (UNDECIDED, True)):
+                most = 1
+                while len(rows := nearest[found.outcome[nearest] == left]):
+
+                    def work(some: Int, most: int = most, to_the_end: bool = to_the_end) -> None:
+                        rule_out(
+                            environment,
+                            self._tubes,
+                            self._insertions,
+                            self._limits,
+                            target,
+                            space.arrays,
+                            space.boxes,
+                            space.owners,
+                            some,
+                            most,
+                            to_the_end,
+                            found,
+                        )
+
+                    yield from in_tasks(pool, work, rows, max(TASK_LOOKS // most, 1))
+                    most *= MORE_LOOKS
 
     def _environment(self, target: Float) -> ProofEnvironment:
         lung = self._lung
@@ -167,18 +241,27 @@ class UnreachableProof:
                 expected="a point of the image",
                 remedy="Check the frame of the point",
             )
-        lumen, leaving, hazards = self._masks
-        depth = lung.lumen_depth
+        if self._free is None:
+            return self._surroundings(np.zeros_like(self._masks[0]))
         near = _near(lung, target, self._limits.goal_tolerance_mm + self._loss_mm)
         regions = np.unique(self._free[near])
-        passable = np.isin(self._free, regions[regions > 0])
+        regions = regions[regions > 0]
+        if regions.tobytes() not in self._passable:
+            passable = np.isin(self._free, regions)
+            self._passable = {regions.tobytes(): distance_corners(passable, lung.grid.spacing_mm)}
+        return self._surroundings(self._passable[regions.tobytes()])
+
+    def _surroundings(self, passable: np.ndarray) -> ProofEnvironment:
+        lung = self._lung
+        lumen, leaving, hazards = self._masks
+        depth = lung.lumen_depth
         return ProofEnvironment(
             lumen=lumen,
             may_be_left=leaving,
             hazards=hazards,
             depth=depth.corners,
             tips=self._tips,
-            passable=distance_corners(passable, lung.grid.spacing_mm),
+            passable=passable,
             labels=lung.labels,
             not_lumen=self._not_lumen,
             geometry=lung.geometry,
@@ -187,6 +270,24 @@ class UnreachableProof:
             loss_mm=self._loss_mm,
             least_depth_mm=self._least_depth_mm,
         )
+
+
+def _limits(lung: Lung, system: System, with_fissures: bool) -> Limits:
+    """Return the limits of the needle; without one, of a needle of no length at the tip of the tubes."""
+    if system.needle is not None:
+        return needle_environment(lung, system.needle, system.margins, with_fissures=with_fissures).limits
+    return Limits(
+        kappa=1.0,
+        max_length_mm=0.0,
+        max_angle_rad=0.0,
+        max_turn_rad=0.0,
+        required_mm=0.0,
+        radius_mm=0.0,
+        exempt_mm=0.0,
+        max_step_mm=0.0,
+        cost_step_mm=0.0,
+        goal_tolerance_mm=0.0,
+    )
 
 
 def _may_be_left(lung: Lung) -> Mask:

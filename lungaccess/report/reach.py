@@ -36,9 +36,9 @@ CLEARANCE_MM = (0.0, 8.0)
 
 COLOURS: dict[str, str] = {
     "direct arc": "#009E73",
-    "search": "#56B4E9",
-    "not reached": "#D55E00",
-    "no clearance": "#C4C4C4",
+    "search": "#8FD3B6",
+    "undecided": "#C4C4C4",
+    "unreachable": "#D55E00",
 }
 
 
@@ -155,7 +155,7 @@ def _bar(figure: Figure) -> None:
 
 
 def _text(figure: Figure, reach: ReachMap) -> None:
-    from lungaccess.reachability import KINDS
+    from lungaccess.reachability import KINDS, STATES
 
     system = reach.system
     style.heading(figure, reach.words, size=15)
@@ -173,8 +173,9 @@ def _text(figure: Figure, reach: ReachMap) -> None:
         loc="upper left", bbox_to_anchor=(TEXT_IN[0] / WIDTH_IN, TEXT_IN[1] / HEIGHT_IN), fontsize=10,
         frameon=False, title="share of the counted lung tissue", alignment="left",
     )  # fmt: skip
-    lines = [
-        f"{row.name}: {row.volume_ml:.0f} mL, {100.0 * row.reached:.1f} % reached"
+    lines = ["region: mL reachable / unreachable / undecided"]
+    lines += [
+        f"{row.name}: " + " / ".join(f"{row.state_ml(state):.0f}" for state in STATES)
         for row in reach.by_region()
     ]
     diameter, radius = system.needle_sizes

@@ -42,8 +42,7 @@ def tour_png(answer: TourAnswer, lung: Lung, path: str | os.PathLike[str]) -> Pa
     tour = answer.shortest
     style.heading(
         figure,
-        f"{lung.name}: tour to {len(tour.order)} lesions, {tour.length_mm:.0f} mm "
-        f"({answer.one_by_one_mm:.0f} mm one by one)",
+        f"{lung.name}: {answer.title}, {tour.length_mm:.0f} mm ({answer.one_by_one_mm:.0f} mm one by one)",
     )
     figure.legend(handles=_legend(), loc="lower center", ncol=5, frameon=False, fontsize=10)
     return style.save_png(figure, path)

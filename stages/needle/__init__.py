@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     )
     from stages.needle.query import Query
     from stages.needle.reach import (
+        BLOCK_MM,
         DEFAULT_ARCS,
         DIRECT,
         NO_CLEARANCE,

@@ -12,6 +12,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import reach as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
+from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.search.base import RANDOM_SHARE
 
 DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
@@ -30,8 +31,8 @@ class Reached:
     ----------
     kinds : (N,) uint8
         `DIRECT`: a single arc is proved clear.  `SEARCHED`: a path of several arcs is.  `UNREACHED`: no
-        single arc is, and the search, if there was one, found nothing.  `NO_CLEARANCE`: the same, and the
-        point is nearer to an obstacle than the needle's axis may be.
+        single arc is, and the search, if there was one, found nothing.  `NO_CLEARANCE`: no needle can end at
+        the point, because an obstacle that is no airway is nearer than the axis may be.
     cost : (N,) float64
         Estimated integral of 1 / clearance of the path found; 0 where there is none.
     clearance_mm : (N,) float64
@@ -50,6 +51,8 @@ class Reached:
 
 
 DEFAULT_ARCS = 4
+BLOCK_MM = 12.0
+"""Side of the cubes whose points share their start poses: larger ones share fewer."""
 RRT_ITERATIONS = 200
 """Iterations of a tree: those that succeed do so early, see `RESTART_ITERATIONS`."""
 ORDER_SEED = 1
@@ -104,7 +107,7 @@ class ReachScan:
         self._objective = environment.objective_arrays(Objective(length=0.0, inverse_clearance=1.0))
 
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
-        """Try all points, one after the other.
+        """Try all points, cube by cube of `BLOCK_MM`: what neighbours have in common is found once.
 
         Parameters
         ----------
@@ -112,7 +115,7 @@ class ReachScan:
         seeds : (N,) uint64
             Seed of the search to each point.
         near : (N, K) int64, optional
-            Indices of points near each that come before it, -1 for none; by default the one before.
+            Indices of points near each, -1 for none; by default the one before.
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds, found = np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 2))
@@ -120,20 +123,57 @@ class ReachScan:
         before = np.arange(len(places))[:, None] - 1 if near is None else near
         kernel.reach_by_arcs(
             environment.obstacles, environment.limits, self._starts, self._branches, self._order, self._mixed,
-            places, np.array(before, dtype=np.int64, order="C"), self._arcs, np.full(len(self._starts), 0.5),
-            np.zeros(kernel.BLOCK, dtype=np.uint8), kinds, found, entries,
+            places, *_cubes(places), np.array(before, dtype=np.int64, order="C"), self._arcs,
+            np.full(len(self._starts), 0.5), kinds, found, entries,
         )  # fmt: skip
         if self.trees:
-            rows = RRT_ITERATIONS * tree.ROWS_PER_STEP
-            kernel.reach_by_search(
-                environment.obstacles, environment.limits, self._objective, self._starts, self._branches,
-                self._order, places, self.trees, RRT_ITERATIONS, RANDOM_SHARE, np.array(seeds,
-                dtype=np.uint64), np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64),
-                np.zeros(self.trees, dtype=np.int64), kinds, found, entries,
-            )  # fmt: skip
+            self._search(places, seeds, kinds, found, entries)
         return Reached(
             kinds=kinds.astype(np.uint8),
             cost=found[:, kernel.COST],
             clearance_mm=found[:, kernel.CLEARANCE],
             entries=entries,
         )
+
+    def _search(
+        self, places: Float, seeds: UInt64, kinds: Int, found: Float, entries: Int
+    ) -> tuple[Float, Int, int]:
+        """Search paths to the points not reached; return the tree to the last one, and its row there."""
+        rows = RRT_ITERATIONS * tree.ROWS_PER_STEP
+        nodes, parents = np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64)
+        last = kernel.reach_by_search(
+            self.environment.obstacles, self.environment.limits, self._objective, self._starts,
+            self._branches, self._order, places, self.trees, RRT_ITERATIONS, RANDOM_SHARE,
+            np.array(seeds, dtype=np.uint64), nodes, parents, np.zeros(self.trees, dtype=np.int64), kinds,
+            found, entries,
+        )  # fmt: skip
+        return nodes, parents, last
+
+    def searched_path(self, point: ArrayLike, seed: int, lps_from_start: Float) -> ArcPath | None:
+        """Return again the path that the search found to a point, None if it finds none.
+
+        Parameters
+        ----------
+        point : (3,) float64, LPS mm
+        seed : int
+            That of the point in `reach`.
+        lps_from_start : (4, 4) float64
+            The start pose that was found for it.
+        """
+        places = np.array(point, dtype=np.float64).reshape(1, 3)
+        kinds = np.full(1, UNREACHED, dtype=np.int64)
+        nodes, parents, last = self._search(
+            places, np.array([seed], dtype=np.uint64), kinds, np.zeros((1, 2)), np.full(1, -1)
+        )
+        return path_from_tree(lps_from_start, nodes, parents, last) if last else None
+
+
+def _cubes(points: Float) -> tuple[Int, Int]:
+    """Return an order (N,) that puts the points of a cube in a row, and where in it each begins (B + 1,)."""
+    if not len(points):
+        return np.zeros(0, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    cubes = np.floor((points - points.min(axis=0)) / BLOCK_MM + 1e-9).astype(np.int64)
+    order = np.lexsort(cubes.T)
+    in_order = cubes[order]
+    begins = np.flatnonzero((in_order[1:] != in_order[:-1]).any(axis=1)) + 1
+    return order, np.concatenate([[0], begins, [len(points)]])

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Count
-from lungaccess.cli.options import PatientFolder, PatientOptions, SystemOptions, TargetOptions
+from lungaccess.cli.numbers import Count, Seconds
+from lungaccess.cli.options import (
+    PatientFolder,
+    PatientOptions,
+    SystemOptions,
+    TargetOptions,
+    require_picture,
+)
 from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from anatomy.typed import Float
+    from lungaccess.reachability import OpenPlace, ReachVerdict
+
+SHOWN = 8
+"""Open places that the table names."""
 
 
 def certify(
@@ -15,20 +33,28 @@ def certify(
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     most_boxes: Count | None = None,
+    time_s: Annotated[Seconds | None, Parameter(name="--time")] = None,
+    out: Path | None = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Prove that a target is unreachable: from no place in the airways, however scope and tubes are turned.
 
-    Exit code 0 if it is proved, 1 if it is not: then nothing is known.
+    Exit code 0 if it is proved, 1 if it is not: then nothing is known of the target, but which share of the
+    deployments is ruled out, and where the others start.
 
     Parameters
     ----------
     most_boxes : int
-        Ranges of deployments to look at for every 8 mm of airway before the proof is given up; 3 million if
-        not given.
+        Ranges of deployments to look at before the proof is given up; 20 million if not given.
+    time_s : float
+        Seconds to look at them, after the preparation; the same time need not give the same answer.
+    out : Path
+        PNG file that shows what is ruled out and what is open.
     """
     from lungaccess.reachability import MOST_BOXES, UnreachableProof
 
+    if out is not None:
+        require_picture(out)
     stated = target.stated()
     device = system.load()
     lung = output.load(patient)
@@ -36,27 +62,72 @@ def certify(
     with progress("proving") as shown:
         proof = UnreachableProof(lung, device, with_fissures=not device.fissures_allowed)
         verdict = proof.prove(
-            point, most_boxes=most_boxes or MOST_BOXES, progress=lambda share: shown.step("proving", share)
+            point,
+            most_boxes=most_boxes or MOST_BOXES,
+            time_s=time_s,
+            progress=lambda share: shown.step("proving", share),
         )
-    open_lps = None if verdict.open_lps is None else verdict.open_lps.tolist()
+    if out is not None:
+        from lungaccess.report.open_places import open_places_png
+
+        open_places_png(lung, proof, verdict, point, out)
     if output.json:
         terminal.show_json(
-            {
-                "patient": lung.name,
-                "system": device.name,
-                "target_lps_mm": point.tolist(),
-                "proved_unreachable": verdict.proved,
-                "boxes": verdict.boxes,
-                "open_place_lps_mm": open_lps,
-            }
+            {"patient": lung.name, "system": device.name, "target_lps_mm": point.tolist()} | _as_json(verdict)
         )
         return ExitCode.of(verdict.proved)
     rows = [
         ("system", device.name),
         ("outcome", "proved unreachable" if verdict.proved else "not proved: it may be reachable or not"),
+        ("deployments ruled out", f"{_percent(verdict.share_ruled_out)} of the deployment space"),
         ("ranges of deployments looked at", f"{verdict.boxes:,}"),
     ]
-    if open_lps is not None:
-        rows.append(("not ruled out from", ", ".join(f"{value:.1f}" for value in open_lps) + " (LPS mm)"))
+    if verdict.open_places:
+        branches = len({place.branch for place in verdict.open_places})
+        rows.append(("open", f"{len(verdict.open_places)} places in {branches} branches"))
+        rows += [("", _words(place)) for place in verdict.open_places[:SHOWN]]
+    if out is not None:
+        rows.append(("picture", str(out)))
     terminal.show([terminal.table("proof", ("", ""), rows)])
     return ExitCode.of(verdict.proved)
+
+
+def _as_json(verdict: ReachVerdict) -> dict[str, object]:
+    return {
+        "proved_unreachable": verdict.proved,
+        "boxes": verdict.boxes,
+        "share_ruled_out": verdict.share_ruled_out,
+        "finished": verdict.finished,
+        "open_place_lps_mm": None if verdict.open_lps is None else verdict.open_lps.tolist(),
+        "open_places": [
+            {
+                "branch": place.branch,
+                "generation": place.generation,
+                "name": place.name,
+                "share": place.share,
+                "narrowest": place.narrowest,
+                "tip_lps_mm": place.tip_lps.tolist(),
+                "insertions_mm": list(place.insertions_mm),
+            }
+            for place in verdict.open_places
+        ],
+    }
+
+
+def _percent(share: float) -> str:
+    """Return a share in percent, with as many digits as tell it from all of it."""
+    for digits in (1, 3, 6):
+        if share == 1.0 or round(100.0 * share, digits) < 100.0:
+            return f"{100.0 * share:.{digits}f} %"
+    return "all but a millionth of a percent"
+
+
+def _words(place: OpenPlace) -> str:
+    return (
+        f"branch {place.name}, generation {place.generation}, from {_point(place.tip_lps)} (LPS mm): "
+        f"{100.0 * place.share:.2g} % of the space"
+    )
+
+
+def _point(point: Float) -> str:
+    return ", ".join(f"{value:.1f}" for value in point)

@@ -105,10 +105,11 @@ def plan(
 def _require_plain(asked: str, search: SearchOptions, system: SystemOptions) -> None:
     """Raise SettingsError unless the search is one that can be made for success or a window."""
     plain = SearchOptions()
-    if (search.method, search.needle_planner, search.processes) != (plain.method, None, plain.processes):
+    asked_for = search.method, search.needle_planner, search.processes, search.gap
+    if asked_for != (plain.method, None, plain.processes, None):
         raise SettingsError(
             f"{asked} is asked for with another search",
-            expected="neither --method nor --needle-planner nor --processes",
+            expected="neither --method nor --needle-planner nor --processes nor --gap",
             remedy="Leave them out",
         )
     if system.system == AUTO:

@@ -84,7 +84,8 @@ def reach(
     terminal.show([_region_table(each) for each in maps])
     if len(maps) > 1:
         terminal.show([_comparison_table(maps)])
-    ends = (".nrrd", "-cost.nrrd", "-clearance.nrrd", *(("-window.nrrd",) if asked else ()), ".png")
+    parts = ("", "-cost", "-clearance", "-deployment", *(("-window",) if asked else ()))
+    ends = (*(f"{part}.nrrd" for part in parts), ".png")
     files = ", ".join(f"{stem}{end}" for stem in stems for end in ends)
     also = "" if page is None else f"; {page}"
     terminal.say(f"Written to {out}: {files}, reach.json{also}")
@@ -101,6 +102,8 @@ def _stems(maps: tuple[ReachMap, ...]) -> list[str]:
 
 def record(reach: ReachMap) -> dict[str, object]:
     """Return the figures of a map as plain values."""
+    from lungaccess.reachability import KINDS, NOT_COUNTED
+
     system, needle = reach.system, reach.system.needle
     return {
         "patient": reach.patient_name,
@@ -110,6 +113,7 @@ def record(reach: ReachMap) -> dict[str, object]:
         "needle_radius_of_curvature_mm": None if needle is None else needle.min_radius_of_curvature_mm,
         "fissures_are_obstacles": reach.with_fissures,
         "spacing_mm": float(reach.kinds.grid.spacing_mm[0]),
+        "labels": {"not counted": NOT_COUNTED, **KINDS},
         "deployments": reach.entries,
         "lungs_are_separate": reach.regions.lungs_are_separate,
         "regions": [_plain(row) for row in reach.by_region()],
@@ -120,11 +124,12 @@ def record(reach: ReachMap) -> dict[str, object]:
 
 
 def _plain(row: RegionReach) -> dict[str, object]:
-    from lungaccess.reachability import KINDS
+    from lungaccess.reachability import KINDS, STATES
 
     return {
         "name": row.name,
         "volume_ml": row.volume_ml,
+        "states_ml": {state: row.state_ml(state) for state in STATES},
         "shares": dict(zip(KINDS, row.shares, strict=True)),
         "median_cost": row.median_cost if row.reached else None,
         "median_clearance_mm": row.median_clearance_mm if row.reached else None,
@@ -132,19 +137,19 @@ def _plain(row: RegionReach) -> dict[str, object]:
 
 
 def _region_table(reach: ReachMap) -> Table:
-    from lungaccess.reachability import KINDS
+    from lungaccess.reachability import STATES
 
     rows = [
         (
             row.name,
             f"{row.volume_ml:.0f}",
-            *(f"{100.0 * share:.1f}" for share in row.shares),
+            *(f"{row.state_ml(state):.0f} ({100.0 * row.share(state):.1f} %)" for state in STATES),
             f"{row.median_cost:.2f}",
             f"{row.median_clearance_mm:.2f}",
         )
         for row in reach.by_region()
     ]
-    headings = ("", "mL", *(f"{name}, %" for name in KINDS), "median cost", "median clearance, mm")
+    headings = ("", "mL", *(f"{state}, mL" for state in STATES), "median cost", "median clearance, mm")
     during = "" if reach.phases is None else ", phases {:g} to {:g}".format(*reach.phases)
     return terminal.table(f"{reach.system.name} in {reach.patient_name}{during}", headings, rows)
 

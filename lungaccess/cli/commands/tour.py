@@ -133,7 +133,7 @@ def _show(answer: TourAnswer, speed: float, per_lesion: float) -> None:
     exits = "each exit has a coupled plan" if answer.plan_required else "exits without plans"
     terminal.show(
         [
-            terminal.table(f"Tours to {count} lesions ({exits})", headings, rows),
+            terminal.table(f"{answer.title.capitalize()} ({exits})", headings, rows),
             terminal.table(
                 "Visits of the shortest tour",
                 ("visit", "lesion", "exit", "from the lesion, mm", "angle, deg"),

@@ -38,8 +38,7 @@ SCOPE_POSE = 0
 ROTATION = 1
 OUTER = 2
 INNER = 3
-N_CHOICE = 4
-"""Places of the numbers of a choice of planar tubes in `x`, and how many they are."""
+"""Places of the numbers of a choice of planar tubes in `x`."""
 
 ROUNDING = 1e-9
 """Share of each limit that stays unused, so that rounding does not carry a plan beyond the limit."""

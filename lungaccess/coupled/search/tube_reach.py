@@ -20,7 +20,7 @@ from lungaccess.coupled.search.aimed_tubes import (
     tips_of,
 )
 from lungaccess.plans.candidate import tubes_in_tissue
-from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, UNREACHED, Objective, Reached
+from stages.needle import DEFAULT_ARCS, DIRECT, UNREACHED, Objective, Reached
 from stages.tube import DeploymentValidator
 
 if TYPE_CHECKING:
@@ -56,8 +56,6 @@ class TubeReachScan:
         self._aiming = TubeAiming(
             atlas.lung, atlas.system, Objective(inverse_clearance=1.0), with_fissures=atlas.with_fissures
         )
-        self._field = atlas.lung.obstacle_field(with_fissures=atlas.with_fissures)
-        self._required_mm = atlas.system.tubes.inner.radius_mm + atlas.system.margins.total_mm
         self._tips = cKDTree(atlas.deployments.positions) if atlas.deployments.count else None
 
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
@@ -70,7 +68,6 @@ class TubeReachScan:
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds, entries = np.full(len(places), UNREACHED, dtype=np.uint8), np.full(len(places), -1)
         cost, clearance = np.zeros(len(places)), np.zeros(len(places))
-        kinds[self._field.lower_bound_mm(places) < self._required_mm] = NO_CLEARANCE
         for n, point in enumerate(places):
             found = self._best(point)
             if found is not None:

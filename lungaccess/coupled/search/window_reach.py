@@ -16,7 +16,7 @@ from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from stages.needle import DIRECT, NO_CLEARANCE, UNREACHED, Reached
+from stages.needle import DIRECT, UNREACHED, Reached
 
 STEP_MM = 0.25
 """Spacing of the points at which the clearance of a needle is looked up; half of it is taken off."""
@@ -37,7 +37,6 @@ class WindowReachScan:
         self._lung, self._atlas, self._phases = lung, atlas, phases
         needle = atlas.system.require_needle("A map for phases of the breath")
         self._exempt_mm = needle.exit_exemption_mm
-        self._required_mm = needle.radius_mm + atlas.system.margins.total_mm
         self._field = lung.obstacle_field(with_fissures=atlas.with_fissures)
 
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
@@ -49,7 +48,6 @@ class WindowReachScan:
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds = np.full(len(places), UNREACHED, dtype=np.uint8)
-        kinds[self._field.lower_bound_mm(places) < self._required_mm] = NO_CLEARANCE
         cost, clearance, share = np.zeros(len(places)), np.zeros(len(places)), np.zeros(len(places))
         for n, point in enumerate(places):
             target = Target(lps_mm=point, origin="point")

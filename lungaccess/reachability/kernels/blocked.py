@@ -20,6 +20,7 @@ from stages.tube.kernels import (
     OUTER_RADIUS,
     OVERLAP_CURVATURE,
     lateral_sweep,
+    sweep_slope,
 )
 
 UNNOTICED_MM = 0.05
@@ -108,23 +109,34 @@ def no_tip_near(environment, place, away):
 
 
 @inner_kernel
-def tips_blocked(environment, tubes, limits, seen, family, box):
-    """Tell whether all tips are in the lumen or blocked ahead, and how far tips are from the middle."""
+def tips_differ(tubes, family, box):
+    """Return how far the tips of the tubes of a box are from the middle one at most, mm."""
+    return sample_of(tubes, family, box[INNER])[1] + box[HALF + INNER]
+
+
+@inner_kernel
+def tips_in_lumen(environment, family, tubes, box, away):
+    """Tell whether the tips of all tubes of a box, within `away` of the middle one, are in the lumen."""
+    tip, _away = sample_of(tubes, family, box[INNER])
+    return distance_bound(environment.depth, environment.depth_geometry, tip[0], tip[1], tip[2]) > away
+
+
+@inner_kernel
+def tips_blocked(environment, tubes, limits, seen, family, box, away):
+    """Tell whether all tips, within `away` of the middle one, are in the lumen or blocked ahead."""
     pose, rho, ahead, _size, _moved, _second = seen
     _middle, _forward, _normal, bounds, _outer, _inner = family
     _place, tilt, roll, sharing, _first_outer, opening = bounds
     half_inner = box[HALF + INNER]
-    _point, away = sample_of(tubes, family, box[INNER])
-    away += half_inner
-    if distance_bound(environment.depth, environment.depth_geometry, pose[0], pose[1], pose[2]) > away:
-        return True, away
+    if tips_in_lumen(environment, family, tubes, box, away):
+        return True
     spare = limits.goal_tolerance_mm + SPARE_MM
     exempt = limits.exempt_mm
     if (
         distance_bound(environment.passable, environment.geometry, pose[0], pose[1], pose[2])
         > away + exempt + spare
     ):
-        return True, away
+        return True
     most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
     turned = sharing + opening + most * half_inner
     angle = turned + tilt + roll * min(abs(math.sin(heading(tubes, box[OUTER], box[INNER]))) + turned, 1.0)
@@ -136,9 +148,9 @@ def tips_blocked(environment, tubes, limits, seen, family, box):
             break
         x, y, z = pose[0] + length * pose[3], pose[1] + length * pose[4], pose[2] + length * pose[5]
         if distance_bound(environment.passable, environment.geometry, x, y, z) > around:
-            return True, away
+            return True
         length += around
-    return False, away
+    return False
 
 
 @inner_kernel
@@ -224,16 +236,3 @@ def tubes_blocked(environment, tubes, family, box):
         if s >= longest:
             return not may_leave
         s = min(s + step, longest)
-
-
-@inner_kernel
-def sweep_slope(bend):
-    """Return how fast the lateral sweep may change with an insertion, mm a mm; `bend` (rad) is curvature x
-    length.
-
-    The sweep is the distance of two points: the tip when it first got there, and the body of the final
-    shape.  Where the tip is sampled moves with the insertion by at most as much; the first point moves by at
-    most 1 + `bend` with it, the second by 1; and the final shape at a fixed place changes by at most `bend`
-    with each insertion, the first by `bend` with the outer.
-    """
-    return 2.0 + 3.0 * bend

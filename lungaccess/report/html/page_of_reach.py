@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 MODULES = ("reach.js",)
 STEPS_PER_MM = 25.0
 """A clearance is stored in steps of 0.04 mm, up to 10.2 mm."""
-SURFACES = {"reached": COLOURS["direct arc"], "not reached": COLOURS["not reached"]}
+SURFACES = {
+    "reachable": COLOURS["direct arc"],
+    "unreachable": COLOURS["unreachable"],
+    "undecided": COLOURS["undecided"],
+}
 
 
 def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str]) -> Path:
@@ -84,17 +88,14 @@ def packed_map(reach: ReachMap) -> Packed:
 
 
 def _surfaces(reach: ReachMap) -> list[Packed]:
-    from lungaccess.reachability import NOT_COUNTED
-
-    counted = reach.kinds.array != NOT_COUNTED
-    masks = {"reached": reach.reached, "not reached": counted & ~reach.reached}
+    masks = {state: reach.in_state(state) for state in SURFACES}
     cell_mm = 0.9 * float(reach.kinds.grid.spacing_mm.max())
     return [
         packed_surface(
             Volume(grid=reach.kinds.grid, array=mask),
             Look(
                 key=name, name=name.capitalize(), colour=SURFACES[name], opacity=0.28,
-                shown=name == "reached", cell_mm=cell_mm, most_faces=60_000,
+                shown=name == "reachable", cell_mm=cell_mm, most_faces=60_000,
             ),
         )
         for name, mask in masks.items()
@@ -104,11 +105,11 @@ def _surfaces(reach: ReachMap) -> list[Packed]:
 
 def volumes_section(maps: Sequence[ReachMap]) -> str:
     """Return a table of volumes by side for each system, in mL and as a share."""
-    from lungaccess.reachability import KINDS
+    from lungaccess.reachability import STATES
 
     headings = (
-        "", "tissue, mL", *(f"{name}, mL (%)" for name in KINDS), "median 1/clearance integral",
-        "median clearance, mm",
+        "", "tissue, mL", *(f"{state}, mL (%)" for state in STATES), "reachable by search alone, mL",
+        "median 1/clearance integral", "median clearance, mm",
     )  # fmt: skip
     tables = []
     for each in maps:
@@ -116,7 +117,8 @@ def volumes_section(maps: Sequence[ReachMap]) -> str:
             (
                 words.text(row.name),
                 f"{row.volume_ml:.0f}",
-                *(f"{row.volume_ml * share:.0f} ({100.0 * share:.1f})" for share in row.shares),
+                *(f"{row.state_ml(state):.0f} ({100.0 * row.share(state):.1f})" for state in STATES),
+                f"{row.volume_ml * row.shares[1]:.0f}",
                 words.number(row.median_cost),
                 words.number(row.median_clearance_mm),
             )

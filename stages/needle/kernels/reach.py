@@ -118,54 +118,80 @@ def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
 
 
 @inner_kernel
-def _mark_candidates(limits, mixed, q, begin, end, marks):
-    """Mark the poses `begin` to `end` of the mixed order whose arc to a point may be within the limits.
+def _mark_candidates(limits, poses, q, radius, begin, end, marks):
+    """Mark the poses `begin` to `end` whose arc to a point within `radius` of `q` may be within the limits.
 
-    It needs no angles: with a turn of at most `a`, the chord leans at most a / 2 from the start, and the
-    curvature is twice the offset over the squared chord.
+    It needs no angles.  With a turn of at most `a`, the chord leans at most a / 2 from the start, so that the
+    point lies in a cone; and it lies outside the circle of the tightest arc, which touches the start.
     """
     # Slightly too wide: rounding may not exclude what the arc itself would pass.
-    lean = 0.999999 * math.cos(0.5 * min(limits.max_angle_rad, limits.max_turn_rad))
-    lean2 = lean * lean
+    lean = 0.5 * min(limits.max_angle_rad, limits.max_turn_rad)
+    sine, cosine2 = 1.000001 * math.sin(lean), 0.999999 * math.cos(lean) ** 2
     kappa2 = 1.000001 * 0.25 * limits.kappa * limits.kappa
-    longest2 = limits.max_length_mm * limits.max_length_mm
+    outside = max(2.0 / limits.kappa - radius, 0.0) * radius if radius * limits.kappa < 1.0 else math.inf
+    longest2 = (limits.max_length_mm + radius) * (limits.max_length_mm + radius)
     for m in range(begin, end):
-        dx = q[0] - mixed[0, m]
-        dy = q[1] - mixed[1, m]
-        dz = q[2] - mixed[2, m]
-        h = dx * mixed[3, m] + dy * mixed[4, m] + dz * mixed[5, m]
+        dx = q[0] - poses[0, m]
+        dy = q[1] - poses[1, m]
+        dz = q[2] - poses[2, m]
+        h = dx * poses[3, m] + dy * poses[4, m] + dz * poses[5, m]
         chord2 = dx * dx + dy * dy + dz * dz
+        aside2 = chord2 - h * h
+        into = radius + sine * h
+        seen2 = chord2 + outside
         marks[m - begin] = (
-            (h > 0.0)
-            & (chord2 - h * h <= kappa2 * chord2 * chord2)
+            (into > 0.0)
+            & (aside2 <= kappa2 * seen2 * seen2)
             & (chord2 <= longest2)
-            & (h * h >= lean2 * chord2)
+            & (cosine2 * aside2 <= into * into)
         )
 
 
 @inner_kernel
-def _best_of_mixed(obstacles, limits, starts, branches, order, mixed, q, wanted, hints, marks):
-    """Return the cheapest of the first `wanted` clear arcs and its start pose, (inf, -1) if there is none."""
-    best = math.inf
-    chosen = -1
-    clear = 0
+def _gather(limits, order, mixed, q, radius, marks, chosen, near):
+    """Copy the poses that `_mark_candidates` marks for a ball, in their order, to `near`; return how many.
+
+    `chosen` receives their numbers.
+    """
+    count = 0
     total = mixed.shape[1]
     for begin in range(0, total, BLOCK):
         end = min(begin + BLOCK, total)
-        _mark_candidates(limits, mixed, q, begin, end, marks)
+        _mark_candidates(limits, mixed, q, radius, begin, end, marks)
+        for m in range(begin, end):
+            if marks[m - begin]:
+                chosen[count] = order[m]
+                for c in range(6):
+                    near[c, count] = mixed[c, m]
+                count += 1
+    return count
+
+
+@inner_kernel
+def _best_of(obstacles, limits, starts, branches, chosen, poses, total, q, wanted, hints, marks):
+    """Return the cheapest of the first `wanted` clear arcs and its start pose, (inf, -1) if there is none.
+
+    `poses` are those of the entries `chosen`; the first `total` columns count.
+    """
+    best = math.inf
+    found = -1
+    clear = 0
+    for begin in range(0, total, BLOCK):
+        end = min(begin + BLOCK, total)
+        _mark_candidates(limits, poses, q, 0.0, begin, end, marks)
         for m in range(begin, end):
             if not marks[m - begin]:
                 continue
-            entry = order[m]
+            entry = chosen[m]
             cost = _arc_cost(obstacles, limits, starts[entry], branches[entry], q, math.inf, hints, entry)
             if cost < math.inf:
                 clear += 1
                 if cost < best:
                     best = cost
-                    chosen = entry
+                    found = entry
                 if clear >= wanted:
-                    return best, chosen
-    return best, chosen
+                    return best, found
+    return best, found
 
 
 @inner_kernel
@@ -200,15 +226,15 @@ def _has_clearance(obstacles, limits, q, bits):
 
 @numba.njit(cache=True, nogil=True)
 def reach_by_arcs(
-    obstacles, limits, starts, branches, order, mixed, points, near, wanted, hints, marks, kinds, found,
-    entries
+    obstacles, limits, starts, branches, order, mixed, points, visits, blocks, near, wanted, hints, kinds,
+    found, entries
 ):  # fmt: skip
     """Try the single arcs to each point.
 
     A point counts as reached if one arc is proved clear.  The cheapest is taken of the first `wanted` clear
     ones in the mixed order and of those from the start poses of neighbouring points; then its neighbours in
     the list are tried as long as they are cheaper: a good arc, not the proved best.  Where none is clear,
-    all have been tried.
+    all have been tried.  The start poses that come into question are found once for the points of a block.
 
     Parameters
     ----------
@@ -216,12 +242,16 @@ def reach_by_arcs(
     starts, branches, order, mixed
         See the module.
     points : (N, 3) float64, LPS mm
+    visits : (N,) int64
+        The points in the order in which they are tried.
+    blocks : (B + 1,) int64
+        Where in that order the points of each block begin, and N; those of a block should be close.
     near : (N, K) int64
-        Points near each that come before it; -1 for none.
+        Points near each; -1 for none.  Those that are tried later do not count.
     wanted : int
         At least 1.
-    hints : (E,) float64, marks : (BLOCK,) uint8
-        Scratch; `hints` starts at 0.5, and says where each arc was blocked the last time.
+    hints : (E,) float64
+        Scratch; starts at 0.5, and says where each arc was blocked the last time.
     kinds : (N,) int64
         Receives DIRECT, UNREACHED or NO_CLEARANCE.
     found : (N, 2) float64
@@ -230,34 +260,58 @@ def reach_by_arcs(
         Receives the start pose of what is reached, else -1.
     """
     bits = obstacles.bits
-    for n in range(points.shape[0]):
-        q = (points[n, 0], points[n, 1], points[n, 2])
-        kinds[n] = NO_CLEARANCE
-        entries[n] = -1
-        # At the exit the airway may be nearer.
-        if not _has_clearance(obstacles, limits, q, bits & ~AIRWAY):
-            continue
-        best, chosen = _best_of_mixed(
-            obstacles, limits, starts, branches, order, mixed, q, wanted, hints, marks
-        )
-        if chosen < 0:
-            if _has_clearance(obstacles, limits, q, bits):
-                kinds[n] = UNREACHED
-            continue
-        for other in near[n]:
-            entry = entries[other] if other >= 0 else -1
-            if entry >= 0:
-                cost = _arc_cost(obstacles, limits, starts[entry], branches[entry], q, best, hints, entry)
-                if cost < best:
-                    best, chosen = cost, entry
-        best, chosen = _improved(obstacles, limits, starts, branches, q, best, chosen, hints)
-        entries[n] = chosen
-        start = starts[chosen]
-        pose = (start[0], start[1], start[2], start[3], start[4], start[5])
-        length, bend, _turn = arc_to_point(pose, q)
-        kinds[n] = DIRECT
-        found[n, COST] = best
-        found[n, CLEARANCE] = _least_clearance(obstacles, limits, pose, bend, length, 0.0, math.inf)
+    marks = np.zeros(BLOCK, dtype=np.uint8)
+    chosen = np.zeros(len(order), dtype=np.int64)
+    poses = np.zeros(mixed.shape)
+    entries[:] = -1
+    for block in range(len(blocks) - 1):
+        members = visits[blocks[block] : blocks[block + 1]]
+        centre, radius = _ball_around(points, members)
+        total = _gather(limits, order, mixed, centre, radius, marks, chosen, poses)
+        for n in members:
+            q = (points[n, 0], points[n, 1], points[n, 2])
+            # At the exit the airway may be nearer, but nothing else.
+            if not _has_clearance(obstacles, limits, q, bits & ~AIRWAY):
+                kinds[n] = NO_CLEARANCE
+                continue
+            kinds[n] = UNREACHED
+            best, entry = _best_of(
+                obstacles, limits, starts, branches, chosen, poses, total, q, wanted, hints, marks
+            )
+            if entry < 0:
+                continue
+            for other in near[n]:
+                known = entries[other] if other >= 0 else -1
+                if known >= 0 and known != entry:
+                    cost = _arc_cost(obstacles, limits, starts[known], branches[known], q, best, hints, known)
+                    if cost < best:
+                        best, entry = cost, known
+            best, entry = _improved(obstacles, limits, starts, branches, q, best, entry, hints)
+            entries[n] = entry
+            start = starts[entry]
+            pose = (start[0], start[1], start[2], start[3], start[4], start[5])
+            length, bend, _turn = arc_to_point(pose, q)
+            kinds[n] = DIRECT
+            found[n, COST] = best
+            found[n, CLEARANCE] = _least_clearance(obstacles, limits, pose, bend, length, 0.0, math.inf)
+
+
+@inner_kernel
+def _ball_around(points, members):
+    """Return the centre and the radius of a ball that holds points, slightly too large."""
+    centre = np.zeros(3)
+    for c in range(3):
+        low = high = points[members[0], c]
+        for n in members:
+            low, high = min(low, points[n, c]), max(high, points[n, c])
+        centre[c] = 0.5 * (low + high)
+    radius2 = 0.0
+    for n in members:
+        gap2 = 0.0
+        for c in range(3):
+            gap2 += (points[n, c] - centre[c]) ** 2
+        radius2 = max(radius2, gap2)
+    return (centre[0], centre[1], centre[2]), math.sqrt(radius2) * (1.0 + 1e-9)
 
 
 @inner_kernel
@@ -311,8 +365,14 @@ def reach_by_search(
         Scratch: a tree, and `trees` int64.
     kinds, found, entries : arrays
         As `reach_by_arcs` left them; points found become SEARCHED.
+
+    Returns
+    -------
+    int
+        The row of `nodes` at the last point that was searched, 0 if it was not found.
     """
     state = seeds[:1].copy()
+    last = 0
     for n in range(points.shape[0]):
         if kinds[n] != UNREACHED:
             continue
@@ -346,3 +406,4 @@ def reach_by_search(
             kinds[n] = SEARCHED
             entries[n] = entry
             _record_path(obstacles, limits, nodes, parents, last, found[n])
+    return last

@@ -16,7 +16,10 @@ from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
 
 FIRST_ITERATIONS = 200
-"""Of the tree alone: half of the paths are found by then, before the proof and the other search are made."""
+"""Of the tree alone: half of the paths are found by then, before the other search is made."""
+PROOF_FROM = 400
+"""Iterations before the proof is made: it takes as long to begin as the resolution search takes for a path
+that is not narrow."""
 PIECE = 200
 """Iterations between two looks at the proof, a few tenths of a millisecond."""
 RESOLUTION_SHARE = 5 / 6
@@ -69,7 +72,7 @@ class Decision:
             piece = left if self.path is not None else min(PIECE, left)
             left -= piece
             better = self._search(piece)
-            if self.path is None and self.iterations >= FIRST_ITERATIONS:
+            if self.path is None and self.iterations >= PROOF_FROM:
                 self._prove()
         return better
 

@@ -16,6 +16,12 @@ if TYPE_CHECKING:
         validate_arcs,
         validate_deployment,
     )
+    from stages.tube.kernels.insertions import (
+        INSERTION_STEP_MM,
+        greatest_insertions,
+        insertions_exist,
+        sweep_slope,
+    )
     from stages.tube.kernels.one_shape import (
         DesignArrays,
         ManyShapes,

@@ -186,6 +186,7 @@ def test_taking_a_correction_back_restores_what_was_made(
     assert _voxels(copy) == _voxels(made.folder)
 
 
+@pytest.mark.slow
 def test_a_segmentation_of_slicer_over_a_part_of_the_image_is_taken(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:

@@ -114,7 +114,7 @@ def test_a_checker_that_has_seen_other_plans_says_the_same(
     """What is kept from one plan to the next changes nothing."""
     checker = Checker(small_lung)
     for _ in range(2):
-        for _system, _target, case in cases[::4]:
+        for _system, _target, case in cases[::6]:
             assert checker.check(case.plan).findings == check(case.plan, small_lung).findings
 
 

@@ -137,6 +137,8 @@ def test_a_lesion_out_of_reach_is_left_out_and_named(small_lung: Lung) -> None:
     answer = plan_tour(small_lung, np.vstack((corner, places(small_lung, 2))))
     assert answer.numbers == (2, 3)
     assert "has no exit" in answer.left_out[1]
+    seen = len(answer.lesions_lps)
+    assert answer.title == f"tour to {seen} of {seen + 1} lesions"
     with pytest.raises(TargetError, match="No lesion"):
         plan_tour(small_lung, corner)
     with pytest.raises(TargetError, match="outside the image"):

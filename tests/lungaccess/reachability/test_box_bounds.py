@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
@@ -10,10 +11,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from anatomy.typed import Float
-from lungaccess.reachability.kernels import blocked
 from lungaccess.reachability.kernels import deployment_boxes as boxes
-from lungaccess.reachability.kernels import unreachable as kernel
-from stages.tube.kernels import CURVED_LENGTH, MAX_SWEEP, lateral_sweep, planar_point
+from stages.tube.kernels import (
+    CURVED_LENGTH,
+    INSERTION_STEP_MM,
+    MAX_SWEEP,
+    greatest_insertions,
+    lateral_sweep,
+    planar_point,
+    sweep_slope,
+)
 from tests.lungaccess.reachability.deployment_cases import KAPPA, draw, random_case
 
 
@@ -42,7 +49,12 @@ def tip_frame(tubes: Float, frame: Float, place: Float, values: Float) -> Float:
     return pose
 
 
-@pytest.mark.parametrize("seed", range(4))
+def seeds(first: int, of_all: int) -> list[Any]:
+    """Return the seeds of a quick run, and those that make it a hundred thousand cases, marked slow."""
+    return [*range(first), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(first, of_all))]
+
+
+@pytest.mark.parametrize("seed", seeds(4, 12))
 def test_no_deployment_of_a_box_sees_the_target_farther_off_than_its_bounds(tubes: Float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     tight = 0
@@ -76,7 +88,7 @@ def test_no_deployment_of_a_box_sees_the_target_farther_off_than_its_bounds(tube
     assert tight > 20
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", seeds(2, 30))
 def test_no_tube_of_a_box_is_farther_from_its_samples_than_they_say(tubes: Float, seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
     for _ in range(200):
@@ -95,13 +107,13 @@ def test_no_tube_of_a_box_is_farther_from_its_samples_than_they_say(tubes: Float
 
 def test_insertions_that_sweep_little_are_in_the_table(tubes: Float) -> None:
     table = np.zeros(121)
-    kernel.greatest_insertions(tubes, 60.0, 0.02, table)
+    greatest_insertions(tubes, 60.0, 0.02, table)
     assert table.max() < 60.0
     rng = np.random.default_rng(3)
     near = 0
     for outer, inner in rng.uniform(0.0, 60.0, (20_000, 2)):
         if outer <= inner and lateral_sweep(tubes, outer, inner) <= tubes[MAX_SWEEP]:
-            limit = table[int(outer / kernel.INSERTION_STEP_MM)]
+            limit = table[int(outer / INSERTION_STEP_MM)]
             assert inner <= limit
             near += inner > max(limit - 0.5, tubes[CURVED_LENGTH])
     assert near > 20
@@ -111,7 +123,7 @@ def test_the_sweep_changes_no_faster_than_stated(tubes: Float) -> None:
     rng = np.random.default_rng(4)
     bend = float(np.abs(tubes[:2]).max() * tubes[CURVED_LENGTH])
     slope = 2.0 + 3.0 * bend
-    assert blocked.sweep_slope.py_func(bend) == slope
+    assert sweep_slope.py_func(bend) == slope
     for outer, inner in rng.uniform(0.0, 60.0, (3000, 2)):
         step = rng.normal(0.0, 0.05, 2)
         other = np.maximum([outer, inner] + step, 0.0)

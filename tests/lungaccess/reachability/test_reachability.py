@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.errors import GridMismatchError, SettingsError, TargetError
 from anatomy.grid import Grid, Volume
 from anatomy.io.images import read_volume
 from anatomy.lung import Lung
@@ -29,6 +29,7 @@ from lungaccess.reachability.reach_map import (
     reach_grid,
 )
 from lungaccess.reachability.regions import LEFT, RIGHT, lung_regions
+from lungaccess.reachability.voxel_plan import plan_to_voxel
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment
 from stages.needle.path import direct_path
 from stages.needle.reach import DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED, ReachScan
@@ -76,7 +77,8 @@ def test_every_point_agrees_with_all_arcs_tried(
         if clear.any():
             ratios.append(float(reach.cost.array[tuple(ijk)]) / costs[clear].min())
             continue
-        room = small_lung.exact_clearance_mm(point, OBSTACLES | FISSURE, cap_mm=2.0)[0]
+        assert kind in (UNREACHED, NO_CLEARANCE)
+        room = small_lung.exact_clearance_mm(point, (OBSTACLES & ~AIRWAY) | FISSURE, cap_mm=2.0)[0]
         assert (kind == NO_CLEARANCE) == (room < environment.required_clearance_mm)
         assert reach.cost.array[tuple(ijk)] == reach.clearance_mm.array[tuple(ijk)] == 0.0
     assert min(ratios) >= 1.0 - 1e-6
@@ -127,6 +129,21 @@ def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     assert searched.gained_and_lost_ml(plain) == (gained.sum() * 12.0**3 / 1000.0, 0.0)
 
 
+@pytest.mark.parametrize(("trees", "kind", "count"), [(0, DIRECT, 4), (1, SEARCHED, 1)])
+def test_a_reachable_voxel_has_a_plan_that_the_checker_accepts(
+    trees: int, kind: int, count: int, reach: ReachMap, small_lung: Lung, atlas: la.Atlas
+) -> None:
+    made = map_reach(small_lung, SYSTEM, spacing_mm=12.0, atlas=atlas, trees=trees) if trees else reach
+    assert np.array_equal(made.deployment.array >= 0, made.reached)
+    voxels = np.argwhere(made.kinds.array == kind)
+    for ijk in np.random.default_rng(3).permutation(voxels)[:count]:
+        plan = plan_to_voxel(made, atlas, ijk)
+        assert np.allclose(plan.target_lps, made.kinds.grid.lps(ijk))
+        assert la.check(plan, small_lung).accepted
+    with pytest.raises(TargetError, match="not reachable"):
+        plan_to_voxel(made, atlas, np.argwhere(made.kinds.array == UNREACHED)[0])
+
+
 class StoppedError(Exception):
     pass
 
@@ -150,7 +167,7 @@ def test_a_stopped_run_goes_on(small_lung: Lung, atlas: la.Atlas, reach: ReachMa
     layers[1].write_bytes(b"")
     resumed = map_reach(small_lung, SYSTEM, spacing_mm=SPACING_MM, atlas=atlas, work=tmp_path)
     assert 0 < resumed.resumed_layers == len(layers) - 2
-    for name in ("kinds", "cost", "clearance_mm"):
+    for name in ("kinds", "cost", "clearance_mm", "deployment"):
         assert np.array_equal(getattr(resumed, name).array, getattr(reach, name).array)
     assert not list(tmp_path.glob(".reach-*"))
 
@@ -167,8 +184,10 @@ def test_another_question_does_not_go_on(small_lung: Lung, atlas: la.Atlas, tmp_
 def test_a_known_voxel_is_where_it_was(reach: ReachMap, small_lung: Lung, tmp_path: Path) -> None:
     """The frame survives writing and reading, also of a lung whose axes point the other way."""
     written = reach.save(tmp_path, "map")
-    assert [path.name for path in written] == ["map.nrrd", "map-cost.nrrd", "map-clearance.nrrd"]
-    for path, volume in zip(written, (reach.kinds, reach.cost, reach.clearance_mm), strict=True):
+    names = [f"map{end}.nrrd" for end in ("", "-cost", "-clearance", "-deployment")]
+    assert [path.name for path in written] == names
+    volumes = (reach.kinds, reach.cost, reach.clearance_mm, reach.deployment)
+    for path, volume in zip(written, volumes, strict=True):
         back = read_volume(path)
         assert np.allclose(back.grid.lps_from_ijk, reach.kinds.grid.lps_from_ijk, atol=1e-9)
         assert np.array_equal(back.array, volume.array) and back.array.dtype == volume.array.dtype
@@ -242,15 +261,15 @@ def test_lobes_are_regions_if_the_patient_has_them() -> None:
 
 
 def test_neighbours_come_before() -> None:
-    counted = np.random.default_rng(1).uniform(size=(9, 7)) < 0.6
+    counted = np.random.default_rng(1).uniform(size=(9, 7, 3)) < 0.6
     places = np.argwhere(counted)
     for n, near in enumerate(_earlier_neighbours(counted)):
-        for offset, other in zip(((0, -1), (-1, 0), (-1, 1)), near, strict=True):
-            i, j = places[n] + offset
-            there = 0 <= i < 9 and 0 <= j < 7 and counted[i, j]
+        for axis, other in enumerate(near):
+            before = places[n] - np.eye(3, dtype=int)[axis]
+            there = before.min() >= 0 and counted[tuple(before)]
             assert (other >= 0) == there
             if there:
-                assert other < n and tuple(places[other]) == (i, j)
+                assert other < n and tuple(places[other]) == tuple(before)
 
 
 def test_devices_are_compared(small_lung: Lung) -> None:
@@ -296,6 +315,9 @@ def test_the_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.Monke
     (written,) = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in written["regions"]] == ["right lung", "left lung", "total"]
     assert set(written["regions"][0]["shares"]) == set(KINDS)
+    assert sum(written["regions"][0]["states_ml"].values()) == pytest.approx(
+        written["regions"][0]["volume_ml"]
+    )
     assert json.loads((tmp_path / "reach.json").read_text()) == [written]
     assert (tmp_path / "reach.png").read_bytes().startswith(PNG)
     assert read_volume(tmp_path / "reach.nrrd").array.any()

@@ -54,7 +54,7 @@ def not_ruled_out(environment, tubes, insertions, limits, target, frame, cones, 
 
 @numba.njit
 def outside_workspace(limits, seen, sums):  # type: ignore[no-untyped-def]
-    return kernel._outside_workspace(limits, seen, sums)
+    return kernel._outside_workspace(limits, seen, sums, 0.1)
 
 
 @pytest.mark.parametrize("max_turn_deg", [90.0, 180.0, 540.0])
@@ -112,7 +112,7 @@ HALVES = np.array([0.7, 0.7, 3.0, 20.0, 20.0, 2.0, 2.0, 2.0])
 
 def random_tips(proof: UnreachableProof, rng: np.random.Generator, n: int) -> list[tuple[PlacePiece, Float]]:
     """Draw places of the scope tip, with their pieces; some are not in the lumen."""
-    chosen = [proof._pieces[m] for m in rng.integers(len(proof._pieces), size=n)]
+    chosen = [proof.space.pieces[m] for m in rng.integers(len(proof.space.pieces), size=n)]
     return [(piece, rng.uniform(*piece.places) @ piece.frame) for piece in chosen]
 
 
@@ -121,7 +121,7 @@ def pieces_of(proof: UnreachableProof, lung: Lung, place: Float) -> list[PlacePi
     nearest = lung.tree.points_lps[np.linalg.norm(lung.tree.points_lps - place, axis=1).argmin()]
     return [
         piece
-        for piece in proof._pieces
+        for piece in proof.space.pieces
         if ((piece.cones[:, :3] == nearest).all(axis=1) & (piece.cones[:, 6] > 0.0)).any()
     ]
 
@@ -201,7 +201,7 @@ def test_what_a_plan_reaches_is_never_ruled_out(
     assert len(plans) >= 6
     for plan in plans:
         target, pose = plan.target_lps, plan.scope.lps_from_scope_tip
-        assert not proof.prove(target, most_boxes=3000).proved
+        assert not proof.prove(target, most_boxes=30_000).proved
         environment = proof._environment(target)
         tested = 0
         for piece in pieces_of(proof, small_lung, pose[:3, 3]):
@@ -281,14 +281,17 @@ def test_a_weak_system_is_proved_not_to_reach_what_it_does_not(small_lung: Lung,
     proved = 0
     for point in points:
         shares: list[float] = []
-        verdict = proof.prove(point, most_boxes=200_000, progress=shares.append)
+        verdict = proof.prove(point, most_boxes=300_000, progress=shares.append)
         assert verdict.boxes > 0
         assert (verdict.open_lps is None) == verdict.proved
         assert shares == sorted(shares)
+        assert 0.0 <= verdict.share_ruled_out <= 1.0
+        left = sum(place.share for place in verdict.open_places)
+        assert verdict.share_ruled_out + left == pytest.approx(1.0)
         if verdict.proved:
             proved += 1
             assert shares[-1] == 1.0
-            again = proof.prove(point, most_boxes=200_000)
+            again = proof.prove(point, most_boxes=300_000)
             assert (again.proved, again.boxes) == (True, verdict.boxes)
             with pytest.raises(la.LungaccessError):
                 next(la.plan(small_lung, weak, point_target(small_lung, point), atlas=atlas, iterations=50))
@@ -313,7 +316,9 @@ def test_the_command(
     said = json.loads(capsys.readouterr().out)
     assert code == (0 if said["proved_unreachable"] else 1)
     assert said["boxes"] > 0
-    main([*words, "--target", f"lps:{target}", "--most-boxes", "1000"])
+    assert said["share_ruled_out"] == pytest.approx(1.0 - sum(each["share"] for each in said["open_places"]))
+    main([*words, "--target", f"lps:{target}", "--most-boxes", "1000", "--out", str(tmp_path / "open.png")])
     assert "proved" in capsys.readouterr().out
+    assert (tmp_path / "open.png").stat().st_size > 10_000
     assert main([*words, "--target", f"lps:{target}", "--most-boxes", "0"]) == ExitCode.BAD_INPUT
     assert main(words) == ExitCode.BAD_INPUT

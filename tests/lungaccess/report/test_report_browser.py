@@ -299,7 +299,7 @@ def test_the_map_opens_and_its_slices_follow_the_sliders(small_lung: Lung, tmp_p
         assert window.messages() == []
         state = window.state()
         assert state["gl_error"] == 0
-        assert state["structures"]["0: reached"] is True
+        assert state["structures"]["0: reachable"] is True
         before = window.run("return Number(document.getElementById('place-2').value)")
         window.press("#place-2", "ArrowRight", "ArrowRight")
         assert window.state()["place_lps"][2] == before + 2

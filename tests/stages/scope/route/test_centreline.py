@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Rotation
 
 from anatomy.errors import AnatomyError, TargetError
 from anatomy.fields import SOLID
@@ -93,22 +96,74 @@ def test_the_lumen_of_a_mask_lies_in_the_mask(rounded: bool) -> None:
     assert np.abs(rho - 30.0).max() < 1.0
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_no_ball_on_a_line_leaves_the_mask(seed: int) -> None:
-    """Lines that touch the wall and lead out of the lumen, where radii become 0."""
-    mask, rng = bent_tube(), np.random.default_rng(seed)
-    angle = np.sort(rng.uniform(0.1, 1.4, 40))
-    rho, z = 30.0 + rng.uniform(-3.4, 3.4, 40), rng.uniform(-2.5, 2.5, 40)
-    nodes = np.stack((rho * np.cos(angle), rho * np.sin(angle), z), axis=1)
-    edges = np.stack((np.arange(39), np.arange(1, 40)), axis=1)
-    walls = centreline._Walls(mask.array, mask.grid, SOLID)
-    tube = centreline._proved(*centreline._refined(nodes, edges, 0.75), walls)
-    for share in np.linspace(0.0, 1.0, 97):
-        balls = tube.nodes_mm[tube.edges[:, 0]] * (1.0 - share) + tube.nodes_mm[tube.edges[:, 1]] * share
-        radius = tube.radius_mm[tube.edges[:, 0]] * (1.0 - share) + tube.radius_mm[tube.edges[:, 1]] * share
-        over = radius - np.maximum(walls.depth_mm(balls), 0.0)
-        assert over[radius > 0.0].max() <= 1e-6
-    assert (tube.radius_mm > 0.5).sum() > 20
+def drawn_line(rng: np.random.Generator, count: int = 40) -> tuple[Volume, np.ndarray, np.ndarray]:
+    """Return a tube in a grid of any rotation, and a line that touches its wall and leads out of it."""
+    mask = bent_tube()
+    turn = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
+    matrix = np.eye(4)
+    matrix[:3] = turn @ mask.grid.lps_from_ijk[:3]
+    angle = np.sort(rng.uniform(0.1, 1.4, count))
+    rho, z = 30.0 + rng.uniform(-3.4, 3.4, count), rng.uniform(-2.5, 2.5, count)
+    nodes = np.stack((rho * np.cos(angle), rho * np.sin(angle), z), axis=1) @ turn.T
+    edges = np.stack((np.arange(count - 1), np.arange(1, count)), axis=1)
+    grid = Grid(shape=mask.grid.shape, lps_from_ijk=matrix)
+    return Volume(grid=grid, array=mask.array), *centreline._refined(nodes, edges, 0.75)
+
+
+def clamped(nodes: np.ndarray, edges: np.ndarray, walls: centreline._Walls) -> Centreline:
+    """Give nodes radii lowered once, and then taken to be 0 where they would be less."""
+    radius = walls.depth_mm(nodes)
+    excess = np.zeros(len(edges))
+    for share in np.linspace(0.0, 1.0, 17):
+        balls = nodes[edges[:, 0]] * (1.0 - share) + nodes[edges[:, 1]] * share
+        wanted = radius[edges[:, 0]] * (1.0 - share) + radius[edges[:, 1]] * share
+        excess = np.maximum(excess, wanted - walls.depth_mm(balls))
+    excess += np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1) / 16
+    lowered = np.zeros(len(nodes))
+    for side in range(2):
+        np.maximum.at(lowered, edges[:, side], excess)
+    return Centreline(nodes_mm=nodes, radius_mm=np.maximum(radius - lowered, 0.0), edges=edges)
+
+
+def balls_outside(
+    seed: int,
+    count: int,
+    radii: Callable[[np.ndarray, np.ndarray, centreline._Walls], Centreline] = centreline._proved,
+) -> tuple[float, int]:
+    """Draw lines of so many pieces; return by how much the worst of their balls leaves the mask, mm.
+
+    The second number is that of nodes with a radius of more than 0.5 mm.
+    """
+    rng = np.random.default_rng(seed)
+    worst, wide, drawn = 0.0, 0, 0
+    while drawn < count:
+        mask, nodes, edges = drawn_line(rng)
+        drawn += len(edges)
+        walls = centreline._Walls(mask.array, mask.grid, SOLID)
+        tube = radii(nodes, edges, walls)
+        first, last = tube.edges.T
+        for share in np.linspace(0.0, 1.0, 49):
+            balls = tube.nodes_mm[first] * (1.0 - share) + tube.nodes_mm[last] * share
+            radius = tube.radius_mm[first] * (1.0 - share) + tube.radius_mm[last] * share
+            over = radius - np.maximum(walls.depth_mm(balls), 0.0)
+            worst = max(worst, float(over[radius > 0.0].max(initial=0.0)))
+        wide += int((tube.radius_mm > 0.5).sum())
+    return worst, wide
+
+
+def test_no_ball_on_a_drawn_line_leaves_the_mask() -> None:
+    worst, wide = balls_outside(0, 800)
+    assert worst <= 1e-6
+    assert wide > 100
+
+
+def test_the_same_search_finds_radii_that_are_clamped() -> None:
+    assert balls_outside(0, 800, clamped)[0] > 0.01
+
+
+@pytest.mark.slow
+def test_no_ball_on_a_hundred_thousand_pieces_leaves_the_mask() -> None:
+    assert balls_outside(1, 100_000)[0] <= 1e-6
 
 
 def test_a_drawing_becomes_a_flat_centreline() -> None:

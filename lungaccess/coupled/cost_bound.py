@@ -1,0 +1,163 @@
+"""A proved lower bound of the cost of every plan to a target; docs/explanation/cost_bound.md derives it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.errors import SettingsError
+from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.kernels.box_queue import ENDED, MOST_BOXES, WAITING, begin_queue, divide
+from lungaccess.coupled.kernels.cost_bound import BOUND, BOX_COLUMNS, BoundEnvironment
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
+from stages.tube import tube_constants
+from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
+
+BOXES_A_STEP = 200
+"""Boxes that are divided in one step of a search, which takes some milliseconds."""
+INSERTION_SPACING_MM = 0.1
+"""Spacing of the insertions that are tried for the greatest one."""
+
+
+class CostBound:
+    """Bounds from below what plans to a target cost, better and better.
+
+    The bound holds for every deployment from a scope tip of the atlas, with any rotation and any insertions
+    of the tubes, and for every path of the needle from there to the target.  Of other scope tips, which the
+    planner tries along the motions between those of the atlas, it says nothing.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+    most_boxes : int
+        Boxes that may wait.
+
+    Raises
+    ------
+    SettingsError
+        If the tubes are not planar, there is no needle, or it is longer than half a circle of its greatest
+        curvature.
+    """
+
+    def __init__(self, task: Task, atlas: Atlas, *, most_boxes: int = MOST_BOXES) -> None:
+        system = task.system
+        needle = system.require_needle("A lower bound of the cost")
+        system.tubes.require_planar("A lower bound of the cost")
+        if needle.max_length_mm * needle.max_curvature_per_mm > math.pi:
+            raise SettingsError(
+                f"The needle is {needle.max_length_mm:g} mm long and bends to a radius of "
+                f"{1.0 / needle.max_curvature_per_mm:g} mm",
+                expected="a needle no longer than half a circle, so that its paths lie near a straight line",
+                remedy="Leave out the gap",
+            )
+        self._most_boxes = most_boxes
+        self._environment = _environment(task)
+        self._tubes = tube_constants(system.tubes, system.margins)
+        longest = float(self._tubes[MAX_EXTENSION])
+        self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
+        greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)
+        self._longest = float(self._insertions.max())
+        self._tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
+        self._rates = np.zeros((len(self._tips), 2))
+        x, y, z = task.target.lps_mm.tolist()
+        self._target = (x, y, z)
+        self._state: tuple[np.ndarray, ...] | None = None
+        self._left_out = math.inf
+        self.settled = False
+        """Whether it rises no more."""
+
+    @property
+    def value(self) -> float:
+        """The bound: 0 before it has begun."""
+        if self._state is None:
+            return 0.0
+        boxes, heap, _unused, numbers = self._state
+        lowest = float(boxes[heap[0], BOUND]) if numbers[WAITING] else math.inf
+        return min(lowest, self._left_out)
+
+    def improve(self, cost: float, boxes: int) -> float:
+        """Divide so many boxes, and return the bound.
+
+        Parameters
+        ----------
+        cost : float
+            That of a plan: deployments that cost as much need not be told apart.  The first call takes some
+            seconds, fewer where it is low.
+        """
+        if self.settled:
+            return self.value
+        if self._state is None:
+            self._begin(cost)
+            return self.value
+        outcome, _divided = divide(
+            self._environment, self._tubes, self._insertions, self._tips, self._rates, self._target,
+            boxes, cost, self._state,
+        )  # fmt: skip
+        self._left_out = min(self._left_out, cost)
+        self.settled = outcome != ENDED
+        return self.value
+
+    def _begin(self, cost: float) -> None:
+        most = self._most_boxes
+        places = np.zeros(most, dtype=np.int64)
+        state = (np.zeros((most, BOX_COLUMNS)), places, np.zeros_like(places), np.zeros(2, dtype=np.int64))
+        room = begin_queue(
+            self._environment, self._tubes, self._insertions, self._tips, self._rates, self._target,
+            self._longest, cost, state,
+        )  # fmt: skip
+        self._state = state
+        self._left_out = cost if room else 0.0
+        self.settled = not room
+
+
+class GapGoal:
+    """The goal that a plan costs at most so much more than the best possible, proved.
+
+    Parameters
+    ----------
+    bound : CostBound
+    gap : float
+        Share of the best possible cost.
+
+    Raises
+    ------
+    SettingsError
+        If the gap is negative or not finite.
+    """
+
+    def __init__(self, bound: CostBound, gap: float) -> None:
+        if not 0.0 <= gap < math.inf:
+            raise SettingsError(
+                f"The gap is {gap}", expected="a share of 0 or more", remedy="State 0.05 for five per cent"
+            )
+        self.bound, self._gap = bound, gap
+
+    def is_met(self, cost: float) -> bool:
+        """Improve the bound, and tell whether a plan of this cost is so near to the best possible."""
+        return cost <= (1.0 + self._gap) * self.bound.improve(cost, BOXES_A_STEP)
+
+
+def _environment(task: Task) -> BoundEnvironment:
+    lung = task.lung
+    obstacles = lung.obstacle_field(with_fissures=task.with_fissures)
+    field = {name: each.corners for name, each in lung.fields.items()}
+    evaluator = CandidateEvaluator(task)
+    limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
+    return BoundEnvironment(
+        obstacles=obstacles.corners,
+        airway=field["airway"],
+        vessels=field["vessel"],
+        outside=field["pleura"],
+        fissures=field["fissure" if task.with_fissures else "vessel"],
+        geometry=obstacles.geometry,
+        depth=lung.lumen_depth.corners,
+        depth_geometry=lung.lumen_depth.geometry,
+        kappa=limits.kappa,
+        max_length_mm=limits.max_length_mm,
+        goal_tolerance_mm=limits.goal_tolerance_mm,
+        per_clearance=objective.inverse_clearance,
+        per_mm=objective.length,
+    )

@@ -1,0 +1,183 @@
+"""The lower bound of the cost: no plan is below it, and its parts are bounds."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+import numba
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lungaccess as la
+from anatomy.errors import SettingsError
+from anatomy.fields import distance_field
+from anatomy.grid import Grid
+from anatomy.lung import Lung
+from lungaccess.coupled.cost_bound import CostBound, GapGoal
+from lungaccess.coupled.kernels.cost_bound import BoundEnvironment, between, most_distance
+from lungaccess.coupled.search.direct_arcs import DirectArcs
+from lungaccess.plans.candidate import Candidate
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
+from stages.needle import direct_path
+from tests.lungaccess.coupled.planning import SYSTEM, plans_of, same_run
+
+Points = NDArray[np.float64]
+SPACING_MM = (0.6, 0.8, 1.1)
+SHAPE = (24, 20, 16)
+
+
+@numba.njit
+def _distances(field: Any, geometry: Any, points: Any, out: Any) -> None:
+    for n in range(len(points)):
+        out[n] = most_distance(field, geometry, points[n, 0], points[n, 1], points[n, 2])
+
+
+@numba.njit
+def _between(environment: Any, begin: Any, end: Any, begin_off: float, end_off: float) -> float:
+    return float(between(environment, begin, end, begin_off, end_off))
+
+
+def _boxes(rng: np.random.Generator, count: int) -> tuple[Grid, NDArray[np.bool_]]:
+    mask = np.zeros(SHAPE, dtype=bool)
+    mask[tuple(rng.integers(0, SHAPE, size=(count, 3)).T)] = True
+    return Grid.from_spacing(SHAPE, SPACING_MM, (0.0, 0.0, 0.0)), mask
+
+
+def _exact(mask: NDArray[np.bool_], points: Points) -> Points:
+    centres, half = np.argwhere(mask) * np.array(SPACING_MM), 0.5 * np.array(SPACING_MM)
+    gaps = np.maximum(np.abs(points[:, None] - centres) - half, 0.0)
+    return np.asarray(np.sqrt((gaps**2).sum(axis=2)).min(axis=1))
+
+
+@pytest.mark.parametrize(("seed", "count"), [(0, 1), (1, 5), (2, 60)])
+def test_no_distance_exceeds_its_upper_bound(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    grid, mask = _boxes(rng, count)
+    field = distance_field("obstacle", mask, grid)
+    points = rng.uniform(1.5, np.array(SHAPE) - 2.5, size=(3000, 3)) * np.array(SPACING_MM)
+    found = np.zeros(len(points))
+    _distances(field.corners, field.geometry, points, found)
+    over = found - _exact(mask, points)
+    assert np.isfinite(found).all()
+    assert over.min() > -1e-9
+    assert np.median(over) < 0.15
+
+
+def _environment(field: Any, kappa: float) -> BoundEnvironment:
+    corners, geometry = field.corners, field.geometry
+    return BoundEnvironment(
+        obstacles=corners,
+        airway=corners,
+        vessels=corners,
+        outside=corners,
+        fissures=corners,
+        geometry=geometry,
+        depth=corners,
+        depth_geometry=geometry,
+        kappa=kappa,
+        max_length_mm=math.pi / kappa,
+        goal_tolerance_mm=0.0,
+        per_clearance=1.0,
+        per_mm=0.1,
+    )
+
+
+def _winding(rng: np.random.Generator, kappa: float, length_mm: float) -> Points:
+    """Return a path (N, 3) of arcs of at most a curvature, their planes and bends at random."""
+    steps, frame, points = 400, np.eye(3), [np.zeros(3)]
+    bend = 0.0
+    for n in range(steps):
+        if n % 40 == 0:
+            roll, bend = rng.uniform(0.0, 2.0 * math.pi), kappa * rng.choice([0.3, 1.0])
+            c, s = math.cos(roll), math.sin(roll)
+            frame = frame @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        angle = bend * length_mm / steps
+        c, s = math.cos(angle), math.sin(angle)
+        points.append(points[-1] + frame[:, 2] * length_mm / steps)
+        frame = frame @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    return np.array(points)
+
+
+def test_no_winding_path_costs_less_than_its_bound() -> None:
+    rng = np.random.default_rng(3)
+    grid, mask = _boxes(rng, 25)
+    field = distance_field("obstacle", mask, grid)
+    tightest, looked_at = math.inf, 0
+    middle = 0.5 * np.array(SHAPE) * np.array(SPACING_MM)
+    while looked_at < 150:
+        kappa = rng.choice([0.05, 0.15, 0.3])
+        path = _winding(rng, kappa, float(rng.uniform(3.0, 8.0)))
+        turned = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        path = (path - path[200]) @ turned.T + middle + rng.uniform(-2.0, 2.0, 3)
+        if (path < 2.0).any() or (path > (np.array(SHAPE) - 3.0) * np.array(SPACING_MM)).any():
+            continue
+        looked_at += 1
+        pieces = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        rates = 1.0 / np.maximum(_exact(mask, 0.5 * (path[1:] + path[:-1])), 0.1) + 0.1
+        cost = float((rates * pieces).sum())
+        begin_off, end_off = rng.uniform(0.0, 0.5, 2) * rng.integers(0, 2)
+        begin = path[0] + _direction(rng) * begin_off
+        end = path[-1] + _direction(rng) * end_off
+        bound = _between(_environment(field, float(kappa)), tuple(begin), tuple(end), begin_off, end_off)
+        assert bound <= cost * (1.0 + 1e-3)
+        tightest = min(tightest, cost / bound)
+    assert tightest < 1.3
+
+
+def _direction(rng: np.random.Generator) -> Points:
+    away = rng.standard_normal(3)
+    return np.asarray(away / np.linalg.norm(away))
+
+
+def test_no_deployment_costs_less_than_the_bound(small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+    """Rotations and insertions beside those of the atlas, each with a single arc."""
+    task = Task(lung=small_lung, system=SYSTEM, target=target)
+    *_, best = plans_of(small_lung, target, atlas, iterations=20)
+    bound = CostBound(task, atlas)
+    values = [bound.improve(4.0 * best.cost, 3000) for _ in range(4)]
+    assert values == sorted(values)
+    assert values[-1] > 0.0
+    arcs, rng, accepted, least = DirectArcs(task, atlas), np.random.default_rng(5), 0, math.inf
+    entries, evaluator = atlas.deployments, arcs.evaluator
+    for entry in rng.choice(arcs.in_workspace, 400):
+        tip = atlas.motions.tip(int(entries.site[entry]))
+        outer, inner = entries.outer_mm[entry], entries.inner_mm[entry] + rng.uniform(-1.0, 1.0)
+        rotation = entries.rotation_rad[entry] + rng.uniform(-0.2, 0.2)
+        made = evaluator.tubes.choose(tip.lps_from_scope_tip, rotation, min(outer, inner), inner, -1)
+        if isinstance(made, str):
+            continue
+        path = direct_path(made.lps_from_tip, target.lps_mm)
+        cost = evaluator.evaluate(Candidate(tip=tip, deployment=made, path=path))
+        accepted += math.isfinite(cost)
+        least = min(least, cost)
+    assert accepted > 10
+    assert values[-1] <= least
+
+
+def test_a_plan_states_its_gap_and_the_same_run_states_the_same(
+    small_lung: Lung, target: Target, atlas: la.Atlas
+) -> None:
+    plain = plans_of(small_lung, target, atlas, iterations=30)
+    plans = plans_of(small_lung, target, atlas, iterations=30, gap=0.0)
+    assert plans[-1].gap is not None
+    assert 0.0 < plans[-1].cost_bound <= plans[-1].cost * (1.0 + 1e-9) or plans[-1].gap == 0.0
+    assert [plan.cost for plan in plans[:-1]] == [plan.cost for plan in plain]
+    assert plans[-1].cost == plans[-2].cost
+    assert "at most" in plans[-1].gap_in_words
+    assert la.Plan.from_json(plans[-1].to_json()).cost_bound == plans[-1].cost_bound
+    assert same_run(plans) == same_run(plans_of(small_lung, target, atlas, iterations=30, gap=0.0))
+
+
+def test_a_wide_gap_ends_the_search_at_once(small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+    *_, last = plans_of(small_lung, target, atlas, iterations=1000, gap=20.0)
+    assert last.iterations < 1000
+    assert last.gap is not None and last.gap <= 20.0
+
+
+@pytest.mark.parametrize("gap", [-0.1, math.nan, math.inf])
+def test_a_gap_is_no_negative_number(gap: float) -> None:
+    with pytest.raises(SettingsError, match="share of 0 or more"):
+        GapGoal(cast(CostBound, None), gap)

@@ -92,8 +92,8 @@ def shortest_path(rho, h, kappa, max_angle, max_turn):
     """Return the length of the shortest path CS or CC to a point within two turning limits, inf if none.
 
     `max_angle` limits the angle between tip and start direction, `max_turn` the sum of all turning, both
-    in rad.  Exact without turning limits, and where either is at most 180 degrees: then no path leads to
-    points inside the circle, and to others none turns less than CS.
+    in rad.  Exact without turning limits, with an angle of at most 90 degrees, and with a turn of at most
+    180: then no path leads to points inside the circle, and to others none turns less than CS.
     """
     turn, straight = arc_and_straight(rho, h, kappa)
     if min(turn, math.pi) <= max_angle + TINY and turn <= max_turn + TINY:

@@ -2,7 +2,7 @@
 
 With R the smallest radius and r the tolerance: where the shortest path CS to the goal itself has a straight
 piece of at least r, it is that path less its last r mm; else it is the arc C as far as the ball
-(docs/explanation/resolution_search.md).  With r = 0 all of this is about the goal itself.
+(docs/explanation/proofs.md, "Workspace").  With r = 0 all of this is about the goal itself.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ PAPERS = {
 OUR_OWN = (
     "reachability_by_device",
     "coverage_by_device",
+    "decided_targets",
     "tube_designs",
     "needle_planners",
     "tube_speed",

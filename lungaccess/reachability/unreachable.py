@@ -27,7 +27,8 @@ from lungaccess.reachability.kernels.unreachable import RULED_OUT, TOO_MANY, UND
 from lungaccess.reachability.layers import THREADS
 from lungaccess.reachability.open_places import OpenPlace, open_places
 from lungaccess.reachability.tip_places import place_pieces, places_of_tips
-from stages.needle import needle_environment
+from stages.needle import NOT_BOUNDED, backward_reach, needle_environment
+from stages.needle.infeasibility.kernels import BackwardReach
 from stages.needle.kernels import Limits
 from stages.tube import tube_constants
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
@@ -40,6 +41,21 @@ MORE_LOOKS = 16
 """A box is given so many times as many looks as in the round before, so that rounds repeat little."""
 TASK_LOOKS = 16384
 """Looks that a thread may take at a time."""
+
+
+NO_NEEDLE = Limits(
+    kappa=1.0,
+    max_length_mm=0.0,
+    max_angle_rad=0.0,
+    max_turn_rad=0.0,
+    required_mm=0.0,
+    radius_mm=0.0,
+    exempt_mm=0.0,
+    max_step_mm=0.0,
+    cost_step_mm=0.0,
+    goal_tolerance_mm=0.0,
+)
+"""Limits of a needle of no length at the tip of the tubes."""
 
 
 @frozen_record
@@ -102,7 +118,12 @@ class UnreachableProof:
         pause = between or (lambda: None)
         self._lung = lung
         self._tubes = tube_constants(system.tubes, system.margins)
-        self._limits = _limits(lung, system, with_fissures)
+        self._needle = (
+            None
+            if system.needle is None
+            else needle_environment(lung, system.needle, system.margins, with_fissures=with_fissures)
+        )
+        self._limits = NO_NEEDLE if self._needle is None else self._needle.limits
         longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
         greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)
@@ -121,11 +142,11 @@ class UnreachableProof:
         pause()
         # Corners are rounded down, and between them a bound lacks at most a diagonal of a voxel: on the half
         # to the nearest corner the distance may grow, and from there on the bound falls.
-        self._loss_mm = float(np.linalg.norm(spacing_mm)) + 1.0 / UNITS_PER_MM
+        self._loss_mm = float(np.linalg.norm(spacing_mm)) + 2.0 / UNITS_PER_MM
         # The tip of the tubes alone needs no free region.
         self._free = (
             None
-            if system.needle is None
+            if self._needle is None
             else _free_regions(lung, self._limits.required_mm, self._loss_mm, with_fissures)
         )
         self._passable: dict[bytes, np.ndarray] = {}
@@ -249,9 +270,17 @@ class UnreachableProof:
         if regions.tobytes() not in self._passable:
             passable = np.isin(self._free, regions)
             self._passable = {regions.tobytes(): distance_corners(passable, lung.grid.spacing_mm)}
-        return self._surroundings(self._passable[regions.tobytes()])
+        return self._surroundings(self._passable[regions.tobytes()], self._backward_reach(target))
 
-    def _surroundings(self, passable: np.ndarray) -> ProofEnvironment:
+    def _backward_reach(self, target: Float) -> BackwardReach:
+        """Return where the needle's paths to a target come from; the middle is where most tips are."""
+        if self._needle is None:
+            return NOT_BOUNDED
+        starts = np.array([piece.cones[0, :3] for piece in self._space.pieces]).reshape(-1, 3) - target
+        near = starts[np.linalg.norm(starts, axis=1) <= 2.0 * self._limits.max_length_mm]
+        return backward_reach(self._needle, target, near.mean(axis=0) if len(near) else np.array([0, 0, 1.0]))
+
+    def _surroundings(self, passable: np.ndarray, backward: BackwardReach = NOT_BOUNDED) -> ProofEnvironment:
         lung = self._lung
         lumen, leaving, hazards = self._masks
         depth = lung.lumen_depth
@@ -266,28 +295,11 @@ class UnreachableProof:
             not_lumen=self._not_lumen,
             geometry=lung.geometry,
             depth_geometry=depth.geometry,
+            backward=backward,
             hazard_bits=self._hazard_bits,
             loss_mm=self._loss_mm,
             least_depth_mm=self._least_depth_mm,
         )
-
-
-def _limits(lung: Lung, system: System, with_fissures: bool) -> Limits:
-    """Return the limits of the needle; without one, of a needle of no length at the tip of the tubes."""
-    if system.needle is not None:
-        return needle_environment(lung, system.needle, system.margins, with_fissures=with_fissures).limits
-    return Limits(
-        kappa=1.0,
-        max_length_mm=0.0,
-        max_angle_rad=0.0,
-        max_turn_rad=0.0,
-        required_mm=0.0,
-        radius_mm=0.0,
-        exempt_mm=0.0,
-        max_step_mm=0.0,
-        cost_step_mm=0.0,
-        goal_tolerance_mm=0.0,
-    )
 
 
 def _may_be_left(lung: Lung) -> Mask:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         needle_environment,
         workspace_lengths,
     )
+    from stages.needle.infeasibility.backward_reach import NOT_BOUNDED, backward_reach
     from stages.needle.infeasibility.certificate import NoPathProof
     from stages.needle.kernels.cost import ObjectiveArrays
     from stages.needle.kernels.limits import Limits

@@ -42,6 +42,8 @@ SPARE = 1e-6
 """For rounding, mm and rad."""
 ROUNDING = 1e-4
 """Share by which distance transforms are made smaller before they are rounded down; they have less."""
+LARGEST_SINE = 0.99
+"""Of half the turn of an arc over a line; paths over longer ones do not lie near it."""
 COST_STEP_MM = 0.7
 """Longest step of the bounds of an integral where both ends are known well."""
 TUBE_STEP_MM = 0.5
@@ -144,6 +146,8 @@ def between(environment, begin, end, begin_off, end_off):
         return 0.0
     kappa = environment.kappa
     most = far + begin_off + end_off
+    if 0.5 * kappa * most > LARGEST_SINE:
+        return least * environment.per_mm
     steps = int(math.ceil(far / max(COST_STEP_MM, 0.25 * (begin_off + end_off))))
     lean = _angle_at(kappa, most)
     step, reach_step = far / steps, most / steps
@@ -165,9 +169,11 @@ def between(environment, begin, end, begin_off, end_off):
         # The greatest distance from the straight line: a concave function of the way, below its tangent.
         turn = _angle_at(kappa, (n + 0.5) * reach_step)
         half = 0.5 * max(lean - turn, 0.0)
-        slope = abs(2.0 * math.sin(half) - math.tan(min(turn, 1.5)) * math.cos(half))
+        slope = abs(2.0 * math.sin(half) - math.tan(turn) * math.cos(half))
         aside = 2.0 * (n + 0.5) * reach_step * math.sin(half) + 0.5 * reach_step * slope
         aside += begin_off + (n + 0.5) / steps * (end_off - begin_off)
+        if low + aside < CLEARANCE_FLOOR_MM:
+            middle += CLEARANCE_FLOOR_MM  # Of max(clearance, floor), whose inverse is convex.
         total += 1.0 / max(middle + aside, CLEARANCE_FLOOR_MM)
     return least * (environment.per_clearance * total / steps + environment.per_mm)
 
@@ -348,7 +354,7 @@ def bound_box(environment, tubes, insertions, tips, rates, target, box):
     box[LOSS + 5] = 0.0
     most_far = far + away + off
     box[WIDE] = max(_angle_at(kappa, most_far) - _angle_at(kappa, 0.5 * most_far), 0.0)
-    if box[HALF_ACROSS] < 0.0 or far <= away + off:
+    if box[HALF_ACROSS] < 0.0 or far <= away + off or 0.5 * kappa * most_far > LARGEST_SINE:
         box[LOSS + 4] = 0.06 * kappa * far * far
         return between(environment, target, tip, off, away)
     return _by_halfway(environment, target, tip, tangent, swing, off, away, box)

@@ -12,6 +12,7 @@ from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
 from lungaccess.reachability.kernels.deployment_boxes import HALF, INNER, OUTER, SPARE_MM, heading, sample_of
+from stages.needle.infeasibility.kernels import BackwardReach, never_along
 from stages.tube.kernels import (
     CURVED_LENGTH,
     INNER_CURVATURE,
@@ -25,8 +26,8 @@ from stages.tube.kernels import (
 
 UNNOTICED_MM = 0.05
 """A tube that is farther than this from all lumen has left it noticeably; see `deployment.march`."""
-FIRST_LOOK_MM, FARTHEST_LOOK_MM = 5.0, 40.0
-"""The path of the needle is looked at from so far ahead of the tip on, as long as it is known so well."""
+LOOK_STEP_MM, FARTHEST_LOOK_MM = 5.0, 40.0
+"""The path of the needle is looked at in such steps, as long as it is known so well."""
 LOOSE_SWEEP_MM = 0.3
 """The sweep of a box is looked at where it is known so well."""
 EXACT_BELOW_MM = 1.0
@@ -51,6 +52,8 @@ class ProofEnvironment(NamedTuple):
         1 outside the lumen.
     geometry, depth_geometry : (3, 5) float64
         Of the labels and the other distances, and of `depth` and `tips`.
+    backward : BackwardReach
+        Directions from which paths come to the target.
     hazard_bits : int
         Structures that tubes keep clear of.
     loss_mm : float
@@ -69,6 +72,7 @@ class ProofEnvironment(NamedTuple):
     not_lumen: np.ndarray
     geometry: np.ndarray
     depth_geometry: np.ndarray
+    backward: BackwardReach
     hazard_bits: int
     loss_mm: float
     least_depth_mm: float
@@ -132,25 +136,21 @@ def tips_blocked(environment, tubes, limits, seen, family, box, away):
         return True
     spare = limits.goal_tolerance_mm + SPARE_MM
     exempt = limits.exempt_mm
-    if (
-        distance_bound(environment.passable, environment.geometry, pose[0], pose[1], pose[2])
-        > away + exempt + spare
-    ):
-        return True
+    far = math.hypot(rho, ahead)
     most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
     turned = sharing + opening + most * half_inner
     angle = turned + tilt + roll * min(abs(math.sin(heading(tubes, box[OUTER], box[INNER]))) + turned, 1.0)
-    far = math.hypot(rho, ahead)
-    length = max(FIRST_LOOK_MM, exempt)
+    # A needle that ends within the exempt length keeps clear of nothing but hazards.
+    length = exempt
     while length < far - away - spare:
         around = away + length * angle + 0.5 * limits.kappa * length * length
         if around > FARTHEST_LOOK_MM:
             break
         x, y, z = pose[0] + length * pose[3], pose[1] + length * pose[4], pose[2] + length * pose[5]
-        if distance_bound(environment.passable, environment.geometry, x, y, z) > around:
+        if distance_bound(environment.passable, environment.geometry, x, y, z) > around + spare:
             return True
-        length += around
-    return False
+        length += max(around, LOOK_STEP_MM)
+    return never_along(environment.backward, pose, away + spare, angle, exempt)
 
 
 @inner_kernel

@@ -77,7 +77,8 @@ def greatest_insertions(tubes, longest, spacing, insertions):
             inner = longest
             while inner > max(greatest, outer - spacing):
                 over = lateral_sweep(tubes, min(outer, inner), inner) - tubes[MAX_SWEEP]
-                over -= 0.5 * slope * spacing
+                # Half a spacing for the outer tube, and what the least step passes over.
+                over -= 0.75 * slope * spacing
                 if over <= 0.0:
                     greatest = inner
                     break

@@ -127,6 +127,40 @@ def test_no_winding_path_costs_less_than_its_bound() -> None:
     assert tightest < 1.3
 
 
+def test_from_farther_than_a_circle_is_wide_a_path_may_lie_anywhere() -> None:
+    """An arc, then a straight line far beside the chord, along which there is a row of obstacles."""
+    radius, turn, straight, side = 50.0, 1.4, 80.0, 1.0
+    length = radius * turn + straight
+    s = np.linspace(0.0, length, 2001)
+    arc, line = np.minimum(s / radius, turn), np.maximum(s - radius * turn, 0.0)
+    across = radius * (1.0 - np.cos(arc)) + line * math.sin(turn)
+    along = radius * np.sin(arc) + line * math.cos(turn)
+    end = np.array([across[-1], along[-1]])
+    chord = end / np.linalg.norm(end)
+    beside = np.abs(across * chord[1] - along * chord[0])
+    path = np.stack([across * chord[0] + along * chord[1], beside, 0.0 * s], axis=1) + 10.0
+    shape = (170, 60, 21)
+    mask = np.zeros(shape, dtype=bool)
+    mask[111:128, 10, 10] = True
+    field = distance_field("obstacle", mask, Grid.from_spacing(shape, (side,) * 3, (0.0, 0.0, 0.0)))
+    low, high = np.array([110.5, 9.5, 9.5]), np.array([127.5, 10.5, 10.5])
+    clearance = np.linalg.norm(np.maximum(np.maximum(low - path, path - high), 0.0), axis=1)
+    cost = float(np.trapezoid(1.0 / np.maximum(clearance, 0.1) + 0.1, s))
+    bound = _between(_environment(field, 1.0 / radius), tuple(path[0]), tuple(path[-1]), 0.0, 0.0)
+    assert 0.0 < bound <= cost
+
+
+def test_a_slit_that_is_narrower_than_the_floor_is_not_dearer_than_it_is() -> None:
+    side, shape = 0.4, (12, 12, 12)
+    mask = np.zeros(shape, dtype=bool)
+    mask[4] = mask[6] = True
+    field = distance_field("obstacle", mask, Grid.from_spacing(shape, (side,) * 3, (0.0, 0.0, 0.0)))
+    begin, end = (4.5 * side, 5.5 * side, 5.5 * side), (5.5 * side, 5.5 * side, 5.5 * side)
+    at = np.linspace(0.0, side, 10_001)
+    cost = side * float(np.mean(1.0 / np.maximum(np.minimum(at, side - at), 0.1) + 0.1))
+    assert 0.0 < _between(_environment(field, 1.0 / 121.0), begin, end, 0.0, 0.0) <= cost
+
+
 def _direction(rng: np.random.Generator) -> Points:
     away = rng.standard_normal(3)
     return np.asarray(away / np.linalg.norm(away))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,7 +30,7 @@ def kept_record(
     make: Callable[[], T],
     parts: Callable[[T], Mapping[str, Any]],
     rebuilt: Callable[[dict[str, Any]], T],
-    cache: Path | None = None,
+    cache: str | os.PathLike[str] | None = None,
     name: str = "",
     in_use: tuple[Path, ...] = (),
 ) -> T:
@@ -45,7 +46,7 @@ def kept_record(
         Plain values.
     parts, rebuilt : callable
         Returns the arrays and the plain values of a record by name, and the record from them.
-    cache : Path, optional
+    cache : path, optional
         Folder of the cache; `anatomy.cache.default_cache()` if None.
     name : str
         Whose it is; empty if it belongs to no patient.
@@ -60,7 +61,7 @@ def kept_record(
         If the limit of the cache is no size.
     """
     text = json.dumps({"format": version, **depends_on}, sort_keys=True, default=list)
-    path = (cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
+    path = Path(cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
     stored = _stored(path, rebuilt) if path.exists() else None
     if stored is not None:
         note_use(path)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from pathlib import Path
 from typing import Any, get_type_hints
 
 from anatomy.kept_records import kept_record
@@ -28,7 +28,7 @@ def open_atlas(
     rotations: int = DEFAULT_ROTATIONS,
     stop_spacing_mm: float = DEFAULT_STOP_MM,
     site_spacing_mm: float = TIP_SPACING_MM,
-    cache: Path | None = None,
+    cache: str | os.PathLike[str] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Atlas:
     """Return the atlas from the cache, or make and keep it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
@@ -61,7 +62,7 @@ def open_source(
     lumen: str | None = None,
     frame: Frame | None = None,
     pixel_mm: float | None = None,
-    cache: Path | None = None,
+    cache: str | os.PathLike[str] | None = None,
 ) -> RouteSource:
     """Return the centreline of a patient folder, a centreline file, a mask of vessels or a drawing.
 
@@ -73,7 +74,7 @@ def open_source(
         Frame of a centreline file or mask that states none.
     pixel_mm : float, optional
         Size of a pixel of a drawing; needed for one.
-    cache : Path, optional
+    cache : path, optional
         Where prepared patients are kept.
 
     Raises

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,14 @@ from lungaccess.problem.system import System
 from stages.tube import ShapeLimits, TubeShapes, open_shapes
 
 
-def design_shapes(device: System | BareTubes, *, cache: Path | None = None) -> TubeShapes:
+def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None) -> TubeShapes:
     """Return the shapes of a design, from the cache if they are there.
 
     Parameters
     ----------
     device : System or BareTubes
         The limits are those of the system; bare tubes have those of `ShapeLimits()`.
-    cache : Path, optional
+    cache : path, optional
         Folder of the cache.
 
     Raises

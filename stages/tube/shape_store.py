@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ def open_shapes(
     limits: ShapeLimits | None = None,
     grid: ShapeGrid | None = None,
     *,
-    cache: Path | None = None,
+    cache: str | os.PathLike[str] | None = None,
 ) -> TubeShapes:
     """Return the shapes of a design from the cache, or make and keep them.
 

@@ -49,7 +49,7 @@ def same(one: Any, other: Any) -> bool:
 
 def test_found_again(small_lung: Lung, tmp_path: Path, made: list[str]) -> None:
     first = open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
-    again = open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
+    again = open_atlas(small_lung, SYSTEM, cache=str(tmp_path), **COARSE)
     assert made == [SYSTEM.name] and same(first, again) and first.deployments.count > 0
     assert not again.deployments.positions.flags.writeable
     other = replace(SYSTEM, name="other", needle=replace(SYSTEM.needle, max_curvature_per_mm=1 / 40))

@@ -107,7 +107,8 @@ def systems(preset: str) -> Iterator[tuple[str, System]]:
     system = la.load_system(preset, fissures_allowed=True)
     for radius in RADII_MM:
         needle = replace(system.require_needle("The study"), max_curvature_per_mm=1.0 / radius)
-        yield f"{preset}, R = {radius:g} mm", replace(system, needle=needle)
+        label = f"{preset}, R = {radius:g} mm"
+        yield label, replace(system, name=label, needle=needle)
 
 
 def add_rows(result: Result, label: str, records: list[dict[str, Any]]) -> None:

@@ -11,6 +11,7 @@ import lungaccess as la
 from anatomy.lung import Lung
 from experiments.support.results import Result
 from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.system import require_own_name
 
 
 def test_a_target_is_decided_once(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,6 +25,11 @@ def test_a_target_is_decided_once(small_lung: Lung, tmp_path: Path, monkeypatch:
     assert {record["outcome"] for record in made} <= {study.PLANNED, study.PROVED, study.OPEN}
     monkeypatch.setattr(study.Decider, "record", None)
     assert study.Records(file).of(atlas, system, points, 0) == made
+
+
+def test_systems_have_names_of_their_own() -> None:
+    for _label, system in study.systems("tight-inner"):
+        require_own_name(system)
 
 
 def test_every_outcome_is_counted() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,7 @@ class NeedleAnswer(PathSearch):
             "blocked": None
             if self.obstruction is None
             else obstruction_record(self.obstruction, self.proved, self.lobe),
+            "open_passage": None if self.open_passage is None else asdict(self.open_passage),
             "path": None,
         }
         if path is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 from anatomy.kernel_clock import working_s
 from anatomy.records import frozen_record
@@ -16,6 +17,7 @@ from stages.needle import (
     NeedleEnvironment,
     Objective,
     Obstruction,
+    Passage,
     Query,
     Search,
     easiest_obstruction,
@@ -42,6 +44,8 @@ class PathSearch:
         Time to the first path, by the clock of the search.
     obstruction : Obstruction or None
         What stands in the way, if there is no path.
+    open_passage : Passage or None
+        Where a path would have to pass, if neither a path was found nor a proof that there is none.
     """
 
     outcome: str
@@ -50,6 +54,7 @@ class PathSearch:
     cost: float = math.inf
     first_path_s: float | None = None
     obstruction: Obstruction | None = None
+    open_passage: Passage | None = None
 
     @property
     def proved(self) -> bool:
@@ -94,7 +99,7 @@ def search_path(
         found = _advance(search, iterations, time_s, clock, portion)
     if found.path is not None:
         return found
-    return PathSearch(outcome=found.outcome, obstruction=blocked or easiest_obstruction(environment, query))
+    return replace(found, obstruction=blocked or easiest_obstruction(environment, query))
 
 
 def _advance(
@@ -116,6 +121,7 @@ def _advance(
         first_path=first,
         cost=search.cost,
         first_path_s=first_path_s,
+        open_passage=getattr(search, "passage", None),
     )
 
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     )
     from stages.needle.infeasibility.backward_reach import NOT_BOUNDED, backward_reach
     from stages.needle.infeasibility.certificate import NoPathProof
+    from stages.needle.infeasibility.passage import Passage
     from stages.needle.kernels.cost import ObjectiveArrays
     from stages.needle.kernels.limits import Limits
     from stages.needle.kernels.proof import Obstacles

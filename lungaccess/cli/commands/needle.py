@@ -134,6 +134,14 @@ def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
     path = answer.path
     if answer.obstruction is not None:
         rows += obstruction_rows(answer.obstruction, answer.proved, answer.lobe)
+    if (passage := answer.open_passage) is not None:
+        rows += [
+            ("open at a resolution of", f"{passage.cell_mm:.2g} mm and a slope of {passage.slope_cell:.2g}"),
+            (
+                "a path would pass",
+                f"a place {passage.width_mm:.2f} mm wide, {passage.from_start_mm:.1f} mm ahead",
+            ),
+        ]
     if path is None:
         return [terminal.table("needle", ("", ""), rows)]
     if answer.first_path_s is not None:

@@ -22,6 +22,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
 from stages.needle.infeasibility.kernels import reachability_pruning as pruning
 from stages.needle.infeasibility.kernels import reachable_sets as sets
+from stages.needle.infeasibility.passage import Passage, tightest
 from stages.needle.infeasibility.path_bounds import ROUNDING, PathBounds
 from stages.needle.infeasibility.plane import Plane
 from stages.needle.obstruction import blocked_end
@@ -78,6 +79,8 @@ class NoPathProof:
     cell_mm, slope_cell : float
         Sides of the cells of the present level: of position in mm, and of direction as a slope (1 is 45
         degrees).
+    passage : Passage or None
+        What the last finished level left; None before the first, and where the proof succeeds.
 
     Raises
     ------
@@ -98,6 +101,7 @@ class NoPathProof:
         self.reason = ""
         self.cell_mm = math.inf
         self.slope_cell = math.inf
+        self.passage: Passage | None = None
         self.states = 0
         """Largest number of states on a plane so far."""
         self._environment = environment
@@ -129,6 +133,8 @@ class NoPathProof:
 
     def _end(self, outcome: str, reason: str) -> None:
         self.outcome, self.reason = outcome, reason
+        if outcome == "no path":
+            self.passage = None
 
     def _run(self) -> Iterator[None]:
         """Try one kind of proof after the other."""
@@ -180,6 +186,7 @@ class NoPathProof:
             self._scale[bounds.KAPPA] = self._kappa
             if self._along > 0.0:
                 self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
+            self._tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
 
     def _parted(self, side: float) -> bool:
         """Tell whether cubes that no path can pass part the target from the start."""
@@ -241,6 +248,8 @@ class NoPathProof:
                     return
                 yield
             self._coarse = self._planes
+            line = self._frame[0], self._frame[1] + self._tangent, self._frame[2:]
+            self.passage = tightest(self._planes, self._depth, self.cell_mm, self._paths, self._kappa, line)
         self._end("undecided", "states are left at the finest level")
 
     def _forward(self, number: int) -> None:
@@ -378,8 +387,7 @@ class NoPathProof:
             # A path at this depth is at least as long, so beyond the exempt length nothing is spared.
             inserted = self._query.inserted_mm + max(depth, 0.0)
             exempt = self._query.branch if inserted < limits.exempt_mm else -1
-            tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
-            origin = self._frame[0] + depth * (self._frame[1] + tangent) + corners[n] @ across
+            origin = self._frame[0] + depth * (self._frame[1] + self._tangent) + corners[n] @ across
             blocked.grade_clearance(
                 self._environment.obstacles, limits, exempt, inserted, origin, across, probed[n], slacks,
                 grades[n],

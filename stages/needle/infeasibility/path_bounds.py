@@ -67,3 +67,12 @@ class PathBounds:
             aside_mm=min(0.5 * math.sqrt(longest**2 - total_mm**2) + bounds.SPARE, highest),
             before_mm=0.5 * (longest - total_mm) + bounds.SPARE,
         )
+
+    def width_mm(self, depth_mm: float, kappa: float) -> float:
+        """Return about how wide paths spread at a depth without obstacles, by their start and the spindle."""
+        of_start = kappa * depth_mm**2
+        radius, total = float(self.ends[bounds.SPINDLE_RADIUS]), float(self.ends[bounds.TOTAL])
+        if not math.isfinite(radius):
+            return of_start
+        aside = math.sqrt(max(radius**2 - (depth_mm - 0.5 * total) ** 2, 0.0))
+        return min(of_start, 2.0 * max(aside - float(self.ends[bounds.SPINDLE_OFFSET]), 0.0))

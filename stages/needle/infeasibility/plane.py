@@ -51,6 +51,13 @@ class Plane:
         bitmaps.refine(self.bits, directions, bits)
         return Plane(bits, np.where(halved, 2 * self.window - 1, self.window))
 
+    @property
+    def places(self) -> Int:
+        """Cells (N, 2) of position, numbers (y, x), in which the plane has a state of any direction."""
+        words = np.ascontiguousarray(np.bitwise_or.reduce(self.bits, axis=(0, 1))).astype("<u8")
+        cells = np.unpackbits(words.view(np.uint8), axis=1, bitorder="little")
+        return np.asarray(np.argwhere(cells) + self.window[2:], dtype=np.int64)
+
     def probed_cells(self, moves: Float) -> tuple[Int, Int]:
         """Return which cells of position the tangents of the states can meet at some depths.
 

@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.certificate import NoPathProof
+from stages.needle.infeasibility.passage import Passage
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
@@ -85,6 +86,11 @@ class Decision:
             self._resolution.cost = self.cost
         return self._resolution
 
+    @property
+    def passage(self) -> Passage | None:
+        """The narrowest place that the proof left open; None with a path, and before the proof has looked."""
+        return None if self.path is not None or self._proof is None else self._proof.passage
+
     def _search(self, iterations: int) -> bool:
         """Spend iterations on the searches; return whether there is a better path."""
         begins = self.iterations < FIRST_ITERATIONS
@@ -136,6 +142,11 @@ class _ProofInThread:
         self._due = iterations + STEP_ITERATIONS + self._proof.states // STATES_PER_ITERATION
         self._step = self._pool.submit(self._take_steps)
         return "running"
+
+    @property
+    def passage(self) -> Passage | None:
+        """What the last finished level of the proof left."""
+        return self._proof.passage
 
     def _take_steps(self) -> None:
         """Take a step, and more of them while nobody would look."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from anatomy.errors import SettingsError, TargetError
 from anatomy.lung import Lung
@@ -16,10 +17,12 @@ from anatomy.poses import pose
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.checking import check_needle_alone
 from lungaccess.cli.app import main
+from lungaccess.cli.commands import needle
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage import pierced_branches, plan_needle, reason_in_words
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, nodule_target
+from stages.needle import Passage
 from stages.needle.path import blocker_on_path
 from stages.needle.search.planners import PLANNERS
 
@@ -204,6 +207,21 @@ def test_a_blocked_target_is_named(small_lung: Lung, system: System) -> None:
     assert answer.record()["blocked"]["what"] == found.place
 
 
+def test_an_open_question_tells_where_a_path_would_pass(small_lung: Lung, system: System) -> None:
+    start, target = start_beside(small_lung, 8.0), nodule_target(small_lung, 1)
+    answer = plan_needle(small_lung, system, start, target, iterations=2000)
+    assert answer.path is not None and answer.open_passage is None
+    passage = Passage(
+        point_lps=(1.0, 2.0, 3.0), width_mm=0.4, from_start_mm=5.0, cell_mm=0.03, slope_cell=0.1
+    )
+    still_open = replace(answer, path=None, outcome="undecided", open_passage=passage)
+    assert still_open.record()["open_passage"]["width_mm"] == 0.4
+    console = Console(width=200)
+    with console.capture() as shown:
+        console.print(*needle._tables(still_open, is_lung=True))
+    assert "0.40 mm wide, 5.0 mm ahead" in shown.get() and "0.03 mm" in shown.get()
+
+
 def test_command(
     small_lung: Lung, small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,6 +245,7 @@ def test_command(
     assert main([*away, "--json"]) == ExitCode.NEGATIVE
     told = json.loads(capsys.readouterr().out)
     assert told["no_path_is_proved"] and told["blocked"]["what"] == "reach"
+    assert told["open_passage"] is None
     assert main([*command, "--start", str(start), "--out", "needle.pdf"]) == ExitCode.BAD_INPUT
     assert main([*command, "--start", "99"]) == ExitCode.BAD_INPUT
     assert main([*command, "--start", str(tmp_path / "none.txt")]) == ExitCode.BAD_INPUT

@@ -63,6 +63,22 @@ def test_a_wall_is_proved_and_a_hole_is_not() -> None:
     assert finds(environment_of(wall(4.0)), query())
 
 
+@pytest.mark.parametrize("at", [0.0, 2.0])
+def test_the_passage_of_an_open_query_is_its_hole(at: float) -> None:
+    """Of a hole of 4 mm radius 3 mm are left, less where voxels cut it; cells along the edge are added."""
+    proof = NoPathProof(environment_of(wall(4.0, at)), query())
+    assert proof.passage is None
+    while proof.passage is None and not proof.advance():
+        pass
+    passage = proof.passage
+    assert passage is not None and passage.cell_mm <= 0.5
+    assert abs(passage.from_start_mm - 28.0) < 6.0
+    assert 3.0 < passage.width_mm < 7.0
+    assert np.linalg.norm(np.array(passage.point_lps) - (at, 0.0, passage.from_start_mm - 28.0)) < 1.5
+    walled = NoPathProof(environment_of(wall()), query())
+    assert walled.run() == "no path" and walled.passage is None
+
+
 def test_a_hole_that_is_too_narrow() -> None:
     """A hole of one voxel's width leaves 0.5 mm about its middle."""
     narrow = (np.abs(Z) < 2.0) & ~((np.abs(X) < 1.0) & (np.abs(Y) < 1.0))

@@ -7,12 +7,14 @@ import math
 import numpy as np
 
 from anatomy.errors import SettingsError
+from anatomy.structures import AIRWAY
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.box_queue import ENDED, MOST_BOXES, WAITING, begin_queue, divide
-from lungaccess.coupled.kernels.cost_bound import BOUND, BOX_COLUMNS, BoundEnvironment
+from lungaccess.coupled.kernels.cost_bound import BoundEnvironment
+from lungaccess.coupled.kernels.deployment_box import BOUND, BOX_COLUMNS, TubeSurroundings
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
-from stages.tube import tube_constants
+from stages.tube import tube_constants, tube_environment
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
 
 BOXES_A_STEP = 200
@@ -142,19 +144,22 @@ class GapGoal:
 
 def _environment(task: Task) -> BoundEnvironment:
     lung = task.lung
-    obstacles = lung.obstacle_field(with_fissures=task.with_fissures)
-    field = {name: each.corners for name, each in lung.fields.items()}
     evaluator = CandidateEvaluator(task)
     limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
+    tubes = tube_environment(lung, with_fissures=task.with_fissures)
     return BoundEnvironment(
-        obstacles=obstacles.corners,
-        airway=field["airway"],
-        vessels=field["vessel"],
-        outside=field["pleura"],
-        fissures=field["fissure" if task.with_fissures else "vessel"],
-        geometry=obstacles.geometry,
-        depth=lung.lumen_depth.corners,
-        depth_geometry=lung.lumen_depth.geometry,
+        obstacles=tubes.field,
+        geometry=tubes.geometry,
+        surroundings=TubeSurroundings(
+            clearance=tubes.field,
+            labels=tubes.labels,
+            geometry=tubes.geometry,
+            depth=tubes.lumen,
+            depth_geometry=tubes.lumen_geometry,
+            bits=tubes.bits,
+            hazard_bits=tubes.bits & ~AIRWAY,
+            mediastinal=tubes.mediastinal,
+        ),
         kappa=limits.kappa,
         max_length_mm=limits.max_length_mm,
         goal_tolerance_mm=limits.goal_tolerance_mm,

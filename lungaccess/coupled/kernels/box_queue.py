@@ -8,7 +8,8 @@ import numba
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from lungaccess.coupled.kernels.cost_bound import (
+from lungaccess.coupled.kernels.cost_bound import bound_box
+from lungaccess.coupled.kernels.deployment_box import (
     ACROSS,
     AWAY,
     BOUND,
@@ -28,7 +29,6 @@ from lungaccess.coupled.kernels.cost_bound import (
     TIP,
     UP,
     WIDE,
-    bound_box,
 )
 
 MOST_BOXES = 400_000
@@ -153,7 +153,7 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
         stacked = 1
         while stacked > 0:
             box = stack[stacked - 1]
-            box[BOUND] = bound_box(environment, tubes, insertions, tips, rates, target, box)
+            box[BOUND] = bound_box(environment, tubes, insertions, tips, rates, target, limit, box)
             if box[BOUND] >= limit:
                 stacked -= 1
                 continue
@@ -212,7 +212,7 @@ def divide(environment, tubes, insertions, tips, rates, target, most, limit, sta
             numbers[UNUSED] -= 1
         for part in range(halves):
             at = row if part == 0 else other
-            bound = bound_box(environment, tubes, insertions, tips, rates, target, boxes[at])
+            bound = bound_box(environment, tubes, insertions, tips, rates, target, limit, boxes[at])
             boxes[at, BOUND] = max(bound, floor)
             if boxes[at, BOUND] < limit:
                 _push(boxes, heap, numbers, at)

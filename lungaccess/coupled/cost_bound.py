@@ -19,7 +19,7 @@ from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_inser
 
 BOXES_A_STEP = 200
 """Boxes that are divided in one step of a search, which takes some milliseconds."""
-INSERTION_SPACING_MM = 0.1
+INSERTION_SPACING_MM = 0.01
 """Spacing of the insertions that are tried for the greatest one."""
 
 

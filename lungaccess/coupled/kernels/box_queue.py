@@ -42,7 +42,7 @@ BEGUN_MM = 6.0
 MOST_STACKED = 200
 TIP_SIDES = 4
 """The first sides, which tell where the tips of the tubes are."""
-SMALL_MM = 0.03
+SMALL_MM = 0.005
 """Sides that make less difference are not halved."""
 
 

@@ -24,7 +24,9 @@ from stages.tube.kernels import (
     MARGIN,
     OUTER_RADIUS,
     OVERLAP_CURVATURE,
+    lateral_sweep,
     planar_point,
+    sweep_slope,
 )
 
 BOUND, TIP, FIRST, LAST, ROTATION, OUTER, INNER, ACROSS, UP = range(9)
@@ -39,10 +41,14 @@ SPARE = 1e-6
 """For rounding, mm and rad."""
 TUBE_STEP_MM = 0.5
 """Step at which tubes of a small box are looked at."""
+LOOSE_SWEEP_MM = 0.3
+"""The whole sweep is looked at where it is known so well."""
+LEAST_STEP_MM = 0.1
+"""The same where they leave their airway."""
 WIDEST_LOOK_MM = 2.5
 """Lumen is searched for branches within less than this."""
 NONE, SEVERAL = -2, -3
-"""Instead of the branch of a lumen: no lumen, lumen of several branches."""
+"""Instead of the branch of a lumen: no lumen, lumen of more than two branches."""
 
 
 class TubeSurroundings(NamedTuple):
@@ -131,15 +137,20 @@ def least_sweep(tubes, box):
     most = max(abs(tubes[OVERLAP_CURVATURE]), abs(tubes[INNER_CURVATURE]))
     loose = most * curved * box[HALF_INNER]
     loose += 2.0 * unlike * curved * (box[HALF_OUTER] + max(box[OUTER] - outer, 0.0))
-    return max(math.hypot(after_x - before_x, after_z - before_z) - loose - SPARE, 0.0)
+    least = max(math.hypot(after_x - before_x, after_z - before_z) - loose - SPARE, 0.0)
+    loose = sweep_slope(most * curved) * (box[HALF_INNER] + box[HALF_OUTER] + box[OUTER] - outer)
+    if loose < LOOSE_SWEEP_MM:
+        least = max(least, lateral_sweep(tubes, outer, inner) - loose - SPARE)
+    return least
 
 
 @inner_kernel
-def _branch_of_lumen(surroundings, point, reach, branch):
-    """Return the branch of all lumen within `reach` of a point, and of what was found before: see NONE."""
+def _branches_of_lumen(surroundings, point, reach, branches):
+    """Return the branches of all lumen within `reach` of a point, and of what was found before: see NONE."""
     labels, geometry = surroundings.labels, surroundings.geometry
-    if branch == SEVERAL or reach > WIDEST_LOOK_MM:
-        return SEVERAL
+    one, other = branches
+    if one == SEVERAL or reach > WIDEST_LOOK_MM:
+        return SEVERAL, NONE
     x, y, z = point
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
     v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
@@ -152,16 +163,25 @@ def _branch_of_lumen(surroundings, point, reach, branch):
             dv = max(abs(j + 0.5 - v) - half, 0.0) * sv
             for i in range(max(int(u - reach / su), 0), min(int(u + reach / su) + 1, labels.shape[0])):
                 label = int(labels[i, j, k])
-                if label & LUMEN == 0:
+                here = (label >> BRANCH_SHIFT) - 1
+                if label & LUMEN == 0 or here == one or here == other:
                     continue
                 du = max(abs(i + 0.5 - u) - half, 0.0) * su
-                here = (label >> BRANCH_SHIFT) - 1
-                if here == branch or du * du + dv * dv + dw * dw > reach * reach:
+                if du * du + dv * dv + dw * dw > reach * reach:
                     continue
-                if branch != NONE:
-                    return SEVERAL
-                branch = here
-    return branch
+                if one == NONE:
+                    one = here
+                elif other == NONE:
+                    other = here
+                else:
+                    return SEVERAL, NONE
+    return one, other
+
+
+@inner_kernel
+def _must_not_leave(surroundings, branch):
+    """Tell whether tubes must not leave a branch, or there is none."""
+    return branch == NONE or branch == -1 or (branch >= 0 and surroundings.mediastinal[branch])
 
 
 @inner_kernel
@@ -193,7 +213,9 @@ def tubes_blocked(surroundings, tubes, pose, box, sweep):
         No tube of the box sweeps sideways by less, mm.
     """
     shortest = max(box[INNER] - box[HALF_INNER], 0.0)
-    left, meets, branch = False, True, NONE
+    hazards, bits = surroundings.hazard_bits, surroundings.bits
+    left, meets, branches = False, True, (NONE, NONE)
+    refused = other_refused = False
     s = back = 0.0
     while True:
         point, away = point_of(tubes, pose, box, s)
@@ -201,27 +223,34 @@ def tubes_blocked(surroundings, tubes, pose, box, sweep):
         deep = distance_bound(surroundings.depth, surroundings.depth_geometry, x, y, z)
         radius = tubes[OUTER_RADIUS] if s <= box[OUTER] - box[HALF_OUTER] else tubes[INNER_RADIUS]
         required = radius + tubes[MARGIN] + sweep - SPARE
-        step = max(TUBE_STEP_MM, away)
         if not left:
+            step = max(min(TUBE_STEP_MM, 2.0 * away), LEAST_STEP_MM, away)
             if deep > away + back:
-                meets, branch = True, NONE
+                meets, branches = True, (NONE, NONE)
                 step = max(step, 0.5 * (deep - away))
             else:
-                branch = _branch_of_lumen(surroundings, point, away + back + 2.0 * CORNER_MM, branch)
-                reach = required - away - back
-                meets = meets and _within(surroundings, point, surroundings.hazard_bits, -1, reach)
+                around = away + back
+                branches = _branches_of_lumen(surroundings, point, around + 2.0 * CORNER_MM, branches)
+                meets = meets and _within(surroundings, point, hazards, -1, required - around)
                 left = not _within(surroundings, point, LUMEN, -1, away + CORNER_MM + SPARE)
-                if left and (meets or branch == -1 or (branch >= 0 and surroundings.mediastinal[branch])):
+                if left and meets:
                     return True
+                if left and branches[0] != SEVERAL:
+                    refused = _must_not_leave(surroundings, branches[0])
+                    other_refused = _must_not_leave(surroundings, branches[1])
         if left:
-            one = branch >= 0
-            bits = surroundings.bits if one else surroundings.hazard_bits
-            if _within(surroundings, point, bits, branch if one else -1, required - away):
-                return True
             if deep > away + SPARE:
                 return True
+            reach = required - away
+            if branches[0] == SEVERAL:
+                refused = other_refused = _within(surroundings, point, hazards, -1, reach)
+            else:
+                refused = refused or _within(surroundings, point, bits, branches[0], reach)
+                other_refused = other_refused or _within(surroundings, point, bits, branches[1], reach)
+            if refused and other_refused:
+                return True
             clear = distance_bound(surroundings.clearance, surroundings.geometry, x, y, z)
-            step = max(step, clear - required - away)
+            step = max(TUBE_STEP_MM, away, clear - required - away)
         if s >= shortest:
             return deep > away + 2.0 * box[HALF_INNER] + SPARE
         back = min(step, shortest - s)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,14 +12,26 @@ from anatomy.structures import AIRWAY
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.box_queue import ENDED, MOST_BOXES, WAITING, begin_queue, divide
 from lungaccess.coupled.kernels.cost_bound import BoundEnvironment
-from lungaccess.coupled.kernels.deployment_box import BOUND, BOX_COLUMNS, TubeSurroundings
+from lungaccess.coupled.kernels.deployment_box import (
+    BOUND,
+    BOX_COLUMNS,
+    INNER,
+    OUTER,
+    ROTATION,
+    TIP,
+    TubeSurroundings,
+)
+from lungaccess.coupled.search.atlas_search import AtlasSearch
+from lungaccess.coupled.search.base import Step, evaluated_step
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from stages.tube import tube_constants, tube_environment
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
 
-BOXES_A_STEP = 200
-"""Boxes that are divided in one step of a search, which takes some milliseconds."""
+BOXES_A_STEP = 250
+"""Boxes that are divided in one step of a search, which takes some ten milliseconds."""
+TRIED_A_STEP = 4
+"""Deployments that are tried in one step, in the middle of boxes: less than a millisecond."""
 INSERTION_SPACING_MM = 0.01
 """Spacing of the insertions that are tried for the greatest one."""
 
@@ -102,6 +115,16 @@ class CostBound:
         self.settled = outcome != ENDED
         return self.value
 
+    def lowest(self, count: int) -> list[tuple[int, float, float, float]]:
+        """Return scope tip, rotation (rad) and insertions (mm) in the middle of some of the lowest boxes."""
+        if self._state is None:
+            return []
+        boxes, heap, _unused, numbers = self._state
+        rows = boxes[heap[: min(count, int(numbers[WAITING]))]]
+        inner = rows[:, INNER]
+        columns = rows[:, TIP], rows[:, ROTATION], np.clip(rows[:, OUTER], 0.0, inner), inner
+        return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
+
     def _begin(self, cost: float) -> None:
         most = self._most_boxes
         places = np.zeros(most, dtype=np.int64)
@@ -140,6 +163,22 @@ class GapGoal:
     def is_met(self, cost: float) -> bool:
         """Improve the bound, and tell whether a plan of this cost is so near to the best possible."""
         return cost <= (1.0 + self._gap) * self.bound.improve(cost, BOXES_A_STEP)
+
+    def guided(self, search: AtlasSearch, steps: Iterator[Step]) -> Iterator[Step]:
+        """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
+
+        Each of those becomes the search's best candidate, which it then improves.
+        """
+        phase, tips = "lower bound", search.atlas.motions
+        for step in steps:
+            yield step
+            if step.iteration == 0 or self.bound.settled:
+                continue
+            for tip, rotation, outer, inner in self.bound.lowest(TRIED_A_STEP):
+                candidate = search.evaluator.direct(tips.tip(tip), rotation, outer, inner)
+                found = evaluated_step(search.evaluator, phase, candidate, step.iteration)
+                if found.cost < search.incumbent.cost:
+                    yield search.incumbent.improved(found)
 
 
 def _environment(task: Task) -> BoundEnvironment:

@@ -183,6 +183,8 @@ def plan(
 
     limits = Limits.of(iterations, time_s, first_plan_s)
     goal = None if gap is None else GapGoal(CostBound(task, atlas), gap)
+    if goal is not None and processes == 1 and isinstance(search, AtlasSearch):
+        steps = goal.guided(search, steps)
     return drive(steps, limits, tell, made, no_plan, goal)
 
 

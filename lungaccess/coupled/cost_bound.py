@@ -71,10 +71,8 @@ class CostBound:
         self._most_boxes = most_boxes
         self._environment = _environment(task)
         self._tubes = tube_constants(system.tubes, system.margins)
-        longest = float(self._tubes[MAX_EXTENSION])
-        self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
-        greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)
-        self._longest = float(self._insertions.max())
+        self._longest = float(self._tubes[MAX_EXTENSION])
+        self._insertions = np.zeros(0)
         self._tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
         self._rates = np.zeros((len(self._tips), 2))
         x, y, z = task.target.lps_mm.tolist()
@@ -126,12 +124,14 @@ class CostBound:
         return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
 
     def _begin(self, cost: float) -> None:
+        self._insertions = np.zeros(int(self._longest / INSERTION_STEP_MM) + 1)
+        greatest_insertions(self._tubes, self._longest, INSERTION_SPACING_MM, self._insertions)
         most = self._most_boxes
         places = np.zeros(most, dtype=np.int64)
         state = (np.zeros((most, BOX_COLUMNS)), places, np.zeros_like(places), np.zeros(2, dtype=np.int64))
         room = begin_queue(
             self._environment, self._tubes, self._insertions, self._tips, self._rates, self._target,
-            self._longest, cost, state,
+            float(self._insertions.max()), cost, state,
         )  # fmt: skip
         self._state = state
         self._left_out = cost if room else 0.0

@@ -192,7 +192,8 @@ def _within(surroundings, point, bits, branch, reach):
     x, y, z = point
     if distance_bound(surroundings.clearance, surroundings.geometry, x, y, z) >= reach:
         return False
-    _distance, label = exact_distance(surroundings.labels, surroundings.geometry, x, y, z, bits, branch, reach)
+    labels, geometry = surroundings.labels, surroundings.geometry
+    _distance, label = exact_distance(labels, geometry, x, y, z, bits, branch, reach)
     return label != 0
 
 

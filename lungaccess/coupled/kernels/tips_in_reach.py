@@ -43,7 +43,7 @@ def minus(a, b, scale):
 
 @inner_kernel
 def least_distance(tubes, kappa, pose, box, tip, tangent, target, off):
-    """Return how far the tips of a box from which a target is in reach are at least, mm; inf if there is none.
+    """Return how far the tips of a box with the target in reach are at least, mm; inf if there is none.
 
     The target moves, as the tips see it, with each side of the box.  To first order its distance from the
     middle tip, and from the centre of the tightest circle there, change with each in proportion.  The least

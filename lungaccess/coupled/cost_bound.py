@@ -30,6 +30,8 @@ from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_inser
 
 BOXES_A_STEP = 250
 """Boxes that are divided in one step of a search, which takes some ten milliseconds."""
+BOXES_A_TIP = 2
+"""A scope tip is begun with instead of dividing so many boxes."""
 TRIED_A_STEP = 4
 """Deployments that are tried in one step, in the middle of boxes: less than a millisecond."""
 INSERTION_SPACING_MM = 0.01
@@ -69,7 +71,8 @@ class CostBound:
                 remedy="Leave out the gap",
             )
         self._most_boxes = most_boxes
-        self._environment = _environment(task)
+        self._task = task
+        self._environment: BoundEnvironment | None = None
         self._tubes = tube_constants(system.tubes, system.margins)
         self._longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(0)
@@ -78,6 +81,7 @@ class CostBound:
         x, y, z = task.target.lps_mm.tolist()
         self._target = (x, y, z)
         self._state: tuple[np.ndarray, ...] | None = None
+        self._begun = 0
         self._left_out = math.inf
         self.settled = False
         """Whether it rises no more."""
@@ -85,7 +89,7 @@ class CostBound:
     @property
     def value(self) -> float:
         """The bound: 0 before it has begun."""
-        if self._state is None:
+        if self._state is None or self._begun < len(self._tips):
             return 0.0
         boxes, heap, _unused, numbers = self._state
         lowest = float(boxes[heap[0], BOUND]) if numbers[WAITING] else math.inf
@@ -97,19 +101,19 @@ class CostBound:
         Parameters
         ----------
         cost : float
-            That of a plan: deployments that cost as much need not be told apart.  The first call takes some
-            seconds, fewer where it is low.
+            That of a plan: deployments that cost as much need not be told apart.  The first calls only begin
+            with the boxes of some scope tips each.
         """
         if self.settled:
             return self.value
-        if self._state is None:
-            self._begin(cost)
+        self._left_out = min(self._left_out, cost)
+        if self._begun < len(self._tips):
+            self._begin(cost, max(boxes // BOXES_A_TIP, 1))
             return self.value
         outcome, _divided = divide(
             self._environment, self._tubes, self._insertions, self._tips, self._rates, self._target,
             boxes, cost, self._state,
         )  # fmt: skip
-        self._left_out = min(self._left_out, cost)
         self.settled = outcome != ENDED
         return self.value
 
@@ -123,19 +127,40 @@ class CostBound:
         columns = rows[:, TIP], rows[:, ROTATION], np.clip(rows[:, OUTER], 0.0, inner), inner
         return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
 
-    def _begin(self, cost: float) -> None:
-        self._insertions = np.zeros(int(self._longest / INSERTION_STEP_MM) + 1)
-        greatest_insertions(self._tubes, self._longest, INSERTION_SPACING_MM, self._insertions)
-        most = self._most_boxes
-        places = np.zeros(most, dtype=np.int64)
-        state = (np.zeros((most, BOX_COLUMNS)), places, np.zeros_like(places), np.zeros(2, dtype=np.int64))
+    def _begin(self, cost: float, tips: int) -> None:
+        if self._state is None:
+            self._environment = _environment(self._task)
+            self._insertions = np.zeros(int(self._longest / INSERTION_STEP_MM) + 1)
+            greatest_insertions(self._tubes, self._longest, INSERTION_SPACING_MM, self._insertions)
+            most = self._most_boxes
+            places = np.zeros(most, dtype=np.int64)
+            numbers = np.zeros(2, dtype=np.int64)
+            self._state = (np.zeros((most, BOX_COLUMNS)), places, np.zeros_like(places), numbers)
+        first, last = self._begun, min(self._begun + tips, len(self._tips))
         room = begin_queue(
             self._environment, self._tubes, self._insertions, self._tips, self._rates, self._target,
-            float(self._insertions.max()), cost, state,
+            float(self._insertions.max()), cost, first, last, self._state,
         )  # fmt: skip
-        self._state = state
-        self._left_out = cost if room else 0.0
-        self.settled = not room
+        self._begun = last
+        if not room:
+            self._left_out, self.settled = 0.0, True
+
+
+def guided(search: AtlasSearch, steps: Iterator[Step], bound: CostBound) -> Iterator[Step]:
+    """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
+
+    Each of those becomes the search's best candidate, which it then improves.  Who takes the steps improves
+    the bound.
+    """
+    for step in steps:
+        yield step
+        if bound.settled or search.incumbent.step is None:
+            continue
+        for tip, rotation, outer, inner in bound.lowest(TRIED_A_STEP):
+            candidate = search.evaluator.direct(search.atlas.motions.tip(tip), rotation, outer, inner)
+            found = evaluated_step(search.evaluator, "lower bound", candidate, step.iteration)
+            if found.cost < search.incumbent.cost:
+                yield search.incumbent.improved(found)
 
 
 class GapGoal:
@@ -163,22 +188,6 @@ class GapGoal:
     def is_met(self, cost: float) -> bool:
         """Improve the bound, and tell whether a plan of this cost is so near to the best possible."""
         return cost <= (1.0 + self._gap) * self.bound.improve(cost, BOXES_A_STEP)
-
-    def guided(self, search: AtlasSearch, steps: Iterator[Step]) -> Iterator[Step]:
-        """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
-
-        Each of those becomes the search's best candidate, which it then improves.
-        """
-        phase, tips = "lower bound", search.atlas.motions
-        for step in steps:
-            yield step
-            if step.iteration == 0 or self.bound.settled:
-                continue
-            for tip, rotation, outer, inner in self.bound.lowest(TRIED_A_STEP):
-                candidate = search.evaluator.direct(tips.tip(tip), rotation, outer, inner)
-                found = evaluated_step(search.evaluator, phase, candidate, step.iteration)
-                if found.cost < search.incumbent.cost:
-                    yield search.incumbent.improved(found)
 
 
 def _environment(task: Task) -> BoundEnvironment:

@@ -117,8 +117,8 @@ def _halve(parent, child, sides):
 
 
 @numba.njit(cache=True, nogil=True)
-def begin_queue(environment, tubes, insertions, tips, rates, target, longest, limit, state):
-    """Let boxes wait that hold all deployments whose bound may be below a limit, from all tips.
+def begin_queue(environment, tubes, insertions, tips, rates, target, longest, limit, first, last, state):
+    """Let boxes wait that hold all deployments whose bound may be below a limit, from tips `first` to `last`.
 
     Boxes of more than BEGUN_MM are divided at once, depth first.
 
@@ -129,6 +129,8 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
     longest : float
         Greatest insertion, mm.
     limit : float
+    first, last : int
+        Rows of tips, without the last; those of the first call begin with 0.
     state : tuple of arrays
         Boxes (N, BOX_COLUMNS) float64, heap (N,) and unused rows (N,) int64, and numbers (2,) int64.
 
@@ -138,12 +140,13 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
         False if there was no room for all.
     """
     boxes, heap, unused, numbers = state
-    numbers[WAITING], numbers[UNUSED] = 0, 0
-    for row in range(len(boxes) - 1, -1, -1):
-        unused[numbers[UNUSED]] = row
-        numbers[UNUSED] += 1
+    if first == 0:
+        numbers[WAITING], numbers[UNUSED] = 0, 0
+        for row in range(len(boxes) - 1, -1, -1):
+            unused[numbers[UNUSED]] = row
+            numbers[UNUSED] += 1
     stack = np.zeros((MOST_STACKED, BOX_COLUMNS))
-    for n in range(len(tips)):
+    for n in range(first, last):
         box = stack[0]
         box[:] = 0.0
         box[TIP], box[FIRST], box[LAST] = n, 0.0, tips.shape[1] - 1.0

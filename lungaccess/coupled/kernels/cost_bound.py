@@ -255,10 +255,9 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box):
         bound = as_far_as(environment, target, tip, off, away, least)
     else:
         bound = _by_halfway(environment, target, tip, tangent, swing, off, away, least, box)
-    if bound < limit and away < FOLLOWED_MM:
-        if tubes_blocked(environment.surroundings, tubes, pose, box, sweep):
-            return math.inf
-    return bound
+    if bound >= limit or away >= FOLLOWED_MM:
+        return bound
+    return math.inf if tubes_blocked(environment.surroundings, tubes, pose, box, sweep) else bound
 
 
 @inner_kernel

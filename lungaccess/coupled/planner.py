@@ -12,7 +12,7 @@ from anatomy.kernel_clock import working_s
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
-from lungaccess.coupled.cost_bound import CostBound, GapGoal
+from lungaccess.coupled.cost_bound import CostBound, GapGoal, guided
 from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
 from lungaccess.coupled.search.atlas_search import AtlasSearch
 from lungaccess.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
@@ -183,6 +183,8 @@ def plan(
 
     limits = Limits.of(iterations, time_s, first_plan_s)
     goal = None if gap is None else GapGoal(CostBound(task, atlas), gap)
+    if goal is not None and processes == 1 and isinstance(search, AtlasSearch):
+        steps = guided(search, steps, goal.bound)
     return drive(steps, limits, tell, made, no_plan, goal)
 
 

@@ -8,7 +8,8 @@ import numba
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from lungaccess.coupled.kernels.cost_bound import (
+from lungaccess.coupled.kernels.cost_bound import bound_box
+from lungaccess.coupled.kernels.deployment_box import (
     ACROSS,
     AWAY,
     BOUND,
@@ -28,21 +29,20 @@ from lungaccess.coupled.kernels.cost_bound import (
     TIP,
     UP,
     WIDE,
-    bound_box,
 )
 
-MOST_BOXES = 400_000
-"""Boxes that may wait; they take 70 MB."""
+MOST_BOXES = 1_000_000
+"""Boxes that may wait; they take 180 MB."""
 WAITING, UNUSED = 0, 1
 """Of the numbers of a queue: boxes that wait, and rows that hold none."""
 ENDED, EMPTY, FULL, WHOLE = 0, 1, 2, 3
 """Why dividing ended: after so many boxes; none is below the limit; no row is left; the lowest is small."""
-BEGUN_MM = 6.0
+BEGUN_MM = 14.0
 """Tips differ by less in the boxes with which a bound begins."""
 MOST_STACKED = 200
 TIP_SIDES = 4
 """The first sides, which tell where the tips of the tubes are."""
-SMALL_MM = 0.03
+SMALL_MM = 0.005
 """Sides that make less difference are not halved."""
 
 
@@ -117,8 +117,8 @@ def _halve(parent, child, sides):
 
 
 @numba.njit(cache=True, nogil=True)
-def begin_queue(environment, tubes, insertions, tips, rates, target, longest, limit, state):
-    """Let boxes wait that hold all deployments whose bound may be below a limit, from all tips.
+def begin_queue(environment, tubes, insertions, tips, rates, target, longest, limit, first, last, state):
+    """Let boxes wait that hold all deployments whose bound may be below a limit, from tips `first` to `last`.
 
     Boxes of more than BEGUN_MM are divided at once, depth first.
 
@@ -129,6 +129,8 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
     longest : float
         Greatest insertion, mm.
     limit : float
+    first, last : int
+        Rows of tips, without the last; those of the first call begin with 0.
     state : tuple of arrays
         Boxes (N, BOX_COLUMNS) float64, heap (N,) and unused rows (N,) int64, and numbers (2,) int64.
 
@@ -138,12 +140,13 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
         False if there was no room for all.
     """
     boxes, heap, unused, numbers = state
-    numbers[WAITING], numbers[UNUSED] = 0, 0
-    for row in range(len(boxes) - 1, -1, -1):
-        unused[numbers[UNUSED]] = row
-        numbers[UNUSED] += 1
+    if first == 0:
+        numbers[WAITING], numbers[UNUSED] = 0, 0
+        for row in range(len(boxes) - 1, -1, -1):
+            unused[numbers[UNUSED]] = row
+            numbers[UNUSED] += 1
     stack = np.zeros((MOST_STACKED, BOX_COLUMNS))
-    for n in range(len(tips)):
+    for n in range(first, last):
         box = stack[0]
         box[:] = 0.0
         box[TIP], box[FIRST], box[LAST] = n, 0.0, tips.shape[1] - 1.0
@@ -153,7 +156,7 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
         stacked = 1
         while stacked > 0:
             box = stack[stacked - 1]
-            box[BOUND] = bound_box(environment, tubes, insertions, tips, rates, target, box)
+            box[BOUND] = bound_box(environment, tubes, insertions, tips, rates, target, limit, box)
             if box[BOUND] >= limit:
                 stacked -= 1
                 continue
@@ -212,7 +215,7 @@ def divide(environment, tubes, insertions, tips, rates, target, most, limit, sta
             numbers[UNUSED] -= 1
         for part in range(halves):
             at = row if part == 0 else other
-            bound = bound_box(environment, tubes, insertions, tips, rates, target, boxes[at])
+            bound = bound_box(environment, tubes, insertions, tips, rates, target, limit, boxes[at])
             boxes[at, BOUND] = max(bound, floor)
             if boxes[at, BOUND] < limit:
                 _push(boxes, heap, numbers, at)

@@ -13,11 +13,14 @@ from stages.tube.kernels.planar import (
     MAX_PROTRUSION,
     MAX_SWEEP,
     OVERLAP_CURVATURE,
-    lateral_sweep,
+    sampled_sweep,
 )
 
 INSERTION_STEP_MM = 0.5
 """Of the outer tube, in the table of greatest insertions."""
+
+SAMPLED_EVERY = 25
+"""Samples of the sweep of which one is looked at for that table: the sweep peaks elsewhere."""
 
 
 @inner_kernel
@@ -76,7 +79,7 @@ def greatest_insertions(tubes, longest, spacing, insertions):
             outer = (m + (n + 0.5) / tried) * INSERTION_STEP_MM
             inner = longest
             while inner > max(greatest, outer - spacing):
-                over = lateral_sweep(tubes, min(outer, inner), inner) - tubes[MAX_SWEEP]
+                over = sampled_sweep(tubes, min(outer, inner), inner, SAMPLED_EVERY) - tubes[MAX_SWEEP]
                 # Half a spacing for the outer tube, and what the least step passes over.
                 over -= 0.75 * slope * spacing
                 if over <= 0.0:

@@ -89,6 +89,12 @@ def lateral_sweep(tubes, outer, inner):
     farthest from its final place when the tip first gets there: the sweep is also the error with which
     the tubes follow their leader.  While the tip is within the curved length of the scope it is 0.
     """
+    return sampled_sweep(tubes, outer, inner, 1)
+
+
+@numba.njit(cache=True)
+def sampled_sweep(tubes, outer, inner, every):
+    """Return the lateral sweep at its two sharp peaks and at one of `every` samples of the rest: no more."""
     curved = tubes[CURVED_LENGTH]
     if inner <= curved:
         return 0.0
@@ -96,7 +102,7 @@ def lateral_sweep(tubes, outer, inner):
     worst = max(
         _off_track(tubes, outer, inner, curved), _off_track(tubes, outer, inner, min(outer + curved, inner))
     )
-    for m in range(1, SWEEP_SAMPLES + 1):
+    for m in range(every, SWEEP_SAMPLES + 1, every):
         worst = max(worst, _off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
     return worst
 

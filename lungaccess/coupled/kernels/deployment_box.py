@@ -1,0 +1,258 @@
+"""Boxes of deployments from a scope tip: where their tubes are, and whether all of them are ruled out.
+
+A box is a row of `BOX_COLUMNS` float64: a range of places of the scope tip along a motion (samples FIRST to
+LAST of a row of tips), of the rotation of the tubes, and of both insertions (middles and half widths); and
+where the paths cross a sphere halfway to the target, as a rotation vector (rad) from the straight line, with
+half widths; a half width below 0 is no such range.  docs/explanation/cost_bound.md derives what is ruled out.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.field import distance_bound, exact_distance
+from anatomy.kernels.labels import BRANCH_SHIFT, LUMEN
+from stages.tube.kernels import (
+    CORNER_MM,
+    CURVED_LENGTH,
+    INNER_CURVATURE,
+    INNER_RADIUS,
+    MARGIN,
+    OUTER_RADIUS,
+    OVERLAP_CURVATURE,
+    lateral_sweep,
+    planar_point,
+    sweep_slope,
+)
+
+BOUND, TIP, FIRST, LAST, ROTATION, OUTER, INNER, ACROSS, UP = range(9)
+HALF_ROTATION, HALF_OUTER, HALF_INNER, HALF_ACROSS, HALF_UP = range(9, 14)
+AWAY, WIDE, LOSS, SIDES = 14, 15, 16, 6
+BOX_COLUMNS = LOSS + SIDES
+"""`AWAY` is how far tips are from the middle one at most, mm, and `WIDE` the greatest angle (rad) of that
+rotation vector; from `LOSS` on stands what each side costs, mm: place, rotation, outer, inner, and the two
+sides of the rotation vector."""
+
+SPARE = 1e-6
+"""For rounding, mm and rad."""
+TUBE_STEP_MM = 0.5
+"""Step at which tubes of a small box are looked at."""
+LOOSE_SWEEP_MM = 0.3
+"""The whole sweep is looked at where it is known so well."""
+LEAST_STEP_MM = 0.1
+"""The same where they leave their airway."""
+WIDEST_LOOK_MM = 2.5
+"""Lumen is searched for branches within less than this."""
+NONE, SEVERAL = -2, -3
+"""Instead of the branch of a lumen: no lumen, lumen of more than two branches."""
+
+
+class TubeSurroundings(NamedTuple):
+    """What tubes are kept clear of.
+
+    Parameters
+    ----------
+    clearance : (ni + 1, nj + 1, nk + 1) uint16
+        Corner field of the distance to all obstacles.
+    labels : (ni, nj, nk) uint16
+    geometry : (3, 6) float64
+    depth, depth_geometry
+        Corner field of the depth in the lumen.
+    bits, hazard_bits : int
+        Structures that are obstacles: all, and those other than airways.
+    mediastinal : (B,) bool
+        Airway branches that must not be left.
+    """
+
+    clearance: np.ndarray
+    labels: np.ndarray
+    geometry: np.ndarray
+    depth: np.ndarray
+    depth_geometry: np.ndarray
+    bits: int
+    hazard_bits: int
+    mediastinal: np.ndarray
+
+
+@inner_kernel
+def pose_of(tips, rates, box):
+    """Return the middle scope tip of a box, its tubes' normal, and how far others may be from it.
+
+    That is: point, direction, normal; by how many mm the places and by what angle the frames differ.
+    """
+    n, m = int(box[TIP]), int(0.5 * (box[FIRST] + box[LAST]))
+    tip = tips[n, m]
+    base = (tip[0], tip[1], tip[2])
+    forward = (tip[3], tip[4], tip[5])
+    binormal = (
+        forward[1] * tip[8] - forward[2] * tip[7],
+        forward[2] * tip[6] - forward[0] * tip[8],
+        forward[0] * tip[7] - forward[1] * tip[6],
+    )
+    c, s = math.cos(box[ROTATION]), math.sin(box[ROTATION])
+    normal = (c * tip[6] + s * binormal[0], c * tip[7] + s * binormal[1], c * tip[8] + s * binormal[2])
+    samples = max(box[LAST] - m, m - box[FIRST])
+    return base, forward, normal, samples * rates[n, 0], samples * rates[n, 1]
+
+
+@inner_kernel
+def point_of(tubes, pose, box, s):
+    """Return the point of the middle tubes at arc length `s`, and how far from it those of others are, mm."""
+    base, forward, normal, place, tilt = pose
+    outer, half_inner = box[OUTER], box[HALF_INNER]
+    longest = box[INNER] + half_inner
+    bent = longest > tubes[CURVED_LENGTH]
+    x, z = planar_point(tubes, outer, box[INNER] if bent else longest, s)
+    unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
+    most = max(abs(tubes[OVERLAP_CURVATURE]), abs(tubes[INNER_CURVATURE]))
+    wrong = unlike * box[HALF_OUTER] * max(s - max(outer - box[HALF_OUTER], 0.0), 0.0)
+    if bent:
+        wrong += most * half_inner * s
+    away = place + wrong + tilt * (math.hypot(x, z) + wrong) + box[HALF_ROTATION] * (abs(x) + wrong)
+    point = (
+        base[0] + x * normal[0] + z * forward[0],
+        base[1] + x * normal[1] + z * forward[1],
+        base[2] + x * normal[2] + z * forward[2],
+    )
+    return point, away
+
+
+@inner_kernel
+def least_sweep(tubes, box):
+    """Return a sideways sweep (mm) that no deployment of a box goes below; see `stages.tube.lateral_sweep`.
+
+    It looks at the point of the body that is the first to go straight, for which the insertions change shapes
+    by no more than the length beyond their bend times the change of its angle.
+    """
+    curved, inner, outer = tubes[CURVED_LENGTH], box[INNER], min(box[OUTER], box[INNER])
+    if inner - box[HALF_INNER] <= curved:
+        return 0.0
+    before_x, before_z = planar_point(tubes, min(curved, outer), curved, curved)
+    after_x, after_z = planar_point(tubes, outer, inner, curved)
+    unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
+    most = max(abs(tubes[OVERLAP_CURVATURE]), abs(tubes[INNER_CURVATURE]))
+    loose = most * curved * box[HALF_INNER]
+    loose += 2.0 * unlike * curved * (box[HALF_OUTER] + max(box[OUTER] - outer, 0.0))
+    least = max(math.hypot(after_x - before_x, after_z - before_z) - loose - SPARE, 0.0)
+    loose = sweep_slope(most * curved) * (box[HALF_INNER] + box[HALF_OUTER] + box[OUTER] - outer)
+    if loose < LOOSE_SWEEP_MM:
+        least = max(least, lateral_sweep(tubes, outer, inner) - loose - SPARE)
+    return least
+
+
+@inner_kernel
+def _branches_of_lumen(surroundings, point, reach, branches):
+    """Return the branches of all lumen within `reach` of a point, and of what was found before: see NONE."""
+    labels, geometry = surroundings.labels, surroundings.geometry
+    one, other = branches
+    if one == SEVERAL or reach > WIDEST_LOOK_MM:
+        return SEVERAL, NONE
+    x, y, z = point
+    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
+    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
+    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    half = geometry[0, 5]
+    su, sv, sw = math.sqrt(geometry[0, 4]), math.sqrt(geometry[1, 4]), math.sqrt(geometry[2, 4])
+    for k in range(max(int(w - reach / sw), 0), min(int(w + reach / sw) + 1, labels.shape[2])):
+        dw = max(abs(k + 0.5 - w) - half, 0.0) * sw
+        for j in range(max(int(v - reach / sv), 0), min(int(v + reach / sv) + 1, labels.shape[1])):
+            dv = max(abs(j + 0.5 - v) - half, 0.0) * sv
+            for i in range(max(int(u - reach / su), 0), min(int(u + reach / su) + 1, labels.shape[0])):
+                label = int(labels[i, j, k])
+                here = (label >> BRANCH_SHIFT) - 1
+                if label & LUMEN == 0 or here == one or here == other:
+                    continue
+                du = max(abs(i + 0.5 - u) - half, 0.0) * su
+                if du * du + dv * dv + dw * dw > reach * reach:
+                    continue
+                if one == NONE:
+                    one = here
+                elif other == NONE:
+                    other = here
+                else:
+                    return SEVERAL, NONE
+    return one, other
+
+
+@inner_kernel
+def _must_not_leave(surroundings, branch):
+    """Tell whether tubes must not leave a branch, or there is none."""
+    return branch == NONE or branch == -1 or (branch >= 0 and surroundings.mediastinal[branch])
+
+
+@inner_kernel
+def _within(surroundings, point, bits, branch, reach):
+    """Tell whether a structure, but airways of a branch, is within `reach` mm of a point."""
+    if reach <= 0.0:
+        return False
+    x, y, z = point
+    if distance_bound(surroundings.clearance, surroundings.geometry, x, y, z) >= reach:
+        return False
+    labels, geometry = surroundings.labels, surroundings.geometry
+    _distance, label = exact_distance(labels, geometry, x, y, z, bits, branch, reach)
+    return label != 0
+
+
+@inner_kernel
+def tubes_blocked(surroundings, tubes, pose, box, sweep):
+    """Tell whether all tubes of a box are refused, or end in a lumen.
+
+    A tube leaves its airway behind the last sample at which all tubes are in the lumen, and before the first
+    at which all are out of every lumen.  Where they all leave one branch, other branches count as obstacles.
+
+    Parameters
+    ----------
+    surroundings : TubeSurroundings
+    tubes : (N_TUBES,) float64
+    pose
+        See `pose_of`.
+    sweep : float
+        No tube of the box sweeps sideways by less, mm.
+    """
+    shortest = max(box[INNER] - box[HALF_INNER], 0.0)
+    hazards, bits = surroundings.hazard_bits, surroundings.bits
+    left, meets, branches = False, True, (NONE, NONE)
+    refused = other_refused = False
+    s = back = 0.0
+    while True:
+        point, away = point_of(tubes, pose, box, s)
+        x, y, z = point
+        deep = distance_bound(surroundings.depth, surroundings.depth_geometry, x, y, z)
+        radius = tubes[OUTER_RADIUS] if s <= box[OUTER] - box[HALF_OUTER] else tubes[INNER_RADIUS]
+        required = radius + tubes[MARGIN] + sweep - SPARE
+        if not left:
+            step = max(min(TUBE_STEP_MM, 2.0 * away), LEAST_STEP_MM, away)
+            if deep > away + back:
+                meets, branches = True, (NONE, NONE)
+                step = max(step, 0.5 * (deep - away))
+            else:
+                around = away + back
+                branches = _branches_of_lumen(surroundings, point, around + 2.0 * CORNER_MM, branches)
+                meets = meets and _within(surroundings, point, hazards, -1, required - around)
+                left = not _within(surroundings, point, LUMEN, -1, away + CORNER_MM + SPARE)
+                if left and meets:
+                    return True
+                if left and branches[0] != SEVERAL:
+                    refused = _must_not_leave(surroundings, branches[0])
+                    other_refused = _must_not_leave(surroundings, branches[1])
+        if left:
+            if deep > away + SPARE:
+                return True
+            reach = required - away
+            if branches[0] == SEVERAL:
+                refused = other_refused = _within(surroundings, point, hazards, -1, reach)
+            else:
+                refused = refused or _within(surroundings, point, bits, branches[0], reach)
+                other_refused = other_refused or _within(surroundings, point, bits, branches[1], reach)
+            if refused and other_refused:
+                return True
+            clear = distance_bound(surroundings.clearance, surroundings.geometry, x, y, z)
+            step = max(TUBE_STEP_MM, away, clear - required - away)
+        if s >= shortest:
+            return deep > away + 2.0 * box[HALF_INNER] + SPARE
+        back = min(step, shortest - s)
+        s = min(s + step, shortest)

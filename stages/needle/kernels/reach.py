@@ -20,7 +20,7 @@ from stages.needle.kernels.connections import seen_from, single_arc_exceeds
 from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.limits import TINY
-from stages.needle.kernels.proof import PROBE_SPACING_MM, blocker_on_arc
+from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
 
@@ -38,6 +38,8 @@ JUMP_GROWTH = 4
 ROUNDS = 20
 BLOCK = 512
 
+LOOK_SPACING_MM = 3.0
+"""Before their proof, arcs are looked at in places at most so far apart."""
 BUNDLE_SHARE = 0.7
 """Arcs of a bundle are looked at together as long as they are apart by less than this share of the clearance."""
 STEEPEST_SINE = 0.9
@@ -139,7 +141,7 @@ def _blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
     if hint >= begin and hint < end and _is_blocked_at(obstacles, limits, start, aside, spread, hint):
         return hint
     count = 1
-    while (end - begin) / count > PROBE_SPACING_MM:
+    while (end - begin) / count > LOOK_SPACING_MM:
         for m in range(count):
             c = begin + (end - begin) * (m + 0.5) / count
             if _is_blocked_at(obstacles, limits, start, aside, spread, c):

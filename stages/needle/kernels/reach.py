@@ -107,23 +107,34 @@ def _inverted_aside(start, q):
 
 
 @inner_kernel
-def _is_blocked_at(obstacles, limits, start, aside, spread, c):
-    """Tell whether all arcs of a bundle are blocked where they are `c` away from their common start.
+def _apart(aside, spread, c):
+    """Return how far arcs from one start may be apart where they are `c` away from it; inf if not bounded.
 
-    `aside` is that of one of the arcs, and that of the others differs from it by at most `spread`: there
-    they are apart by less than is taken off the required clearance.
+    `aside` is that of one of the arcs, and that of the others differs from it by at most `spread`.
     """
-    apart = 0.0
+    sine = c * (math.sqrt(aside[0] ** 2 + aside[1] ** 2 + aside[2] ** 2) + spread)
+    return c * c * spread / math.sqrt(1.0 - sine * sine) if sine < STEEPEST_SINE else math.inf
+
+
+@inner_kernel
+def _is_blocked_at(obstacles, limits, start, aside, spread, c):
+    """Tell whether all arcs of a bundle are blocked where they are `c` away from their start, see `_apart`."""
+    required = limits.required_mm
     if spread > 0.0:
-        sine = c * (math.sqrt(aside[0] ** 2 + aside[1] ** 2 + aside[2] ** 2) + spread)
-        if sine >= STEEPEST_SINE:
-            return False
-        apart = c * c * spread / math.sqrt(1.0 - sine * sine)
-    required = limits.required_mm - apart
+        required -= _apart(aside, spread, c)
     if required <= 0.0:
         return False
     x, y, z = _point_at_chord(start, aside, c)
     return _is_blocked(obstacles, required, x, y, z)
+
+
+@inner_kernel
+def _spread(chord, radius):
+    """Return how much `_inverted_aside` may differ for points within `radius` of one that is `chord` away.
+
+    Inversion divides distances by the product of the distances from the start.
+    """
+    return radius / (chord * (chord - radius)) if chord > radius else math.inf
 
 
 @inner_kernel
@@ -152,15 +163,12 @@ def _blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
 
 @inner_kernel
 def _is_blocked_bundle(obstacles, limits, start, q, radius, hints, entry):
-    """Tell whether all arcs to the points within `radius` of `q` are blocked, as far as they are close.
-
-    Inversion divides distances by the product of the distances from the start.
-    """
+    """Tell whether all arcs to the points within `radius` of `q` are blocked, as far as they are close."""
     chord2, aside = _inverted_aside(start, q)
     chord = math.sqrt(chord2)
-    if chord <= radius:
+    spread = _spread(chord, radius)
+    if spread == math.inf:
         return False
-    spread = radius / (chord * (chord - radius))
     end = min(math.sqrt(BUNDLE_SHARE * limits.required_mm / max(spread, TINY)), chord - radius)
     c = _blocked_at(obstacles, limits, start, aside, spread, limits.exempt_mm, end, hints[entry])
     if c >= 0.0:

@@ -41,7 +41,7 @@ BLOCK = 512
 LOOK_SPACING_MM = 3.0
 """Before their proof, arcs are looked at in places at most so far apart."""
 BUNDLE_SHARE = 0.7
-"""Arcs of a bundle are looked at together as long as they are apart by less than this share of the clearance."""
+"""Arcs of a bundle are looked at together up to where they are about this share of the clearance apart."""
 STEEPEST_SINE = 0.9
 """Lean of a chord beyond which arcs of a bundle are not looked at together."""
 
@@ -100,10 +100,7 @@ def _inverted_aside(start, q):
     chord2 = dx * dx + dy * dy + dz * dz
     h = dx * start[3] + dy * start[4] + dz * start[5]
     share = 1.0 / max(chord2, TINY)
-    return (
-        chord2,
-        (share * (dx - h * start[3]), share * (dy - h * start[4]), share * (dz - h * start[5])),
-    )
+    return (chord2, (share * (dx - h * start[3]), share * (dy - h * start[4]), share * (dz - h * start[5])))
 
 
 @inner_kernel
@@ -118,7 +115,7 @@ def _apart(aside, spread, c):
 
 @inner_kernel
 def _is_blocked_at(obstacles, limits, start, aside, spread, c):
-    """Tell whether all arcs of a bundle are blocked where they are `c` away from their start, see `_apart`."""
+    """Tell whether all arcs of a bundle are blocked at the distance `c` from their start, see `_apart`."""
     required = limits.required_mm
     if spread > 0.0:
         required -= _apart(aside, spread, c)
@@ -326,8 +323,9 @@ def reach_by_arcs(
     A point counts as reached if one arc is proved clear.  The cheapest is taken of the first `wanted` clear
     ones in the mixed order and of those from the start poses of neighbouring points; then its neighbours in
     the list are tried as long as they are cheaper: a good arc, not the proved best.  Where none is clear,
-    all have been tried.  The start poses that come into question are found once for the points of a block, as far
-    as they are asked for: those whose arcs to all of the points are blocked at one place are passed over.
+    all have been tried.  The start poses that come into question are found once for the points of a block,
+    as far as they are asked for: those whose arcs to all of the points are blocked at one place are passed
+    over.
 
     Parameters
     ----------

@@ -65,4 +65,4 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
 
 
 def _scaled(vector: np.ndarray) -> np.ndarray:
-    return vector / np.linalg.norm(vector)
+    return np.asarray(vector / np.linalg.norm(vector))

@@ -124,7 +124,7 @@ class ReachScan:
         kernel.reach_by_arcs(
             environment.obstacles, environment.limits, self._starts, self._branches, self._order, self._mixed,
             places, *_cubes(places), np.array(before, dtype=np.int64, order="C"), self._arcs,
-            np.full(len(self._starts), 0.5), kinds, found, entries,
+            np.zeros(len(self._starts)), kinds, found, entries,
         )  # fmt: skip
         if self.trees:
             self._search(places, seeds, kinds, found, entries)

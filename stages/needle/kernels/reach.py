@@ -19,7 +19,8 @@ from anatomy.kernels.labels import AIRWAY
 from stages.needle.kernels.connections import seen_from, single_arc_exceeds
 from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.goal_ball import workspace_length
-from stages.needle.kernels.proof import PROBE_SPACING_MM, blocker_on_arc
+from stages.needle.kernels.limits import TINY
+from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
 
@@ -36,6 +37,13 @@ JUMP_GROWTH = 4
 """Neighbours of the best start pose are tried 1, 4, 16, ... places away in the list, up to the longest."""
 ROUNDS = 20
 BLOCK = 512
+
+LOOK_SPACING_MM = 3.0
+"""Before their proof, arcs are looked at in places at most so far apart."""
+BUNDLE_SHARE = 0.7
+"""Arcs of a bundle are looked at together up to where they are about this share of the clearance apart."""
+STEEPEST_SINE = 0.9
+"""Lean of a chord beyond which arcs of a bundle are not looked at together."""
 
 # A typed number: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)
@@ -70,27 +78,99 @@ def _is_blocked(obstacles, required, x, y, z):
 
 
 @inner_kernel
-def _blocked_share(obstacles, limits, pose, bend, length, share):
-    """Look for an obstacle at a few points of an arc, first where it was met the last time; -1 if none is.
+def _point_at_chord(start, aside, c):
+    """Return the point of an arc that is `c` away from its start, for `aside` see `_inverted_aside`."""
+    wx, wy, wz = c * aside[0], c * aside[1], c * aside[2]
+    ahead = math.sqrt(max(1.0 - wx * wx - wy * wy - wz * wz, 0.0))
+    return (
+        start[0] + c * (ahead * start[3] + wx),
+        start[1] + c * (ahead * start[4] + wy),
+        start[2] + c * (ahead * start[5] + wz),
+    )
 
-    `share` is that place, as a share of the length beyond the exempt one.
+
+@inner_kernel
+def _inverted_aside(start, q):
+    """Return the squared distance of a point and what tells the arc to it: half its curvature, sideways.
+
+    Inversion about the start, `d -> d / |d|^2`, takes the circles that touch the start to straight lines
+    along its tangent.  A line keeps its part across the tangent, which is returned (1/mm).
     """
+    dx, dy, dz = q[0] - start[0], q[1] - start[1], q[2] - start[2]
+    chord2 = dx * dx + dy * dy + dz * dz
+    h = dx * start[3] + dy * start[4] + dz * start[5]
+    share = 1.0 / max(chord2, TINY)
+    return (chord2, (share * (dx - h * start[3]), share * (dy - h * start[4]), share * (dz - h * start[5])))
+
+
+@inner_kernel
+def _apart(aside, spread, c):
+    """Return how far arcs from one start may be apart where they are `c` away from it; inf if not bounded.
+
+    `aside` is that of one of the arcs, and that of the others differs from it by at most `spread`.
+    """
+    sine = c * (math.sqrt(aside[0] ** 2 + aside[1] ** 2 + aside[2] ** 2) + spread)
+    return c * c * spread / math.sqrt(1.0 - sine * sine) if sine < STEEPEST_SINE else math.inf
+
+
+@inner_kernel
+def _is_blocked_at(obstacles, limits, start, aside, spread, c):
+    """Tell whether all arcs of a bundle are blocked at the distance `c` from their start, see `_apart`."""
     required = limits.required_mm
-    begin = limits.exempt_mm
-    if length <= begin:
-        return -1.0
-    x, y, z = point_on_arc(pose, bend, begin + (length - begin) * share)
-    if _is_blocked(obstacles, required, x, y, z):
-        return share
+    if spread > 0.0:
+        required -= _apart(aside, spread, c)
+    if required <= 0.0:
+        return False
+    x, y, z = _point_at_chord(start, aside, c)
+    return _is_blocked(obstacles, required, x, y, z)
+
+
+@inner_kernel
+def _spread(chord, radius):
+    """Return how much `_inverted_aside` may differ for points within `radius` of one that is `chord` away.
+
+    Inversion divides distances by the product of the distances from the start.
+    """
+    return radius / (chord * (chord - radius)) if chord > radius else math.inf
+
+
+@inner_kernel
+def _blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
+    """Look for an obstacle at a few places of a bundle of arcs, first where one was met the last time.
+
+    A place is its distance from the start, as is `hint`.  Looked at are places from `begin` to `end`; no arc
+    is exempt there, since none is shorter than its chord.
+
+    Returns
+    -------
+    float
+        The place, -1 if none was met.
+    """
+    if hint >= begin and hint < end and _is_blocked_at(obstacles, limits, start, aside, spread, hint):
+        return hint
     count = 1
-    while (length - begin) / count > PROBE_SPACING_MM:
+    while (end - begin) / count > LOOK_SPACING_MM:
         for m in range(count):
-            share = (m + 0.5) / count
-            x, y, z = point_on_arc(pose, bend, begin + (length - begin) * share)
-            if _is_blocked(obstacles, required, x, y, z):
-                return share
+            c = begin + (end - begin) * (m + 0.5) / count
+            if _is_blocked_at(obstacles, limits, start, aside, spread, c):
+                return c
         count *= 2
     return -1.0
+
+
+@inner_kernel
+def _is_blocked_bundle(obstacles, limits, start, q, radius, hints, entry):
+    """Tell whether all arcs to the points within `radius` of `q` are blocked, as far as they are close."""
+    chord2, aside = _inverted_aside(start, q)
+    chord = math.sqrt(chord2)
+    spread = _spread(chord, radius)
+    if spread == math.inf:
+        return False
+    end = min(math.sqrt(BUNDLE_SHARE * limits.required_mm / max(spread, TINY)), chord - radius)
+    c = _blocked_at(obstacles, limits, start, aside, spread, limits.exempt_mm, end, hints[entry])
+    if c >= 0.0:
+        hints[entry] = c
+    return c >= 0.0
 
 
 @inner_kernel
@@ -99,13 +179,15 @@ def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
 
     It is inf if the arc breaks a limit, is not proved clear, or costs no less than `below`.
     """
+    chord2, aside = _inverted_aside(start, q)
+    chord = math.sqrt(chord2)
+    c = _blocked_at(obstacles, limits, start, aside, 0.0, limits.exempt_mm, chord, hints[entry])
+    if c >= 0.0:
+        hints[entry] = c
+        return math.inf
     pose = (start[0], start[1], start[2], start[3], start[4], start[5])
     length, bend, turn = arc_to_point(pose, q)
     if single_arc_exceeds(limits, bend, length, turn):
-        return math.inf
-    share = _blocked_share(obstacles, limits, pose, bend, length, hints[entry])
-    if share >= 0.0:
-        hints[entry] = share
         return math.inf
     cost = -1.0
     if below < math.inf:
@@ -148,50 +230,57 @@ def _mark_candidates(limits, poses, q, radius, begin, end, marks):
 
 
 @inner_kernel
-def _gather(limits, order, mixed, q, radius, marks, chosen, near):
-    """Copy the poses that `_mark_candidates` marks for a ball, in their order, to `near`; return how many.
+def _extend(obstacles, limits, starts, order, mixed, q, radius, marks, hints, chosen, near, count, scanned):
+    """Add start poses whose arcs to the points within `radius` of `q` come into question, a block at a time.
 
-    `chosen` receives their numbers.
+    `chosen` receives their numbers and `near` the poses, in the mixed order; `count` are there already, from
+    the first `scanned` of all.
+
+    Returns
+    -------
+    count, scanned : int
+        Both grown; `count` is not if no more poses come into question.
     """
-    count = 0
-    total = mixed.shape[1]
-    for begin in range(0, total, BLOCK):
-        end = min(begin + BLOCK, total)
-        _mark_candidates(limits, mixed, q, radius, begin, end, marks)
-        for m in range(begin, end):
-            if marks[m - begin]:
-                chosen[count] = order[m]
-                for c in range(6):
-                    near[c, count] = mixed[c, m]
-                count += 1
-    return count
+    total, before = mixed.shape[1], count
+    while scanned < total and count == before:
+        end = min(scanned + BLOCK, total)
+        _mark_candidates(limits, mixed, q, radius, scanned, end, marks)
+        for m in range(scanned, end):
+            if not marks[m - scanned]:
+                continue
+            entry = order[m]
+            if radius > 0.0 and _is_blocked_bundle(obstacles, limits, starts[entry], q, radius, hints, entry):
+                continue
+            chosen[count] = entry
+            for c in range(6):
+                near[c, count] = mixed[c, m]
+            count += 1
+        scanned = end
+    return count, scanned
 
 
 @inner_kernel
-def _best_of(obstacles, limits, starts, branches, chosen, poses, total, q, wanted, hints, marks):
-    """Return the cheapest of the first `wanted` clear arcs and its start pose, (inf, -1) if there is none.
+def _best_of(obstacles, limits, starts, branches, chosen, poses, begin, end, q, wanted, hints, marks, state):
+    """Try the entries `chosen` from `begin` to `end`, at most BLOCK, until `wanted` arcs are clear.
 
-    `poses` are those of the entries `chosen`; the first `total` columns count.
+    `poses` are those of the entries.  `state` holds the cheapest clear arc, its start pose and the number of
+    clear ones so far; it is returned.
     """
-    best = math.inf
-    found = -1
-    clear = 0
-    for begin in range(0, total, BLOCK):
-        end = min(begin + BLOCK, total)
-        _mark_candidates(limits, poses, q, 0.0, begin, end, marks)
-        for m in range(begin, end):
-            if not marks[m - begin]:
-                continue
-            entry = chosen[m]
-            cost = _arc_cost(obstacles, limits, starts[entry], branches[entry], q, math.inf, hints, entry)
-            if cost < math.inf:
-                clear += 1
-                if cost < best:
-                    best = cost
-                    found = entry
-                if clear >= wanted:
-                    return best, found
-    return best, found
+    best, found, clear = state
+    _mark_candidates(limits, poses, q, 0.0, begin, end, marks)
+    for m in range(begin, end):
+        if not marks[m - begin]:
+            continue
+        entry = chosen[m]
+        cost = _arc_cost(obstacles, limits, starts[entry], branches[entry], q, math.inf, hints, entry)
+        if cost < math.inf:
+            clear += 1
+            if cost < best:
+                best = cost
+                found = entry
+            if clear >= wanted:
+                break
+    return best, found, clear
 
 
 @inner_kernel
@@ -234,7 +323,9 @@ def reach_by_arcs(
     A point counts as reached if one arc is proved clear.  The cheapest is taken of the first `wanted` clear
     ones in the mixed order and of those from the start poses of neighbouring points; then its neighbours in
     the list are tried as long as they are cheaper: a good arc, not the proved best.  Where none is clear,
-    all have been tried.  The start poses that come into question are found once for the points of a block.
+    all have been tried.  The start poses that come into question are found once for the points of a block,
+    as far as they are asked for: those whose arcs to all of the points are blocked at one place are passed
+    over.
 
     Parameters
     ----------
@@ -251,7 +342,7 @@ def reach_by_arcs(
     wanted : int
         At least 1.
     hints : (E,) float64
-        Scratch; starts at 0.5, and says where each arc was blocked the last time.
+        Scratch; starts at 0, and says how far from its start each arc was blocked the last time, mm.
     kinds : (N,) int64
         Receives DIRECT, UNREACHED or NO_CLEARANCE.
     found : (N, 2) float64
@@ -267,7 +358,7 @@ def reach_by_arcs(
     for block in range(len(blocks) - 1):
         members = visits[blocks[block] : blocks[block + 1]]
         centre, radius = _ball_around(points, members)
-        total = _gather(limits, order, mixed, centre, radius, marks, chosen, poses)
+        total, scanned = 0, 0
         for n in members:
             q = (points[n, 0], points[n, 1], points[n, 2])
             # At the exit the airway may be nearer, but nothing else.
@@ -275,9 +366,23 @@ def reach_by_arcs(
                 kinds[n] = NO_CLEARANCE
                 continue
             kinds[n] = UNREACHED
-            best, entry = _best_of(
-                obstacles, limits, starts, branches, chosen, poses, total, q, wanted, hints, marks
-            )
+            state = (math.inf, _NOBODY, 0)
+            begin = 0
+            while state[2] < wanted:
+                if begin == total:
+                    total, scanned = _extend(
+                        obstacles, limits, starts, order, mixed, centre, radius, marks, hints, chosen, poses,
+                        total, scanned,
+                    )  # fmt: skip
+                    if begin == total:
+                        break
+                end = min(begin + BLOCK, total)
+                state = _best_of(
+                    obstacles, limits, starts, branches, chosen, poses, begin, end, q, wanted, hints, marks,
+                    state,
+                )  # fmt: skip
+                begin = end
+            best, entry, _clear = state
             if entry < 0:
                 continue
             for other in near[n]:

@@ -116,6 +116,21 @@ def test_the_clearance_is_kept(
             assert reached.clearance_mm[n] >= environment.required_clearance_mm - 1.2
 
 
+def test_points_of_a_cube_agree_with_each_alone(
+    reach: ReachMap, environment: NeedleEnvironment, small_lung: Lung, atlas: la.Atlas
+) -> None:
+    entries, rng = atlas.deployments, np.random.default_rng(8)
+    scan = ReachScan(environment, entries.positions, entries.tangents, entries.branch)
+    kinds = reach.kinds.array
+    for kind in (DIRECT, UNREACHED):
+        for centre in rng.permutation(reach.kinds.grid.lps(np.argwhere(kinds == kind)))[:6]:
+            points = centre + rng.uniform(-5.0, 5.0, (40, 3))
+            seeds = np.zeros(len(points), dtype=np.uint64)
+            together = scan.reach(points, seeds)
+            alone = [scan.reach(point[None], seeds[:1]).kinds[0] for point in points]
+            assert np.array_equal(together.kinds, alone)
+
+
 def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     plain, searched, again = (
         map_reach(small_lung, SYSTEM, spacing_mm=12.0, atlas=atlas, trees=trees) for trees in (0, 1, 1)

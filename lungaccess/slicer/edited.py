@@ -100,8 +100,9 @@ def check_curve(plan: Plan, lung: Lung, curve: Markup) -> EditedCurve:
                 expected="a plan with a needle",
                 remedy="Only needles can be drawn; plan again for another system",
             )
-        end_mm = float(np.linalg.norm(points[-1] - plan.needle.end_lps))
-        if max(float(away.max()), end_mm) > MOVED_MM:
+        ends = np.stack([plan.needle.lps_from_start[:3, 3], plan.needle.end_lps])
+        ends_mm = np.linalg.norm(points[[0, -1]] - ends, axis=1)
+        if max(away.max(), ends_mm.max()) > MOVED_MM:
             path = path_of_points(points, np.asarray(plan.needle.lps_from_start))
             findings = _too_tight(path, points, plan)
             if findings:
@@ -190,11 +191,10 @@ def _of_body(
     detail = f"distance from the planned curve; {why[device]}"
     collected.at_most(f"{device}.curve", float(away.max()), MOVED_MM, "mm", detail)
     if device == "scope":
-        depth = lung.lumen_depth.lower_bound_mm(points)
+        depth, kept = (lung.lumen_depth.lower_bound_mm(each) for each in (points, planned.points_lps))
+        least = min(float(planned.radius_mm.max()), float(kept.min()))
         detail = f"depth in the lumen of point {int(depth.argmin()) + 1}, the shallowest"
-        collected.at_least(
-            "scope.curve.lumen", float(depth.min()), float(planned.radius_mm.max()), "mm", detail, MOVED_MM
-        )
+        collected.at_least("scope.curve.lumen", float(depth.min()), least, "mm", detail, MOVED_MM)
     return collected.report().findings
 
 
@@ -285,6 +285,9 @@ def _with_needle(plan: Plan, lung: Lung, path: ArcPath) -> tuple[Plan, tuple[Fin
     )
     environment = needle_environment(lung, needle, system.margins, with_fissures=task.with_fissures)
     query = Query(lps_from_start=np.asarray(plan.tube.lps_from_tip), target=plan.end_lps, branch=branch)
-    broken = violation(environment, query, path)
-    proved = Finding(name="needle.proof", ok=not broken, detail=broken or "clear and within all limits")
-    return made, (proved,)
+    broken = violation(environment, query, path, goal_tolerance_mm=MOVED_MM)
+    collected = Findings()
+    collected.true("needle.proof", not broken, broken or "clear and within all limits")
+    missed = float(np.linalg.norm(path.frames()[-1][:3, 3] - plan.end_lps))
+    collected.at_most("needle.curve.end", missed, MOVED_MM, "mm", "distance from the target")
+    return made, collected.report().findings

@@ -15,14 +15,12 @@ from anatomy.lung import Lung
 from anatomy.typed import Float, Int
 from lungaccess.coupled import Atlas, build_atlas, plan
 from lungaccess.coupled.atlas import require_same
-from lungaccess.plans.curves import deployed_pieces, pieces_beyond
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import StartIndex
-from stages.tube import shapes_of
-from stages.tube.arcs import pieces_of_arcs
+from stages.tube import centreline, points_on_arcs, shapes_of
 
 WITHIN_MM = 5.0
 """A point placed by hand is meant to a few millimetres, about the spacing of exits in the atlas."""
@@ -106,11 +104,10 @@ def exit_points(atlas: Atlas, entries: Int) -> Float:
     points = np.zeros((len(entries), 3))
     for n, entry in enumerate(entries.tolist()):
         turned, outer, inner, shape = every.choice(entry)
-        if shape < 0:
-            pieces = deployed_pieces(tubes, turned, outer, inner)
-        else:
-            pieces = pieces_of_arcs(np.asarray(shapes_of(tubes).member(shape).arcs), turned)
         tip = atlas.motions.tips[every.site[entry]]
-        frame = poses.pose(tip[:3], tip[3:6], tip[6:9])
-        points[n] = pieces_beyond(frame, pieces, float(every.exit_mm[entry]))[0][:3, 3]
+        frame, at_mm = poses.pose(tip[:3], tip[3:6], tip[6:9]), [float(every.exit_mm[entry])]
+        if shape < 0:
+            points[n] = centreline(tubes, frame, turned, outer, inner, at_mm)[0]
+        else:
+            points[n] = points_on_arcs(shapes_of(tubes).member(shape).arcs, frame, turned, at_mm)[0]
     return points

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
+from anatomy import poses
 from anatomy.errors import FrameError, SettingsError
 from anatomy.io.markups import Reference, read_named_curve, read_named_pose
 from anatomy.lung import Lung
@@ -21,6 +22,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.target import stated_target
 from lungaccess.slicer import check_curve
+from stages.tube import DeploymentValidator
 
 Edit = Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
 Edited = Callable[[str, Edit], Any]
@@ -180,6 +182,21 @@ def test_a_measured_tip_is_read_from_a_scene(exported: Path, command: Any) -> No
     asked = ("--scope", scene + "scope tip", "--target", scene + "target")
     code, answer = command("replan", "toy", "--system", "ultrathin", *asked)
     assert code == 0 and answer["found"]
+
+
+def test_exits_of_the_atlas_are_those_of_its_deployments(small_atlas: la.Atlas) -> None:
+    lung, system, every = small_atlas.lung, small_atlas.system, small_atlas.deployments
+    validator = DeploymentValidator(
+        lung, system.tubes, system.margins, with_fissures=small_atlas.with_fissures
+    )
+    chosen = np.linspace(0, every.count - 1, 5).astype(np.int64)
+    for entry, found in zip(chosen.tolist(), exit_points(small_atlas, chosen), strict=True):
+        tip = small_atlas.motions.tips[every.site[entry]]
+        frame = poses.pose(tip[:3], tip[3:6], tip[6:9])
+        deployment = validator.choose(frame, *every.choice(entry))
+        assert not isinstance(deployment, str)
+        expected = deployment.points(system.tubes, frame, [deployment.exit_mm])[0]
+        assert np.abs(found - expected).max() < 1e-6
 
 
 def test_a_moved_exit_starts_a_new_plan_from_there(

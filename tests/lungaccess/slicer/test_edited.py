@@ -196,7 +196,7 @@ def test_exits_of_the_atlas_are_those_of_its_deployments(small_atlas: la.Atlas) 
         deployment = validator.choose(frame, *every.choice(entry))
         assert not isinstance(deployment, str)
         expected = deployment.points(system.tubes, frame, [deployment.exit_mm])[0]
-        assert np.abs(found - expected).max() < 1e-6
+        assert np.abs(found - expected).max() < 1e-4
 
 
 def test_a_moved_exit_starts_a_new_plan_from_there(

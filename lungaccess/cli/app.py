@@ -41,6 +41,7 @@ from lungaccess.cli.commands.segment import segment
 from lungaccess.cli.commands.shapes import shapes
 from lungaccess.cli.commands.start_region import start_region
 from lungaccess.cli.commands.steps import steps
+from lungaccess.cli.commands.stream import stream
 from lungaccess.cli.commands.study import study
 from lungaccess.cli.commands.template import template
 from lungaccess.cli.commands.tour import tour
@@ -91,8 +92,8 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 
 
 for _command in (
-    plan, needle, replan, certify, check, info, presets, template, phantom, demo, advise, alternatives, route,
-    tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report, export, doctor,
+    plan, needle, replan, stream, certify, check, info, presets, template, phantom, demo, advise,
+    alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report, export, doctor,
     completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))

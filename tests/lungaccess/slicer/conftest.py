@@ -6,24 +6,9 @@ from pathlib import Path
 
 import pytest
 
-import lungaccess as la
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer import export_slicer
-
-
-@pytest.fixture(scope="session")
-def small_atlas(breathing_lung: Lung) -> la.Atlas:
-    """What scope and tubes can do in the small phantom."""
-    return la.build_atlas(breathing_lung, la.load_system("ultrathin"))
-
-
-@pytest.fixture(scope="session")
-def small_plan(small_atlas: la.Atlas) -> Plan:
-    """A plan to the nodule of the small phantom, which the check accepts."""
-    lung = small_atlas.lung
-    *_, best = la.plan(lung, small_atlas.system, la.resolve_target(lung), atlas=small_atlas, iterations=20)
-    return best
 
 
 @pytest.fixture(scope="session")

@@ -93,8 +93,8 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 
 for _command in (
     plan, needle, replan, stream, certify, check, info, presets, template, phantom, demo, advise,
-    alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report, export, doctor,
-    completion,
+    alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report,
+    export, doctor, completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 app.command(study)

@@ -10,5 +10,6 @@ if TYPE_CHECKING:
     from lungaccess.procedure.report import ProcedureReport, StageReport
     from lungaccess.procedure.settings import DEFAULT_PROCEDURE, Procedure, load_procedure, procedure_names
     from lungaccess.procedure.simulation import Simulator, simulate_procedure
+    from lungaccess.procedure.tracker import Measured, Tracker
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -7,6 +7,13 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.procedure.insertion import (
+        Errors,
+        InsertionStudy,
+        SimulatedTracker,
+        TrackerModel,
+        insert_plan,
+    )
     from lungaccess.procedure.report import ProcedureReport, StageReport
     from lungaccess.procedure.settings import DEFAULT_PROCEDURE, Procedure, load_procedure, procedure_names
     from lungaccess.procedure.simulation import Simulator, simulate_procedure

@@ -107,8 +107,8 @@ def insertion_webp(
 ) -> Path:
     """Write a film of the first needle, blindly and with the tracker side by side in time.
 
-    Shown are the true paths so far, the plan, and the path that was planned last from where the tracker has the
-    tip; at the end where the target is.
+    Shown are the true paths so far, the plan, the path that was planned last from where the tracker has the
+    tip, and where the target is in the end.
 
     Parameters
     ----------
@@ -143,7 +143,8 @@ def insertion_webp(
         planned.set_data(*_planned(watched, plane, at_mm))
         words = f"{at_mm:.1f} mm inserted"
         if at_mm >= last:
-            words += f"; blind ends {blind.tip_error_mm:.1f} mm from the target, tracked {watched.tip_error_mm:.1f} mm"
+            words += f"; blind ends {blind.tip_error_mm:.1f} mm from the target"
+            words += f", tracked {watched.tip_error_mm:.1f} mm"
         axes.set_title(words, fontsize=10)
         canvas.draw()
         pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))

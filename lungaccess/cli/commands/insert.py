@@ -110,13 +110,13 @@ def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
         ("replans", *(f"{each['replans']}" for each in columns)),
         ("of them without a path", *(f"{each['replans_without_path']}" for each in columns)),
     ]
-    made = terminal.table(
-        f"{record['samples']} needles, each inserted in both ways", ("", "blind", "tracked"), rows
-    )
+    title = f"{record['samples']} needles, each inserted in both ways"
+    made = terminal.table(title, ("", "blind", "tracked"), rows)
     tracker = found.tracker
     made.caption = (
         f"Tracker: {tracker.position_mm:g} mm and {tracker.direction_deg:g}°, {tracker.rate_hz:g} Hz, "
-        f"{tracker.latency_s:g} s late, {100.0 * tracker.lost_share:g} % lost; {tracker.insertion_mm_per_s:g} mm/s. "
+        f"{tracker.latency_s:g} s late, {100.0 * tracker.lost_share:g} % lost; "
+        f"{tracker.insertion_mm_per_s:g} mm/s. "
         "The errors of needle and target are assumed."
     )
     return made

@@ -22,13 +22,20 @@ from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, anatomy, default_anatomies
-from experiments.support.insertion.closed_loop import TOLERANCE_MM, Outcome
 from experiments.support.insertion.figure import draw_insertions
-from experiments.support.insertion.repeated import Study, Summary, study, summary
-from experiments.support.insertion.truth import Errors
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
+from lungaccess.procedure.insertion import (
+    TOLERANCE_MM,
+    Errors,
+    Outcome,
+    Study,
+    Summary,
+    assumed_errors,
+    study,
+    summary,
+)
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform
@@ -46,22 +53,6 @@ SIZES = {"quick": (2, 8, 60), "full": (12, 30, 1000)}
 """Targets, insertions for each target and mode and level, and replans to time."""
 SYSTEMS = {PHANTOM: "flexure-needle"}
 DRAWN_RUNS = 12
-
-
-def errors_of_size(size: float) -> Errors:
-    """Return all errors together; those of size 1 are an assumption, not measured."""
-    return Errors(
-        curvature_sd=0.08 * size,
-        curvature_wander_sd=0.05 * size,
-        roll_sd_deg=5.0 * size,
-        roll_wander_deg=10.0 * size,
-        pull_per_mm=0.0003 * size,
-        position_noise_mm=0.4 * size,
-        direction_noise_deg=0.6 * size,
-        target_drift_mm=2.0 * size,
-        target_walk_mm=1.0 * size,
-        target_noise_mm=0.4 * size,
-    )
 
 
 LEVELS = {"no": 0.0, "half": 0.5, "full": 1.0, "double": 2.0}
@@ -203,7 +194,7 @@ def insert_all(
     """Add the rows by size of the errors and by reserve; return the studies of all sizes above 0."""
     by_level = {}
     for name, size in LEVELS.items():
-        by_level[name] = inserted(environment, cases, errors_of_size(size), RESERVE, runs)
+        by_level[name] = inserted(environment, cases, assumed_errors(size), RESERVE, runs)
         add_study(result, f"{name} errors", by_level[name])
     for reserve in RESERVES:
         made = inserted(environment, cases, WEAK, reserve, runs)
@@ -243,7 +234,7 @@ def main() -> None:
     by_level = insert_all(result, environment, cases, runs)
     add_replans(result, replan_times_ms(environment, cases, poses, options.seed))
     longest = cases[int(np.argmax(lengths))]
-    at_target = inserted(environment, [longest], errors_of_size(1.0), RESERVE, min(runs, DRAWN_RUNS))
+    at_target = inserted(environment, [longest], assumed_errors(1.0), RESERVE, min(runs, DRAWN_RUNS))
     result.figure = draw_insertions(lung, longest.query, longest.plans[RESERVE], at_target, by_level)
     write_result(result, options.results)
 

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from lungaccess.one_stage import (
         advise_scope,
         deploy_tubes,
+        plan_near_exit,
         plan_needle,
         plan_tour,
         replan_from_scope,

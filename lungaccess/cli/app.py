@@ -29,6 +29,7 @@ from lungaccess.cli.commands.demo import demo
 from lungaccess.cli.commands.doctor import doctor
 from lungaccess.cli.commands.export import export
 from lungaccess.cli.commands.info import info, presets
+from lungaccess.cli.commands.insert import insert
 from lungaccess.cli.commands.needle import needle
 from lungaccess.cli.commands.phantom import phantom
 from lungaccess.cli.commands.plan import plan
@@ -41,6 +42,7 @@ from lungaccess.cli.commands.segment import segment
 from lungaccess.cli.commands.shapes import shapes
 from lungaccess.cli.commands.start_region import start_region
 from lungaccess.cli.commands.steps import steps
+from lungaccess.cli.commands.stream import stream
 from lungaccess.cli.commands.study import study
 from lungaccess.cli.commands.template import template
 from lungaccess.cli.commands.tour import tour
@@ -91,9 +93,9 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 
 
 for _command in (
-    plan, needle, replan, certify, check, info, presets, template, phantom, demo, advise, alternatives, route,
-    tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report, export, doctor,
-    completion,
+    plan, needle, replan, stream, certify, check, info, presets, template, phantom, demo, advise,
+    alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report,
+    export, insert, doctor, completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 app.command(study)

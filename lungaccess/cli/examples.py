@@ -22,6 +22,8 @@ EXAMPLES = MappingProxyType(
         "window": "lungaccess window plan/plan.json PATIENT",
         "start-region": "lungaccess start-region plan/plan.json PATIENT",
         "export": "lungaccess export plan/plan.json PATIENT --slicer slicer",
+        "stream": "lungaccess stream plan/plan.json PATIENT --port 0 --seconds 2",
+        "insert": "lungaccess insert plan/plan.json PATIENT --samples 5 --film insert.webp",
         "alternatives": "lungaccess alternatives PATIENT --nodule --count 5 --out plans",
         "needle": "lungaccess needle PATIENT --start plan/plan.json --nodule",
         "replan": "lungaccess replan PATIENT --scope plan/plan.json --nodule",

@@ -10,6 +10,10 @@ from cyclopts import Parameter, Token
 
 from anatomy.records import frozen_value
 
+LARGEST_PORT = 2**16 - 1
+"""Of TCP."""
+FASTEST_HZ = 1000.0
+"""No tracker and no robot in a patient needs more."""
 LARGEST_SEED = 2**32 - 1
 """Compiled kernels take seeds of 32 bits."""
 MOST = 10**9
@@ -66,6 +70,8 @@ CountOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=MO
 Processes = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST_PROCESSES))]
 Samples = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST_SAMPLES))]
 SamplesOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=MOST_SAMPLES))]
+Port = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=LARGEST_PORT))]
+Hertz = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FASTEST_HZ))]
 Spacing = Annotated[float, Parameter(validator=Within(at_least=0.5, at_most=50.0))]
 Seconds = Annotated[float, Parameter(validator=Within(above=0.0))]
 Positive = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FARTHEST_MM))]

@@ -20,6 +20,7 @@ from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS, Objecti
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.organ import Organ
+    from anatomy.typed import Float
     from lungaccess.coupled.atlas import Atlas
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget
@@ -112,8 +113,8 @@ class TargetOptions:
     target: Annotated[
         str | None,
         Parameter(
-            help="Target point in mm with its frame, ras:x,y,z or lps:x,y,z; or the name of a target that "
-            "came with the patient, such as target1."
+            help="Target point in mm with its frame, ras:x,y,z or lps:x,y,z; a point saved in 3D Slicer, "
+            "scene.mrml#name; or the name of a target that came with the patient, such as target1."
         ),
     ] = None
     nodule: Annotated[
@@ -137,6 +138,33 @@ class TargetOptions:
         from lungaccess.problem.target import stated_target
 
         return stated_target(self.target, self.nodule)
+
+
+@Parameter(name="*")
+@frozen_value
+class ExitOptions:
+    """Where the tubes leave the airway."""
+
+    exit: Annotated[
+        str | None,
+        Parameter(
+            help="Let the tubes leave the airway near this point: ras:x,y,z or lps:x,y,z, or one moved in 3D "
+            "Slicer, such as scene.mrml#exit through the wall."
+        ),
+    ] = None
+    exit_within: Annotated[
+        NotNegative, Parameter(help="How far from that point the tubes may leave the lumen, mm.")
+    ] = 5.0
+
+    def stated(self) -> Float | None:
+        """Return the point `(3,)` LPS mm that the user states, None for none; errors as `TargetOptions`."""
+        from anatomy.io.frames import parse_point
+        from anatomy.io.markups import parse_reference, read_named_point
+
+        if self.exit is None:
+            return None
+        saved = parse_reference(self.exit)
+        return parse_point(self.exit) if saved is None else read_named_point(saved).lps_mm
 
 
 @Parameter(name="*")

@@ -18,6 +18,7 @@ from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from anatomy.typed import Float
     from lungaccess.appraisal import Appraisal
     from lungaccess.coupled import Atlas, ProgressEvent
     from lungaccess.plans.plan import Plan
@@ -94,7 +95,8 @@ class PlanRequest:
     """What to plan and where to; of several systems the least invasive that reaches the target is chosen.
 
     For success the chance that the procedure succeeds is made large, instead of a cost small; for the widest
-    window its share of the breath.  Phases are those that the window of the plan has to hold.
+    window its share of the breath.  Phases are those that the window of the plan has to hold.  An exit is
+    where the tubes have to leave the airway, `(3,)` LPS mm, and how far from it they may.
     """
 
     systems: tuple[System, ...]
@@ -108,6 +110,8 @@ class PlanRequest:
     for_success: bool = False
     phases: tuple[float, float] | None = None
     widest: bool = False
+    exit_lps: Float | None = None
+    exit_within_mm: float = 0.0
 
     @property
     def made_small(self) -> str:
@@ -157,6 +161,7 @@ def run_search(
 def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Found]:
     """Yield better and better plans with the request's system, or with the one that is chosen of several."""
     from lungaccess.coupled import atlas_event, open_atlas, plan, plan_for_window, plan_with_presets
+    from lungaccess.one_stage import plan_near_exit
     from lungaccess.success import plan_for_success
 
     def atlas_of(system: System) -> Atlas:
@@ -194,7 +199,12 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
         "processes": search.processes,
         "gap": search.gap,
     }
-    if len(request.systems) > 1:
+    if request.exit_lps is not None:
+        plans = plan_near_exit(
+            lung, system, target, request.exit_lps, within_mm=request.exit_within_mm, atlas=atlas_of(system),
+            counterfactuals=False, **options,
+        )  # fmt: skip
+    elif len(request.systems) > 1:
         plans = plan_with_presets(lung, target, systems=request.systems, atlas_of=atlas_of, **options)
     else:
         plans = plan(lung, system, target, atlas=atlas_of(system), counterfactuals=False, **options)

@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.one_stage.from_scope import ScopeReplanner
+    from lungaccess.one_stage.near_exit import plan_near_exit
     from lungaccess.one_stage.needle import (
         NeedleAnswer,
         NeedleQuestion,
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
         point_in_words,
         reason_in_words,
     )
-    from lungaccess.one_stage.replan import replan_from_scope, replan_from_tube
+    from lungaccess.one_stage.replan import measured_pose, replan_from_scope, replan_from_tube
     from lungaccess.one_stage.rest import RestOfPlan
     from lungaccess.one_stage.route import RouteSource, open_source, read_drawing, route_record, widest_end
     from lungaccess.one_stage.scope import ADVICE_FILE, CAMERA_FILE, ScopeAdvice, advise_scope, save_advice

@@ -71,7 +71,7 @@ def replan_from_scope(
     TargetError
         If pose or target lie outside the images, or the target in an obstacle.
     """
-    frame = _rigid(lung, lps_from_scope_tip, "scope")
+    frame = measured_pose(lung, lps_from_scope_tip, "scope")
     task = _task(lung, system, target, objective, seed)
     return ScopeReplanner(task, tries=tries, searches=searches).replan(frame)
 
@@ -99,7 +99,7 @@ def replan_from_tube(
     iterations : int
         Of the needle's search, which begins with the direct arc.
     """
-    frame = _rigid(lung, lps_from_tip, "tube")
+    frame = measured_pose(lung, lps_from_tip, "tube")
     task = _task(lung, system, target, objective, seed)
     asked = needle_question(lung, system, frame, target.lps_mm)
     blocked = find_obstruction(asked.environment, asked.query)
@@ -128,8 +128,16 @@ def _task(lung: Lung, system: System, target: Target, objective: str | Objective
     return Task(lung=lung, system=system, target=target, objective=weighed, method="replan", seed=seed)
 
 
-def _rigid(lung: Lung, pose: ArrayLike, what: str) -> Float:
-    """Return the nearest rigid pose to a measured one."""
+def measured_pose(lung: Lung, pose: ArrayLike, what: str) -> Float:
+    """Return the nearest rigid pose `(4, 4)` to a measured one, LPS mm; `what` device it is of, for messages.
+
+    Raises
+    ------
+    FrameError
+        If it is not a rigid pose within SKEW.
+    TargetError
+        If it lies outside the images.
+    """
     matrix = np.array(pose, dtype=np.float64)
     good = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all())
     turn = matrix[:3, :3] if good else np.zeros((3, 3))

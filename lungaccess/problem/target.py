@@ -71,15 +71,18 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
     Parameters
     ----------
     text : str or None
-        A point with its frame, ``ras:x,y,z`` or ``lps:x,y,z``, mm; or the name or number of a target that
-        came with the patient, such as ``target1``.
+        A point with its frame, ``ras:x,y,z`` or ``lps:x,y,z``, mm; a point that 3D Slicer saved, such as
+        ``scene.mrml#target``, see `anatomy.io.markups`; or the name or number of a target that came with the
+        patient, such as ``target1``.
     nodule : int or None
         Number of a nodule.
 
     Raises
     ------
     FrameError
-        If the text states no frame.
+        If the text states no frame, or the point of 3D Slicer has none that is plain.
+    FileError
+        If the file of 3D Slicer cannot be read, or has no such point.
     TargetError
         If there is not exactly one of the two.
     """
@@ -91,6 +94,11 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
         )
     if text is None:
         return StatedTarget(lps_mm=None, nodule=nodule or 0, origin=f"nodule {nodule}")
+    from anatomy.io.markups import parse_reference, read_named_point
+
+    saved = parse_reference(text)
+    if saved is not None:
+        return StatedTarget(lps_mm=read_named_point(saved).lps_mm, nodule=0, origin=f"point {saved}")
     if text and not set(text) & set(":,;[( "):
         return StatedTarget(lps_mm=None, nodule=0, origin=f"published {text}", name=text)
     from anatomy.io.frames import parse_point
@@ -124,7 +132,7 @@ def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = No
     Parameters
     ----------
     text : str, optional
-        A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm.
+        A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm; or as `stated_target` takes it.
     nodule : int, optional
         Number of a nodule, 1 for the largest.  The target is its centroid where a needle may end
         there, else its voxel farthest from every obstacle.

@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.procedure.insertion import (
+        Errors,
+        InsertionStudy,
+        SimulatedTracker,
+        TrackerModel,
+        insert_plan,
+    )
     from lungaccess.procedure.report import ProcedureReport, StageReport
     from lungaccess.procedure.settings import DEFAULT_PROCEDURE, Procedure, load_procedure, procedure_names
     from lungaccess.procedure.simulation import Simulator, simulate_procedure
+    from lungaccess.procedure.tracker import Measured, Tracker
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from anatomy.typed import Float
@@ -21,8 +22,7 @@ def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
     axes of the device.  `Radius` is the radius of the device at each point.
     """
     points = [
-        _point(number, f"{curve.name} {along:.1f} mm", frame[:3, 3])
-        | {"orientation": frame[:3, :3].ravel().tolist()}
+        _point(number, f"{curve.name} {along:.1f} mm", frame[:3, 3]) | _orientation(frame)
         for number, (frame, along) in enumerate(
             zip(curve.lps_from_device, curve.arc_length_mm.tolist(), strict=True), start=1
         )
@@ -38,13 +38,17 @@ def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
 
 
 def points_of_interest(plan: Plan) -> dict[str, Any]:
-    """Return the content of a `.mrk.json` file: scope tip, exit through the wall and target, LPS mm."""
+    """Return the content of a `.mrk.json` file: scope tip, tip of the tubes, exit and target, LPS mm.
+
+    The tips keep the pose of their device, also where they are moved in 3D Slicer.
+    """
+    tips = {"scope tip": plan.scope.lps_from_scope_tip, "tube tip": plan.tube.lps_from_tip}
     places = {
-        "scope tip": plan.scope.lps_from_scope_tip[:3, 3],
+        **{label: tip[:3, 3] for label, tip in tips.items()},
         "exit through the wall": plan.tube.exit.point_lps,
         "target": plan.target_lps,
     }
-    return _fiducials("points", places)
+    return _fiducials("points", places, tips)
 
 
 def aim_point(aim: BreathingAim) -> dict[str, Any]:
@@ -52,9 +56,18 @@ def aim_point(aim: BreathingAim) -> dict[str, Any]:
     return _fiducials("aim", {"aim of the devices": aim.point_lps})
 
 
-def _fiducials(name: str, places: Mapping[str, Float]) -> dict[str, Any]:
-    points = [_point(number, label, place) for number, (label, place) in enumerate(places.items(), start=1)]
+def _fiducials(
+    name: str, places: Mapping[str, Float], poses: Mapping[str, Float] = MappingProxyType({})
+) -> dict[str, Any]:
+    points = [
+        _point(number, label, place) | (_orientation(poses[label]) if label in poses else {})
+        for number, (label, place) in enumerate(places.items(), start=1)
+    ]
     return _file("Fiducial", name, points, TARGET_COLOUR, labels=True, measurements=[])
+
+
+def _orientation(pose: Float) -> dict[str, list[float]]:
+    return {"orientation": pose[:3, :3].ravel().tolist()}
 
 
 def _point(number: int, label: str, place: Float) -> dict[str, Any]:
@@ -62,7 +75,7 @@ def _point(number: int, label: str, place: Float) -> dict[str, Any]:
         "id": f"{number}",
         "label": label,
         "position": place.tolist(),
-        "locked": True,
+        "locked": False,
         "visibility": True,
         "positionStatus": "defined",
     }

@@ -15,7 +15,7 @@ _MEANING = {
     "scope.mrk.json": "the bronchoscope: curve, pose and radius at every point",
     "tubes.mrk.json": "the tubes beyond the scope: curve, pose and radius at every point",
     "needle.mrk.json": "the needle: curve, pose and radius at every point",
-    "points.mrk.json": "scope tip, exit through the airway wall, target",
+    "points.mrk.json": "scope tip, tube tip, exit through the airway wall, target",
     "aim.mrk.json": "where the devices end in the masks' phase, of a plan for a window of breathing",
     "scope.ply": "the bronchoscope, true to its radius",
     "tubes.ply": "the tubes, true to their radius",

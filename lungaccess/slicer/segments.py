@@ -44,12 +44,14 @@ SEGMENTS: tuple[Segment, ...] = (
             kind="SCT^27925004^Nodule"),
     Segment(value=4, name="vessel", colour=(0.84, 0.15, 0.16), category=_STRUCTURE,
             kind="SCT^59820001^Blood vessel"),
-    Segment(value=5, name="airway wall", colour=(0.50, 0.50, 0.50), category=_STRUCTURE,
+    Segment(value=5, name="airway wall", colour=(0.52, 0.52, 0.52), category=_STRUCTURE,
             kind="SCT^89187006^Airway structure"),
     Segment(value=6, name="airway lumen", colour=(0.62, 0.85, 0.90), category=_STRUCTURE,
             kind="SCT^89187006^Airway structure"),
 )  # fmt: skip
-"""From the weakest to the strongest: where two structures overlap, the voxel goes to the later one."""
+"""From the weakest to the strongest: where two structures overlap, the voxel goes to the later one.
+
+3D Slicer takes a grey of 0.5 for no colour, and draws one at random."""
 
 
 def label_map(lung: Lung) -> Volume:

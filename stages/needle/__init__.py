@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from stages.needle.infeasibility.passage import Passage
     from stages.needle.kernels.cost import ObjectiveArrays
     from stages.needle.kernels.limits import Limits
-    from stages.needle.kernels.proof import Obstacles
+    from stages.needle.kernels.proof import Obstacles, blocker_on_arc
     from stages.needle.objective import DEFAULT, NO_MAP, SHORTEST, TERMS, Objective, Term
     from stages.needle.obstruction import Obstruction, easiest_obstruction, find_obstruction
     from stages.needle.path import (
@@ -68,9 +68,12 @@ if TYPE_CHECKING:
         Reached,
         ReachScan,
     )
+    from stages.needle.replanning.escaping import structure_name, with_limits
     from stages.needle.replanning.insertion import GAIN, Belief, TrueNeedle, steer, tilt
+    from stages.needle.replanning.reaiming import pose_at
     from stages.needle.replanning.replanner import (
         DEFAULT_SETTINGS,
+        ITERATIONS,
         Failure,
         Replan,
         Replanner,

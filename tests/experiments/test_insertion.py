@@ -16,9 +16,7 @@ from anatomy.errors import SettingsError
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL
-from experiments.support.insertion.closed_loop import Insertion, Outcome, simulate
-from experiments.support.insertion.repeated import Study, study, summary
-from experiments.support.insertion.truth import Errors, Truth
+from lungaccess.procedure.insertion import Errors, Insertion, Outcome, Study, Truth, simulate, study, summary
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.path import ArcPath, arc_transform, direct_path

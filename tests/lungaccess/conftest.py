@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+import lungaccess as la
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.motion.prepare import prepare_motion
@@ -54,6 +55,20 @@ def breathing_lung(small_phantom: Phantom, small_lung: Lung) -> Lung:
     source = PhantomBreathing.of(small_phantom).source(small_phantom)
     middle_mm = float(small_lung.tree.carina_lps[0])
     return replace(small_lung, motion=prepare_motion(source, small_lung.labels, small_lung.grid, middle_mm))
+
+
+@pytest.fixture(scope="session")
+def small_atlas(breathing_lung: Lung) -> la.Atlas:
+    """What scope and tubes can do in the small phantom."""
+    return la.build_atlas(breathing_lung, la.load_system("ultrathin"))
+
+
+@pytest.fixture(scope="session")
+def small_plan(small_atlas: la.Atlas) -> Plan:
+    """A plan to the nodule of the small phantom, which the check accepts."""
+    lung = small_atlas.lung
+    *_, best = la.plan(lung, small_atlas.system, la.resolve_target(lung), atlas=small_atlas, iterations=20)
+    return best
 
 
 def _segment(points: np.ndarray, a: list[float], b: list[float], radius: float) -> np.ndarray:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
+from cyclopts import Parameter
+
+from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
@@ -11,30 +15,60 @@ from lungaccess.cli.progress import progress
 
 
 def export(
-    plan: PlanFile, patient: PatientOfPlan, *, slicer: Path, output: PatientOptions = PatientOptions()
+    plan: PlanFile,
+    patient: PatientOfPlan,
+    *,
+    slicer: Annotated[
+        Path | None,
+        Parameter(
+            help="Folder for the scene, curves, models and segmentation; drag its scene.mrml into 3D Slicer."
+        ),
+    ] = None,
+    trajectory: Annotated[
+        Path | None,
+        Parameter(help="Folder for the motion in time: joint values as CSV, and messages of ROS 2 as YAML."),
+    ] = None,
+    output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Write a stored plan and its patient for 3D Slicer; exit code 1 if the check refuses the plan.
+    """Write a stored plan for 3D Slicer, for robots, or both; exit code 1 if the check refuses the plan.
 
-    Parameters
-    ----------
-    slicer : Path
-        Folder for the scene, curves, models and segmentation; drag its scene.mrml into 3D Slicer.
+    A refused plan is named so for 3D Slicer, and is not written for robots.
     """
+    if slicer is None and trajectory is None:
+        raise SettingsError(
+            "Neither --slicer nor --trajectory is given",
+            expected="a folder for 3D Slicer, one for the motion in time, or both",
+            remedy="Add --slicer DIR",
+        )
     from lungaccess.appraisal import DRAWS, SEED, Headline
+    from lungaccess.checking import check
     from lungaccess.cli.plan_tables import show_headline
+    from lungaccess.live import plan_trajectory, write_trajectory
     from lungaccess.plans.plan import Plan
     from lungaccess.risk import assess
     from lungaccess.slicer import export_slicer
 
     stored = Plan.load(plan)
     lung = output.load(patient)
-    with progress("exporting") as shown:
-        written = export_slicer(stored, lung, slicer, progress=shown.step)
-    accepted = written.report.accepted
-    if output.json:
-        terminal.show_json({"folder": str(slicer), **written.to_mapping()})
+    stored.require_lung(lung)
+    written: dict[Path, tuple[str, ...]] = {}
+    if slicer is not None:
+        with progress("exporting") as shown:
+            exported = export_slicer(stored, lung, slicer, progress=shown.step)
+        written[slicer], report = exported.files, exported.report
     else:
-        terminal.say(f"Written to {slicer}: {', '.join(written.files)}")
+        with progress("checking the plan"):
+            report = check(stored, lung)
+    if trajectory is not None and report.accepted:
+        written[trajectory] = write_trajectory(plan_trajectory(stored), trajectory)
+    accepted = report.accepted
+    if output.json:
+        folders = [{"folder": str(folder), "files": list(files)} for folder, files in written.items()]
+        answer = {**(folders[0] if folders else {}), "accepted": accepted}
+        terminal.show_json(answer | ({"others": folders[1:]} if folders[1:] else {}))
+    else:
+        for folder, files in written.items():
+            terminal.say(f"Written to {folder}: {', '.join(files)}")
         risk = assess(stored, lung, samples=DRAWS, seed=SEED, each_kind=False) if accepted else None
-        show_headline(Headline.of(written.report, risk))
+        show_headline(Headline.of(report, risk))
     return ExitCode.of(accepted)

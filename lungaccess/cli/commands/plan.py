@@ -18,6 +18,7 @@ from lungaccess.cli.options import (
     SUCCESS,
     WINDOW,
     ErrorOptions,
+    ExitOptions,
     PatientFolder,
     PatientOptions,
     SearchOptions,
@@ -36,6 +37,7 @@ def plan(
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     search: SearchOptions = SearchOptions(),
+    through: ExitOptions = ExitOptions(),
     errors: ErrorOptions = ErrorOptions(),
     thick_slices: Annotated[
         bool,
@@ -69,6 +71,15 @@ def plan(
         search = replace(search, objective=SearchOptions().objective)
     if phases is not None:
         _require_plain("--phases", search, system)
+    exit_lps = through.stated()
+    if exit_lps is not None:
+        _require_plain("--exit", search, system)
+        if for_success or widest or phases is not None:
+            raise SettingsError(
+                "--exit is asked for with success, a window or phases",
+                expected="a cost that is made small",
+                remedy="Leave one of them out",
+            )
     if phases is not None and for_success:
         raise SettingsError(
             "--phases is asked for with --objective success",
@@ -87,6 +98,7 @@ def plan(
     request = PlanRequest(
         systems=systems, target=stated, search=search, errors=model, out=out, output=output,
         pictures=pictures, procedure=procedure, for_success=for_success, phases=phases, widest=widest,
+        exit_lps=exit_lps, exit_within_mm=through.exit_within,
     )  # fmt: skip
     try:
         return plan_and_report(lung, request)

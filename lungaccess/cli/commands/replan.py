@@ -37,14 +37,15 @@ def replan(
         str | None,
         Parameter(
             help="Where the tip of the bronchoscope really is: a text file with a 4x4 pose, +z forward and "
-            "+x up in the camera's picture; or a plan.json, whose scope ends there."
+            "+x up in the camera's picture; a point moved in 3D Slicer, scene.mrml#name; or a plan.json, "
+            "whose scope ends there."
         ),
     ] = None,
     tube: Annotated[
         str | None,
         Parameter(
-            help="Where the tip of the tubes really is, instead: a text file with a 4x4 pose, +z forward; or "
-            "a plan.json."
+            help="Where the tip of the tubes really is, instead: a text file with a 4x4 pose, +z forward; a "
+            "point moved in 3D Slicer, scene.mrml#name; or a plan.json."
         ),
     ] = None,
     frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
@@ -85,6 +86,7 @@ def replan(
 def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float, Plan | None]:
     """Return the pose as measured, and the plan that it is of if it is one of a plan."""
     from anatomy.io.frames import read_pose
+    from anatomy.io.markups import parse_reference, read_named_pose
     from lungaccess.plans.plan import Plan
 
     given = scope if tube is None else tube
@@ -94,6 +96,9 @@ def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float,
             expected="one of them: where the tip of the scope or of the tubes really is",
             remedy="`lungaccess template pose` prints a file to start from",
         )
+    saved = parse_reference(given)
+    if saved is not None:
+        return read_named_pose(saved), None
     if not given.endswith(".json"):
         return read_pose(given, frame), None
     plan = Plan.load(given)

@@ -33,8 +33,8 @@ class Truth(Protocol):
     def bend(self, frame: Float, curvature: float, inserted_mm: float) -> tuple[float, float]:
         """Return direction (rad about +z from +x of a frame) and amount (1/mm) of the true curvature."""
 
-    def measure(self, frame: Float, inserted_mm: float) -> tuple[Float, Float]:
-        """Return tip frame and target as they are measured."""
+    def measure(self, frame: Float, inserted_mm: float) -> tuple[Float, Float] | None:
+        """Return tip frame and target as they are measured; None if the measurement is lost."""
 
 
 def tilt(angle: float, towards: float) -> Float:
@@ -163,11 +163,13 @@ def steer(
     branch: int,
     step_mm: float,
     measure_every_mm: float,
+    replan_every_mm: float = 0.0,
 ) -> tuple[tuple[Replan, ...], Failure | None]:
     """Insert a needle by a plan until it is done, stops or hits something; return the replans, and why.
 
-    Every measurement is followed by a replan.  If that finds no path, the needle goes on by the old one as
-    long as this, moved to where the tip is taken to be, is proved clear; otherwise it stops.
+    A measurement is followed by a replan, if the last one is far enough back.  If that finds no path, the
+    needle goes on by the old one as long as this, moved to where the tip is taken to be, is proved clear;
+    otherwise it stops.
 
     Parameters
     ----------
@@ -177,15 +179,24 @@ def steer(
         Piece of needle within which the errors are constant.
     measure_every_mm : float
         Insertion between two measurements; infinite for open loop.
+    replan_every_mm : float
+        Least insertion between two replans.
     """
     commands = Commands(plan)
     replans: list[Replan] = []
     longest_mm = environment.limits.max_length_mm
     measure_mm = needle.inserted_mm + measure_every_mm
+    replan_mm = needle.inserted_mm + replan_every_mm
     while not (commands.finished or needle.label):
         if needle.inserted_mm >= measure_mm - index.TINY:
             measure_mm += measure_every_mm
-            belief.correct(*truth.measure(needle.frame, needle.inserted_mm))
+            seen = truth.measure(needle.frame, needle.inserted_mm)
+            if seen is None:
+                continue
+            belief.correct(*seen)
+            if needle.inserted_mm < replan_mm - index.TINY:
+                continue
+            replan_mm = needle.inserted_mm + replan_every_mm
             replans.append(replanner.replan(belief.frame, belief.target, needle.inserted_mm))
             path = replans[-1].path
             if path is not None:

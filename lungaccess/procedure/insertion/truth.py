@@ -9,9 +9,7 @@ import numpy as np
 
 from anatomy.settings import quantity, settings
 from anatomy.typed import Float
-from stages.needle.path import bend_direction
-from stages.needle.query import Query
-from stages.needle.replanning.insertion import tilt
+from stages.needle import Query, bend_direction, tilt
 
 KNOT_MM = 1.0
 """Spacing of the random walks; between two knots they are linear."""
@@ -42,6 +40,13 @@ class Errors:
         Curvature by which tissue pulls the needle towards a direction drawn for the run, 1/mm.
     measure_every_mm : float
         Insertion between two measurements.
+    replan_every_mm : float
+        Least insertion between two replans; measurements between them only correct where the tip is taken to
+        be.
+    latency_mm : float
+        Insertion between a measurement and its use; what was commanded meanwhile is added to it.
+    lost_share : float
+        Share of the measurements that are lost.
     position_noise_mm, direction_noise_deg : float
         Error of the measured tip, for each coordinate and about each of two axes.
     target_drift_mm : float
@@ -81,6 +86,15 @@ class Errors:
     measure_every_mm: Annotated[
         float, quantity("insertion between two measurements", above=0.0, at_most=500.0)
     ] = 5.0
+    replan_every_mm: Annotated[
+        float, quantity("least insertion between two replans", at_least=0.0, at_most=500.0)
+    ] = 0.0
+    latency_mm: Annotated[
+        float, quantity("insertion between a measurement and its use", at_least=0.0, at_most=100.0)
+    ] = 0.0
+    lost_share: Annotated[
+        float, quantity("share of the measurements that are lost", at_least=0.0, at_most=1.0)
+    ] = 0.0
     position_noise_mm: Annotated[
         float, quantity("error of the measured tip in each coordinate", at_least=0.0, at_most=20.0)
     ] = 0.0
@@ -112,7 +126,8 @@ class Truth:
     """
 
     def __init__(self, errors: Errors, query: Query, length_mm: float, seed: int) -> None:
-        body, bevel, tracker = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
+        streams = np.random.SeedSequence(seed).spawn(4)
+        body, bevel, tracker, self._losses = (np.random.default_rng(each) for each in streams)
         self._errors, self._bevel, self._tracker = errors, bevel, tracker
         self._target = query.target
         self._knots = query.inserted_mm + KNOT_MM * np.arange(math.ceil(length_mm / KNOT_MM) + 2)
@@ -157,11 +172,13 @@ class Truth:
         moved = [np.interp(inserted_mm, self._knots, column) for column in self._motion.T]
         return np.asarray(self._target + moved)
 
-    def measure(self, frame: Float, inserted_mm: float) -> tuple[Float, Float]:
-        """Return tip frame and target as the tracker sees them.
+    def measure(self, frame: Float, inserted_mm: float) -> tuple[Float, Float] | None:
+        """Return tip frame and target as the tracker sees them, None if the measurement is lost.
 
         The tracker sees no roll: it is what was commanded.
         """
+        if self._losses.random() < self._errors.lost_share:
+            return None
         noise = self._tracker.standard_normal(8)
         a, b = math.radians(self._errors.direction_noise_deg) * noise[:2]
         seen = frame @ tilt(math.hypot(a, b), math.atan2(b, a))
@@ -177,3 +194,20 @@ def _walk(steps: Float) -> Float:
 def _direction(rng: np.random.Generator) -> Float:
     vector = rng.standard_normal(3)
     return np.asarray(vector / np.linalg.norm(vector))
+
+
+def assumed_errors(size: float, **changes: float) -> Errors:
+    """Return all errors together, and some changed; those of size 1 are an assumption, not measured."""
+    stated = {
+        "curvature_sd": 0.08 * size,
+        "curvature_wander_sd": 0.05 * size,
+        "roll_sd_deg": 5.0 * size,
+        "roll_wander_deg": 10.0 * size,
+        "pull_per_mm": 0.0003 * size,
+        "position_noise_mm": 0.4 * size,
+        "direction_noise_deg": 0.6 * size,
+        "target_drift_mm": 2.0 * size,
+        "target_walk_mm": 1.0 * size,
+        "target_noise_mm": 0.4 * size,
+    }
+    return Errors(**(stated | changes))

@@ -9,12 +9,10 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_record
-from experiments.support.insertion.closed_loop import Insertion, Outcome, simulate
-from experiments.support.insertion.truth import Errors
+from lungaccess.procedure.insertion.simulation import Insertion, Outcome, simulate
+from lungaccess.procedure.insertion.truth import Errors
 from lungaccess.risk import Share
-from stages.needle.environment import NeedleEnvironment
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle import ArcPath, NeedleEnvironment, Query
 
 
 @frozen_record

@@ -16,22 +16,28 @@ from anatomy.grid import read_only
 from anatomy.kernels.field import bounds_at, exact_at
 from anatomy.records import frozen_record
 from anatomy.typed import Float
-from experiments.support.insertion.truth import Errors, Truth
-from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import ArcPath, bend_direction
-from stages.needle.query import Query
-from stages.needle.replanning.escaping import structure_name, with_limits
-from stages.needle.replanning.insertion import GAIN, Belief, TrueNeedle, steer
-from stages.needle.replanning.reaiming import pose_at
-from stages.needle.replanning.replanner import (
+from lungaccess.procedure.insertion.tracking import DelayedBelief, SimulatedTracker, TrackedTruth
+from lungaccess.procedure.insertion.truth import Errors, Truth
+from stages.needle import (
     DEFAULT_SETTINGS,
+    GAIN,
     ITERATIONS,
+    SHORTEST,
+    ArcPath,
     Failure,
+    NeedleEnvironment,
+    Objective,
+    Query,
     Replan,
     Replanner,
     ReplanSettings,
+    TrueNeedle,
+    bend_direction,
+    blocker_on_arc,
+    pose_at,
+    steer,
+    structure_name,
+    with_limits,
 )
 
 STEP_MM = 0.25
@@ -96,6 +102,11 @@ class _Needle(TrueNeedle):
         self._environment = with_limits(environment, required_mm=environment.needle.radius_mm)
         self._branch = query.branch
         self.frames, self.lengths = [self.frame], [self.inserted_mm]
+
+    def roll(self, angle: float) -> None:
+        """Roll at the base: the tip stays where it is."""
+        super().roll(angle)
+        self.frames[-1] = self.frame
 
     def insert(self, length: float, curvature: float) -> None:
         """Insert by a small step."""
@@ -169,13 +180,15 @@ def simulate(
         )
     longest_mm = environment.limits.max_length_mm
     truth = Truth(errors, query, longest_mm - query.inserted_mm, seed)
-    needle, belief = _Needle(environment, query, truth), Belief(query, gain)
+    needle = _Needle(environment, query, truth)
+    tracker = SimulatedTracker(truth, needle, errors.latency_mm)
+    belief = DelayedBelief(query, gain, errors.latency_mm)
     replanner = Replanner(
         environment, query, plan, objective=objective, settings=replanning, iterations=iterations, seed=seed
     )
     replans, stopped = steer(
         environment,
-        truth,
+        TrackedTruth(truth, tracker),
         needle,
         belief,
         plan,
@@ -183,6 +196,7 @@ def simulate(
         branch=query.branch,
         step_mm=step_mm,
         measure_every_mm=errors.measure_every_mm if closed_loop else math.inf,
+        replan_every_mm=errors.replan_every_mm,
     )
     return _insertion(environment, query, needle, truth, stopped, tolerance_mm, replans)
 

@@ -1,0 +1,122 @@
+"""The command `lungaccess insert`: the needle of a plan inserted with errors, watched by a tracker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+from rich.table import Table
+
+from anatomy.errors import SettingsError
+from anatomy.io.files import require_writable_folder
+from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Hertz, NotNegative, Positive, Samples, Seed
+from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile, require_picture
+from lungaccess.cli.progress import progress
+
+if TYPE_CHECKING:
+    from lungaccess.procedure.insertion import InsertionStudy
+
+
+def insert(
+    plan: PlanFile,
+    patient: PatientOfPlan,
+    *,
+    noise: Annotated[NotNegative, Parameter(help="Noise of the tracked tip along each axis, mm.")] = 0.4,
+    tilt: Annotated[
+        NotNegative, Parameter(help="Noise of its direction about each of two axes, degrees.")
+    ] = 0.6,
+    rate: Annotated[Hertz, Parameter(help="Measurements a second.")] = 20.0,
+    latency: Annotated[NotNegative, Parameter(help="Age of a measurement when it is used, s.")] = 0.1,
+    lost: Annotated[NotNegative, Parameter(help="Share of the measurements that are lost, 0 to 1.")] = 0.0,
+    speed: Annotated[Positive, Parameter(help="Speed of the insertion, mm/s.")] = 2.0,
+    replan_every: Annotated[NotNegative, Parameter(help="Least insertion between two replans, mm.")] = 2.0,
+    size: Annotated[
+        NotNegative,
+        Parameter(help="Size of the errors of needle and target: 1 is what is assumed of a real needle."),
+    ] = 1.0,
+    tolerance: Annotated[
+        NotNegative, Parameter(help="A tip that ends no farther from the target has reached it, mm.")
+    ] = 2.0,
+    samples: Annotated[Samples, Parameter(help="How many needles are inserted, each in both ways.")] = 50,
+    seed: Annotated[Seed, Parameter(help="Seed of the first needle; the others count on.")] = 0,
+    film: Annotated[
+        Path | None, Parameter(help="WebP file for a film of the first needle, blindly and tracked.")
+    ] = None,
+    picture: Annotated[
+        Path | None, Parameter(help="PNG file for the true paths and tip errors of all.")
+    ] = None,
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
+    """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees."""
+    from lungaccess.checking import check
+    from lungaccess.plans.plan import Plan
+    from lungaccess.procedure.insertion import TrackerModel, insert_plan
+    from lungaccess.report.insertion import insertion_webp, insertions_png
+
+    stored = Plan.load(plan)
+    tracker = TrackerModel(
+        position_mm=noise, direction_deg=tilt, target_mm=noise, rate_hz=rate, latency_s=latency,
+        lost_share=lost, insertion_mm_per_s=speed, replan_every_mm=replan_every,
+    )  # fmt: skip
+    if film is not None and film.suffix.lower() != ".webp":
+        raise SettingsError(
+            f"--film is {film}", expected="a file name that ends in .webp", remedy="Choose insert.webp"
+        )
+    if film is not None:
+        require_writable_folder(film.parent)
+    if picture is not None:
+        require_picture(picture)
+    lung = output.load(patient)
+    with progress("inserting needles"):
+        found = insert_plan(
+            stored, lung, tracker, size=size, samples=samples, seed=seed, tolerance_mm=tolerance
+        )
+    accepted = check(stored, lung).accepted
+    files = []
+    if film is not None:
+        files.append(str(insertion_webp(found, lung, film)))
+    if picture is not None:
+        files.append(str(insertions_png(found, lung, picture)))
+    record = found.to_mapping()
+    if output.json:
+        terminal.show_json({**record, "plan_accepted": accepted, "files": files})
+    else:
+        if not accepted:
+            terminal.say("The check REFUSES this plan: `lungaccess check` says why.")
+        terminal.show([_table(found, record)])
+        if files:
+            terminal.say(f"Written: {', '.join(files)}")
+    return ExitCode.of(accepted)
+
+
+def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
+    columns = [record["open_loop"], record["closed_loop"]]
+    hits = [", ".join(f"{name} {n}" for name, n in each["hits"].items()) or "none" for each in columns]
+    reached = [each["reached"] for each in columns]
+    rows = [
+        ("reached, %", *(f"{100.0 * each['probability']:.1f}" for each in reached)),
+        (
+            "95 % interval",
+            *("{:.1f} to {:.1f}".format(*(100.0 * end for end in each["interval_95"])) for each in reached),
+        ),
+        ("hit", *hits),
+        ("no path left", *(f"{each['outcomes']['no path left']}" for each in columns)),
+        ("tip error, median, mm", *(f"{each['tip_error_median_mm']:.2f}" for each in columns)),
+        ("95 % within, mm", *(f"{each['tip_error_95_mm']:.2f}" for each in columns)),
+        ("least clearance, mm", *(f"{each['least_clearance_mm']:.2f}" for each in columns)),
+        ("replans", *(f"{each['replans']}" for each in columns)),
+        ("of them without a path", *(f"{each['replans_without_path']}" for each in columns)),
+    ]
+    title = f"{record['samples']} needles, each inserted in both ways"
+    made = terminal.table(title, ("", "blind", "tracked"), rows)
+    tracker = found.tracker
+    made.caption = (
+        f"Tracker: {tracker.position_mm:g} mm and {tracker.direction_deg:g}°, {tracker.rate_hz:g} Hz, "
+        f"{tracker.latency_s:g} s late, {100.0 * tracker.lost_share:g} % lost; "
+        f"{tracker.insertion_mm_per_s:g} mm/s. "
+        "The errors of needle and target are assumed."
+    )
+    return made

@@ -1,0 +1,97 @@
+"""The command `lungaccess stream`: a plan over OpenIGTLink, planned again from what is tracked."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from rich.table import Table
+
+from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Hertz, Port, Seconds
+from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
+
+if TYPE_CHECKING:
+    from lungaccess.live import Answer, LiveCounts
+
+
+def stream(
+    plan: PlanFile,
+    patient: PatientOfPlan,
+    *,
+    host: Annotated[
+        str, Parameter(help="Address to listen at, or of the server; this machine alone if not given.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        Port, Parameter(help="Its port; 0 for a free one to listen at, which is printed.")
+    ] = 18944,
+    connect: Annotated[
+        bool, Parameter(negative="", help="Connect to a server there, such as PLUS, and do not listen.")
+    ] = False,
+    rate: Annotated[
+        Hertz, Parameter(help="Rounds a second, in each of which all poses are sent, Hz.")
+    ] = 20.0,
+    loop: Annotated[bool, Parameter(negative="", help="Begin the motion again when it has ended.")] = False,
+    seconds: Annotated[
+        Seconds | None, Parameter(help="End after so long; until Ctrl-C if not given.")
+    ] = None,
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
+    """Send poses, paths and phases of a plan by OpenIGTLink, and plan again from tracked poses.
+
+    A plan that the check refuses is not sent: exit code 1.
+    """
+    from lungaccess.appraisal import Headline
+    from lungaccess.checking import check
+    from lungaccess.cli.plan_tables import show_headline
+    from lungaccess.live import Link, LiveSession
+    from lungaccess.plans.plan import Plan
+
+    stored = Plan.load(plan)
+    with Link(host, port, connects=connect) as link:
+        lung = output.load(patient)
+        report = check(stored, lung)
+        if not report.accepted:
+            if output.json:
+                terminal.show_json({"accepted": False, **report.to_mapping()})
+            else:
+                show_headline(Headline.of(report, None))
+            return ExitCode.NEGATIVE
+        session = LiveSession(
+            stored, lung, link, rate_hz=rate, loop=loop, on_answer=None if output.json else _say
+        )
+        if not output.json:
+            done = "Connecting to" if connect else "Listening at"
+            terminal.say(f"{done} {host}:{link.port}. Ctrl-C ends.")
+        with contextlib.suppress(KeyboardInterrupt):
+            session.run(seconds)
+        counts = session.counts
+    if output.json:
+        terminal.show_json(asdict(counts))
+    else:
+        terminal.show([_table(counts)])
+    return ExitCode.OK
+
+
+def _say(answer: Answer) -> None:
+    terminal.say(f"{answer.name}: {answer.words} ({1e3 * answer.processor_s:.1f} ms)")
+
+
+def _table(counts: LiveCounts) -> Table:
+    link = counts.link
+    rows = [
+        ("rounds", f"{counts.ticks}, of which {counts.overrun} took too long"),
+        ("planned again", f"{counts.replans} times, {counts.found} with a way"),
+        (
+            "processor time of one",
+            f"median {counts.replan_median_ms:.1f} ms, most {counts.replan_most_ms:.1f} ms",
+        ),
+        ("poses passed over for newer ones", f"{counts.superseded}"),
+        ("messages", f"{link.sent} sent, {link.received} received, {counts.unknown} of no known name"),
+        ("connections", f"{link.joined} joined, {link.left} left"),
+        *((f"dropped: {reason}", f"{count}") for reason, count in link.dropped.items()),
+    ]
+    return terminal.table("What was streamed", ("", ""), rows)

@@ -1,0 +1,17 @@
+"""A plan in time and over a network: trajectories as files, and a live link by OpenIGTLink."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.live.link import HOST, PORT, Link, LinkCounts
+    from lungaccess.live.replanning import Answer, TrackedReplanner
+    from lungaccess.live.session import RATE_HZ, LiveCounts, LiveSession
+    from lungaccess.live.tracker import LinkTracker
+    from lungaccess.live.trajectory import Speeds, Trajectory, plan_trajectory
+    from lungaccess.live.trajectory_files import write_trajectory
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

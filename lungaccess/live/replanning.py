@@ -1,0 +1,175 @@
+"""Plan again from poses as they are tracked, one after another: what is prepared once serves all of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+
+from anatomy.errors import LungaccessError
+from anatomy.lung import Lung
+from anatomy.poses import poses_on_pieces
+from anatomy.records import frozen_record
+from anatomy.typed import Float
+from lungaccess.one_stage import RestOfPlan, ScopeReplanner, measured_pose, replan_from_tube
+from lungaccess.plans.curves import STEP_MM, needle_pieces, tube_pieces
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.target import Target, point_target
+from lungaccess.problem.task import Task
+from stages.needle import ArcPath, Objective, Query, Replanner, needle_environment
+
+SCOPE_TIP, TUBE_TIP, NEEDLE_TIP, TARGET = (
+    "ScopeTipTracked", "TubeTipTracked", "NeedleTipTracked", "TargetTracked",
+)  # fmt: skip
+"""Names of the tracked poses; of the target only the place counts."""
+TRACKED = (SCOPE_TIP, TUBE_TIP, NEEDLE_TIP)
+SEARCHES = 10
+"""Deployments from which the needle's own search starts where no direct arc is clear: ten milliseconds."""
+ITERATIONS = 300
+"""Of the needle's search from a tracked tip: more made no difference in simulated insertions."""
+PATH_STEP_MM = 1.0
+"""Distance of the points of a path that is sent."""
+
+
+@frozen_record
+class Answer:
+    """What came of one tracked pose.
+
+    Parameters
+    ----------
+    name : str
+        Which pose it was.
+    words : str
+        What came of it, for people.
+    tubes_lps, needle_lps : (N, 3) float64 or None
+        Points of the way from there, LPS mm, proved clear; None for what is not left to do, or without one.
+    processor_s : float
+        Processor time that it took.
+    """
+
+    name: str
+    words: str
+    tubes_lps: Float | None
+    needle_lps: Float | None
+    processor_s: float
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a way."""
+        return self.tubes_lps is not None or self.needle_lps is not None
+
+
+class TrackedReplanner:
+    """Plans the rest of a plan from tracked poses; nothing that a pose can be makes it fail.
+
+    Parameters
+    ----------
+    plan, lung
+        The plan that is followed, and its patient.
+    clock : callable
+        Returns the processor time in seconds.
+
+    Raises
+    ------
+    PlanFileError
+        If the plan was made for another patient.
+    """
+
+    def __init__(self, plan: Plan, lung: Lung, clock: Callable[[], float] = time.process_time) -> None:
+        plan.require_lung(lung)
+        self._plan, self._lung, self._clock = plan, lung, clock
+        self._target = Target(lps_mm=np.asarray(plan.end_lps), origin=plan.target_origin)
+
+    @property
+    def target_lps(self) -> Float:
+        """Where the target is now, `(3,)` LPS mm."""
+        return self._target.lps_mm
+
+    def warm_up(self) -> None:
+        """Plan once from each planned pose, so that nothing is prepared or compiled later."""
+        plan = self._plan
+        for name, pose in (
+            (SCOPE_TIP, plan.scope.lps_from_scope_tip), (TUBE_TIP, plan.tube.lps_from_tip),
+            (NEEDLE_TIP, plan.tube.lps_from_tip),
+        ):  # fmt: skip
+            self.answer(name, np.asarray(pose))
+
+    def answer(self, name: str, lps_from_device: Float) -> Answer:
+        """Return what comes of a tracked pose `(4, 4)` LPS mm of a name of `TRACKED`, or of the target."""
+        began = self._clock()
+        try:
+            tubes, needle, words = self._planned(name, lps_from_device)
+        except LungaccessError as reason:
+            tubes, needle, words = None, None, f"no plan: {reason.found}"
+        return Answer(
+            name=name, words=words, tubes_lps=tubes, needle_lps=needle, processor_s=self._clock() - began
+        )
+
+    def _planned(self, name: str, pose: Float) -> tuple[Float | None, Float | None, str]:
+        if name == TARGET:
+            self._retarget(pose[:3, 3])
+            return None, None, "target moved"
+        if name == NEEDLE_TIP:
+            return self._from_needle(pose)
+        rest = self._from_scope(pose) if name == SCOPE_TIP else self._from_tube(pose)
+        tubes = None
+        if rest.tube is not None:
+            pieces = tube_pieces(rest.tube, self._plan.system.tubes)
+            tubes = poses_on_pieces(rest.lps_from_measured, pieces, PATH_STEP_MM)[0][:, :3, 3]
+        needle = rest.path.sample(PATH_STEP_MM)[0] if rest.needle is not None else None
+        return tubes, needle, f"plan: cost {rest.cost:.4g}, needle {rest.path.length_mm:.1f} mm"
+
+    def _retarget(self, place: Float) -> None:
+        """Take another target from now on; TargetError if a needle may not end there."""
+        self._target = point_target(self._lung, place, origin="tracked")
+        for prepared in ("_scope_replanner", "_needle_replanner"):
+            self.__dict__.pop(prepared, None)
+
+    @cached_property
+    def _scope_replanner(self) -> ScopeReplanner:
+        plan = self._plan
+        task = Task(
+            lung=self._lung, system=plan.system, target=self._target, method="replan", seed=plan.seed,
+            objective=Objective.of(plan.objective),
+        )  # fmt: skip
+        return ScopeReplanner(task, tries=0, searches=SEARCHES)
+
+    def _from_scope(self, pose: Float) -> RestOfPlan:
+        return self._scope_replanner.replan(measured_pose(self._lung, pose, "scope"))
+
+    def _from_tube(self, pose: Float) -> RestOfPlan:
+        return replan_from_tube(
+            self._lung, self._plan.system, pose, self._target, objective=self._plan.objective,
+            seed=self._plan.seed, iterations=ITERATIONS,
+        )  # fmt: skip
+
+    @cached_property
+    def _needle_replanner(self) -> Replanner:
+        plan, system = self._plan, self._plan.system
+        needle = system.require_needle("A tracked needle")
+        environment = needle_environment(
+            self._lung, needle, system.margins, with_fissures=plan.fissures_are_obstacles
+        )
+        start = np.asarray(plan.tube.lps_from_tip)
+        query = Query(lps_from_start=start, target=self.target_lps, branch=plan.exemption.branch)
+        path = ArcPath(lps_from_start=start, arcs=needle_pieces(plan.needle))
+        objective = Objective.of(plan.objective)
+        return Replanner(environment, query, path, objective=objective, iterations=ITERATIONS, seed=plan.seed)
+
+    def _from_needle(self, pose: Float) -> tuple[Float | None, Float | None, str]:
+        """Plan the rest of a needle; what is inserted is taken from the place of the path that is nearest."""
+        replanner = self._needle_replanner
+        points, lengths = self._first_path.sample(STEP_MM)
+        inserted = float(lengths[np.linalg.norm(points - pose[:3, 3], axis=1).argmin()])
+        found = replanner.replan(pose, self.target_lps, inserted)
+        if found.path is None:
+            return None, None, f"no plan: {found.why}"
+        words = f"plan: {found.path.length_mm:.1f} mm left, ends {found.miss_mm:.2f} mm from the target"
+        return None, found.path.sample(PATH_STEP_MM)[0], words
+
+    @cached_property
+    def _first_path(self) -> ArcPath:
+        start = np.asarray(self._plan.tube.lps_from_tip)
+        return ArcPath(lps_from_start=start, arcs=needle_pieces(self._plan.needle))

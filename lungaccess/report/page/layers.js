@@ -1,7 +1,7 @@
 // The pictures that are put together: the solid bodies, and for each structure its nearest layers.
 const NOTHING = [0, 1, 1, 0];
 
-export const LAYERS = 2;
+const LAYERS = 2;
 
 // Framebuffers of one size: `solids` holds colour and depth, `peeled[k][n]` the layer k of the structure n.
 export class Layers {

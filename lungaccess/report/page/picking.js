@@ -1,8 +1,8 @@
 // What is under a pixel: read from the layers of the last picture, so that it is what is seen.
 import { add, dot, minus, times } from "./vectors.js";
 
-// Surfaces at least so dense can be picked; lungs and fissures only where nothing else is hit.
-const LEAST_OPACITY = 0.2;
+// Surfaces less dense, as lungs and fissures, are picked only where nothing else is hit.
+export const FAINTEST = 0.2;
 const HIT = { surface: "surface", solid: "solid", points: "points" };
 
 export class Picker {
@@ -25,7 +25,7 @@ export class Picker {
     const hits = this.hitsAt(column, row, ray);
     if (!hits.length) return null;
     const can = ({ kind, key }) => kind !== HIT.surface
-      || (pickable ? pickable.includes(key) : scene.surfaces.get(key).opacity >= LEAST_OPACITY);
+      || (pickable ? pickable.includes(key) : scene.surfaces.get(key).opacity >= FAINTEST);
     return { ...(hits.find(can) || hits[0]), hits };
   }
 
@@ -46,12 +46,10 @@ export class Picker {
         hits[0].index = this.nearestPoint(scene.points.get(key), hits[0].point);
       }
     }
-    for (let k = 0; k < view.layers; k++) {
-      view.shown.forEach(([key], n) => {
-        const { depth } = layers.read(layers.peeled[k][n], column, row);
-        if (depth < 65535 && depth < solid) put(HIT.surface, key, depth);
-      });
-    }
+    view.counts.forEach((count, k) => view.shown.slice(0, count).forEach(([key], n) => {
+      const { depth } = layers.read(layers.peeled[k][n], column, row);
+      if (depth < 65535 && depth < solid) put(HIT.surface, key, depth);
+    }));
     return hits.sort((a, b) => a.depth_mm - b.depth_mm);
   }
 

@@ -1,14 +1,14 @@
 // The 3-D scene: see-through surfaces in layers, sorted by depth in each pixel, and solid bodies and points among them.
 import { unpack } from "./decode.js";
-import { Layers, LAYERS } from "./layers.js";
-import { Picker } from "./picking.js";
+import { Layers } from "./layers.js";
+import { FAINTEST, Picker } from "./picking.js";
 import { MOST_SLICES, programs } from "./shaders.js";
 import { facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
 const SCOPE_HALF_ANGLE = (48 * Math.PI) / 180;
-const RIM = 0.55, DARK_GAIN = 1.6, HAZE = 0.6;
+const RIM = 0.55, DARK_GAIN = 1.6, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
 const INSIDE = "inside";
 const NO_CUT = [0, 0, 0, 0];
 const OUTLINE_PX = 1.2;
@@ -196,8 +196,11 @@ export class Scene {
     const { width, height } = this.canvas;
     const view = this.view = this.viewOf(camera, width / height);
     // What is proved in the phase of the masks alone is shown in that phase alone.
-    view.shown = [...this.surfaces].filter(([, s]) => s.shown && !(s.ofMasks && this.share !== 0)).slice(0, MOST_SLICES);
-    view.layers = this.moving && this.slow ? 1 : LAYERS;
+    const shown = [...this.surfaces].filter(([, s]) => s.shown && !(s.ofMasks && this.share !== 0)).slice(0, MOST_SLICES);
+    const isFaint = ([, surface]) => surface.opacity < FAINTEST;
+    view.shown = [...shown.filter((each) => !isFaint(each)), ...shown.filter(isFaint)];
+    // Of what is faint, as lungs and fissures, the nearest layer says all.
+    view.counts = [shown.length, this.moving && this.slow ? 0 : shown.filter((each) => !isFaint(each)).length];
     const isNew = this.layers.fit(width, height, view.shown.length);
     gl.disable(gl.BLEND);
     gl.disable(gl.SCISSOR_TEST);
@@ -206,7 +209,7 @@ export class Scene {
     this.drawSolids(view);
     this.drawPoints(view);
     const signature = JSON.stringify([
-      camera.eye, camera.forward, camera.up, view.span, view.shown.map(([key]) => key), view.layers, this.share, this.cut, this.changes,
+      camera.eye, camera.forward, camera.up, view.span, view.shown.map(([key]) => key), view.counts, this.share, this.cut, this.changes,
     ]);
     if (isNew || signature !== this.peeledAs) this.peel(view);
     this.peeledAs = signature;
@@ -231,10 +234,10 @@ export class Scene {
     gl.uniform4fv(places.cut, this.cut || NO_CUT);
     gl.uniform1i(places.before, 0);
     gl.activeTexture(gl.TEXTURE0);
-    for (let k = 0; k < view.layers; k++) {
+    view.counts.forEach((count, k) => {
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.layers.arrays[k === 0 ? 1 : k - 1]);
       gl.uniform1i(places.peeled, k);
-      view.shown.forEach(([, surface], n) => {
+      view.shown.slice(0, count).forEach(([, surface], n) => {
         this.layers.into(this.layers.peeled[k][n]);
         // Of a closed surface only the outside, unless a cut lets one see into it.
         if (this.cut) gl.disable(gl.CULL_FACE);
@@ -243,12 +246,12 @@ export class Scene {
         gl.uniform1i(places.slice, n);
         this.drawSurface(surface, program);
       });
-    }
+    });
     gl.disable(gl.CULL_FACE);
   }
 
   putTogether(view, background, scale) {
-    const gl = this.gl, { program, places } = this.programs.together;
+    const gl = this.gl, { program, places } = this.programs.together(...view.counts);
     const dark = Math.max(...background) < 0.3;
     // On a dark ground a surface has to be denser to be seen as well.
     this.gain = dark ? DARK_GAIN : 1;
@@ -266,19 +269,17 @@ export class Scene {
       gl.uniform1i(place, n);
     });
     const looks = new Float32Array(4 * MOST_SLICES);
-    view.shown.forEach(([, { colour, opacity }], n) => looks.set([...colour, opacity], 4 * n));
+    view.shown.forEach(([, { colour, opacity }], n) => looks.set([...colour, this.gain * opacity], 4 * n));
     gl.uniform4fv(places.looks, looks);
-    gl.uniform1i(places.slices, view.shown.length);
-    gl.uniform1i(places.layers, view.layers);
-    gl.uniform2f(places.strength, this.gain, RIM);
+    gl.uniform3fv(places.dense, this.focus && this.focused ? [FAR_DENSE, NEAR_DENSE - FAR_DENSE, RIM] : [1, 0, RIM]);
     gl.uniform3fv(places.background, background);
     gl.uniform3fv(places.ink, dark ? [0, 0, 0] : [0.1, 0.12, 0.14]);
     gl.uniform1f(places.outline, Math.max(Math.round(OUTLINE_PX * scale), 1));
-    gl.uniform1f(places.step_mm, (view.span[1] - view.span[0]) / 65534);
-    gl.uniform2fv(places.span, view.span);
-    gl.uniform1f(places.focused, this.focus && this.focused ? 1 : 0);
-    const { distance } = view.camera, deep = 0.3 * distance + 40;
-    gl.uniform3f(places.haze, distance - 0.2 * deep, distance + deep, HAZE);
+    const step = (view.span[1] - view.span[0]) / 65534;
+    gl.uniform1f(places.step_mm, step);
+    // Haze begins a little before what is looked at, and grows evenly.
+    const { distance } = view.camera, deep = 0.36 * distance + 48;
+    gl.uniform3f(places.haze, (HAZE * step) / deep, (HAZE * (view.span[0] - distance + deep / 6)) / deep, HAZE);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     // A texture that is drawn into must not be bound to be read.
     pictures.forEach(([kind], n) => {

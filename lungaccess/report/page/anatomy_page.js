@@ -144,6 +144,7 @@ export function openPage(page) {
       page.redraw.now();
     },
     pick: (x, y, options) => page.scene.pick(x, y, options),
+    project: (point) => page.scene.project(point),
     ...(page.data.breath && {
       breathe: (phase) => {
         page.breathe(phase);

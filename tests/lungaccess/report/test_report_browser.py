@@ -318,7 +318,8 @@ def test_several_plans_have_numbers_and_styles(page: browser.Browser) -> None:
     assert page.run(LABELS) == ["0", "1"]
     assert "plan 1" in page.state()["solids"]
     swatches = page.run(
-        "return [0, 1].map((n) => document.querySelector(`[data-key='plan-${n}'] + .swatch`).style.background)"
+        "return [0, 1].map((n) => "
+        "document.querySelector(`[data-key='plan-${n}'] + .swatch`).style.background)"
     )
     assert swatches[0] != swatches[1]
     page.run("document.querySelector(`input[data-key='plan-1']`).click(); window.lungaccessReport.set(1)")

@@ -6,8 +6,9 @@ import { Slice, STANDARD } from "./slices.js";
 import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
 import { ViewTools } from "./view_tools.js";
 
-// A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another one.
-const REST_MS = 200, FINE_MS = 900;
+// A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another
+// one.  A moment is at least so many ms, and a few times as long as the last picture took.
+const REST_MS = 300, FINE_MS = 900, PICTURES = 4;
 
 export const byId = (id) => document.getElementById(id);
 
@@ -21,16 +22,28 @@ export class AnatomyPage {
     this.breath = null;
     publishColours();
     this.redraw = oncePerFrame((atOnce) => this.show(atOnce ? "rest" : "moving"));
+    this.redrawView = oncePerFrame((atOnce) => this.show(atOnce ? "rest" : "moving", false));
   }
 
-  // Draw all in a quality of the 3-D view, and on a slow machine better when nothing moves any more.
-  show(quality) {
+  // Draw all, or the 3-D view alone, in a quality of that; on a slow machine better when nothing moves any more.
+  show(quality, all = true) {
     clearTimeout(this.better);
     if (this.scene) this.scene.quality = quality;
-    this.draw();
-    if (!this.scene || !this.scene.slow || quality === "fine" || (this.tools && this.tools.recording)) return;
+    const now = performance.now(), took = Math.min(now - (this.shownAt || 0), REST_MS);
+    this.shownAt = now;
+    if (all) this.draw();
+    else this.drawView();
+    if (!this.scene || !this.scene.slow || (this.tools && this.tools.recording)) return;
+    // What else was drawn in a hurry is drawn better with it.
+    this.hasHurried = quality !== "fine" && (this.hasHurried || all);
+    if (quality === "fine") return;
     const [next, ms] = quality === "moving" ? ["rest", REST_MS] : ["fine", FINE_MS];
-    this.better = setTimeout(() => this.show(next), ms);
+    this.better = setTimeout(() => this.show(next, this.hasHurried), Math.max(ms, PICTURES * took));
+  }
+
+  // Draw the 3-D view, where that is not all that there is.
+  drawView() {
+    this.draw();
   }
 
   // Open the 3-D view, and return whether there is one; distanceOf takes the size of the lung in mm.
@@ -47,7 +60,7 @@ export class AnatomyPage {
     for (const packed of this.structures) await this.scene.addSurface(packed, this.breath);
     const box = this.structures.find(({ key }) => key === "lung") || this.structures[0];
     const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
-    this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redraw);
+    this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redrawView);
     connectViews(byId("scene-figure"), this.orbit);
     new ResizeObserver(() => this.redraw.now()).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);

@@ -101,12 +101,14 @@ class NoPlanPage extends AnatomyPage {
     }
   }
 
+  drawView() {
+    this.switchSolids();
+    this.scene.fit();
+    this.drawScene();
+  }
+
   draw() {
-    if (this.scene) {
-      this.switchSolids();
-      this.scene.fit();
-      this.drawScene();
-    }
+    if (this.scene) this.drawView();
     if (!this.slices) return;
     const lines = this.data.paths.flatMap(({ lines: curves, colour, radius_mm: radius }, n) =>
       (this.shown[`path ${n}`] ? curves.map((points) => ({ points, radius, colour })) : []));

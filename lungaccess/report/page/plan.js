@@ -252,7 +252,11 @@ class PlanPage extends AnatomyPage {
     for (const button of document.querySelectorAll("button[data-stage]")) {
       button.setAttribute("aria-pressed", String(Number(button.dataset.stage) === state.stage));
     }
-    if (this.scene) this.drawDevices(state);
+    if (this.scene) {
+      this.putDevices(state);
+      this.bronchoscopy.draw(state, this.motion);
+      this.drawScene();
+    }
     if (this.slices) this.drawSlices(state);
     for (const move of this.cursors) move(this.motion.alongMm(state));
   }
@@ -295,7 +299,13 @@ class PlanPage extends AnatomyPage {
     if (this.drawClearance && shown !== this.clearanceAt) this.drawClearance(shown);
   }
 
-  drawDevices(state) {
+  drawView() {
+    if (!this.state) return;
+    this.putDevices(this.state);
+    this.drawScene();
+  }
+
+  putDevices(state) {
     const { scene, shown } = this;
     const radius = thickened(this.motion.plan.radius_mm, this.orbit.distance);
     const followed = this.shownPlans[this.followed];
@@ -313,8 +323,6 @@ class PlanPage extends AnatomyPage {
     put("aim", shown.aim && this.aim, (s) => s.ball(this.aim, AIM_MM, rgb(AIM)));
     put("target", shown.target, (s) => s.ball(this.target, TARGET_MM, rgb(TARGET)));
     scene.fit();
-    this.bronchoscopy.draw(state, this.motion);
-    this.drawScene();
   }
 
   // The plans beside the one followed, each in a colour and in bands of its own.

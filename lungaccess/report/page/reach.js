@@ -132,11 +132,13 @@ class ReachPage extends AnatomyPage {
     };
   }
 
+  drawView() {
+    this.scene.fit();
+    this.drawScene();
+  }
+
   draw() {
-    if (this.scene) {
-      this.scene.fit();
-      this.drawScene();
-    }
+    if (this.scene) this.drawView();
     if (!this.slices) return;
     this.image.overlay = this.painter();
     for (const [name, plane] of Object.entries(STANDARD)) {

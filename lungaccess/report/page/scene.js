@@ -3,7 +3,7 @@ import { unpack } from "./decode.js";
 import { Layers } from "./layers.js";
 import { FAINTEST, Picker } from "./picking.js";
 import { MOST_SLICES, programs } from "./shaders.js";
-import { facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
+import { coarser, facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
@@ -55,13 +55,15 @@ export class Scene {
       ...(breath ? [attribute(gl, 2, breath.displacements(places, packed), gl.FLOAT, false, 3, 0)] : []),
       gl.createBuffer(),
     ];
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[buffers.length - 1]);
+    const fine = buffers[buffers.length - 1];
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, fine);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.removeSurface(packed.key);
     const surface = {
       array,
       buffers,
+      fine,
       count: faces.length,
       name: packed.name,
       colour: rgb(packed.colour),
@@ -71,6 +73,7 @@ export class Scene {
       shown: packed.shown,
       ofMasks: packed.key.startsWith("start-"),
       places,
+      faces,
       outward: isInsideOut(places, faces, packed.size_mm) ? -1 : 1,
     };
     this.surfaces.set(packed.key, surface);
@@ -246,7 +249,7 @@ export class Scene {
         else gl.enable(gl.CULL_FACE);
         gl.frontFace(surface.outward > 0 ? gl.CCW : gl.CW);
         gl.uniform1i(places.slice, n);
-        this.drawSurface(surface, program);
+        this.drawSurface(surface, program, this.slow && this.quality === "moving");
       });
     });
     gl.disable(gl.CULL_FACE);
@@ -364,14 +367,27 @@ export class Scene {
     if (places.span) this.gl.uniform2fv(places.span, view.span);
   }
 
-  drawSurface(surface, { places }) {
+  drawSurface(surface, { places }, isCoarse = false) {
     const gl = this.gl;
     gl.uniform3fv(places.low, surface.low);
     gl.uniform3fv(places.size, surface.size);
     gl.uniform1f(places.share, this.share);
     if (places.outward) gl.uniform1f(places.outward, surface.outward);
     gl.bindVertexArray(surface.array);
-    gl.drawElements(gl.TRIANGLES, surface.count, gl.UNSIGNED_INT, 0);
+    if (isCoarse) this.useCoarse(surface);
+    gl.drawElements(gl.TRIANGLES, isCoarse ? surface.coarse.count : surface.count, gl.UNSIGNED_INT, 0);
+    if (isCoarse) gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.fine);
+  }
+
+  // Draw fewer triangles of a surface, which are made when they are first wanted.
+  useCoarse(surface) {
+    const gl = this.gl;
+    if (surface.coarse) return gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
+    const faces = coarser(surface.places, surface.faces, surface.size);
+    surface.coarse = { buffer: gl.createBuffer(), count: faces.length };
+    surface.buffers.push(surface.coarse.buffer);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
+    return gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
   }
 }
 

@@ -29,12 +29,12 @@ export class ViewTools {
   connectCut() {
     const changed = () => {
       this.find("cut-row").hidden = !this.find("cut").checked;
-      this.page.redraw();
+      this.page.redrawView();
     };
     for (const id of ["cut", "cut-offset"]) this.find(id).addEventListener("input", changed);
     this.find("focus").addEventListener("input", () => {
       this.page.scene.focused = this.find("focus").checked;
-      this.page.redraw();
+      this.page.redrawView();
     });
   }
 
@@ -154,7 +154,7 @@ export class ViewTools {
     for (const point of this.measured) solids.ball(point, 2 * radius, ink);
     solids.tube(this.measured, 0.7 * radius, ink);
     this.page.scene.setSolids("measure", solids);
-    this.page.redraw();
+    this.page.redrawView();
   }
 
   clear() {
@@ -186,7 +186,7 @@ export class ViewTools {
 
   // Return a PNG of the view as it is, with the letters of the sides and the labels.
   picture() {
-    this.page.show("fine");
+    this.page.show("fine", false);
     const { canvas } = this, sheet = document.createElement("canvas");
     [sheet.width, sheet.height] = [canvas.width, canvas.height];
     const pen = sheet.getContext("2d"), scale = canvas.width / canvas.clientWidth, frame = canvas.getBoundingClientRect();
@@ -228,7 +228,7 @@ export class ViewTools {
       const share = Math.min((performance.now() - start) / (1000 * seconds), 1);
       if (kind === "turn") this.page.orbit.yaw = yaw + 2 * Math.PI * share;
       else this.page.filmAt(kind, share);
-      this.page.show("moving");
+      this.page.show("moving", kind !== "turn");
       await new Promise(requestAnimationFrame);
       if (share >= 1) recorder.stop();
     }

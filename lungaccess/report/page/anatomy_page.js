@@ -34,6 +34,8 @@ export class AnatomyPage {
     if (all) this.draw();
     else this.drawView();
     if (!this.scene || !this.scene.slow || (this.tools && this.tools.recording)) return;
+    // Else the pictures of a movement wait in a queue and come late.
+    if (quality === "moving") this.scene.finish();
     // What else was drawn in a hurry is drawn better with it.
     this.hasHurried = quality !== "fine" && (this.hasHurried || all);
     if (quality === "fine") return;

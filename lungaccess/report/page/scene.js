@@ -190,8 +190,13 @@ export class Scene {
     const start = performance.now();
     this.changes += 1;
     this.paint(camera, background);
-    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
+    this.finish();
     this.slow = performance.now() - start > SLOW_MS;
+  }
+
+  // Wait until all is drawn.
+  finish() {
+    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
   }
 
   paint(camera, background) {

@@ -299,14 +299,15 @@ def test_pictures_and_films_are_saved(page: browser.Browser, tmp_path: Path) -> 
 
 
 def recorded(page: browser.Browser, folder: Path) -> bytes:
-    """Return a film of so many pictures that the browser has begun to write them, which a busy one puts off."""
+    """Return a film of so many pictures that the browser has begun to write them."""
     film = b""
     for frames in (5, 20, 60, 120):
         page.run("document.getElementById('save-film').click()")
         for _ in range(frames):
             page.frame()
         # Where it was not stopped, it has come to its end.
-        page.run("const b = document.getElementById('save-film'); if (b.textContent === 'Stop film') b.click()")
+        stop = "if (b.textContent === 'Stop film') b.click()"
+        page.run(f"const b = document.getElementById('save-film'); {stop}")
         file = wait_for_file(page, folder, ".webm")
         film = file.read_bytes()
         file.unlink()

@@ -3,7 +3,7 @@ import { publishColours } from "./colours.js";
 import { Orbit } from "./orbit.js";
 import { Scene } from "./scene.js";
 import { Slice, STANDARD } from "./slices.js";
-import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { addSwitch, connectViews, isOnScreen, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
 import { ViewTools } from "./view_tools.js";
 
 // A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another
@@ -41,6 +41,11 @@ export class AnatomyPage {
     if (quality === "fine") return;
     const [next, ms] = quality === "moving" ? ["rest", REST_MS] : ["fine", FINE_MS];
     this.better = setTimeout(() => this.show(next, this.hasHurried), Math.max(ms, PICTURES * took));
+  }
+
+  // Return whether a picture is left out for now: it cannot be seen, and a slow machine is in a hurry.
+  leavesOut(canvas) {
+    return Boolean(this.scene && this.scene.slow && this.scene.quality === "moving" && !isOnScreen(canvas));
   }
 
   // Draw the 3-D view, where that is not all that there is.

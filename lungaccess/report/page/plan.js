@@ -254,10 +254,10 @@ class PlanPage extends AnatomyPage {
     }
     if (this.scene) {
       this.putDevices(state);
-      this.bronchoscopy.draw(state, this.motion);
+      if (!this.leavesOut(byId("inside"))) this.bronchoscopy.draw(state, this.motion);
       this.drawScene();
     }
-    if (this.slices) this.drawSlices(state);
+    if (this.slices && !this.leavesOut(this.slices.axial.canvas)) this.drawSlices(state);
     for (const move of this.cursors) move(this.motion.alongMm(state));
   }
 

@@ -27,12 +27,19 @@ export class AnatomyPage {
 
   // Draw all, or the 3-D view alone, in a quality of that; on a slow machine better when nothing moves any more.
   show(quality, all = true) {
+    // While a page opens it is drawn once, at the end.
+    if (this.isOpening) return;
     clearTimeout(this.better);
     if (this.scene) this.scene.quality = quality;
     const now = performance.now(), took = Math.min(now - (this.shownAt || 0), REST_MS);
     this.shownAt = now;
     if (all) this.draw();
     else this.drawView();
+    this.drawBetter(quality, all, took);
+  }
+
+  // On a slow machine, draw better when nothing has moved for a moment.
+  drawBetter(quality, all = false, took = 0) {
     if (!this.scene || !this.scene.slow || (this.tools && this.tools.recording)) return;
     // Else the pictures of a movement wait in a queue and come late.
     if (quality === "moving") this.scene.finish();
@@ -69,7 +76,10 @@ export class AnatomyPage {
     const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
     this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redrawView);
     connectViews(byId("scene-figure"), this.orbit);
-    new ResizeObserver(() => this.redraw.now()).observe(canvas);
+    new ResizeObserver(() => {
+      const [width, height] = this.scene.fitted || [];
+      if (canvas.clientWidth !== width || canvas.clientHeight !== height) this.redraw.now();
+    }).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
     if (byId("save-picture")) this.tools = new ViewTools(this, byId("scene-figure"));
     return true;
@@ -156,8 +166,12 @@ export class AnatomyPage {
 
 // Open a page, and let tests and tools see and move it; docs/how_to/report.md says how.
 export function openPage(page) {
+  page.isOpening = true;
   window.lungaccessReport = {
-    ready: page.open(),
+    ready: page.open().then(() => {
+      page.isOpening = false;
+      page.drawBetter("rest");
+    }),
     state: () => page.report(),
     set: (place) => {
       page.moveTo(place);

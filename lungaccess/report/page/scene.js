@@ -15,7 +15,7 @@ const OUTLINE_PX = 1.2;
 const LEAST_POINT_PX = 3;
 const SLACK_MM = 20;
 const MOST_PIXELS = 2_600_000;
-const SLOW_MS = 60;
+const SLOW_MS = 30;
 // Pixels of the canvas for one of the page; on a slow machine fewer, at rest and still fewer while something moves.
 const FINE = 2, RESTING = 1, COARSE = 0.6;
 
@@ -169,10 +169,16 @@ export class Scene {
     }
   }
 
+  // Whether to draw coarsely: while something moves on a slow machine, and on one of which nothing is known yet.
+  get isHurried() {
+    return this.slow === null || (this.slow && this.quality === "moving");
+  }
+
   // Bring the canvas to its size on the page, as fine as the quality says.
   fit() {
     const { clientWidth, clientHeight } = this.canvas;
-    const wished = this.slow ? { moving: COARSE, rest: RESTING, fine: FINE }[this.quality] : FINE;
+    this.fitted = [clientWidth, clientHeight];
+    const wished = this.isHurried ? COARSE : this.slow && this.quality === "rest" ? RESTING : FINE;
     const scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(clientWidth * clientHeight, 1)));
     const width = Math.max(Math.round(clientWidth * scale), 1);
     const height = Math.max(Math.round(clientHeight * scale), 1);
@@ -186,12 +192,15 @@ export class Scene {
   draw(camera, background) {
     this.paint(camera, background);
     if (this.slow !== null || !this.surfaces.size) return;
-    // The second picture is that of a machine which has its programs.
+    // The second, coarse picture is timed: then the machine has its programs.
+    this.finish();
     const start = performance.now();
     this.changes += 1;
     this.paint(camera, background);
     this.finish();
     this.slow = performance.now() - start > SLOW_MS;
+    this.fit();
+    this.paint(camera, background);
   }
 
   // Wait until all is drawn.
@@ -210,7 +219,7 @@ export class Scene {
     const isFaint = ([, surface]) => surface.opacity < FAINTEST;
     view.shown = [...shown.filter((each) => !isFaint(each)), ...shown.filter(isFaint)];
     // Of what is faint, as lungs and fissures, the nearest layer says all.
-    view.counts = [shown.length, this.slow && this.quality === "moving" ? 0 : shown.filter((each) => !isFaint(each)).length];
+    view.counts = [shown.length, this.isHurried ? 0 : shown.filter((each) => !isFaint(each)).length];
     const isNew = this.layers.fit(width, height, view.shown.length);
     gl.disable(gl.BLEND);
     gl.disable(gl.SCISSOR_TEST);
@@ -254,7 +263,7 @@ export class Scene {
         else gl.enable(gl.CULL_FACE);
         gl.frontFace(surface.outward > 0 ? gl.CCW : gl.CW);
         gl.uniform1i(places.slice, n);
-        this.drawSurface(surface, program, this.slow && this.quality === "moving");
+        this.drawSurface(surface, program, this.isHurried);
       });
     });
     gl.disable(gl.CULL_FACE);

@@ -1,8 +1,14 @@
 // What the pages have in common: the 3-D view of the structures, their switches, and the slices.
+import { publishColours } from "./colours.js";
 import { Orbit } from "./orbit.js";
 import { Scene } from "./scene.js";
 import { Slice, STANDARD } from "./slices.js";
-import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { addSwitch, connectViews, isOnScreen, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { ViewTools } from "./view_tools.js";
+
+// A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another
+// one.  A moment is at least so many ms, and a few times as long as the last picture took.
+const REST_MS = 300, FINE_MS = 900, PICTURES = 4;
 
 export const byId = (id) => document.getElementById(id);
 
@@ -14,7 +20,44 @@ export class AnatomyPage {
       ? data.structures.map((packed) => ({ ...packed, shown: shownFirst.includes(packed.key) }))
       : data.structures;
     this.breath = null;
-    this.redraw = oncePerFrame(() => this.draw());
+    publishColours();
+    this.redraw = oncePerFrame((atOnce) => this.show(atOnce ? "rest" : "moving"));
+    this.redrawView = oncePerFrame((atOnce) => this.show(atOnce ? "rest" : "moving", false));
+  }
+
+  // Draw all, or the 3-D view alone, in a quality of that; on a slow machine better when nothing moves any more.
+  show(quality, all = true) {
+    // While a page opens it is drawn once, at the end.
+    if (this.isOpening) return;
+    clearTimeout(this.better);
+    if (this.scene) this.scene.quality = quality;
+    const now = performance.now(), took = Math.min(now - (this.shownAt || 0), REST_MS);
+    this.shownAt = now;
+    if (all) this.draw();
+    else this.drawView();
+    this.drawBetter(quality, all, took);
+  }
+
+  // On a slow machine, draw better when nothing has moved for a moment.
+  drawBetter(quality, all = false, took = 0) {
+    if (!this.scene || !this.scene.slow || (this.tools && this.tools.recording)) return;
+    // Else the pictures of a movement wait in a queue and come late.
+    if (quality === "moving") this.scene.finish();
+    // What else was drawn in a hurry is drawn better with it.
+    this.hasHurried = quality !== "fine" && (this.hasHurried || all);
+    if (quality === "fine") return;
+    const [next, ms] = quality === "moving" ? ["rest", REST_MS] : ["fine", FINE_MS];
+    this.better = setTimeout(() => this.show(next, this.hasHurried), Math.max(ms, PICTURES * took));
+  }
+
+  // Return whether a picture is left out for now: it cannot be seen, and a slow machine is in a hurry.
+  leavesOut(canvas) {
+    return Boolean(this.scene && this.scene.slow && this.scene.quality === "moving" && !isOnScreen(canvas));
+  }
+
+  // Draw the 3-D view, where that is not all that there is.
+  drawView() {
+    this.draw();
   }
 
   // Open the 3-D view, and return whether there is one; distanceOf takes the size of the lung in mm.
@@ -31,11 +74,45 @@ export class AnatomyPage {
     for (const packed of this.structures) await this.scene.addSurface(packed, this.breath);
     const box = this.structures.find(({ key }) => key === "lung") || this.structures[0];
     const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
-    this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redraw);
+    this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redrawView);
     connectViews(byId("scene-figure"), this.orbit);
-    new ResizeObserver(this.redraw).observe(canvas);
+    new ResizeObserver(() => {
+      const [width, height] = this.scene.fitted || [];
+      if (canvas.clientWidth !== width || canvas.clientHeight !== height) this.redraw.now();
+    }).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
+    if (byId("save-picture")) this.tools = new ViewTools(this, byId("scene-figure"));
     return true;
+  }
+
+  // Return through which point a cut goes, along which axis, and what it is called; null for no cut.
+  cutThrough() {
+    return null;
+  }
+
+  // Return labels in the view: { text, point: LPS mm, colour }.
+  labels() {
+    return [];
+  }
+
+  // Name what was hit in the 3-D view.
+  nameOf({ kind, key }) {
+    return kind === "surface" ? this.scene.surfaces.get(key).name : key;
+  }
+
+  // Say how far a point is from what matters.
+  distancesOf() {
+    return [];
+  }
+
+  // Return how far apart two points are along the devices, in mm; null without devices.
+  alongMm() {
+    return null;
+  }
+
+  // Return what films can show besides a turn: { key, name }; filmAt(key, share) then moves the page.
+  films() {
+    return [];
   }
 
   listStructures() {
@@ -67,8 +144,11 @@ export class AnatomyPage {
   }
 
   drawScene() {
-    this.scene.draw(this.orbit.camera(), sceneBackground());
+    const camera = this.orbit.camera();
+    if (this.tools) this.tools.beforeDrawing(camera);
+    this.scene.draw(camera, sceneBackground());
     showEdges(byId("scene-figure"), this.orbit);
+    if (this.tools) this.tools.afterDrawing();
   }
 
   // What a test may read of every page.
@@ -78,6 +158,7 @@ export class AnatomyPage {
       structures: scene ? Object.fromEntries([...scene.surfaces].map(([key, s]) => [key, s.shown])) : {},
       triangles: scene ? [...scene.surfaces.values()].reduce((sum, s) => sum + s.count / 3, 0) : 0,
       gl_error: scene ? scene.gl.getError() : null,
+      view_tools: scene ? { slow: scene.slow, cut: scene.cut, quality: scene.quality, points: [...scene.points.keys()] } : null,
       slice_edges: slices ? Object.fromEntries(Object.entries(slices).map(([key, s]) => [key, s.edges])) : {},
     };
   }
@@ -85,13 +166,19 @@ export class AnatomyPage {
 
 // Open a page, and let tests and tools see and move it; docs/how_to/report.md says how.
 export function openPage(page) {
+  page.isOpening = true;
   window.lungaccessReport = {
-    ready: page.open(),
+    ready: page.open().then(() => {
+      page.isOpening = false;
+      page.drawBetter("rest");
+    }),
     state: () => page.report(),
     set: (place) => {
       page.moveTo(place);
       page.redraw.now();
     },
+    pick: (x, y, options) => page.scene.pick(x, y, options),
+    project: (point) => page.scene.project(point),
     ...(page.data.breath && {
       breathe: (phase) => {
         page.breathe(phase);

@@ -1,16 +1,16 @@
 // The page of a search that found no plan.
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
+import { DEVICE_COLOURS } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { STANDARD, VoxelImage } from "./slices.js";
 import { Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
-import { rgb } from "./vectors.js";
+import { minus, norm, rgb } from "./vectors.js";
 
 const START_MM = 1.1;
 const FAINT_START_MM = 0.6;
 const TARGET_MM = 2.2;
 const PATH_MM = 1.2;
-const ROWS = 4;
 
 // Return points as lists of three numbers.
 async function pointsOf(packed) {
@@ -41,16 +41,25 @@ class NoPlanPage extends AnatomyPage {
     this.draw();
   }
 
+  cutThrough() {
+    return { point: this.data.target_lps, axis: null, name: "the target" };
+  }
+
+  nameOf(hit) {
+    const [what, key] = hit.key.split(/ (.*)/);
+    if (what === "path") return this.data.paths[Number(key)].name;
+    if (what === "start") return `Start of the needle, ${this.data.starts.find((each) => each.key === key).name}`;
+    return hit.key === "target" ? "Target" : super.nameOf(hit);
+  }
+
+  distancesOf(point) {
+    return [`${norm(minus(point, this.data.target_lps)).toFixed(1)} mm to the target`];
+  }
+
   makeSolids() {
     const target = new Solids();
-    target.ball(this.data.target_lps, TARGET_MM, rgb("#39E0B0"));
+    target.ball(this.data.target_lps, TARGET_MM, rgb(DEVICE_COLOURS.target));
     this.solids.set("target", target);
-    for (const { key, colour, places } of this.data.starts) {
-      const balls = new Solids();
-      const radius = key === "out of reach" ? FAINT_START_MM : START_MM;
-      for (const place of places) balls.ball(place, radius, rgb(colour), ROWS);
-      this.solids.set(`start ${key}`, balls);
-    }
     this.data.paths.forEach(({ lines, colour, radius_mm: radius }, n) => {
       const tubes = new Solids();
       for (const line of lines) tubes.tube(line, Math.max(radius, PATH_MM), rgb(colour));
@@ -83,14 +92,23 @@ class NoPlanPage extends AnatomyPage {
       this.scene.setSolids(key, this.shown[key] ? solids : null);
       this.drawn[key] = this.shown[key];
     }
+    for (const { key, colour, places } of this.data.starts) {
+      const name = `start ${key}`;
+      if (this.drawn[name] === this.shown[name]) continue;
+      const radii = key === "out of reach" ? FAINT_START_MM : START_MM, colours = places.flatMap(() => rgb(colour));
+      this.scene.setPoints(name, this.shown[name] ? { places: places.flat(), colours, radii } : null);
+      this.drawn[name] = this.shown[name];
+    }
+  }
+
+  drawView() {
+    this.switchSolids();
+    this.scene.fit();
+    this.drawScene();
   }
 
   draw() {
-    if (this.scene) {
-      this.switchSolids();
-      this.scene.fit();
-      this.drawScene();
-    }
+    if (this.scene) this.drawView();
     if (!this.slices) return;
     const lines = this.data.paths.flatMap(({ lines: curves, colour, radius_mm: radius }, n) =>
       (this.shown[`path ${n}`] ? curves.map((points) => ({ points, radius, colour })) : []));

@@ -1,0 +1,345 @@
+"""The processes that compute for the explorer: each holds the patient, and the latest question wins."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from anatomy.child_process import end_with_parent
+from anatomy.errors import AnatomyError, LungaccessError
+from anatomy.records import frozen_value
+from lungaccess.explorer.messages import Frame, error_message, frame
+from lungaccess.explorer.questions import ANSWERS, PLANS, REACH, Question
+from lungaccess.problem import System
+
+NAMES = (PLANS, REACH, ANSWERS)
+ENDS_WITHIN_S = 5.0
+"""A process that does not end by itself within this time is ended."""
+Key = tuple[str, str]
+"""A page, and what it asked: a later question with the same key supersedes an earlier one."""
+
+
+@frozen_value
+class PatientSource:
+    """Which patient is explored, and with what.
+
+    Parameters
+    ----------
+    folder : path
+        Of the patient.
+    system : str
+        Name of the preset that is shown first, or of `own`.
+    own : tuple of (path, System)
+        Systems from files, which the page offers beside the presets.
+    cache : path or None
+        Folder of prepared anatomy and atlases; the default one if None.
+    ct : path or None
+        CT for the slices.
+    """
+
+    folder: Path
+    system: str
+    own: tuple[tuple[Path, System], ...] = ()
+    cache: Path | None = None
+    ct: Path | None = None
+
+
+@frozen_value
+class KeptPlan:
+    """A plan that a page may ask about: digest, JSON, and seconds, iterations and costs of its search."""
+
+    digest: str
+    text: str
+    curve: tuple[tuple[float, float, float], ...] = ()
+
+
+@frozen_value
+class Asked:
+    """A question of a page on its way to a process, with the plan that it is about."""
+
+    page: str
+    name: str
+    question: Question
+    plan: KeptPlan | None = None
+
+    @property
+    def key(self) -> Key:
+        """What a later question of the same key supersedes."""
+        return self.page, self.name
+
+
+@frozen_value
+class Given:
+    """A part of an answer on its way to the page.
+
+    Parameters
+    ----------
+    sent : str or bytes
+        The message.
+    last : bool
+        Whether the question is answered with it.
+    plan : KeptPlan or None
+        A plan that the page may ask about.
+    file : path or None
+        A file that the page may fetch.
+    """
+
+    page: str
+    number: int
+    sent: Frame
+    last: bool = False
+    plan: KeptPlan | None = None
+    file: Path | None = None
+
+
+@frozen_value
+class Ended:
+    """Tells a process that a page is gone (number None), or no longer wants an answer."""
+
+    page: str
+    number: int | None = None
+
+
+class Superseded(Exception):  # noqa: N818
+    """A later question takes the place of the one that is being answered."""
+
+
+class Part:
+    """A part of an answer, made by what answers: a message, and what goes with it."""
+
+    def __init__(
+        self,
+        message: dict[str, Any],
+        arrays: dict[str, Any] | None = None,
+        *,
+        plan: KeptPlan | None = None,
+        file: Path | None = None,
+    ) -> None:
+        self.message, self.arrays, self.plan, self.file = message, arrays, plan, file
+
+
+Answering = Callable[[Asked, Callable[[], None], Callable[[Part], None]], Iterator[Part | None]]
+"""Answers a question in slices: it yields parts, or None between two slices of work.  Within a long slice it
+calls the first function, which raises Superseded where the answer is no longer wanted; the second sends a
+part at once."""
+
+
+class Worker:
+    """The loop of a process: it answers the questions of all pages by turns, a slice of each.
+
+    Parameters
+    ----------
+    connection : Connection
+        To the process of the server.
+    answering : callable
+        See `Answering`.
+    """
+
+    def __init__(self, connection: Connection, answering: Answering) -> None:
+        self._connection, self._answering = connection, answering
+        self._running: dict[Key, tuple[Asked, Iterator[Part | None]]] = {}
+        self._now: Key | None = None
+        self._lock = threading.RLock()
+
+    def run(self) -> None:
+        """Answer until the server is gone."""
+        try:
+            while True:
+                self._take_in(wait=not self._running)
+                for key in list(self._running):
+                    self._advance(key)
+        except (EOFError, BrokenPipeError, ConnectionResetError):
+            return
+
+    def _take_in(self, *, wait: bool) -> None:
+        while self._connection.poll(None if wait else 0):
+            wait = False
+            received = self._connection.recv()
+            if isinstance(received, Asked):
+                self._end(received.key)
+                between, send = self._between(received), self._sender(received)
+                self._running[received.key] = received, self._answering(received, between, send)
+                continue
+            for key, (asked, _iterator) in list(self._running.items()):
+                if received.page == asked.page and received.number in (None, asked.question.id):
+                    self._end(key)
+
+    def _end(self, key: Key) -> None:
+        """Forget a question that is being answered, and say so."""
+        if key not in self._running:
+            return
+        asked, iterator = self._running.pop(key)
+        if key != self._now:
+            iterator.close()  # type: ignore[attr-defined]
+        self._send(asked, Part({"answer": "superseded"}), last=True)
+
+    def _advance(self, key: Key) -> None:
+        """Do one slice of an answer."""
+        if key not in self._running:
+            return
+        asked, iterator = self._running[key]
+        self._now = key
+        try:
+            part = next(iterator)
+        except StopIteration:
+            self._finish(asked, Part({"answer": "end"}))
+        except Superseded:
+            pass
+        except LungaccessError as error:
+            self._finish(asked, Part(dict(error_message(asked.question.id, error))))
+        except MemoryError:
+            self._finish(asked, _failed(asked, "There is not enough memory for this"))
+        except Exception:  # A fault of one answer must not end the others.
+            traceback.print_exc()
+            self._finish(
+                asked, _failed(asked, "This question made the program fail; its terminal says where")
+            )
+        else:
+            if part is not None and self._is_wanted(asked):
+                self._send(asked, part)
+        finally:
+            self._now = None
+
+    def _finish(self, asked: Asked, part: Part) -> None:
+        if self._is_wanted(asked):
+            del self._running[asked.key]
+            self._send(asked, part, last=True)
+
+    def _is_wanted(self, asked: Asked) -> bool:
+        running = self._running.get(asked.key)
+        return running is not None and running[0] is asked
+
+    def _between(self, asked: Asked) -> Callable[[], None]:
+        def between() -> None:
+            with self._lock:
+                self._take_in(wait=False)
+                if not self._is_wanted(asked):
+                    raise Superseded
+
+        return between
+
+    def _sender(self, asked: Asked) -> Callable[[Part], None]:
+        def send(part: Part) -> None:
+            with self._lock:
+                if self._is_wanted(asked):
+                    self._send(asked, part)
+
+        return send
+
+    def _send(self, asked: Asked, part: Part, *, last: bool = False) -> None:
+        message = {"id": asked.question.id, **part.message}
+        sent = frame(message, part.arrays)
+        self._connection.send(
+            Given(
+                page=asked.page,
+                number=asked.question.id,
+                sent=sent,
+                last=last,
+                plan=part.plan,
+                file=part.file,
+            )
+        )
+
+
+def _failed(asked: Asked, found: str) -> Part:
+    error = AnatomyError(found, expected="an answer", remedy="Ask something else, or close other programs")
+    return Part(dict(error_message(asked.question.id, error)))
+
+
+def _work(connection: Connection, source: PatientSource, folder: Path) -> None:
+    """Run in a process of its own."""
+    end_with_parent()
+    from lungaccess.explorer.answers import Answers
+
+    Worker(connection, Answers(source, folder).parts).run()
+
+
+class Process:
+    """One process from the side of the server; it is started when it is first asked, and again if it ends.
+
+    Parameters
+    ----------
+    given : callable
+        Gets each part of an answer, in a thread of this object.
+    """
+
+    def __init__(self, source: PatientSource, folder: Path, given: Callable[[Given], None]) -> None:
+        self._source, self._folder, self._given = source, folder, given
+        self._process: Any = None
+        self._connection: Connection | None = None
+        self._open: dict[tuple[str, int], None] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def pid(self) -> int | None:
+        """Its number, None before it is started."""
+        return None if self._process is None else self._process.pid
+
+    def ask(self, asked: Asked) -> None:
+        """Send a question."""
+        self._open[asked.page, asked.question.id] = None
+        self._send(asked)
+
+    def end(self, ended: Ended) -> None:
+        """Say that an answer is no longer wanted."""
+        if self._process is not None:
+            self._send(ended)
+
+    def _send(self, what: Asked | Ended) -> None:
+        with self._lock:
+            connection = self._connection or self._start()
+            # Where the process has ended, the thread that reads notices it, and tells what was not answered.
+            with contextlib.suppress(OSError):
+                connection.send(what)
+
+    def _start(self) -> Connection:
+        context = multiprocessing.get_context("spawn")
+        here, there = context.Pipe()
+        self._process = context.Process(target=_work, args=(there, self._source, self._folder), daemon=True)
+        self._process.start()
+        there.close()
+        self._connection = here
+        threading.Thread(target=self._read, args=(here,), daemon=True).start()
+        return here
+
+    def _read(self, connection: Connection) -> None:
+        while True:
+            try:
+                given: Given = connection.recv()
+            except (EOFError, OSError):
+                break
+            if given.last:
+                self._open.pop((given.page, given.number), None)
+            self._given(given)
+        with self._lock:
+            if self._connection is connection:
+                self._connection = None
+        error = AnatomyError(
+            "The process that answers has ended",
+            expected="memory for a patient and its atlases",
+            remedy="Ask again; close other programs if it ends again",
+        )
+        for page, number in list(self._open):
+            self._open.pop((page, number), None)
+            self._given(Given(page=page, number=number, sent=frame(error_message(number, error)), last=True))
+
+    def stop(self) -> None:
+        """End the process."""
+        with self._lock:
+            process, connection = self._process, self._connection
+            self._connection = None
+        self._open.clear()
+        if connection is not None:
+            connection.close()
+        if process is not None:
+            process.terminate()
+            process.join(ENDS_WITHIN_S)
+            if process.is_alive():
+                process.kill()
+                process.join()

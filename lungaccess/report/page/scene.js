@@ -1,24 +1,45 @@
-// The 3-D scene: see-through surfaces, each as one layer, and solid bodies among them.
+// The 3-D scene: see-through surfaces in layers, sorted by depth in each pixel, and solid bodies and points among them.
 import { unpack } from "./decode.js";
-import { programs } from "./shaders.js";
-import { eyeFromLps, perspective, rgb } from "./vectors.js";
+import { Layers, LAYERS } from "./layers.js";
+import { Picker } from "./picking.js";
+import { MOST_SLICES, programs } from "./shaders.js";
+import { facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
+import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
-const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
+export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
 const SCOPE_HALF_ANGLE = (48 * Math.PI) / 180;
-const RIM = 0.55;
-const DARK_GAIN = 1.3;
+const RIM = 0.55, DARK_GAIN = 1.6, HAZE = 0.6;
 const INSIDE = "inside";
+const NO_CUT = [0, 0, 0, 0];
+const OUTLINE_PX = 1.2;
+const LEAST_POINT_PX = 3;
+const SLACK_MM = 20;
+const MOST_PIXELS = 2_600_000;
+const SLOW_MS = 60;
+// Pixels of the canvas for one of the page: at rest, and while something moves on a slow machine.
+const FINE = 2, COARSE = 0.6;
 
 export class Scene {
   constructor(canvas) {
     this.canvas = canvas;
-    this.gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
+    this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!this.gl) throw new Error("WebGL 2 is not available");
     this.programs = programs(this.gl);
+    this.layers = new Layers(this.gl);
+    this.picker = new Picker(this);
     this.surfaces = new Map();
     this.solids = new Map();
+    this.points = new Map();
     this.gain = 1;
     this.share = 0;
+    this.cut = null;
+    this.focus = null;
+    this.focused = true;
+    this.moving = false;
+    this.slow = null;
+    this.low = [0, 0, 0];
+    this.high = [0, 0, 0];
+    this.changes = 0;
   }
 
   // Add a packed surface, which moves with the breath if there is one; resolves when it can be drawn.
@@ -28,33 +49,49 @@ export class Scene {
     const gl = this.gl;
     const array = gl.createVertexArray();
     gl.bindVertexArray(array);
-    attribute(gl, 0, places, gl.UNSIGNED_SHORT, true, 3, 0);
-    attribute(gl, 1, normalsOf(places, faces, packed.size_mm), gl.BYTE, true, 3, 4);
-    if (breath) attribute(gl, 2, breath.displacements(places, packed), gl.FLOAT, false, 3, 0);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    const buffers = [
+      attribute(gl, 0, places, gl.UNSIGNED_SHORT, true, 3, 0),
+      attribute(gl, 1, normalsOf(places, faces, packed.size_mm), gl.BYTE, true, 3, 4),
+      ...(breath ? [attribute(gl, 2, breath.displacements(places, packed), gl.FLOAT, false, 3, 0)] : []),
+      gl.createBuffer(),
+    ];
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[buffers.length - 1]);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    this.surfaces.set(packed.key, {
+    this.removeSurface(packed.key);
+    const surface = {
       array,
+      buffers,
       count: faces.length,
+      name: packed.name,
       colour: rgb(packed.colour),
       opacity: packed.opacity,
       low: packed.low_lps,
       size: packed.size_mm,
       shown: packed.shown,
       ofMasks: packed.key.startsWith("start-"),
-    });
+      places,
+      outward: isInsideOut(places, faces, packed.size_mm) ? -1 : 1,
+    };
+    this.surfaces.set(packed.key, surface);
+    this.enclose([packed.low_lps, packed.low_lps.map((low, axis) => low + packed.size_mm[axis])]);
+    this.focusOn(surface);
+    this.changes += 1;
+  }
+
+  removeSurface(key) {
+    const surface = this.surfaces.get(key);
+    if (!surface) return;
+    surface.buffers.forEach((buffer) => this.gl.deleteBuffer(buffer));
+    this.gl.deleteVertexArray(surface.array);
+    this.surfaces.delete(key);
+    this.changes += 1;
   }
 
   // Put solid bodies under a name, or take them away with null.
   setSolids(name, solids) {
     const gl = this.gl;
-    const old = this.solids.get(name);
-    if (old) {
-      old.buffers.forEach((buffer) => gl.deleteBuffer(buffer));
-      gl.deleteVertexArray(old.array);
-      this.solids.delete(name);
-    }
+    this.remove(this.solids, name);
     if (!solids || !solids.faces.length) return;
     const array = gl.createVertexArray();
     gl.bindVertexArray(array);
@@ -65,12 +102,77 @@ export class Scene {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(solids.faces), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.solids.set(name, { array, buffers, count: solids.faces.length });
+    if (name !== INSIDE) this.enclose(corners(solids.places));
   }
 
+  // Put coloured points under a name, or take them away with null: places `3 N` in LPS mm, colours `3 N` from 0 to 1,
+  // and radii in mm, one for all or `N`.  None is drawn smaller than a few pixels.
+  setPoints(name, points) {
+    const gl = this.gl;
+    this.remove(this.points, name);
+    if (!points || !points.places.length) return;
+    const places = Float32Array.from(points.places), count = places.length / 3;
+    const radii = typeof points.radii === "number" ? new Float32Array(count).fill(points.radii) : Float32Array.from(points.radii);
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    const buffers = [
+      attribute(gl, 0, places, gl.FLOAT, false, 3, 0),
+      attribute(gl, 1, Uint8Array.from(points.colours, (value) => Math.round(255 * value)), gl.UNSIGNED_BYTE, true, 3, 0),
+      attribute(gl, 2, radii, gl.FLOAT, false, 1, 0),
+    ];
+    gl.bindVertexArray(null);
+    this.points.set(name, { array, buffers, count, places, radii });
+    this.enclose(corners(places));
+  }
+
+  remove(map, name) {
+    const old = map.get(name);
+    if (!old) return;
+    old.buffers.forEach((buffer) => this.gl.deleteBuffer(buffer));
+    this.gl.deleteVertexArray(old.array);
+    map.delete(name);
+  }
+
+  // Cut away what is before a plane through a point, `normal` pointing to what is kept; null: nothing.
+  setCut(plane) {
+    this.cut = plane && [...plane.normal, -dot(plane.normal, plane.point)];
+  }
+
+  // Bring out what is near a line of points, and let the rest step back; null: all alike.
+  setFocus(points) {
+    this.focus = points && points.length > 1 ? points : null;
+    for (const surface of this.surfaces.values()) this.focusOn(surface);
+    this.changes += 1;
+  }
+
+  focusOn(surface) {
+    const gl = this.gl;
+    gl.bindVertexArray(surface.array);
+    if (surface.nearness) gl.deleteBuffer(surface.nearness);
+    surface.nearness = null;
+    if (this.focus) surface.nearness = attribute(gl, 3, nearnessOf(surface, this.focus), gl.UNSIGNED_BYTE, true, 1, 0);
+    else gl.disableVertexAttribArray(3);
+    gl.bindVertexArray(null);
+  }
+
+  // Let the depth reach over points; a little more than needed, so that it seldom changes.
+  enclose(points) {
+    const empty = this.low.every((low, axis) => low === this.high[axis]);
+    const low = (axis) => Math.min(...points.map((point) => point[axis]));
+    const high = (axis) => Math.max(...points.map((point) => point[axis]));
+    for (let axis = 0; axis < 3; axis++) {
+      if (empty || low(axis) < this.low[axis]) this.low[axis] = low(axis) - SLACK_MM;
+      if (empty || high(axis) > this.high[axis]) this.high[axis] = high(axis) + SLACK_MM;
+    }
+  }
+
+  // Bring the canvas to its size on the page: fine, or coarse while something moves on a slow machine.
   fit() {
-    const scale = Math.min(window.devicePixelRatio || 1, 2);
-    const width = Math.max(Math.round(this.canvas.clientWidth * scale), 1);
-    const height = Math.max(Math.round(this.canvas.clientHeight * scale), 1);
+    const { clientWidth, clientHeight } = this.canvas;
+    const wished = this.moving && this.slow ? COARSE : Math.max(FINE, Math.min(window.devicePixelRatio || 1, 2));
+    const scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(clientWidth * clientHeight, 1)));
+    const width = Math.max(Math.round(clientWidth * scale), 1);
+    const height = Math.max(Math.round(clientHeight * scale), 1);
     if (this.canvas.width !== width || this.canvas.height !== height) {
       this.canvas.width = width;
       this.canvas.height = height;
@@ -79,50 +181,123 @@ export class Scene {
 
   // Draw everything that is shown, as the camera sees it.
   draw(camera, background) {
-    const gl = this.gl;
-    const { width, height } = this.canvas;
-    gl.viewport(0, 0, width, height);
-    gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(...background, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    gl.enable(gl.DEPTH_TEST);
-    gl.disable(gl.CULL_FACE);
-    // On a dark ground a surface has to be denser to be seen as well.
-    this.gain = Math.max(...background) < 0.3 ? DARK_GAIN : 1;
-    const eye = eyeFromLps(camera.eye, camera.forward, camera.up);
-    const far = camera.distance + 600;
-    const clip = perspective(VIEW_HALF_ANGLE, width / height, Math.max(far / 400, 1), far);
-    gl.disable(gl.BLEND);
-    this.drawSolids(clip, eye);
-    for (const key of [...this.surfaces.keys()].reverse()) this.drawLayer(this.surfaces.get(key), clip, eye);
+    this.paint(camera, background);
+    if (this.slow !== null || !this.surfaces.size) return;
+    // The second picture is that of a machine which has its programs.
+    const start = performance.now();
+    this.changes += 1;
+    this.paint(camera, background);
+    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
+    this.slow = performance.now() - start > SLOW_MS;
   }
 
-  // One layer: of each surface only what is nearest, so that nothing depends on the order of its triangles.
-  drawLayer(surface, clip, eye) {
-    // What is proved in the phase of the masks alone is shown in that phase alone.
-    if (!surface.shown || (surface.ofMasks && this.share !== 0)) return;
+  paint(camera, background) {
     const gl = this.gl;
-    gl.clear(gl.DEPTH_BUFFER_BIT);
-    gl.colorMask(false, false, false, false);
+    const { width, height } = this.canvas;
+    const view = this.view = this.viewOf(camera, width / height);
+    // What is proved in the phase of the masks alone is shown in that phase alone.
+    view.shown = [...this.surfaces].filter(([, s]) => s.shown && !(s.ofMasks && this.share !== 0)).slice(0, MOST_SLICES);
+    view.layers = this.moving && this.slow ? 1 : LAYERS;
+    const isNew = this.layers.fit(width, height, view.shown.length);
     gl.disable(gl.BLEND);
-    this.drawSolids(clip, eye);
-    this.use(this.programs.surface, clip, eye);
-    this.drawSurface(surface, this.programs.surface);
-    gl.colorMask(true, true, true, true);
-    gl.enable(gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.depthFunc(gl.LEQUAL);
-    gl.depthMask(false);
-    this.drawSurface(surface, this.programs.surface);
-    gl.depthMask(true);
-    gl.depthFunc(gl.LESS);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.enable(gl.DEPTH_TEST);
+    this.layers.into(this.layers.solids);
+    this.drawSolids(view);
+    this.drawPoints(view);
+    const signature = JSON.stringify([
+      camera.eye, camera.forward, camera.up, view.span, view.shown.map(([key]) => key), view.layers, this.share, this.cut, this.changes,
+    ]);
+    if (isNew || signature !== this.peeledAs) this.peel(view);
+    this.peeledAs = signature;
+    this.putTogether(view, background, width / Math.max(this.canvas.clientWidth, 1));
+  }
+
+  // Return the matrices of a camera and the range of depth that the scene takes.
+  viewOf(camera, aspect) {
+    const box = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [0, 1, 2].map((axis) => (n & (1 << axis) ? this.high : this.low)[axis]));
+    const deep = box.map((corner) => dot(minus(corner, camera.eye), camera.forward));
+    const far = Math.max(...deep, 10), near = Math.max(Math.min(...deep), far / 1000, 0.5);
+    return {
+      camera, far, near, span: [near, far], aspect, eye: eyeFromLps(camera.eye, camera.forward, camera.up),
+      clip: perspective(VIEW_HALF_ANGLE, aspect, near, far),
+    };
+  }
+
+  // Draw the layers of each structure by itself, so that nothing depends on the order of triangles or structures.
+  peel(view) {
+    const gl = this.gl, program = this.programs.layer, { places } = program;
+    this.use(program, view);
+    gl.uniform4fv(places.cut, this.cut || NO_CUT);
+    gl.uniform1i(places.before, 0);
+    gl.activeTexture(gl.TEXTURE0);
+    for (let k = 0; k < view.layers; k++) {
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.layers.arrays[k === 0 ? 1 : k - 1]);
+      gl.uniform1i(places.peeled, k);
+      view.shown.forEach(([, surface], n) => {
+        this.layers.into(this.layers.peeled[k][n]);
+        // Of a closed surface only the outside, unless a cut lets one see into it.
+        if (this.cut) gl.disable(gl.CULL_FACE);
+        else gl.enable(gl.CULL_FACE);
+        gl.frontFace(surface.outward > 0 ? gl.CCW : gl.CW);
+        gl.uniform1i(places.slice, n);
+        this.drawSurface(surface, program);
+      });
+    }
+    gl.disable(gl.CULL_FACE);
+  }
+
+  putTogether(view, background, scale) {
+    const gl = this.gl, { program, places } = this.programs.together;
+    const dark = Math.max(...background) < 0.3;
+    // On a dark ground a surface has to be denser to be seen as well.
+    this.gain = dark ? DARK_GAIN : 1;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.disable(gl.DEPTH_TEST);
+    gl.useProgram(program);
+    const pictures = [
+      [gl.TEXTURE_2D_ARRAY, this.layers.arrays[0], places.first], [gl.TEXTURE_2D_ARRAY, this.layers.arrays[1], places.second],
+      [gl.TEXTURE_2D, this.layers.colour, places.solids], [gl.TEXTURE_2D, this.layers.known, places.known],
+    ];
+    pictures.forEach(([kind, texture, place], n) => {
+      gl.activeTexture(gl.TEXTURE0 + n);
+      gl.bindTexture(kind, texture);
+      gl.uniform1i(place, n);
+    });
+    const looks = new Float32Array(4 * MOST_SLICES);
+    view.shown.forEach(([, { colour, opacity }], n) => looks.set([...colour, opacity], 4 * n));
+    gl.uniform4fv(places.looks, looks);
+    gl.uniform1i(places.slices, view.shown.length);
+    gl.uniform1i(places.layers, view.layers);
+    gl.uniform2f(places.strength, this.gain, RIM);
+    gl.uniform3fv(places.background, background);
+    gl.uniform3fv(places.ink, dark ? [0, 0, 0] : [0.1, 0.12, 0.14]);
+    gl.uniform1f(places.outline, Math.max(Math.round(OUTLINE_PX * scale), 1));
+    gl.uniform1f(places.step_mm, (view.span[1] - view.span[0]) / 65534);
+    gl.uniform2fv(places.span, view.span);
+    gl.uniform1f(places.focused, this.focus && this.focused ? 1 : 0);
+    const { distance } = view.camera, deep = 0.3 * distance + 40;
+    gl.uniform3f(places.haze, distance - 0.2 * deep, distance + deep, HAZE);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    // A texture that is drawn into must not be bound to be read.
+    pictures.forEach(([kind], n) => {
+      gl.activeTexture(gl.TEXTURE0 + n);
+      gl.bindTexture(kind, null);
+    });
+  }
+
+  // Return what is under a place of the canvas, in pixels of the page from its upper left; picking.js says what.
+  pick(x, y, options) {
+    return this.picker.pick(x, y, options);
   }
 
   // Draw the airway from inside into a square of the canvas, and copy it to another one.
   drawInside(pose, devices, target) {
     const gl = this.gl;
-    const side = Math.min(this.canvas.width, this.canvas.height, target.width);
+    const side = Math.min(this.canvas.width, this.canvas.height, 2 * target.width);
     const surface = this.surfaces.get("airway");
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, side, side);
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(0, 0, side, side);
@@ -130,34 +305,52 @@ export class Scene {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
-    const eye = eyeFromLps(pose.eye, pose.forward, pose.up);
-    const clip = perspective(SCOPE_HALF_ANGLE, 1, 0.2, 400);
+    const view = {
+      eye: eyeFromLps(pose.eye, pose.forward, pose.up), clip: perspective(SCOPE_HALF_ANGLE, 1, 0.2, 400), span: [0.2, 400],
+    };
     if (surface) {
-      this.use(this.programs.inside, clip, eye);
+      this.use(this.programs.inside, view);
       this.drawSurface(surface, this.programs.inside);
     }
     this.setSolids(INSIDE, devices);
-    this.drawSolids(clip, eye, INSIDE);
+    this.drawSolids(view, INSIDE);
     this.setSolids(INSIDE, null);
     gl.disable(gl.SCISSOR_TEST);
     const pen = target.getContext("2d");
     pen.drawImage(this.canvas, 0, this.canvas.height - side, side, side, 0, 0, target.width, target.height);
   }
 
-  // Draw all solid bodies, or only those of one name.
-  drawSolids(clip, eye, only) {
-    this.use(this.programs.solid, clip, eye);
-    for (const [name, solid] of this.solids) {
-      if (only && name !== only) continue;
-      this.gl.bindVertexArray(solid.array);
-      this.gl.drawElements(this.gl.TRIANGLES, solid.count, this.gl.UNSIGNED_INT, 0);
-    }
+  // Draw all solid bodies, or only those of one name; each has its number among them, from 0.
+  drawSolids(view, only) {
+    const gl = this.gl;
+    this.use(this.programs.solid, view);
+    [...this.solids].forEach(([name, solid], n) => {
+      if (only && name !== only) return;
+      gl.uniform1f(this.programs.solid.places.number, n / 255);
+      gl.bindVertexArray(solid.array);
+      gl.drawElements(gl.TRIANGLES, solid.count, gl.UNSIGNED_INT, 0);
+    });
   }
 
-  use(program, clip, eye) {
-    this.gl.useProgram(program.program);
-    this.gl.uniformMatrix4fv(program.places.clipFromEye, false, clip);
-    this.gl.uniformMatrix4fv(program.places.eyeFromLps, false, eye);
+  // Draw the points, which are numbered after the solid bodies.
+  drawPoints(view) {
+    const gl = this.gl, { places } = this.programs.points;
+    if (!this.points.size) return;
+    this.use(this.programs.points, view);
+    const scale = this.canvas.width / Math.max(this.canvas.clientWidth, 1);
+    gl.uniform2f(places.pixels, (view.clip[0] * this.canvas.width) / 2, LEAST_POINT_PX * scale);
+    [...this.points.values()].forEach((points, n) => {
+      gl.uniform1f(places.number, (this.solids.size + n) / 255);
+      gl.bindVertexArray(points.array);
+      gl.drawArrays(gl.POINTS, 0, points.count);
+    });
+  }
+
+  use({ program, places }, view) {
+    this.gl.useProgram(program);
+    this.gl.uniformMatrix4fv(places.clipFromEye, false, view.clip);
+    this.gl.uniformMatrix4fv(places.eyeFromLps, false, view.eye);
+    if (places.span) this.gl.uniform2fv(places.span, view.span);
   }
 
   drawSurface(surface, { places }) {
@@ -165,10 +358,7 @@ export class Scene {
     gl.uniform3fv(places.low, surface.low);
     gl.uniform3fv(places.size, surface.size);
     gl.uniform1f(places.share, this.share);
-    gl.uniform3fv(places.colour, surface.colour);
-    const opacity = Math.min(this.gain * surface.opacity, 1);
-    gl.uniform1f(places.opacity, opacity);
-    gl.uniform1f(places.rim, RIM * Math.min(1, 2 * opacity));
+    if (places.outward) gl.uniform1f(places.outward, surface.outward);
     gl.bindVertexArray(surface.array);
     gl.drawElements(gl.TRIANGLES, surface.count, gl.UNSIGNED_INT, 0);
   }
@@ -183,40 +373,17 @@ function attribute(gl, place, values, type, normalised, size, stride) {
   return buffer;
 }
 
-// Undo lungaccess.report.html.meshes: three rows of differences become the corners of triangles.
-export function facesFrom(differences) {
-  const count = differences.length / 3;
-  const faces = new Uint32Array(differences.length);
-  let first = 0;
-  for (let n = 0; n < count; n++) {
-    first += differences[n];
-    faces[3 * n] = first;
-    faces[3 * n + 1] = first + differences[count + n];
-    faces[3 * n + 2] = first + differences[2 * count + n];
-  }
-  return faces;
-}
-
-// Return a normal of four signed bytes for each vertex: the mean of its triangles by their area.
-function normalsOf(places, faces, size) {
-  const [sx, sy, sz] = size;
-  const sums = new Float32Array(places.length);
-  for (let f = 0; f < faces.length; f += 3) {
-    const a = 3 * faces[f], b = 3 * faces[f + 1], c = 3 * faces[f + 2];
-    const ux = (places[b] - places[a]) * sx, uy = (places[b + 1] - places[a + 1]) * sy;
-    const uz = (places[b + 2] - places[a + 2]) * sz, vx = (places[c] - places[a]) * sx;
-    const vy = (places[c + 1] - places[a + 1]) * sy, vz = (places[c + 2] - places[a + 2]) * sz;
-    const x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx;
-    for (const n of [a, b, c]) {
-      sums[n] += x;
-      sums[n + 1] += y;
-      sums[n + 2] += z;
+// Return the low and the high corner of flat points.
+function corners(flat) {
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (let n = 0; n < flat.length; n += 3) {
+    for (let axis = 0; axis < 3; axis++) {
+      low[axis] = Math.min(low[axis], flat[n + axis]);
+      high[axis] = Math.max(high[axis], flat[n + axis]);
     }
   }
-  const normals = new Int8Array((places.length / 3) * 4);
-  for (let n = 0; n < places.length / 3; n++) {
-    const length = Math.hypot(sums[3 * n], sums[3 * n + 1], sums[3 * n + 2]) || 1;
-    for (let axis = 0; axis < 3; axis++) normals[4 * n + axis] = Math.round((127 * sums[3 * n + axis]) / length);
-  }
-  return normals;
+  return [low, high];
 }
+
+// Return how far the camera has to be from the middle of a ball to see it whole.
+export const distanceToSee = (radius) => radius / Math.sin(VIEW_HALF_ANGLE);

@@ -1,0 +1,90 @@
+// The pictures that are put together: the solid bodies, and for each structure its nearest layers.
+const NOTHING = [0, 1, 1, 0];
+
+export const LAYERS = 2;
+
+// Framebuffers of one size: `solids` holds colour and depth, `peeled[k][n]` the layer k of the structure n.
+export class Layers {
+  constructor(gl) {
+    this.gl = gl;
+    this.width = this.height = this.slices = 0;
+    this.textures = [];
+  }
+
+  // Make room for so many structures; returns whether it is new and empty.
+  fit(width, height, slices) {
+    if (width === this.width && height === this.height && slices <= this.slices) return false;
+    const gl = this.gl;
+    this.free();
+    Object.assign(this, { width, height, slices: Math.max(slices, 1) });
+    this.depth = gl.createRenderbuffer();
+    gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+    this.colour = this.texture(gl.TEXTURE_2D);
+    this.known = this.texture(gl.TEXTURE_2D);
+    this.solids = this.framebuffer(() => {
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.colour, 0);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT1, gl.TEXTURE_2D, this.known, 0);
+      gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
+    });
+    // A framebuffer for the second picture of the solid bodies alone, to read from.
+    this.reading = this.framebuffer(() => {
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.known, 0);
+    });
+    this.arrays = Array.from({ length: LAYERS }, () => this.texture(gl.TEXTURE_2D_ARRAY));
+    this.peeled = this.arrays.map((array) => Array.from({ length: this.slices }, (_, n) => this.framebuffer(() => {
+      gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, array, 0, n);
+    })));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return true;
+  }
+
+  texture(kind) {
+    const gl = this.gl;
+    const texture = gl.createTexture();
+    gl.bindTexture(kind, texture);
+    if (kind === gl.TEXTURE_2D) gl.texStorage2D(kind, 1, gl.RGBA8, this.width, this.height);
+    else gl.texStorage3D(kind, 1, gl.RGBA8, this.width, this.height, this.slices);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(kind, name, gl.NEAREST);
+    this.textures.push(texture);
+    return texture;
+  }
+
+  framebuffer(attach) {
+    const gl = this.gl;
+    const framebuffer = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    attach();
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
+    return framebuffer;
+  }
+
+  free() {
+    const gl = this.gl;
+    for (const texture of this.textures) gl.deleteTexture(texture);
+    this.textures = [];
+    if (!this.solids) return;
+    for (const each of [this.solids, this.reading, ...this.peeled.flat()]) gl.deleteFramebuffer(each);
+    gl.deleteRenderbuffer(this.depth);
+  }
+
+  // Draw from now on into a framebuffer, which is emptied.
+  into(framebuffer) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.viewport(0, 0, this.width, this.height);
+    const buffers = framebuffer === this.solids ? 2 : 1;
+    for (let n = 0; n < buffers; n++) gl.clearBufferfv(gl.COLOR, n, NOTHING);
+    gl.clearBufferfv(gl.DEPTH, 0, [1]);
+  }
+
+  // Return what is stored in a pixel of a framebuffer: four bytes, and the depth as it is stored, 65535 for nothing.
+  read(framebuffer, x, y) {
+    const gl = this.gl;
+    const bytes = new Uint8Array(4);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.readPixels(x, y, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return { bytes, depth: 256 * bytes[1] + bytes[2] };
+  }
+}

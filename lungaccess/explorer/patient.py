@@ -18,6 +18,7 @@ from lungaccess.explorer.workers import PatientSource
 from lungaccess.problem import System, Target, load_system, nodule_target, preset_names, resolve_target
 from lungaccess.report.html.meshes import structure_meshes
 from lungaccess.report.html.volumes import CODES, page_image, read_ct
+from lungaccess.report.reach import COLOURS
 
 MOST_NODULES = 50
 NODULE = "nodule"
@@ -55,6 +56,7 @@ def patient_facts(lung: Lung, source: PatientSource) -> dict[str, Any]:
         "high_lps": high.tolist(),
         "carina_lps": np.asarray(lung.tree.carina_lps).tolist(),
         "targets": _targets(lung),
+        "reach_colours": COLOURS,
         "first_system": source.system,
         "systems": [_system(system) for system in systems.values()],
     }

@@ -55,9 +55,18 @@ class WhatIf:
 
 @settings
 class _Question:
-    """What all questions have: a number, by which their answers are told apart."""
+    """What all questions have.
+
+    Parameters
+    ----------
+    id : int
+        By which the answers are told apart.
+    slot : str
+        A question takes the place of the one before with the same name and slot.
+    """
 
     id: Number
+    slot: Annotated[str, Len(0, 40)] = ""
     worker: ClassVar[str] = PLANS
 
 
@@ -198,6 +207,15 @@ def read_message(text_of_message: str) -> tuple[str, Question]:
             "The message asks nothing that is known", expected=f'"ask": one of {", ".join(QUESTIONS)}'
         )
     return ask, parse(QUESTIONS[ask], values, f"The question {ask!r}")
+
+
+def number_of(text_of_message: str) -> int | None:
+    """Return the number that a message states, as far as it can be read: its error is an answer to it."""
+    try:
+        number = json.loads(text_of_message)["id"]
+    except (ValueError, RecursionError, TypeError, KeyError):
+        return None
+    return number if isinstance(number, int) and not isinstance(number, bool) else None
 
 
 def _refused(constant: str) -> None:

@@ -19,7 +19,7 @@ from aiohttp import WSMsgType, web
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.records import frozen_value
 from lungaccess.explorer.messages import error_message, frame
-from lungaccess.explorer.questions import CANCEL, MOST_CHARACTERS, read_message
+from lungaccess.explorer.questions import CANCEL, MOST_CHARACTERS, number_of, read_message
 from lungaccess.explorer.workers import NAMES, Asked, Ended, Given, KeptPlan, PatientSource, Process
 
 HOST = "127.0.0.1"
@@ -246,7 +246,6 @@ class Explorer:
 
     def _asked(self, page: Page, text: str) -> None:
         """Pass a question on, or answer with the reason why not."""
-        number: int | None = None
         try:
             name, question = read_message(text)
             if name == CANCEL:
@@ -254,16 +253,15 @@ class Explorer:
                 if worker is not None:
                     self._processes[worker].end(Ended(page=page.name, number=question))
                 return
-            number = question.id
             if len(page.asked) >= MOST_OPEN:
                 raise SettingsError(f"{MOST_OPEN} questions are waiting", expected="fewer at a time")
-            page.asked[number] = question.worker
+            page.asked[question.id] = question.worker
             plan = page.plans.get(getattr(question, "plan", ""))
             self._processes[question.worker].ask(
                 Asked(page=page.name, name=name, question=question, plan=plan)
             )
         except LungaccessError as error:
-            sent = frame(error_message(number, error))
+            sent = frame(error_message(number_of(text[: MOST_CHARACTERS + 1]), error))
             page.outbox.put_nowait(Given(page=page.name, number=-1, sent=sent, last=True))
 
     def _given(self, given: Given) -> None:

@@ -71,7 +71,7 @@ class Asked:
     @property
     def key(self) -> Key:
         """What a later question of the same key supersedes."""
-        return self.page, self.name
+        return self.page, f"{self.name} {self.question.slot}"
 
 
 @frozen_value

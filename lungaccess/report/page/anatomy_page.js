@@ -1,8 +1,13 @@
 // What the pages have in common: the 3-D view of the structures, their switches, and the slices.
+import { publishColours } from "./colours.js";
 import { Orbit } from "./orbit.js";
 import { Scene } from "./scene.js";
 import { Slice, STANDARD } from "./slices.js";
 import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { ViewTools } from "./view_tools.js";
+
+// A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another one.
+const REST_MS = 200, FINE_MS = 900;
 
 export const byId = (id) => document.getElementById(id);
 
@@ -14,7 +19,18 @@ export class AnatomyPage {
       ? data.structures.map((packed) => ({ ...packed, shown: shownFirst.includes(packed.key) }))
       : data.structures;
     this.breath = null;
-    this.redraw = oncePerFrame(() => this.draw());
+    publishColours();
+    this.redraw = oncePerFrame((atOnce) => this.show(atOnce ? "rest" : "moving"));
+  }
+
+  // Draw all in a quality of the 3-D view, and on a slow machine better when nothing moves any more.
+  show(quality) {
+    clearTimeout(this.better);
+    if (this.scene) this.scene.quality = quality;
+    this.draw();
+    if (!this.scene || !this.scene.slow || quality === "fine" || (this.tools && this.tools.recording)) return;
+    const [next, ms] = quality === "moving" ? ["rest", REST_MS] : ["fine", FINE_MS];
+    this.better = setTimeout(() => this.show(next), ms);
   }
 
   // Open the 3-D view, and return whether there is one; distanceOf takes the size of the lung in mm.
@@ -35,7 +51,38 @@ export class AnatomyPage {
     connectViews(byId("scene-figure"), this.orbit);
     new ResizeObserver(this.redraw).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
+    if (byId("save-picture")) this.tools = new ViewTools(this, byId("scene-figure"));
     return true;
+  }
+
+  // Return through which point a cut goes, along which axis, and what it is called; null for no cut.
+  cutThrough() {
+    return null;
+  }
+
+  // Return labels in the view: { text, point: LPS mm, colour }.
+  labels() {
+    return [];
+  }
+
+  // Name what was hit in the 3-D view.
+  nameOf({ kind, key }) {
+    return kind === "surface" ? this.scene.surfaces.get(key).name : key;
+  }
+
+  // Say how far a point is from what matters.
+  distancesOf() {
+    return [];
+  }
+
+  // Return how far apart two points are along the devices, in mm; null without devices.
+  alongMm() {
+    return null;
+  }
+
+  // Return what films can show besides a turn: { key, name }; filmAt(key, share) then moves the page.
+  films() {
+    return [];
   }
 
   listStructures() {
@@ -67,8 +114,11 @@ export class AnatomyPage {
   }
 
   drawScene() {
-    this.scene.draw(this.orbit.camera(), sceneBackground());
+    const camera = this.orbit.camera();
+    if (this.tools) this.tools.beforeDrawing(camera);
+    this.scene.draw(camera, sceneBackground());
     showEdges(byId("scene-figure"), this.orbit);
+    if (this.tools) this.tools.afterDrawing();
   }
 
   // What a test may read of every page.
@@ -78,6 +128,7 @@ export class AnatomyPage {
       structures: scene ? Object.fromEntries([...scene.surfaces].map(([key, s]) => [key, s.shown])) : {},
       triangles: scene ? [...scene.surfaces.values()].reduce((sum, s) => sum + s.count / 3, 0) : 0,
       gl_error: scene ? scene.gl.getError() : null,
+      view_tools: scene ? { slow: scene.slow, cut: scene.cut, quality: scene.quality, points: [...scene.points.keys()] } : null,
       slice_edges: slices ? Object.fromEntries(Object.entries(slices).map(([key, s]) => [key, s.edges])) : {},
     };
   }
@@ -92,6 +143,7 @@ export function openPage(page) {
       page.moveTo(place);
       page.redraw.now();
     },
+    pick: (x, y, options) => page.scene.pick(x, y, options),
     ...(page.data.breath && {
       breathe: (phase) => {
         page.breathe(phase);

@@ -1,7 +1,7 @@
 // The pictures that are put together: the solid bodies, and for each structure its nearest layers.
 const NOTHING = [0, 1, 1, 0];
 
-export const LAYERS = 2;
+const LAYERS = 2;
 
 // Framebuffers of one size: `solids` holds colour and depth, `peeled[k][n]` the layer k of the structure n.
 export class Layers {
@@ -78,13 +78,21 @@ export class Layers {
     gl.clearBufferfv(gl.DEPTH, 0, [1]);
   }
 
-  // Return what is stored in a pixel of a framebuffer: four bytes, and the depth as it is stored, 65535 for nothing.
-  read(framebuffer, x, y) {
+  // Return what is stored at a place of a framebuffer, in pixels from its lower left: the number of a body, and the depth
+  // as it is stored, 65535 for nothing; between the four pixels around where these differ by no more than `most`.
+  read(framebuffer, x, y, most) {
     const gl = this.gl;
-    const bytes = new Uint8Array(4);
+    const column = Math.min(Math.max(Math.floor(x - 0.5), 0), Math.max(this.width - 2, 0));
+    const row = Math.min(Math.max(Math.floor(y - 0.5), 0), Math.max(this.height - 2, 0));
+    const bytes = new Uint8Array(16);
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    gl.readPixels(x, y, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    gl.readPixels(column, row, 2, 2, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    return { bytes, depth: 256 * bytes[1] + bytes[2] };
+    const deep = [0, 1, 2, 3].map((n) => 256 * bytes[4 * n + 1] + bytes[4 * n + 2]);
+    const nearest = (Math.floor(x) > column ? 1 : 0) + (Math.floor(y) > row ? 2 : 0);
+    const [u, v] = [Math.min(Math.max(x - 0.5 - column, 0), 1), Math.min(Math.max(y - 0.5 - row, 0), 1)];
+    const low = deep[0] + u * (deep[1] - deep[0]), high = deep[2] + u * (deep[3] - deep[2]);
+    const isOne = Math.max(...deep) - Math.min(...deep) <= most && Math.max(...deep) < 65535;
+    return { number: bytes[4 * nearest], depth: isOne ? low + v * (high - low) : deep[nearest] };
   }
 }

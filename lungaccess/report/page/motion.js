@@ -1,12 +1,13 @@
 // A plan in motion: what is where at a position of the slider.
+import { DEVICE_COLOURS } from "./colours.js";
 import { unpack } from "./decode.js";
 import { minus, mix, point, rgb, unit } from "./vectors.js";
 
 export const STAGES = ["scope", "both tubes", "inner tube", "needle"];
 const WEIGHTS = [0.36, 0.14, 0.18, 0.32];
 
-// Clearance to spare along the needle: from none, over MID_MM, to WIDE_MM and more.
-const TIGHT = rgb("#D81B60"), WIDE = rgb("#56B4E9");
+// Clearance to spare along the needle: dark where there is none, pale where there are WIDE_MM and more.
+const TIGHT = rgb(DEVICE_COLOURS.needle), WIDE = rgb(DEVICE_COLOURS.needle_with_room);
 export const WIDE_MM = 5;
 
 export function marginColour(margin) {

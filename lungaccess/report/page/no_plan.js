@@ -1,10 +1,11 @@
 // The page of a search that found no plan.
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
+import { DEVICE_COLOURS } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { STANDARD, VoxelImage } from "./slices.js";
 import { Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
-import { rgb } from "./vectors.js";
+import { minus, norm, rgb } from "./vectors.js";
 
 const START_MM = 1.1;
 const FAINT_START_MM = 0.6;
@@ -41,9 +42,24 @@ class NoPlanPage extends AnatomyPage {
     this.draw();
   }
 
+  cutThrough() {
+    return { point: this.data.target_lps, axis: null, name: "the target" };
+  }
+
+  nameOf(hit) {
+    const [what, key] = hit.key.split(/ (.*)/);
+    if (what === "path") return this.data.paths[Number(key)].name;
+    if (what === "start") return `Start of the needle, ${this.data.starts.find((each) => each.key === key).name}`;
+    return hit.key === "target" ? "Target" : super.nameOf(hit);
+  }
+
+  distancesOf(point) {
+    return [`${norm(minus(point, this.data.target_lps)).toFixed(1)} mm to the target`];
+  }
+
   makeSolids() {
     const target = new Solids();
-    target.ball(this.data.target_lps, TARGET_MM, rgb("#39E0B0"));
+    target.ball(this.data.target_lps, TARGET_MM, rgb(DEVICE_COLOURS.target));
     this.solids.set("target", target);
     for (const { key, colour, places } of this.data.starts) {
       const balls = new Solids();

@@ -1,19 +1,32 @@
 // The camera that goes round the patient: by mouse, by fingers and by keys.
-import { add, cross, letters, times, unit } from "./vectors.js";
+import { distanceToSee } from "./scene.js";
+import { add, cross, dot, letters, minus, norm, times, unit } from "./vectors.js";
 
 const TURN_KEYS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 const VIEWS = { front: [0, 0], left: [Math.PI / 2, 0], right: [-Math.PI / 2, 0], back: [Math.PI, 0], feet: [0, -1.45] };
 
+const CLICK_PX = 5;
+const BETTER = 1.35;
+
 export class Orbit {
   // changed is called after each movement.
   constructor(canvas, centre, distance, changed) {
-    this.home = { centre, distance };
+    this.homes = { all: { centre, distance } };
+    this.home = this.homes.all;
     this.changed = changed;
+    // Called with the event of a press that did not drag.
+    this.clicked = () => {};
     this.fingers = new Map();
     this.look("front");
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
       this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      this.pressed = [event.clientX, event.clientY];
+    });
+    canvas.addEventListener("pointerup", (event) => {
+      const still = this.pressed && Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) < CLICK_PX;
+      if (still && this.fingers.size === 1) this.clicked(event);
+      this.pressed = null;
     });
     canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const kind of ["pointerup", "pointercancel"]) {
@@ -27,9 +40,25 @@ export class Orbit {
     canvas.addEventListener("keydown", (event) => this.key(event));
   }
 
-  // Look from a named side, all of the patient in view.
+  // Look from a named side at what is fitted: all of the patient, or the plan.
   look(name) {
     [this.yaw, this.pitch] = VIEWS[name];
+    this.comeHome();
+  }
+
+  // Name something that can be fitted: a ball in LPS mm.
+  setHome(name, centre, radius) {
+    this.homes[name] = { centre, distance: distanceToSee(radius) };
+    this.changed();
+  }
+
+  // Bring what has a name into view, from the side we are on.
+  fit(name) {
+    this.home = this.homes[name] || this.homes.all;
+    this.comeHome();
+  }
+
+  comeHome() {
     this.centre = [...this.home.centre];
     this.distance = this.home.distance;
     this.changed();
@@ -84,7 +113,11 @@ export class Orbit {
     else if (turn) this.turn(...turn);
     else if (event.key === "+" || event.key === "=") this.zoom(0.87);
     else if (event.key === "-") this.zoom(1.15);
-    else if (event.key === "0" || event.key === "Home") this.look("front");
+    else if (event.key === "f") this.fit("plan");
+    else if (event.key === "0" || event.key === "Home") {
+      this.home = this.homes.all;
+      this.look("front");
+    }
     else return;
     event.preventDefault();
   }
@@ -107,4 +140,24 @@ export class Orbit {
     const { right, above } = this.camera();
     return [letters(times(right, -1)), letters(right), letters(times(above, -1)), letters(above)];
   }
+}
+
+// Return the name of the side from which a line of points is seen long: the front, unless another side is much better.
+export function sideOf(points) {
+  const line = minus(points[points.length - 1], points[0]);
+  const seen = Object.entries(VIEWS).map(([name, [yaw, pitch]]) => {
+    const back = [Math.sin(yaw) * Math.cos(pitch), -Math.cos(yaw) * Math.cos(pitch), Math.sin(pitch)];
+    return [name, norm(minus(line, times(back, dot(line, back))))];
+  });
+  const best = seen.reduce((a, b) => (b[1] > a[1] + 1e-9 ? b : a));
+  return best[1] > BETTER * seen[0][1] ? best[0] : "front";
+}
+
+// Return the middle and the radius of a ball around points.
+export function ballAround(points) {
+  const middle = [0, 1, 2].map((axis) => {
+    const values = points.map((each) => each[axis]);
+    return (Math.min(...values) + Math.max(...values)) / 2;
+  });
+  return { centre: middle, radius: Math.max(...points.map((each) => norm(minus(each, middle)))) };
 }

@@ -1,8 +1,9 @@
 // What is under a pixel: read from the layers of the last picture, so that it is what is seen.
 import { add, dot, minus, times } from "./vectors.js";
 
-// Surfaces at least so dense can be picked; lungs and fissures only where nothing else is hit.
-const LEAST_OPACITY = 0.2;
+// Surfaces less dense, as lungs and fissures, are picked only where nothing else is hit.
+export const FAINTEST = 0.2;
+const STEEPEST = 8;
 const HIT = { surface: "surface", solid: "solid", points: "points" };
 
 export class Picker {
@@ -19,26 +20,26 @@ export class Picker {
     if (!view || !layers.width) return null;
     const { clientWidth, clientHeight } = scene.canvas;
     if (x < 0 || y < 0 || x >= clientWidth || y >= clientHeight) return null;
-    const column = Math.floor((x * layers.width) / clientWidth);
-    const row = layers.height - 1 - Math.floor((y * layers.height) / clientHeight);
-    const ray = this.ray((2 * (column + 0.5)) / layers.width - 1, (2 * (row + 0.5)) / layers.height - 1);
-    const hits = this.hitsAt(column, row, ray);
+    const across = (x * layers.width) / clientWidth, up = layers.height - (y * layers.height) / clientHeight;
+    const hits = this.hitsAt(across, up, this.ray((2 * across) / layers.width - 1, (2 * up) / layers.height - 1));
     if (!hits.length) return null;
     const can = ({ kind, key }) => kind !== HIT.surface
-      || (pickable ? pickable.includes(key) : scene.surfaces.get(key).opacity >= LEAST_OPACITY);
+      || (pickable ? pickable.includes(key) : scene.surfaces.get(key).opacity >= FAINTEST);
     return { ...(hits.find(can) || hits[0]), hits };
   }
 
-  hitsAt(column, row, ray) {
+  hitsAt(across, up, ray) {
     const { scene } = this, { view, layers } = scene;
-    const hits = [];
+    const hits = [], step = (view.span[1] - view.span[0]) / 65534;
+    // Four pixels are of one surface if it is not steeper than so.
+    const most = (STEEPEST * 2 * view.camera.distance) / (view.clip[5] * layers.height * step);
     const put = (kind, key, depth, more) => {
-      const mm = view.span[0] + (depth / 65534) * (view.span[1] - view.span[0]);
+      const mm = view.span[0] + depth * step;
       hits.push({ kind, key, depth_mm: mm, point: add(view.camera.eye, times(ray, mm)), ...more });
     };
-    const { bytes, depth: solid } = layers.read(layers.reading, column, row);
+    const { number, depth: solid } = layers.read(layers.reading, across, up, most);
     if (solid < 65535) {
-      const names = [...scene.solids.keys()], number = bytes[0];
+      const names = [...scene.solids.keys()];
       if (number < names.length) put(HIT.solid, names[number], solid);
       else {
         const key = [...scene.points.keys()][number - names.length];
@@ -46,12 +47,10 @@ export class Picker {
         hits[0].index = this.nearestPoint(scene.points.get(key), hits[0].point);
       }
     }
-    for (let k = 0; k < view.layers; k++) {
-      view.shown.forEach(([key], n) => {
-        const { depth } = layers.read(layers.peeled[k][n], column, row);
-        if (depth < 65535 && depth < solid) put(HIT.surface, key, depth);
-      });
-    }
+    view.counts.forEach((count, k) => view.shown.slice(0, count).forEach(([key], n) => {
+      const { depth } = layers.read(layers.peeled[k][n], across, up, most);
+      if (depth < 65535 && depth < solid) put(HIT.surface, key, depth);
+    }));
     return hits.sort((a, b) => a.depth_mm - b.depth_mm);
   }
 

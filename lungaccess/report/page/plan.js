@@ -3,21 +3,31 @@ import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { Breath } from "./breath.js";
 import { Bronchoscopy } from "./bronchoscopy.js";
 import { lineChart } from "./charts.js";
+import { DEVICE_COLOURS, planStyle } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { Motion, STAGES } from "./motion.js";
 import { planeAcross, STANDARD, VoxelImage } from "./slices.js";
-import { Solids } from "./solids.js";
+import { ballAround, sideOf } from "./orbit.js";
+import { banded, Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
-import { rgb } from "./vectors.js";
+import { alongLine } from "./surfaces.js";
+import { minus, mix, norm, rgb, unit } from "./vectors.js";
 
+const { scope: SCOPE, outer: OUTER, middle: MIDDLE, inner: INNER, needle: NEEDLE, target: TARGET, aim: AIM } = DEVICE_COLOURS;
 const DEVICES = [
-  { key: "scope", name: "Bronchoscope", colour: "#0072B2", shown: true },
-  { key: "tubes", name: "Tubes", colour: "#E69F00", shown: true },
-  { key: "needle", name: "Needle, coloured by clearance", colour: "linear-gradient(90deg, #D81B60, #56B4E9)", shown: true },
-  { key: "target", name: "Target", colour: "#39E0B0", shown: true },
-  { key: "aim", name: "Aim of the devices, beside the moving target", colour: "#FFD23F", shown: true },
+  { key: "scope", name: "Bronchoscope", colour: SCOPE, shown: true },
+  { key: "tubes", name: "Tubes: outer, inner", colour: `linear-gradient(90deg, ${OUTER} 50%, ${INNER} 50%)`, shown: true },
+  { key: "needle", name: "Needle, darker where tight", colour: `linear-gradient(90deg, ${NEEDLE}, ${DEVICE_COLOURS.needle_with_room})`, shown: true },
+  { key: "target", name: "Target", colour: TARGET, shown: true },
+  { key: "aim", name: "Aim of the devices, beside the moving target", colour: AIM, shown: true },
 ];
-const OUTER = "#E69F00", MIDDLE = "#EDB42E", INNER = "#F4C95D", OTHER = "#8A8F98", NEEDLE_INK = "#D81B60";
+const SOLID_NAMES = {
+  scope: "Bronchoscope", outer: "Outer tube", middle: "Middle tube", inner: "Inner tube", needle: "Needle", target: "Target",
+  aim: "Aim of the devices", measure: "Measured line",
+};
+const WHITE = [1, 1, 1];
+// Of the scope so many points before its tip are in the view of the plan, and so much around all of it.
+const SCOPE_POINTS = 16, AROUND_PLAN_MM = 12;
 const CHART = {
   airway: ["airway wall", "#3A9BD5", ""], vessel: ["vessel", "#D81B60", "9 4"],
   pleura: ["pleura", "#B8860B", "3 4"], fissure: ["fissure", "#785EF0", "12 4 3 4"],
@@ -25,7 +35,7 @@ const CHART = {
 const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
 const PLAY_S = 14, BREATH_S = 5, MOST_STEP_S = 0.25;
 const LEAST_WIDTH = 0.0016;
-const TARGET_MM = 1.6, TARGET = "#39E0B0", AIM_MM = 1.1, AIM = "#FFD23F";
+const TARGET_MM = 1.6, AIM_MM = 1.1;
 
 class PlanPage extends AnatomyPage {
   constructor(data) {
@@ -49,7 +59,10 @@ class PlanPage extends AnatomyPage {
     this.followed = 0;
     this.listSwitches();
     this.connectControls();
-    if (await this.openScene(distanceOfAll)) this.addTarget();
+    if (await this.openScene(distanceOfAll)) {
+      this.addTarget();
+      this.lookAtPlan();
+    }
     this.image = await VoxelImage.of(this.data);
     this.image.breath = this.breath;
     this.openSlices([...Object.keys(STANDARD), "across"]);
@@ -68,6 +81,63 @@ class PlanPage extends AnatomyPage {
     this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"));
   }
 
+  // Look at the devices beyond the scope and at the end of the scope, from the side from which they are seen long.
+  lookAtPlan() {
+    const end = this.motion.at(1), devices = [...end.outer, ...end.middle, ...end.inner, ...end.needle];
+    const { centre, radius } = ballAround([...end.scope.slice(-SCOPE_POINTS), ...devices, this.motion.plan.target_lps]);
+    this.orbit.setHome("plan", centre, radius + AROUND_PLAN_MM);
+    this.scene.setFocus(devices);
+    this.orbit.home = this.orbit.homes.plan;
+    this.orbit.look(sideOf(devices));
+  }
+
+  // The line of tubes and needle at their end, in the phase of the breath.
+  get devices() {
+    const end = this.stateOf(this.followed, 1);
+    return [...end.outer, ...end.middle, ...end.inner, ...end.needle];
+  }
+
+  cutThrough() {
+    const { needle, inner } = this.stateOf(this.followed, 1), [line, name] = needle.length > 1 ? [needle, "the needle"] : [inner, "the tube"];
+    const [first, last] = [line[0], line[line.length - 1]];
+    return line.length > 1 ? { point: mix(first, last, 0.5), axis: unit(minus(last, first)), name } : null;
+  }
+
+  nameOf(hit) {
+    const [, number] = hit.key.split("plan ");
+    return number ? this.data.plans[Number(number)].name : SOLID_NAMES[hit.key] || super.nameOf(hit);
+  }
+
+  distancesOf(point) {
+    const { needle } = this.stateOf(this.followed, 1);
+    const axis = needle.length > 1 ? [`${alongLine(needle, point).awayMm.toFixed(1)} mm to the needle's axis`] : [];
+    return [...axis, `${norm(minus(point, this.target)).toFixed(1)} mm to the target`];
+  }
+
+  alongMm(a, b) {
+    const { devices } = this;
+    return Math.abs(alongLine(devices, a).alongMm - alongLine(devices, b).alongMm);
+  }
+
+  // The numbers of the plans where several are shown, each at another place of its devices.
+  labels() {
+    const shown = this.motions.map((_, n) => n).filter((n) => this.shownPlans[n]);
+    if (shown.length < 2) return [];
+    return shown.map((n, k) => {
+      const end = this.stateOf(n, 1), line = end.needle.length > 1 ? end.needle : end.inner;
+      const at = Math.round((line.length - 1) * (0.25 + (0.6 * k) / shown.length));
+      return { text: String(n), point: line[at], colour: planStyle(n).colour };
+    });
+  }
+
+  films() {
+    return [{ key: "deployment", name: "the deployment" }];
+  }
+
+  filmAt(_kind, share) {
+    this.slider.value = Math.round(1000 * share);
+  }
+
   listSwitches() {
     const hasNeedle = this.motions.some((motion) => motion.hasNeedle);
     for (const element of document.querySelectorAll("[data-needle]")) element.hidden = !hasNeedle;
@@ -82,7 +152,7 @@ class PlanPage extends AnatomyPage {
     this.listStructures();
     this.data.plans.forEach((plan, n) => {
       const name = `${plan.name}${plan.accepted ? "" : " (refused)"}`;
-      addSwitch(byId("plans"), { key: `plan-${n}`, name, colour: n ? OTHER : NEEDLE_INK, shown: n === 0 }, (on) => {
+      addSwitch(byId("plans"), { key: `plan-${n}`, name, colour: swatchOf(planStyle(n)), shown: n === 0 }, (on) => {
         this.shownPlans[n] = on;
         this.redraw();
       });
@@ -134,7 +204,7 @@ class PlanPage extends AnatomyPage {
       if (this.breathing === null) return;
       angle += (2 * Math.PI * seconds) / BREATH_S;
       this.breathe((1 - Math.cos(angle)) / 2, Math.sin(angle) < 0);
-      this.draw();
+      this.show("moving");
       this.breathing = requestAnimationFrame(step);
     });
     byId("breathe").textContent = "Hold";
@@ -158,7 +228,7 @@ class PlanPage extends AnatomyPage {
       if (this.playing === null) return;
       position = Math.min(position + seconds / PLAY_S, 1);
       this.slider.value = 1000 * position;
-      this.draw();
+      this.show("moving");
       if (position >= 1) this.stop();
       else this.playing = requestAnimationFrame(step);
     });
@@ -234,12 +304,12 @@ class PlanPage extends AnatomyPage {
       if (on) fill(solids);
       scene.setSolids(name, solids);
     };
-    put("scope", followed && shown.scope, (s) => s.tube(state.scope, radius.scope, rgb("#0072B2")));
+    put("scope", followed && shown.scope, (s) => s.tube(state.scope, radius.scope, rgb(SCOPE)));
     put("outer", followed && shown.tubes, (s) => s.tube(state.outer, radius.outer, rgb(OUTER)));
     put("middle", followed && shown.tubes, (s) => s.tube(state.middle, radius.middle, rgb(MIDDLE)));
     put("inner", followed && shown.tubes, (s) => s.tube(state.inner, radius.inner, rgb(INNER)));
     put("needle", followed && shown.needle, (s) => s.tube(state.needle, radius.needle, state.needleColours));
-    put("others", true, (s) => this.otherPlans(s));
+    this.motions.forEach((_, n) => put(`plan ${n}`, n !== this.followed && this.shownPlans[n], (s) => this.otherPlan(n, s)));
     put("aim", shown.aim && this.aim, (s) => s.ball(this.aim, AIM_MM, rgb(AIM)));
     put("target", shown.target, (s) => s.ball(this.target, TARGET_MM, rgb(TARGET)));
     scene.fit();
@@ -247,15 +317,17 @@ class PlanPage extends AnatomyPage {
     this.drawScene();
   }
 
-  otherPlans(solids) {
-    this.motions.forEach((motion, n) => {
-      if (n === this.followed || !this.shownPlans[n]) return;
-      const end = this.stateOf(n, 1);
-      const radius = thickened(motion.plan.radius_mm, this.orbit.distance);
-      if (this.shown.scope) solids.tube(end.scope, 0.6 * radius.scope, rgb(OTHER));
-      if (this.shown.tubes) solids.tube([...end.outer, ...end.middle, ...end.inner], 0.8 * radius.inner, rgb("#C9A24A"));
-      if (this.shown.needle) solids.tube(end.needle, 0.8 * radius.needle, end.needleColours);
-    });
+  // The plans beside the one followed, each in a colour and in bands of its own.
+  otherPlan(n, solids) {
+    const end = this.stateOf(n, 1), radius = thickened(this.motions[n].plan.radius_mm, this.orbit.distance);
+    const { colour, bands } = planStyle(n);
+    const put = (points, mm) => {
+      const line = banded(points, rgb(colour), WHITE, bands);
+      solids.tube(line.points, mm, line.colours);
+    };
+    if (this.shown.scope) put(end.scope, 0.6 * radius.scope);
+    if (this.shown.tubes) put([...end.outer, ...end.middle, ...end.inner], 0.8 * radius.inner);
+    if (this.shown.needle) put(end.needle, 0.8 * radius.needle);
   }
 
   drawSlices(state) {
@@ -263,11 +335,11 @@ class PlanPage extends AnatomyPage {
     this.image.tint = byId("tint").checked;
     this.image.setWindow(byId("window").value);
     const lines = [
-      this.shown.scope && { points: state.scope, radius: radius.scope, colour: "#3FA9E8" },
+      this.shown.scope && { points: state.scope, radius: radius.scope, colour: SCOPE },
       this.shown.tubes && { points: state.outer, radius: radius.outer, colour: OUTER },
       this.shown.tubes && { points: state.middle, radius: radius.middle, colour: MIDDLE },
       this.shown.tubes && { points: state.inner, radius: radius.inner, colour: INNER },
-      this.shown.needle && { points: state.needle, radius: radius.needle, colour: "#FF4081" },
+      this.shown.needle && { points: state.needle, radius: radius.needle, colour: NEEDLE },
     ].filter((line) => line && line.points.length > 1);
     const marks = { lines, target: this.shown.target ? target : null, cross: state.tip };
     const width = Number(byId("field").value);
@@ -361,6 +433,13 @@ function paced(step) {
     last = now;
     step(seconds);
   };
+}
+
+// Return a plan's style as the background of a swatch.
+function swatchOf({ colour, bands }) {
+  if (!bands) return colour;
+  const px = (mm) => `${1.5 * mm}px`, [on, off] = bands;
+  return `repeating-linear-gradient(90deg, ${colour} 0 ${px(on)}, #ffffff ${px(on)} ${px(on + off)})`;
 }
 
 // Return how far away the whole lung is seen at once, by its size in mm.

@@ -3,7 +3,7 @@ import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { reportData, unpack } from "./decode.js";
 import { STANDARD, VoxelImage } from "./slices.js";
 import { addSwitch } from "./structures.js";
-import { mix, rgb } from "./vectors.js";
+import { minus, mix, norm, rgb } from "./vectors.js";
 
 // Viridis in five steps: even in lightness, for every colour vision.
 const RAMP = ["#440154", "#3B528B", "#21918C", "#5EC962", "#FDE725"].map(rgb);
@@ -40,6 +40,14 @@ class ReachPage extends AnatomyPage {
 
   get map() {
     return this.maps[this.number];
+  }
+
+  cutThrough() {
+    return { point: this.place, axis: null, name: "the place" };
+  }
+
+  distancesOf(point) {
+    return [`${norm(minus(point, this.place)).toFixed(1)} mm to the place`];
   }
 
   async addMaps() {

@@ -1,14 +1,14 @@
 // The 3-D scene: see-through surfaces in layers, sorted by depth in each pixel, and solid bodies and points among them.
 import { unpack } from "./decode.js";
-import { Layers, LAYERS } from "./layers.js";
-import { Picker } from "./picking.js";
+import { Layers } from "./layers.js";
+import { FAINTEST, Picker } from "./picking.js";
 import { MOST_SLICES, programs } from "./shaders.js";
 import { facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
 const SCOPE_HALF_ANGLE = (48 * Math.PI) / 180;
-const RIM = 0.55, DARK_GAIN = 1.6, HAZE = 0.6;
+const RIM = 0.55, DARK_GAIN = 1.4, DARK_FAINT_GAIN = 2.6, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
 const INSIDE = "inside";
 const NO_CUT = [0, 0, 0, 0];
 const OUTLINE_PX = 1.2;
@@ -16,8 +16,8 @@ const LEAST_POINT_PX = 3;
 const SLACK_MM = 20;
 const MOST_PIXELS = 2_600_000;
 const SLOW_MS = 60;
-// Pixels of the canvas for one of the page: at rest, and while something moves on a slow machine.
-const FINE = 2, COARSE = 0.6;
+// Pixels of the canvas for one of the page; on a slow machine fewer, at rest and still fewer while something moves.
+const FINE = 2, RESTING = 1, COARSE = 0.6;
 
 export class Scene {
   constructor(canvas) {
@@ -30,12 +30,12 @@ export class Scene {
     this.surfaces = new Map();
     this.solids = new Map();
     this.points = new Map();
-    this.gain = 1;
     this.share = 0;
     this.cut = null;
     this.focus = null;
     this.focused = true;
-    this.moving = false;
+    // "moving", "rest" or "fine": how well a slow machine draws; a fast one always draws as well as it can.
+    this.quality = "rest";
     this.slow = null;
     this.low = [0, 0, 0];
     this.high = [0, 0, 0];
@@ -166,10 +166,10 @@ export class Scene {
     }
   }
 
-  // Bring the canvas to its size on the page: fine, or coarse while something moves on a slow machine.
+  // Bring the canvas to its size on the page, as fine as the quality says.
   fit() {
     const { clientWidth, clientHeight } = this.canvas;
-    const wished = this.moving && this.slow ? COARSE : Math.max(FINE, Math.min(window.devicePixelRatio || 1, 2));
+    const wished = this.slow ? { moving: COARSE, rest: RESTING, fine: FINE }[this.quality] : FINE;
     const scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(clientWidth * clientHeight, 1)));
     const width = Math.max(Math.round(clientWidth * scale), 1);
     const height = Math.max(Math.round(clientHeight * scale), 1);
@@ -196,8 +196,13 @@ export class Scene {
     const { width, height } = this.canvas;
     const view = this.view = this.viewOf(camera, width / height);
     // What is proved in the phase of the masks alone is shown in that phase alone.
-    view.shown = [...this.surfaces].filter(([, s]) => s.shown && !(s.ofMasks && this.share !== 0)).slice(0, MOST_SLICES);
-    view.layers = this.moving && this.slow ? 1 : LAYERS;
+    // By their keys, so that the order in which they were added does not matter where two are equally deep.
+    const shown = [...this.surfaces].filter(([, s]) => s.shown && !(s.ofMasks && this.share !== 0))
+      .sort(([a], [b]) => (a < b ? -1 : 1)).slice(0, MOST_SLICES);
+    const isFaint = ([, surface]) => surface.opacity < FAINTEST;
+    view.shown = [...shown.filter((each) => !isFaint(each)), ...shown.filter(isFaint)];
+    // Of what is faint, as lungs and fissures, the nearest layer says all.
+    view.counts = [shown.length, this.slow && this.quality === "moving" ? 0 : shown.filter((each) => !isFaint(each)).length];
     const isNew = this.layers.fit(width, height, view.shown.length);
     gl.disable(gl.BLEND);
     gl.disable(gl.SCISSOR_TEST);
@@ -206,7 +211,7 @@ export class Scene {
     this.drawSolids(view);
     this.drawPoints(view);
     const signature = JSON.stringify([
-      camera.eye, camera.forward, camera.up, view.span, view.shown.map(([key]) => key), view.layers, this.share, this.cut, this.changes,
+      camera.eye, camera.forward, camera.up, view.span, view.shown.map(([key]) => key), view.counts, this.share, this.cut, this.changes,
     ]);
     if (isNew || signature !== this.peeledAs) this.peel(view);
     this.peeledAs = signature;
@@ -231,10 +236,10 @@ export class Scene {
     gl.uniform4fv(places.cut, this.cut || NO_CUT);
     gl.uniform1i(places.before, 0);
     gl.activeTexture(gl.TEXTURE0);
-    for (let k = 0; k < view.layers; k++) {
+    view.counts.forEach((count, k) => {
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.layers.arrays[k === 0 ? 1 : k - 1]);
       gl.uniform1i(places.peeled, k);
-      view.shown.forEach(([, surface], n) => {
+      view.shown.slice(0, count).forEach(([, surface], n) => {
         this.layers.into(this.layers.peeled[k][n]);
         // Of a closed surface only the outside, unless a cut lets one see into it.
         if (this.cut) gl.disable(gl.CULL_FACE);
@@ -243,15 +248,15 @@ export class Scene {
         gl.uniform1i(places.slice, n);
         this.drawSurface(surface, program);
       });
-    }
+    });
     gl.disable(gl.CULL_FACE);
   }
 
   putTogether(view, background, scale) {
-    const gl = this.gl, { program, places } = this.programs.together;
+    const gl = this.gl, { program, places } = this.programs.together(...view.counts);
     const dark = Math.max(...background) < 0.3;
-    // On a dark ground a surface has to be denser to be seen as well.
-    this.gain = dark ? DARK_GAIN : 1;
+    // On a dark ground a surface has to be denser to be seen as well, and what is faint most of all.
+    const gain = (opacity) => (dark ? (opacity < FAINTEST ? DARK_FAINT_GAIN : DARK_GAIN) : 1);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.disable(gl.DEPTH_TEST);
@@ -266,19 +271,17 @@ export class Scene {
       gl.uniform1i(place, n);
     });
     const looks = new Float32Array(4 * MOST_SLICES);
-    view.shown.forEach(([, { colour, opacity }], n) => looks.set([...colour, opacity], 4 * n));
+    view.shown.forEach(([, { colour, opacity }], n) => looks.set([...colour, gain(opacity) * opacity], 4 * n));
     gl.uniform4fv(places.looks, looks);
-    gl.uniform1i(places.slices, view.shown.length);
-    gl.uniform1i(places.layers, view.layers);
-    gl.uniform2f(places.strength, this.gain, RIM);
+    gl.uniform3fv(places.dense, this.focus && this.focused ? [FAR_DENSE, NEAR_DENSE - FAR_DENSE, RIM] : [1, 0, RIM]);
     gl.uniform3fv(places.background, background);
     gl.uniform3fv(places.ink, dark ? [0, 0, 0] : [0.1, 0.12, 0.14]);
     gl.uniform1f(places.outline, Math.max(Math.round(OUTLINE_PX * scale), 1));
-    gl.uniform1f(places.step_mm, (view.span[1] - view.span[0]) / 65534);
-    gl.uniform2fv(places.span, view.span);
-    gl.uniform1f(places.focused, this.focus && this.focused ? 1 : 0);
-    const { distance } = view.camera, deep = 0.3 * distance + 40;
-    gl.uniform3f(places.haze, distance - 0.2 * deep, distance + deep, HAZE);
+    const step = (view.span[1] - view.span[0]) / 65534;
+    gl.uniform1f(places.step_mm, step);
+    // Haze begins a little before what is looked at, and grows evenly.
+    const { distance } = view.camera, deep = 0.36 * distance + 48;
+    gl.uniform3f(places.haze, (HAZE * step) / deep, (HAZE * (view.span[0] - distance + deep / 6)) / deep, HAZE);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     // A texture that is drawn into must not be bound to be read.
     pictures.forEach(([kind], n) => {
@@ -290,6 +293,11 @@ export class Scene {
   // Return what is under a place of the canvas, in pixels of the page from its upper left; picking.js says what.
   pick(x, y, options) {
     return this.picker.pick(x, y, options);
+  }
+
+  // Return where a point is in the picture, in pixels of the page from its upper left; null behind the camera.
+  project(point) {
+    return this.picker.project(point);
   }
 
   // Draw the airway from inside into a square of the canvas, and copy it to another one.

@@ -1,11 +1,13 @@
 // The programs of the graphics card.
 
-// A texel of a layer: red how near the focus, green and blue the depth, alpha how straight and from which side it is seen.
+// A texel of a layer: red how near the focus, green and blue the depth, and in alpha how straight it is seen: from the
+// outside 1/2 to 1, from the inside 1/2 to 0.  All in floats: whole numbers are slow where the processor draws.
 const STORED_DEPTH = `
 uniform vec2 span;
-uint depthOf(float z) { return uint(clamp((-z - span.x) / (span.y - span.x), 0.0, 1.0) * 65534.0 + 0.5); }
-vec2 twoBytes(uint depth) { return vec2(float(depth >> 8), float(depth & 255u)) / 255.0; }
-uint stored(vec4 texel) { return (uint(texel.g * 255.0 + 0.5) << 8) | uint(texel.b * 255.0 + 0.5); }`;
+const float NOTHING = 65535.0;
+float depthOf(float z) { return floor(clamp((-z - span.x) / (span.y - span.x), 0.0, 1.0) * 65534.0 + 0.5); }
+vec2 twoBytes(float depth) { float high = floor(depth / 256.0); return vec2(high, depth - 256.0 * high) / 255.0; }
+float stored(vec4 texel) { return floor(texel.g * 65280.0 + texel.b * 255.0 + 0.5); }`;
 
 const SURFACE_VERTEX = `#version 300 es
 layout(location=0) in vec3 place;
@@ -42,10 +44,9 @@ out vec4 result;
 ${STORED_DEPTH}
 void main() {
   if (kept < 0.0) discard;
-  uint depth = depthOf(eye.z);
+  float depth = depthOf(eye.z);
   if (peeled != 0 && depth <= stored(texelFetch(before, ivec3(gl_FragCoord.xy, slice), 0))) discard;
-  float straight = dot(normalize(facing), normalize(eye)) * outward;
-  result = vec4(near, twoBytes(depth), (floor(abs(straight) * 127.0 + 0.5) + (straight > 0.0 ? 128.0 : 0.0)) / 255.0);
+  result = vec4(near, twoBytes(depth), 0.5 - 0.5 * outward * dot(normalize(facing), normalize(eye)));
 }`;
 
 // The inside of the airway by the light at the tip of the scope.
@@ -78,7 +79,6 @@ void main() {
 // Colour, and beside it which body it is and how deep.
 const SOLID_FRAGMENT = `#version 300 es
 precision highp float;
-precision highp int;
 in vec3 eye, facing, colour;
 uniform float number;
 layout(location=0) out vec4 result;
@@ -112,7 +112,6 @@ void main() {
 
 const POINT_FRAGMENT = `#version 300 es
 precision highp float;
-precision highp int;
 in vec3 centre, colour;
 in float ball;
 uniform float number;
@@ -133,84 +132,54 @@ void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2
 
 export const MOST_SLICES = 16;
 
-// All layers of a pixel in the order of their depth, an outline around solid bodies, and haze with the distance.
-const TOGETHER_FRAGMENT = `#version 300 es
+// All layers of a pixel put together, an outline around solid bodies, and haze with the distance.  The structures of
+// the second layer are the first of those of the first layer.  Nothing is sorted: of each layer as much is seen as those
+// before it let through, which is the same and takes no lists, which are slow where the processor draws.
+function togetherFragment(firsts, seconds) {
+  const slots = [
+    ...Array.from({ length: firsts }, (_, n) => ["first", n]), ...Array.from({ length: seconds }, (_, n) => ["second", n]),
+  ];
+  const last = slots.length;
+  const layer = ([from, n], k) => `
+  texel = texelFetch(${from}, ivec3(at, ${n}), 0);
+  float d${k} = stored(texel);
+  vec4 c${k} = look(looks[${n}], texel, d${k}, deepest);
+  d${k} += ${(k / 64).toFixed(4)};`;
+  const before = (k) => [...slots, null].map((_, j) => (j === k ? "" : ` * (d${j} < d${k} ? 1.0 - c${j}.a : 1.0)`)).join("");
+  return `#version 300 es
 precision highp float;
-precision highp int;
 precision highp sampler2DArray;
 uniform sampler2DArray first, second;
 uniform sampler2D solids, known;
-uniform int slices, layers;
 uniform vec4 looks[${MOST_SLICES}];
-uniform vec2 strength;
-uniform vec3 background, ink;
-uniform float outline, step_mm, focused;
-uniform vec3 haze;
+uniform vec3 background, ink, haze, dense;
+uniform float outline, step_mm;
 out vec4 result;
 ${STORED_DEPTH}
-const int MOST = ${2 * MOST_SLICES + 1};
-uint keys[MOST];
-uint values[MOST];
-int count = 0;
-void put(uint depth, uint value) {
-  int n = count;
-  while (n > 0 && keys[n - 1] > depth) { keys[n] = keys[n - 1]; values[n] = values[n - 1]; n -= 1; }
-  keys[n] = depth;
-  values[n] = value;
-  count += 1;
+// Colour and density of a place: denser where it is seen from the side, and near the focus; paler far away.
+vec4 look(vec4 colour, vec4 texel, float depth, float deepest) {
+  float side = 2.0 * texel.a - 1.0, straight = abs(side), aside = 1.0 - straight;
+  float alpha = min(colour.a * (dense.x + dense.y * texel.r), 1.0);
+  alpha = depth < deepest ? min(alpha + dense.z * min(1.0, 2.0 * alpha) * aside * aside, 1.0) : 0.0;
+  vec3 lit = colour.rgb * (side < 0.0 ? 0.32 + 0.42 * straight : 0.45 + 0.6 * straight);
+  return vec4(lit + (background - lit) * clamp(depth * haze.x + haze.y, 0.0, haze.z), alpha);
 }
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
-  vec4 solid = texelFetch(solids, at, 0);
-  uint deepest = stored(texelFetch(known, at, 0));
-  float darker = 0.0;
-  if (outline > 0.0) {
-    ivec2 last = textureSize(known, 0) - 1;
-    int r = int(outline);
-    uint nearest = 65535u;
-    for (int k = 0; k < 4; k++) {
-      ivec2 aside = k == 0 ? ivec2(r, 0) : k == 1 ? ivec2(-r, 0) : k == 2 ? ivec2(0, r) : ivec2(0, -r);
-      nearest = min(nearest, stored(texelFetch(known, clamp(at + aside, ivec2(0), last), 0)));
-    }
-    float gap = (float(deepest) - float(nearest)) * step_mm;
-    if (nearest < 65535u && gap > 0.8) {
-      if (deepest < 65535u) darker = 0.75;
-      else put(nearest, 0xffffffffu);
-    }
-  }
-  for (int n = 0; n < slices; n++) {
-    vec4 texel = texelFetch(first, ivec3(at, n), 0);
-    uint depth = stored(texel);
-    if (depth >= deepest) continue;
-    put(depth, (uint(n) << 16) | (uint(texel.r * 255.0 + 0.5) << 8) | uint(texel.a * 255.0 + 0.5));
-    if (layers < 2) continue;
-    texel = texelFetch(second, ivec3(at, n), 0);
-    depth = stored(texel);
-    if (depth < deepest) put(depth, (uint(n) << 16) | (uint(texel.r * 255.0 + 0.5) << 8) | uint(texel.a * 255.0 + 0.5));
-  }
-  vec3 sum = vec3(0.0);
-  float left = 1.0;
-  for (int n = 0; n < count && left > 0.004; n++) {
-    uint value = values[n];
-    if (value == 0xffffffffu) {
-      sum += left * 0.75 * ink;
-      left *= 0.25;
-      continue;
-    }
-    vec4 look = looks[value >> 16];
-    float straight = float(value & 127u) / 127.0;
-    float near = float((value >> 8) & 255u) / 255.0;
-    float dense = min(strength.x * look.a * mix(1.0, mix(0.55, 1.5, near), focused), 1.0);
-    float alpha = clamp(dense + strength.y * min(1.0, 2.0 * dense) * (1.0 - straight) * (1.0 - straight), 0.0, 1.0);
-    vec3 lit = look.rgb * (0.45 + 0.6 * straight) * ((value & 128u) != 0u ? 0.7 : 1.0);
-    float mm = span.x + float(keys[n]) * step_mm;
-    float far = haze.z * clamp((mm - haze.x) / (haze.y - haze.x), 0.0, 1.0);
-    sum += left * alpha * mix(lit, background, far);
-    left *= 1.0 - alpha;
-  }
-  vec3 last = deepest < 65535u ? mix(solid.rgb, ink, darker) : background;
-  result = vec4(sum + left * last, 1.0);
+  float deepest = stored(texelFetch(known, at, 0));
+  vec3 behind = deepest < NOTHING ? texelFetch(solids, at, 0).rgb : background;
+  vec4 c${last} = vec4(ink, 0.0), texel;
+  ivec2 end = textureSize(known, 0) - 1, low = max(at - int(outline), 0), high = min(at + int(outline), end);
+  float d${last} = min(
+    min(stored(texelFetch(known, ivec2(high.x, at.y), 0)), stored(texelFetch(known, ivec2(low.x, at.y), 0))),
+    min(stored(texelFetch(known, ivec2(at.x, high.y), 0)), stored(texelFetch(known, ivec2(at.x, low.y), 0)))) - 0.5;
+  float edge = (deepest - d${last}) * step_mm > 0.8 ? 0.75 : 0.0;
+  if (deepest < NOTHING) behind = mix(behind, ink, edge);
+  else c${last}.a = edge;${slots.map(layer).join("")}
+  vec3 sum = ${[...slots, null].map((_, k) => `c${k}.rgb * (c${k}.a${before(k)})`).join("\n    + ")};
+  result = vec4(sum + behind${[...slots, null].map((_, k) => ` * (1.0 - c${k}.a)`).join("")}, 1.0);
 }`;
+}
 
 function compiled(gl, kind, text) {
   const shader = gl.createShader(kind);
@@ -234,13 +203,19 @@ function linked(gl, vertex, fragment) {
   return { program, places };
 }
 
-// Return the five programs: a layer of a surface, the airway from inside, solid bodies, points, and all together.
+// Return the five programs: a layer of a surface, the airway from inside, solid bodies, points, and what puts layers
+// together, which is made for their numbers.
 export function programs(gl) {
+  const made = new Map();
   return {
     layer: linked(gl, SURFACE_VERTEX, LAYER_FRAGMENT),
     inside: linked(gl, SURFACE_VERTEX, INSIDE_FRAGMENT),
     solid: linked(gl, SOLID_VERTEX, SOLID_FRAGMENT),
     points: linked(gl, POINT_VERTEX, POINT_FRAGMENT),
-    together: linked(gl, SCREEN_VERTEX, TOGETHER_FRAGMENT),
+    together: (firsts, seconds) => {
+      const key = `${firsts} ${seconds}`;
+      if (!made.has(key)) made.set(key, linked(gl, SCREEN_VERTEX, togetherFragment(firsts, seconds)));
+      return made.get(key);
+    },
   };
 }

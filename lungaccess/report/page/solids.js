@@ -1,5 +1,5 @@
 // Tubes around lines, and balls, as triangles with a colour at each vertex.
-import { add, cross, dot, minus, times, unit } from "./vectors.js";
+import { add, cross, dot, minus, norm, times, unit } from "./vectors.js";
 
 const SIDES = 14;
 
@@ -73,4 +73,31 @@ export class Solids {
     }
     for (let i = 0; i < rows; i++) this.join(first + i * SIDES, first + (i + 1) * SIDES);
   }
+}
+
+// Cut a line of points into bands of one colour and another, `lengths` of them in mm: points and a colour for each.
+export function banded(points, colour, other, lengths) {
+  if (!lengths || points.length < 2) return { points, colours: points.map(() => colour) };
+  const found = { points: [], colours: [] };
+  const put = (place, shade) => {
+    found.points.push(place);
+    found.colours.push(shade);
+  };
+  let band = 0, rest = lengths[0];
+  const shade = () => (band % 2 ? other : colour);
+  put(points[0], colour);
+  for (let n = 0; n + 1 < points.length; n++) {
+    const step = minus(points[n + 1], points[n]), length = norm(step);
+    let at = 0;
+    while (length - at > rest) {
+      at += rest;
+      put(add(points[n], times(step, at / length)), shade());
+      band += 1;
+      rest = lengths[band % 2];
+      put(add(points[n], times(step, Math.min(at + 1e-3, length) / length)), shade());
+    }
+    rest -= length - at;
+    put(points[n + 1], shade());
+  }
+  return found;
 }

@@ -25,16 +25,19 @@ export function sceneBackground() {
   return [1, 3, 5].map((n) => parseInt(value.slice(n, n + 2), 16) / 255);
 }
 
-// Call a function at most once for each picture of the screen; `now` calls it at once, and no call waits then.
+// Call a function at most once for each picture of the screen; `now` calls it at once, with true, and no call waits then.
 export function oncePerFrame(task) {
   let waiting = null;
   const later = () => {
-    waiting ??= requestAnimationFrame(later.now);
+    waiting ??= requestAnimationFrame(() => {
+      waiting = null;
+      task(false);
+    });
   };
   later.now = () => {
     if (waiting !== null) cancelAnimationFrame(waiting);
     waiting = null;
-    task();
+    task(true);
   };
   return later;
 }
@@ -44,6 +47,9 @@ export function connectViews(figure, orbit) {
   for (const button of figure.querySelectorAll("button[data-view]")) {
     button.addEventListener("click", () => orbit.look(button.dataset.view));
   }
+  for (const button of figure.querySelectorAll("button[data-fit]")) {
+    button.addEventListener("click", () => orbit.fit(button.dataset.fit));
+  }
 }
 
 // Write the patient's sides at the edges of the scene.
@@ -52,4 +58,5 @@ export function showEdges(figure, orbit) {
   figure.querySelectorAll(".edge").forEach((element, n) => {
     element.textContent = names[n];
   });
+  for (const button of figure.querySelectorAll("button[data-fit]")) button.hidden = !orbit.homes[button.dataset.fit];
 }

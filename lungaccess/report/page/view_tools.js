@@ -1,0 +1,251 @@
+// What one does in the 3-D view besides turning it: point, measure, cut, and save a picture or a film.
+import { Solids } from "./solids.js";
+import { add, dot, minus, norm, rgb, times, unit } from "./vectors.js";
+
+const MEASURE_INK = "#FFD23F";
+const FILM_S = 12;
+const FILM_FPS = 25;
+const FILM_TYPES = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
+const PARALLEL = 0.98;
+
+// Return the plane through a point, and along an axis if there is one, that faces the viewer, moved towards the viewer.
+export function planeFacing(camera, { point, axis }, towardsMm = 0) {
+  const across = axis ? minus(camera.forward, times(axis, dot(camera.forward, axis))) : camera.forward;
+  const normal = norm(across) < Math.sqrt(1 - PARALLEL * PARALLEL) ? camera.forward : unit(across);
+  return { normal, point: minus(point, times(normal, towardsMm)) };
+}
+
+// Connects the controls of the figure of the 3-D view with a page, which has a scene, an orbit and words of its own.
+export class ViewTools {
+  constructor(page, figure) {
+    Object.assign(this, { page, figure, canvas: page.scene.canvas, measured: [], measuring: false, recording: null, hit: null });
+    this.find = (id) => figure.querySelector(`#${id}`);
+    this.connectCut();
+    this.connectPointing();
+    this.connectMeasuring();
+    this.connectSaving();
+  }
+
+  connectCut() {
+    const changed = () => {
+      this.find("cut-row").hidden = !this.find("cut").checked;
+      this.page.redraw();
+    };
+    for (const id of ["cut", "cut-offset"]) this.find(id).addEventListener("input", changed);
+    this.find("focus").addEventListener("input", () => {
+      this.page.scene.focused = this.find("focus").checked;
+      this.page.redraw();
+    });
+  }
+
+  // Bring the cut and the labels to the camera, before and after the picture.
+  beforeDrawing(camera) {
+    const through = this.page.cutThrough(), on = this.find("cut").checked && through;
+    const offset = Number(this.find("cut-offset").value);
+    this.find("cut-name").textContent = `Cut through ${through ? through.name : "it"}`;
+    this.find("cut-words").textContent = offset ? `${Math.abs(offset)} mm ${offset < 0 ? "behind" : "before"} it` : "in it";
+    this.find("focus-row").hidden = !this.page.scene.focus;
+    this.page.scene.setCut(on ? planeFacing(camera, through, offset) : null);
+  }
+
+  afterDrawing() {
+    const labels = [...this.page.labels(), ...this.measureLabel()];
+    const list = this.find("scene-labels");
+    while (list.children.length > labels.length) list.lastChild.remove();
+    while (list.children.length < labels.length) list.append(document.createElement("span"));
+    labels.forEach(({ text, point, colour }, n) => {
+      const label = list.children[n], at = this.page.scene.project(point);
+      label.hidden = !at;
+      if (!at) return;
+      label.textContent = text;
+      label.style.borderColor = colour || "currentColor";
+      label.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px)`;
+    });
+  }
+
+  // Pointing ----------------------------------------------------------------------------------------------------------
+
+  connectPointing() {
+    let waiting = null;
+    this.canvas.addEventListener("pointermove", (event) => {
+      if (event.buttons || event.pointerType === "touch") return this.leave();
+      this.pointer = [event.offsetX, event.offsetY];
+      waiting ??= requestAnimationFrame(() => {
+        waiting = null;
+        if (this.pointer) this.pointAt(...this.pointer);
+      });
+      return undefined;
+    });
+    this.canvas.addEventListener("pointerleave", () => this.leave());
+    this.canvas.addEventListener("keydown", (event) => {
+      const middle = [this.canvas.clientWidth / 2, this.canvas.clientHeight / 2];
+      if (event.key === "Enter") this.say(this.wordsOf(this.page.scene.pick(...middle)));
+      else if (event.key === "m") this.measureAt(...middle);
+      else if (event.key === "Escape") this.clear();
+      else return;
+      event.preventDefault();
+    });
+  }
+
+  pointAt(x, y) {
+    this.hit = this.page.scene.pick(x, y);
+    const note = this.find("pointed");
+    note.hidden = !this.hit;
+    if (!this.hit) return;
+    note.textContent = this.wordsOf(this.hit);
+    const aside = x > this.canvas.clientWidth / 2 ? "calc(-100% - 12px)" : "14px";
+    note.style.transform = `translate(${x}px, ${y}px) translate(${aside}, 14px)`;
+  }
+
+  leave() {
+    this.pointer = this.hit = null;
+    this.find("pointed").hidden = true;
+  }
+
+  // Say what a hit is, and how far from the needle and the target.
+  wordsOf(hit) {
+    if (!hit) return "Nothing there";
+    return [this.page.nameOf(hit), ...this.page.distancesOf(hit.point)].join(" · ");
+  }
+
+  say(words) {
+    this.find("scene-words").textContent = words;
+  }
+
+  // Measuring ---------------------------------------------------------------------------------------------------------
+
+  connectMeasuring() {
+    this.find("measure").addEventListener("click", () => {
+      this.measuring = !this.measuring;
+      this.find("measure").setAttribute("aria-pressed", String(this.measuring));
+      if (this.measuring) this.say("Click two places in the view, or press m for the one in the middle; Escape ends it");
+      else this.clear();
+    });
+    this.page.orbit.clicked = (event) => {
+      if (this.measuring) this.measureAt(event.offsetX, event.offsetY);
+      else if (event.pointerType === "touch") this.say(this.wordsOf(this.page.scene.pick(event.offsetX, event.offsetY)));
+    };
+  }
+
+  measureAt(x, y) {
+    const hit = this.page.scene.pick(x, y);
+    if (!hit) return this.say("Nothing there to measure from");
+    if (this.measured.length > 1) this.measured = [];
+    this.measured.push(hit.point);
+    this.say(this.measured.length > 1 ? this.measureWords() : `From ${this.wordsOf(hit)}`);
+    this.drawMeasure();
+    return undefined;
+  }
+
+  // Return the length in mm, and how far apart the places are along the devices.
+  measureWords() {
+    const [a, b] = this.measured, along = this.page.alongMm(a, b);
+    return `${norm(minus(b, a)).toFixed(1)} mm${along === null ? "" : `; ${along.toFixed(1)} mm along tubes and needle`}`;
+  }
+
+  measureLabel() {
+    if (this.measured.length < 2) return [];
+    const [a, b] = this.measured;
+    return [{ text: `${norm(minus(b, a)).toFixed(1)} mm`, point: times(add(a, b), 0.5), colour: MEASURE_INK }];
+  }
+
+  drawMeasure() {
+    const solids = new Solids(), radius = 0.0012 * this.page.orbit.distance, ink = rgb(MEASURE_INK);
+    for (const point of this.measured) solids.ball(point, 2 * radius, ink);
+    solids.tube(this.measured, 0.7 * radius, ink);
+    this.page.scene.setSolids("measure", solids);
+    this.page.redraw();
+  }
+
+  clear() {
+    this.measured = [];
+    this.measuring = false;
+    this.find("measure").setAttribute("aria-pressed", "false");
+    this.say("");
+    this.drawMeasure();
+  }
+
+  // Saving ------------------------------------------------------------------------------------------------------------
+
+  connectSaving() {
+    for (const { key, name } of this.page.films()) this.find("film-kind").append(new Option(name, key));
+    this.find("save-picture").addEventListener("click", async () => save(await this.picture(), `${this.fileName()}.png`));
+    const type = this.filmType();
+    this.find("save-film").disabled = !type;
+    if (!type) this.find("save-film").title = "This browser records no film";
+    this.find("save-film").addEventListener("click", async () => {
+      if (this.recording) return this.recording.stop();
+      const film = await this.film(this.find("film-kind").value);
+      return save(film, `${this.fileName()}.${film.type.includes("mp4") ? "mp4" : "webm"}`);
+    });
+  }
+
+  fileName() {
+    return `${this.page.data.patient} ${this.page.data.page}`.replace(/[^\w.-]+/g, "-");
+  }
+
+  // Return a PNG of the view as it is, with the letters of the sides and the labels.
+  picture() {
+    this.page.show("fine");
+    const { canvas } = this, sheet = document.createElement("canvas");
+    [sheet.width, sheet.height] = [canvas.width, canvas.height];
+    const pen = sheet.getContext("2d"), scale = canvas.width / canvas.clientWidth, frame = canvas.getBoundingClientRect();
+    pen.drawImage(canvas, 0, 0);
+    const style = getComputedStyle(document.documentElement), ink = style.getPropertyValue("--ink").trim();
+    pen.textAlign = "center";
+    pen.textBaseline = "middle";
+    pen.lineWidth = 3 * scale;
+    pen.strokeStyle = style.getPropertyValue("--paper").trim();
+    pen.fillStyle = ink;
+    for (const element of this.figure.querySelectorAll(".edge, #scene-labels > span:not([hidden])")) {
+      const box = element.getBoundingClientRect();
+      const at = [(box.x + box.width / 2 - frame.x) * scale, (box.y + box.height / 2 - frame.y) * scale];
+      pen.font = `700 ${15 * scale}px system-ui, sans-serif`;
+      pen.strokeText(element.textContent, ...at);
+      pen.fillText(element.textContent, ...at);
+    }
+    return new Promise((resolve) => sheet.toBlob(resolve, "image/png"));
+  }
+
+  filmType() {
+    if (!this.canvas.captureStream || !window.MediaRecorder) return null;
+    return FILM_TYPES.find((type) => MediaRecorder.isTypeSupported(type)) || null;
+  }
+
+  // Return a film of one turn, or of what the page moves: in the time it takes, with as many pictures as can be drawn.
+  async film(kind, seconds = FILM_S) {
+    const recorder = new MediaRecorder(this.canvas.captureStream(FILM_FPS), { mimeType: this.filmType(), videoBitsPerSecond: 8e6 });
+    const parts = [], ended = new Promise((resolve) => recorder.addEventListener("stop", resolve));
+    recorder.addEventListener("dataavailable", (event) => parts.push(event.data));
+    this.recording = recorder;
+    this.find("save-film").textContent = "Stop film";
+    const { yaw } = this.page.orbit;
+    // All pictures are of the size of a view that moves.
+    this.page.show("moving");
+    recorder.start();
+    const start = performance.now();
+    while (recorder.state === "recording") {
+      const share = Math.min((performance.now() - start) / (1000 * seconds), 1);
+      if (kind === "turn") this.page.orbit.yaw = yaw + 2 * Math.PI * share;
+      else this.page.filmAt(kind, share);
+      this.page.show("moving");
+      await new Promise(requestAnimationFrame);
+      if (share >= 1) recorder.stop();
+    }
+    await ended;
+    this.recording = null;
+    this.page.orbit.yaw = yaw;
+    this.find("save-film").textContent = "Save film";
+    this.page.redraw();
+    return new Blob(parts, { type: recorder.mimeType.split(";")[0] });
+  }
+}
+
+// Let the browser store a file.
+function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+}

@@ -21,7 +21,7 @@ from lungaccess.explorer import questions as ask
 from lungaccess.explorer.changed_system import plan_command, system_of
 from lungaccess.explorer.patient import image_parts, patient_facts, scene_parts, target_of
 from lungaccess.explorer.questions import WhatIf
-from lungaccess.explorer.workers import Asked, KeptPlan, Part, PatientSource
+from lungaccess.explorer.workers import Asked, KeptPlan, Part, PatientSource, Turn
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
@@ -34,9 +34,6 @@ TELL_EVERY_S = 0.25
 """Exits and plans that become better are sent so often: more often, nobody sees the difference."""
 PLACE_MM = 1.5
 """Tips of the scope within this distance of a chosen one are one place of the scope."""
-
-Between = Callable[[], None]
-Send = Callable[[Part], None]
 
 
 class Answers:
@@ -56,10 +53,10 @@ class Answers:
         self._appraiser: Any = None
         self._reached: dict[tuple[Any, ...], Int] = {}
 
-    def parts(self, asked: Asked, between: Between, send: Send) -> Iterator[Part | None]:
+    def parts(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
         """Answer a question; see `lungaccess.explorer.workers.Answering`."""
         answer = getattr(self, f"_{asked.name}")
-        yield from answer(asked, between, send)
+        yield from answer(asked, turn)
 
     @property
     def lung(self) -> Lung:
@@ -71,7 +68,7 @@ class Answers:
     def _system(self, what_if: WhatIf) -> System:
         return system_of(what_if, self._own)
 
-    def _atlas(self, system: System, between: Between, send: Send) -> Atlas:
+    def _atlas(self, system: System, turn: Turn) -> Atlas:
         """Return the atlas of a system, from memory, from the cache, or made while its progress is sent."""
         key = (
             system.scope, system.tubes, system.margins, fissures_are_obstacles(self.lung, system),
@@ -81,10 +78,10 @@ class Answers:
 
         def progress(share: float) -> None:
             nonlocal told
-            between()
+            turn.check()
             if time.monotonic() - told >= TELL_EVERY_S:
                 told = time.monotonic()
-                send(Part({"answer": "progress", "what": "deployment atlas", "share": round(share, 4)}))
+                turn.send(Part({"answer": "progress", "what": "deployment atlas", "share": round(share, 4)}))
 
         if key not in self._atlases:
             self._atlases[key] = open_atlas(self.lung, system, cache=self._source.cache, progress=progress)
@@ -93,17 +90,17 @@ class Answers:
             self._atlases.popitem(last=False)
         return replace(self._atlases[key], system=system)
 
-    def _patient(self, asked: Asked, _between: Between, _send: Send) -> Iterator[Part]:
+    def _patient(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         yield Part({"answer": "patient", **patient_facts(self.lung, self._source)})
 
-    def _scene(self, asked: Asked, _between: Between, _send: Send) -> Iterator[Part]:
+    def _scene(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         for message in scene_parts(self.lung, self._source):
             yield Part({"answer": "scene", **message})
 
-    def _image(self, asked: Asked, _between: Between, _send: Send) -> Iterator[Part]:
+    def _image(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         yield Part({"answer": "image", **image_parts(self.lung, self._source, asked.question.around)})
 
-    def _place(self, asked: Asked, _between: Between, _send: Send) -> Iterator[Part]:
+    def _place(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         place = describe_place(self.lung, asked.question.point)
         yield Part(
             {
@@ -113,9 +110,9 @@ class Answers:
             }
         )  # fmt: skip
 
-    def _prepare(self, asked: Asked, between: Between, send: Send) -> Iterator[Part]:
+    def _prepare(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         system = self._system(asked.question.what_if)
-        atlas = self._atlas(system, between, send)
+        atlas = self._atlas(system, turn)
         motions, tree = atlas.motions, self.lung.tree
         yield Part(
             {
@@ -130,12 +127,12 @@ class Answers:
             },
         )  # fmt: skip
 
-    def _exits(self, asked: Asked, between: Between, send: Send) -> Iterator[Part | None]:
+    def _exits(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
         question = asked.question
         system = self._system(question.what_if)
         target = target_of(self.lung, question.target)
         system.require_needle("The list of feasible exits")
-        atlas = self._atlas(system, between, send)
+        atlas = self._atlas(system, turn)
         tips = None if question.scope_tip is None else _tips_at(atlas, question.scope_tip)
         began = told = time.monotonic()
         for found in feasible_exits(self.lung, system, target, atlas=atlas, scope_tips=tips):
@@ -163,11 +160,11 @@ class Answers:
                 },
             )  # fmt: skip
 
-    def _plan(self, asked: Asked, between: Between, send: Send) -> Iterator[Part | None]:
+    def _plan(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
         question: ask.PlanQuestion = asked.question
         system = self._system(question.what_if)
         target = target_of(self.lung, question.target)
-        atlas = self._atlas(system, between, send)
+        atlas = self._atlas(system, turn)
         iterations = question.iterations
         if question.entry is not None or question.scope_tip is not None:
             atlas, iterations = _chosen(atlas, question), 0
@@ -175,8 +172,8 @@ class Answers:
         curve: list[tuple[float, float, float]] = []
         told, last, shown = -np.inf, None, None
 
-        def on_progress(event: ProgressEvent) -> None:
-            between()
+        def on_progress(_event: ProgressEvent) -> None:
+            turn.give_way()
 
         try:
             for found in plan(
@@ -232,14 +229,14 @@ class Answers:
         kept = KeptPlan(digest=found.digest, text=found.to_json(), curve=tuple(curve))
         return Part(message, plan=kept)
 
-    def _reach(self, asked: Asked, between: Between, send: Send) -> Iterator[Part | None]:
+    def _reach(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
         from lungaccess.explorer.reach import reach_parts
 
         system = self._system(asked.question.what_if)
-        atlas = self._atlas(system, between, send)
-        yield from reach_parts(self.lung, system, atlas, asked.question.around, self._reached, between)
+        atlas = self._atlas(system, turn)
+        yield from reach_parts(self.lung, system, atlas, asked.question.around, self._reached, turn)
 
-    def _appraise(self, asked: Asked, between: Between, send: Send) -> Iterator[Part]:
+    def _appraise(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         from lungaccess.appraisal import Appraiser
 
         found = self._plan_asked(asked)
@@ -256,22 +253,22 @@ class Answers:
             }
         )  # fmt: skip
 
-    def _explain(self, asked: Asked, between: Between, send: Send) -> Iterator[Part]:
+    def _explain(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         from lungaccess.explorer.explaining import explanation_part
 
         system = self._system(asked.question.what_if)
         target: Target = target_of(self.lung, asked.question.target)
-        own = self._atlas(system, between, send)
+        own = self._atlas(system, turn)
 
         def atlas_of(other: System, progress: Callable[[float], None]) -> Atlas:
             return open_atlas(self.lung, other, cache=self._source.cache, progress=progress)
 
-        yield explanation_part(self.lung, system, target, asked.question, own, atlas_of, between, send)
+        yield explanation_part(self.lung, system, target, asked.question, own, atlas_of, turn)
 
-    def _export(self, asked: Asked, between: Between, send: Send) -> Iterator[Part]:
+    def _export(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         from lungaccess.explorer.exports import export_file
 
-        send(Part({"answer": "progress", "what": f"making {asked.question.what}", "share": None}))
+        turn.send(Part({"answer": "progress", "what": f"making {asked.question.what}", "share": None}))
         found = self._plan_asked(asked)
         curve = () if asked.plan is None else asked.plan.curve
         file = export_file(found, self.lung, asked.question.what, self._folder, curve, self._source.ct)

@@ -9,7 +9,7 @@ from anatomy.lung import Lung
 from lungaccess.coupled import Atlas, plan
 from lungaccess.explanation import DEFAULT_TIME_S, explain_no_plan, sections
 from lungaccess.explorer.questions import ExplainQuestion
-from lungaccess.explorer.workers import Part
+from lungaccess.explorer.workers import Part, Turn
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem import System, Target
 
@@ -23,8 +23,7 @@ def explanation_part(
     question: ExplainQuestion,
     atlas: Atlas,
     atlas_of: Callable[[System, Callable[[float], None]], Atlas],
-    between: Callable[[], None],
-    send: Callable[[Part], None],
+    turn: Turn,
 ) -> Part:
     """Return headline and sections of an explanation.
 
@@ -35,14 +34,14 @@ def explanation_part(
     """
 
     def on_part(name: str) -> None:
-        between()
-        send(Part({"answer": "progress", "what": name, "share": None}))
+        turn.check()
+        turn.send(Part({"answer": "progress", "what": name, "share": None}))
 
     try:
         next(
             plan(
                 lung, system, target, objective=question.objective, seed=question.seed, iterations=ITERATIONS,
-                atlas=atlas, counterfactuals=False, on_progress=lambda _event: between(),
+                atlas=atlas, counterfactuals=False, on_progress=lambda _event: turn.check(),
             )
         )  # fmt: skip
     except NoPlan as failure:

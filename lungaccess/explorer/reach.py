@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Iterator, MutableMapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from anatomy.lung import Lung
 from anatomy.typed import Int
 from lungaccess.coupled import Atlas
-from lungaccess.explorer.workers import Part
+from lungaccess.explorer.workers import Part, Turn
 from lungaccess.problem import System
 from lungaccess.reachability import KINDS, ReachStream
 
@@ -20,12 +20,7 @@ Reached = MutableMapping[tuple[Any, ...], Int]
 
 
 def reach_parts(
-    lung: Lung,
-    system: System,
-    atlas: Atlas,
-    around_lps: ArrayLike,
-    reached: Reached,
-    between: Callable[[], None],
+    lung: Lung, system: System, atlas: Atlas, around_lps: ArrayLike, reached: Reached, turn: Turn
 ) -> Iterator[Part]:
     """Yield the grid, then voxels with what became of them.
 
@@ -55,4 +50,4 @@ def reach_parts(
             {"answer": "reach", "share": part.share},
             {"voxels": part.voxels.astype(np.int32), "kinds": part.kinds.astype(np.uint8)},
         )
-        between()
+        turn.check()

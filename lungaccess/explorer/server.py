@@ -21,6 +21,7 @@ from anatomy.records import frozen_value
 from lungaccess.explorer.messages import error_message, frame
 from lungaccess.explorer.questions import CANCEL, MOST_CHARACTERS, number_of, read_message
 from lungaccess.explorer.workers import NAMES, Asked, Ended, Given, KeptPlan, PatientSource, Process
+from lungaccess.report.html.document import filled, scene_figure
 
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24
@@ -33,6 +34,7 @@ FOLDERS = {"explorer": "lungaccess.explorer", "report": "lungaccess.report"}
 """Packages whose folder `page` holds modules and style sheets, by the first part of their addresses."""
 KINDS = {".js": "text/javascript", ".css": "text/css"}
 PAGE = "explorer.html"
+CLICKS = "; a click chooses a nodule, a painted exit, or the place in the plane through the cross"
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -208,7 +210,7 @@ class Explorer:
         return response
 
     async def _index(self, _request: web.Request) -> web.StreamResponse:
-        return web.Response(text=page_text("explorer", PAGE), content_type="text/html")
+        return web.Response(text=index_text(), content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.StreamResponse:
         folder, name = request.match_info["folder"], request.match_info["name"]
@@ -313,6 +315,11 @@ def asset_names(folder: str) -> frozenset[str]:
     """Return the names of modules and style sheets in one of `FOLDERS`."""
     entries = (resources.files(FOLDERS[folder]) / "page").iterdir()
     return frozenset(each.name for each in entries if Path(each.name).suffix in KINDS)
+
+
+def index_text() -> str:
+    """Return the page itself, with the figure of the 3-D view that all pages have."""
+    return filled(page_text("explorer", PAGE), {"scene": scene_figure(more_notes=CLICKS)})
 
 
 def page_text(folder: str, name: str) -> str:

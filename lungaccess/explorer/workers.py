@@ -124,10 +124,35 @@ class Part:
         self.message, self.arrays, self.plan, self.file = message, arrays, plan, file
 
 
-Answering = Callable[[Asked, Callable[[], None], Callable[[Part], None]], Iterator[Part | None]]
-"""Answers a question in slices: it yields parts, or None between two slices of work.  Within a long slice it
-calls the first function, which raises Superseded where the answer is no longer wanted; the second sends a
-part at once."""
+class Turn:
+    """What an answer may do within a slice of its work.
+
+    Parameters
+    ----------
+    worker : Worker
+    asked : Asked
+        The question that is being answered.
+    """
+
+    def __init__(self, worker: Worker, asked: Asked) -> None:
+        self._worker, self._asked = worker, asked
+
+    def send(self, part: Part) -> None:
+        """Send a part at once."""
+        self._worker.send(self._asked, part)
+
+    def check(self) -> None:
+        """Raise Superseded if the answer is no longer wanted; may be called by several threads."""
+        self._worker.check(self._asked)
+
+    def give_way(self) -> None:
+        """Let the other questions have a slice each, then `check`; from the main thread only."""
+        self._worker.give_way()
+        self.check()
+
+
+Answering = Callable[[Asked, Turn], Iterator[Part | None]]
+"""Answers a question in slices: it yields parts, or None between two slices of work."""
 
 
 class Worker:
@@ -144,7 +169,7 @@ class Worker:
     def __init__(self, connection: Connection, answering: Answering) -> None:
         self._connection, self._answering = connection, answering
         self._running: dict[Key, tuple[Asked, Iterator[Part | None]]] = {}
-        self._now: Key | None = None
+        self._now: list[Key] = []
         self._lock = threading.RLock()
 
     def run(self) -> None:
@@ -163,8 +188,7 @@ class Worker:
             received = self._connection.recv()
             if isinstance(received, Asked):
                 self._end(received.key)
-                between, send = self._between(received), self._sender(received)
-                self._running[received.key] = received, self._answering(received, between, send)
+                self._running[received.key] = received, self._answering(received, Turn(self, received))
                 continue
             for key, (asked, _iterator) in list(self._running.items()):
                 if received.page == asked.page and received.number in (None, asked.question.id):
@@ -175,16 +199,16 @@ class Worker:
         if key not in self._running:
             return
         asked, iterator = self._running.pop(key)
-        if key != self._now:
+        if key not in self._now:
             iterator.close()  # type: ignore[attr-defined]
         self._send(asked, Part({"answer": "superseded"}), last=True)
 
     def _advance(self, key: Key) -> None:
         """Do one slice of an answer."""
-        if key not in self._running:
+        if key not in self._running or key in self._now:
             return
         asked, iterator = self._running[key]
-        self._now = key
+        self._now.append(key)
         try:
             part = next(iterator)
         except StopIteration:
@@ -204,7 +228,7 @@ class Worker:
             if part is not None and self._is_wanted(asked):
                 self._send(asked, part)
         finally:
-            self._now = None
+            self._now.remove(key)
 
     def _finish(self, asked: Asked, part: Part) -> None:
         if self._is_wanted(asked):
@@ -215,22 +239,25 @@ class Worker:
         running = self._running.get(asked.key)
         return running is not None and running[0] is asked
 
-    def _between(self, asked: Asked) -> Callable[[], None]:
-        def between() -> None:
-            with self._lock:
-                self._take_in(wait=False)
-                if not self._is_wanted(asked):
-                    raise Superseded
+    def check(self, asked: Asked) -> None:
+        """See `Turn.check`."""
+        with self._lock:
+            self._take_in(wait=False)
+            if not self._is_wanted(asked):
+                raise Superseded
 
-        return between
+    def give_way(self) -> None:
+        """See `Turn.give_way`: a slice of what gave way itself is not begun within another one."""
+        self._take_in(wait=False)
+        if len(self._now) == 1:
+            for key in list(self._running):
+                self._advance(key)
 
-    def _sender(self, asked: Asked) -> Callable[[Part], None]:
-        def send(part: Part) -> None:
-            with self._lock:
-                if self._is_wanted(asked):
-                    self._send(asked, part)
-
-        return send
+    def send(self, asked: Asked, part: Part) -> None:
+        """See `Turn.send`."""
+        with self._lock:
+            if self._is_wanted(asked):
+                self._send(asked, part)
 
     def _send(self, asked: Asked, part: Part, *, last: bool = False) -> None:
         message = {"id": asked.question.id, **part.message}

@@ -1,7 +1,7 @@
 // Up to five plans beside each other: a table, and all of them in 3-D and in the slices.
 import { byId } from "../report/anatomy_page.js";
+import { planStyle } from "../report/colours.js";
 import { Motion } from "../report/motion.js";
-import { COMPARED } from "./devices.js";
 import { MOST_COMPARED, planKey, planQuestion } from "./state.js";
 import { button, errorWords, made, mm } from "./widgets.js";
 
@@ -16,11 +16,11 @@ export class Compared {
   get shown() {
     const { plan } = this.page;
     return this.rows.filter((row) => row.plan && row.plan.motion && !this.hidden.has(row.key) && row.plan !== plan)
-      .map(({ plan: { motion }, colour }) => ({ motion, colour }));
+      .map(({ plan: { motion }, number }) => ({ motion, number }));
   }
 
   get key() {
-    return this.shown.map(({ motion, colour }) => motion.plan.digest + colour).join(" ");
+    return this.shown.map(({ motion, number }) => `${number} ${motion.plan.digest}`).join(" ");
   }
 
   keep() {
@@ -36,7 +36,7 @@ export class Compared {
     const before = new Map(this.rows.map((row) => [row.key, row]));
     this.rows = this.page.state.compared.map((asked, n) => {
       const key = planKey(asked);
-      return { plan: this.page.plans.get(key), ...before.get(key), asked, key, colour: COMPARED[n] };
+      return { plan: this.page.plans.get(key), ...before.get(key), asked, key, number: n + 1 };
     });
     this.list();
     this.fill();
@@ -81,15 +81,15 @@ export class Compared {
     this.page.redraw();
   }
 
-  row({ key, asked, plan, colour, error }, n) {
+  row({ key, asked, plan, number, error }, n) {
     const swatch = made("span", { className: "swatch" });
-    swatch.style.background = colour;
+    swatch.style.background = planStyle(number).colour;
     const box = made("input", { type: "checkbox", checked: !this.hidden.has(key), ariaLabel: `Show plan ${n + 1}`, onchange: ({ target }) => {
       this.hidden[target.checked ? "delete" : "add"](key);
       this.page.redraw();
     } });
     const of = plan ? plan.system : asked.system, from = asked.exit !== null ? ", from an exit" : asked.tip !== null ? ", from a tip" : "";
-    const open = button(`${asked.target}; ${of}${from}`, `Show plan ${n + 1} again`, () => this.page.state.set({ ...asked }));
+    const open = button(`${number}: ${asked.target}; ${of}${from}`, `Show plan ${n + 1} again`, () => this.page.state.set({ ...asked }));
     const remove = button("Remove", `Remove plan ${n + 1}`, () => this.page.state.compare(this.page.state.compared.filter((_, k) => k !== n)));
     const success = plan && plan.appraisal && plan.appraisal.headline.success;
     const checked = plan && plan.appraisal ? (plan.appraisal.accepted ? "" : "refused") : "not checked";

@@ -1,19 +1,22 @@
 // The page of the explorer: what is asked, what is shown, and how both follow from the address.
 import { AnatomyPage, byId, openPage } from "../report/anatomy_page.js";
+import { planStyle } from "../report/colours.js";
 import { unpackVolume } from "../report/decode.js";
 import { Motion } from "../report/motion.js";
 import { STANDARD, VoxelImage } from "../report/slices.js";
+import { ballAround, sideOf } from "../report/orbit.js";
 import { oncePerFrame } from "../report/structures.js";
-import { add, minus, norm, rgb, times } from "../report/vectors.js";
+import { alongLine } from "../report/surfaces.js";
+import { add, minus, mix, norm, rgb, times, unit } from "../report/vectors.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
-import { deviceLines, comparedLines, showCompared, showDevices, showTarget } from "./devices.js";
+import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
 import { Exits } from "./exits.js";
 import { connectHelp, connectKeys } from "./keys.js";
 import { PlanPanel } from "./plan_panel.js";
 import { connectPointer } from "./pointer.js";
 import { ReachLayer } from "./reach_layer.js";
-import { planKey, planQuestion, State, systemKey, whatIf } from "./state.js";
+import { MOST_COMPARED, planKey, planQuestion, State, systemKey, whatIf } from "./state.js";
 import { Tips } from "./tips.js";
 import { WhatIfPanel } from "./what_if.js";
 import { errorWords, fillRows, lpsText, made, mm, placeWords } from "./widgets.js";
@@ -21,7 +24,7 @@ import { errorWords, fillRows, lpsText, made, mm, placeWords } from "./widgets.j
 const NORMALS = { axial: 2, coronal: 1, sagittal: 0 };
 const PLAY_S = 12, MOST_STEP_S = 0.25, STEP_MM = 1;
 const KEPT_PLANS = 30;
-const NEAR_NODULE_MM = 25;
+const NEAR_NODULE_MM = 25, SCOPE_POINTS = 16, AROUND_PLAN_MM = 12;
 
 class ExplorerPage extends AnatomyPage {
   constructor() {
@@ -32,12 +35,14 @@ class ExplorerPage extends AnatomyPage {
     this.exits = this.tips = this.reach = this.motion = null;
     this.targetLps = null;
     this.stale = { scene: true, slices: true };
-    const later = oncePerFrame(() => this.draw());
+    const later = oncePerFrame((atOnce) => (this.stale.scene ? this.show(atOnce ? "rest" : "moving") : this.draw()));
     const mark = (changes) => Object.assign(this.stale, changes);
     this.redraw = () => later(mark({ scene: true, slices: true }));
     this.redraw.now = () => later.now(mark({ scene: true, slices: true }));
     this.redrawScene = () => later(mark({ scene: true }));
     this.redrawSlices = () => later(mark({ slices: true }));
+    // At once, and as coarsely as a slow machine draws what moves.
+    this.redrawFast = () => this.show("moving", mark({ slices: true }));
   }
 
   async open() {
@@ -52,6 +57,13 @@ class ExplorerPage extends AnatomyPage {
     this.say("Ready. Click into a slice, or pick a nodule.");
     this.ready = true;
     this.follow();
+  }
+
+  // On a slow machine the finest pictures would keep answers waiting: they are for those that are saved.
+  show(quality) {
+    this.stale.scene = true;
+    super.show(quality);
+    if (this.scene && this.scene.slow && quality === "rest") clearTimeout(this.better);
   }
 
   say(words) {
@@ -93,6 +105,7 @@ class ExplorerPage extends AnatomyPage {
     this.facts = facts;
     byId("patient").textContent = facts.patient;
     document.title = `${facts.patient} - lungaccess`;
+    this.data = { ...this.data, patient: facts.patient, page: "explorer" };
     byId("warnings").replaceChildren(...facts.warnings.map((words) => made("li", {}, words)));
     byId("nodule").replaceChildren(new Option(facts.targets.length ? "choose" : "none", ""), ...facts.targets.map(({ text, lobe }) =>
       new Option(lobe ? `${text}, ${lobe}` : text, text)));
@@ -141,7 +154,6 @@ class ExplorerPage extends AnatomyPage {
     byId("tip-back").addEventListener("click", () => this.moveTip(-1));
     byId("tip-forward").addEventListener("click", () => this.moveTip(1));
     byId("free").addEventListener("click", () => this.state.set({ exit: null, tip: null }));
-    byId("view-plan").addEventListener("click", () => this.lookAtPlan());
     byId("position").addEventListener("input", () => {
       this.stop();
       this.redraw();
@@ -293,7 +305,7 @@ class ExplorerPage extends AnatomyPage {
       this.takeTarget(found.target_lps);
       this.showExits();
       if (this.times.exits === null) {
-        this.redraw.now();
+        this.redrawFast();
         this.times.exits = performance.now() - click;
       }
     }).then((last) => this.exitsEnded(last));
@@ -312,7 +324,7 @@ class ExplorerPage extends AnatomyPage {
       else {
         await this.takePlan(found, key);
         if (this.times.plan === null) {
-          this.redraw.now();
+          this.redrawFast();
           this.times.plan = performance.now() - click;
         }
       }
@@ -393,7 +405,8 @@ class ExplorerPage extends AnatomyPage {
     byId("player").hidden = !this.motion;
     this.drawn = null;
     if (this.scene && !this.targetLps) showTarget(this.scene, null);
-    if (this.scene && this.scene.setFocus) this.scene.setFocus(this.motion ? this.motion.at(1).needle : null);
+    if (this.scene) this.scene.setFocus(this.motion ? this.devices : null);
+    if (this.motion && this.orbit) this.fitToPlan();
     this.redraw();
   }
 
@@ -417,12 +430,69 @@ class ExplorerPage extends AnatomyPage {
     this.redraw();
   }
 
+  // The line of tubes and needle of the plan at their end.
+  get devices() {
+    const end = this.motion.at(1);
+    return [...end.outer, ...end.middle, ...end.inner, ...end.needle];
+  }
+
+  // Name the plan as what can be fitted into the 3-D view: its devices beyond the scope, and the end of the scope.
+  fitToPlan() {
+    const points = [...this.motion.at(1).scope.slice(-SCOPE_POINTS), ...this.devices, this.motion.plan.target_lps];
+    const { centre, radius } = ballAround(points);
+    this.orbit.setHome("plan", centre, radius + AROUND_PLAN_MM);
+  }
+
+  // Look at the plan from the side from which it is seen long, or else at the target.
   lookAtPlan() {
     if (!this.orbit) return;
-    const points = this.motion ? [this.motion.at(1).tip, this.motion.plan.scope_tip_lps] : [this.targetLps || this.place];
-    const centre = times(points.reduce(add), 1 / points.length);
-    const size = Math.max(...points.map((each) => norm(minus(each, centre))), NEAR_NODULE_MM);
-    this.orbit.approach(centre, size / Math.tan((11 * Math.PI) / 180));
+    if (!this.motion) {
+      this.orbit.setHome("plan", this.targetLps || this.place, NEAR_NODULE_MM);
+      this.orbit.fit("plan");
+      return;
+    }
+    this.orbit.home = this.orbit.homes.plan;
+    this.orbit.look(sideOf(this.devices));
+  }
+
+  cutThrough() {
+    if (!this.motion) return this.targetLps ? { point: this.targetLps, name: "the target" } : null;
+    const { needle, inner } = this.motion.at(1), [line, name] = needle.length > 1 ? [needle, "the needle"] : [inner, "the tube"];
+    const [first, last] = [line[0], line[line.length - 1]];
+    return line.length > 1 ? { point: mix(first, last, 0.5), axis: unit(minus(last, first)), name } : null;
+  }
+
+  nameOf(hit) {
+    const names = { scope: "Bronchoscope", outer: "Outer tube", middle: "Middle tube", inner: "Inner tube", needle: "Needle", target: "Target",
+      exits: `Exit ${hit.index + 1}`, tip: "Chosen place of the scope tip", preview: "Let go to choose", reach: "Voxel of the reach", measure: "Measured line" };
+    if (hit.key.startsWith(COMPARED)) return `Compared plan ${hit.key.slice(COMPARED.length)}`;
+    return names[hit.key] || super.nameOf(hit);
+  }
+
+  distancesOf(point) {
+    const needle = this.motion ? this.motion.at(1).needle : [];
+    const axis = needle.length > 1 ? [`${mm(alongLine(needle, point).awayMm)} to the needle's axis`] : [];
+    return [...axis, ...(this.targetLps ? [`${mm(norm(minus(point, this.targetLps)))} to the target`] : [])];
+  }
+
+  alongMm(a, b) {
+    return this.motion ? Math.abs(alongLine(this.devices, a).alongMm - alongLine(this.devices, b).alongMm) : null;
+  }
+
+  // The numbers of compared plans, each at its needle.
+  labels() {
+    return this.compared.shown.map(({ motion, number }) => {
+      const { needle } = motion.at(1);
+      return { text: String(number), point: needle[Math.floor(needle.length / 2)] || motion.plan.target_lps, colour: planStyle(number).colour };
+    });
+  }
+
+  films() {
+    return [{ key: "deployment", name: "the deployment" }];
+  }
+
+  filmAt(_kind, share) {
+    byId("position").value = Math.round(1000 * share);
   }
 
   get position() {
@@ -436,7 +506,7 @@ class ExplorerPage extends AnatomyPage {
       position = Math.min(position + Math.min(Math.max(now - last, 0) / 1000, MOST_STEP_S) / PLAY_S, 1);
       last = now;
       byId("position").value = Math.round(1000 * position);
-      this.draw();
+      this.show("moving");
       if (position >= 1) this.stop();
       else this.playing = requestAnimationFrame(step);
     };
@@ -484,7 +554,7 @@ class ExplorerPage extends AnatomyPage {
     if (this.drawn === key) return;
     this.drawn = key;
     showDevices(this.scene, this.motion, state, this.orbit.distance);
-    showCompared(this.scene, this.compared.shown, this.orbit.distance);
+    showCompared(this.scene, this.compared.shown, MOST_COMPARED, this.orbit.distance);
   }
 
   drawSlices(state) {

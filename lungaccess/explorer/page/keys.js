@@ -4,10 +4,10 @@ import { made } from "./widgets.js";
 
 const KEYS = [
   ["n", "next nodule or target"], ["e / Shift e", "next or previous exit: plan from it"], ["[ and ]", "scope tip back and forward: plan from there"],
-  ["f", "exit and tip free again"], ["k", "keep the plan to compare"], ["v", "look at the plan"], ["p", "play the deployment"],
+  ["x", "exit and tip free again"], ["k", "keep the plan to compare"], ["v", "look at the plan"], ["p", "play the deployment"],
   ["Ctrl Z, Ctrl Shift Z", "undo and redo"], ["?", "this help"],
   ["in a slice: arrows, page up and down", "move the cross; shift for 10 mm"], ["in a slice: Enter", "make the cross the target"],
-  ["in 3-D: arrows, + and -, 0", "turn, zoom, all from the front; shift moves"],
+  ["in 3-D: arrows, + and -, 0, f", "turn, zoom, all from the front, the plan; shift moves"], ["in 3-D: Enter, m", "name what is in the middle, measure from there"],
 ];
 
 export function connectHelp() {
@@ -19,7 +19,7 @@ export function connectHelp() {
 export function connectKeys(page) {
   const actions = {
     n: () => nextTarget(page), e: () => nextExit(page, 1), E: () => nextExit(page, -1), "[": () => page.moveTip(-1), "]": () => page.moveTip(1),
-    f: () => byId("free").click(), k: () => byId("keep").click(), v: () => page.lookAtPlan(), p: () => byId("play").click(),
+    x: () => byId("free").click(), k: () => byId("keep").click(), v: () => page.lookAtPlan(), p: () => byId("play").click(),
     "?": () => byId("help-open").click(),
   };
   document.addEventListener("keydown", (event) => {
@@ -30,7 +30,7 @@ export function connectKeys(page) {
       event.preventDefault();
       return;
     }
-    if (event.ctrlKey || event.metaKey || event.altKey || isText(event.target) || byId("help").open) return;
+    if (event.defaultPrevented || event.ctrlKey || event.metaKey || event.altKey || isText(event.target) || byId("help").open) return;
     const action = actions[event.key];
     if (!action) return;
     action();

@@ -1,21 +1,19 @@
-// What pointing at the 3-D view does: it names what is there, chooses by a click, and drags exit and scope tip.
-import { byId } from "../report/anatomy_page.js";
+// What a click in the 3-D view chooses, and how exit and scope tip are dragged.
 import { add, dot, minus, norm, times } from "../report/vectors.js";
-import { lpsText, mm } from "./widgets.js";
+import { lpsText } from "./widgets.js";
 
-const CLICK_PX = 5, HANDLE_PX = 14;
-const NAMES = { scope: "bronchoscope", outer: "outer tube", middle: "middle tube", inner: "inner tube", needle: "needle", target: "target", compared: "compared plan" };
+const HANDLE_PX = 14;
 
 export function connectPointer(page) {
   const { scene, orbit } = page, canvas = scene.canvas;
-  let down = null, dragged = null;
+  let dragged = null;
 
   const place = (event) => {
     const box = canvas.getBoundingClientRect();
     return [event.clientX - box.left, event.clientY - box.top];
   };
   const near = (point, at) => {
-    const seen = scene.picker.project(point);
+    const seen = scene.project(point);
     return seen ? Math.hypot(seen[0] - at[0], seen[1] - at[1]) : Infinity;
   };
   const nearestOf = (count, placeOf, at) => {
@@ -58,7 +56,6 @@ export function connectPointer(page) {
   canvas.parentElement.addEventListener("pointerdown", (event) => {
     if (event.target !== canvas || event.button !== 0) return;
     const at = place(event), kind = event.shiftKey ? null : handleAt(at);
-    down = at;
     if (!kind) return;
     const { tips } = page;
     const usable = kind === "tip" ? Array.from({ length: tips.count }, (_, n) => n).filter((n) => !tips.turned[n] && tips.deployments[n]) : [];
@@ -70,44 +67,32 @@ export function connectPointer(page) {
   canvas.addEventListener("pointermove", (event) => {
     const at = place(event);
     if (dragged) dragTo(at);
-    else if (!event.buttons) page.hover(at);
+    else if (!event.buttons) canvas.style.cursor = handleAt(at) ? "move" : "";
   });
 
-  canvas.addEventListener("pointerup", (event) => {
-    const at = place(event), moved = down ? Math.hypot(at[0] - down[0], at[1] - down[1]) : Infinity;
-    down = null;
-    if (dragged) {
-      const { kind, value } = dragged;
-      dragged = null;
-      page.preview(null);
-      if (value === null) return;
-      if (kind === "exit") page.chooseExit(value);
-      else page.state.set({ tip: value, exit: null });
-      return;
-    }
-    if (moved > CLICK_PX || event.button !== 0) return;
-    page.pickAt(at);
-  });
+  const letGo = (event) => {
+    if (!dragged) return;
+    const { kind, value } = dragged;
+    dragged = null;
+    page.preview(null);
+    if (value === null || event.type === "pointercancel") return;
+    if (kind === "exit") page.chooseExit(value);
+    else page.state.set({ tip: value, exit: null });
+  };
+  for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, letGo);
+
+  const { clicked } = orbit;
+  orbit.clicked = (event) => {
+    const { measuring } = page.tools;
+    clicked(event);
+    if (!measuring && event.button === 0) page.pickAt(place(event));
+  };
 
   page.preview = (point) => {
     scene.setPoints("preview", point ? { places: point, colours: [1, 1, 1], radii: 2.4 } : null);
-    page.redraw();
+    page.redrawScene();
   };
-  page.hint = (words) => {
-    byId("hover").textContent = words;
-  };
-
-  // Name what is at a place of the view.
-  page.hover = (at) => {
-    const hit = scene.pick(...at), hidden = !hit;
-    canvas.style.cursor = handleAt(at) ? "move" : "";
-    if (hidden) return;
-    const surface = scene.surfaces.get(hit.key), structure = page.structures.find(({ key }) => key === hit.key);
-    let name = structure ? structure.name : NAMES[hit.key] || hit.key;
-    if (hit.key === "exits") name = `exit ${hit.index + 1}`;
-    const { targetLps } = page, away = targetLps ? `, ${mm(norm(minus(hit.point, targetLps)))} from the target` : "";
-    page.hint(`${surface || hit.kind !== "surface" ? name : hit.key} at ${lpsText(hit.point)}${away}`);
-  };
+  page.hint = (words) => page.tools.say(words);
 
   // Choose what is at a place of the view: an exit, a nodule, or a place in the plane through the cross.
   page.pickAt = (at) => {

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Whole
+from lungaccess.cli.numbers import Port
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
 
 
@@ -27,7 +27,7 @@ def view(
             "if there is one, else the structures of the masks."
         ),
     ] = None,
-    port: Annotated[Whole | None, Parameter(help="Port of this machine; a free one if not given.")] = None,
+    port: Annotated[Port | None, Parameter(help="Port of this machine; a free one if not given.")] = None,
     browser: Annotated[bool, Parameter(help="Whether the page is opened in the browser.")] = True,
     thick_slices: Annotated[
         bool, Parameter(help="Explore masks from slices of more than 3 mm, which lack small structures.")
@@ -43,7 +43,7 @@ def view(
     import webbrowser
 
     from lungaccess.problem import load_system, shipped_names
-    from lungaccess.report.html.volumes import find_ct
+    from lungaccess.report.html.volumes import find_ct, read_ct
 
     try:
         from lungaccess.explorer import Address, Explorer, PatientSource
@@ -54,6 +54,8 @@ def view(
             remedy="pip install 'lungaccess[view]'",
         ) from error
     first = load_system(system)
+    if ct is not None:
+        read_ct(ct)  # Here, where a file that is none is refused before anything is shown.
     output.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
     own = () if system in shipped_names() else ((Path(system).resolve(), first),)
     source = PatientSource(

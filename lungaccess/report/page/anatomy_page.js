@@ -49,7 +49,7 @@ export class AnatomyPage {
     const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
     this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redraw);
     connectViews(byId("scene-figure"), this.orbit);
-    new ResizeObserver(this.redraw).observe(canvas);
+    new ResizeObserver(() => this.redraw.now()).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
     if (byId("save-picture")) this.tools = new ViewTools(this, byId("scene-figure"));
     return true;
@@ -144,6 +144,7 @@ export function openPage(page) {
       page.redraw.now();
     },
     pick: (x, y, options) => page.scene.pick(x, y, options),
+    project: (point) => page.scene.project(point),
     ...(page.data.breath && {
       breathe: (phase) => {
         page.breathe(phase);

@@ -1,8 +1,24 @@
-"""Colours of what explains a missing plan, in pictures and pages alike."""
+"""Colours that pictures and pages share: of the devices, and of what explains a missing plan."""
 
 from __future__ import annotations
 
+import json
+import re
+from importlib import resources
 from types import MappingProxyType
+
+
+def _device_colours() -> dict[str, str | list[str]]:
+    """Return the colours of devices as the page's script states them, which is their one source."""
+    script = (resources.files("lungaccess.report") / "page" / "colours.js").read_text(encoding="utf-8")
+    stated = re.search(r"DEVICE_COLOURS = (\{.*?\});", script, re.DOTALL)
+    if stated is None:
+        raise RuntimeError("page/colours.js does not state DEVICE_COLOURS")
+    return dict(json.loads(stated.group(1)))
+
+
+DEVICE_COLOURS = MappingProxyType(_device_colours())
+"""``#rrggbb`` of scope, outer, middle, inner, needle, needle_with_room, target and aim; a list for others: plans."""
 
 MISS, NEAREST, OTHER = "#8E24AA", "#2F8FD0", "#009E73"
 """The path that violates least, the plan to the nearest point, plans of other systems; on light and dark."""

@@ -91,9 +91,9 @@ def scale_bar(axes: Axes) -> None:
     )  # fmt: skip
 
 
-def halo(width: float) -> list[patheffects.AbstractPathEffect]:
+def halo(width: float, colour: str = "white") -> list[patheffects.AbstractPathEffect]:
     """Return the effect that sets a line or letter off from what lies behind it."""
-    return [patheffects.withStroke(linewidth=width, foreground="white")]
+    return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 
 def fit(axes: Axes, low: Float, high: Float) -> None:
@@ -203,8 +203,8 @@ def _normals(uv: Float) -> Float:
 def target_mark(axes: Axes, uv: Float, order: int = 12) -> None:
     """Mark the target point."""
     axes.plot(
-        uv[0], uv[1], marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2.0, zorder=order,
-        path_effects=halo(3.5), ls="none",
+        uv[0], uv[1], marker="o", ms=9, mfc="none", mec=style.TARGET, mew=2.0, zorder=order,
+        path_effects=halo(4.0, style.INK), ls="none",
     )  # fmt: skip
 
 
@@ -218,6 +218,6 @@ def aim_mark(axes: Axes, uv: Float, order: int = 13) -> None:
         mec=style.AIM,
         mew=2.0,
         zorder=order,
-        path_effects=halo(3.5),
+        path_effects=halo(4.0, style.INK),
         ls="none",
     )

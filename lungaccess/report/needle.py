@@ -163,7 +163,7 @@ def _legend(axes: Axes, answer: NeedleAnswer) -> None:
     axes.set_axis_off()
     handles: list[Line2D | Patch] = [
         Line2D([], [], marker="D", mfc="white", mec=style.INK, color=style.TUBE, lw=2, label="start"),
-        Line2D([], [], marker="o", mfc="none", mec=style.NODULE, mew=2, ls="none", label="target"),
+        Line2D([], [], marker="o", mfc="none", mec=style.TARGET, mew=2, ls="none", label="target"),
         Line2D([], [], color=style.INK, lw=1.3, ls=(0, (5, 3)), label="tightest arcs of the needle"),
     ]
     if answer.path is not None:

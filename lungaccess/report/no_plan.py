@@ -147,6 +147,6 @@ def _legend(explanation: Explanation) -> list[Line2D]:
             Line2D([], [], color=NEAREST, label="needle to the nearest point found that is reached")
         )
     handles.append(
-        Line2D([], [], marker="o", ls="none", mfc="none", mec=style.NODULE, mew=2.0, ms=8, label="target")
+        Line2D([], [], marker="o", ls="none", mfc="none", mec=style.TARGET, mew=2.0, ms=8, label="target")
     )
     return handles

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 WIDTH_IN, HEIGHT_IN = 12.4, 7.2
 PANELS_IN = ((0.6, 1.0, 5.3, 5.3), (6.6, 1.0, 5.3, 5.3))
 """Left, bottom, width and height of the panels."""
+NARROWEST = "#D55E00"
+"""Colour of a place that is too small to halve."""
 LEAST_SIZE, GREATEST_SIZE = 8.0, 60.0
 """Of the dots: their area grows with the share of the deployment space that is open there."""
 NAMED = 3
@@ -73,7 +75,7 @@ def _panel(
     for number, place in enumerate(verdict.open_places):
         dots = view.project(place.points_lps)
         size = LEAST_SIZE + (GREATEST_SIZE - LEAST_SIZE) * place.share / max(largest, 1e-300)
-        colour = style.AIM if place.narrowest else style.TUBE
+        colour = NARROWEST if place.narrowest else style.TUBE
         axes.scatter(dots[:, 0], dots[:, 1], s=size, c=colour, lw=0, zorder=7)
         if number < NAMED:
             middle = dots.mean(axis=0)
@@ -102,7 +104,7 @@ def _legend(verdict: ReachVerdict) -> list[Line2D]:
     if any(not place.narrowest for place in verdict.open_places):
         handles.append(dot(style.TUBE, "not looked at to the end"))
     if any(place.narrowest for place in verdict.open_places):
-        handles.append(dot(style.AIM, "a part too small to halve is open"))
+        handles.append(dot(NARROWEST, "a part too small to halve is open"))
     handles += [
         Line2D(
             [],
@@ -113,6 +115,6 @@ def _legend(verdict: ReachVerdict) -> list[Line2D]:
         for n, place in enumerate(verdict.open_places[:NAMED])
     ]
     handles.append(
-        Line2D([], [], marker="o", ls="none", mfc="none", mec=style.NODULE, mew=2.0, ms=8, label="target")
+        Line2D([], [], marker="o", ls="none", mfc="none", mec=style.TARGET, mew=2.0, ms=8, label="target")
     )
     return handles

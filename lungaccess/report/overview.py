@@ -121,7 +121,7 @@ def _legend_entries(layers: Layers, plan: Plan) -> list[Line2D | Patch]:
         *([Line2D([], [], color=style.NEEDLE, lw=3, label="needle")] if plan.needle is not None else []),
         Line2D([], [], color=style.INK, lw=0.9, ls=(0, (3, 2)), label="required clearance"),
         Line2D([], [], ls="none", marker="D", mfc="white", mec=style.INK, label="exit"),
-        Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.NODULE, mew=2, label="target"),
+        Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.TARGET, mew=2, label="target"),
     ]
     if plan.aim is not None:
         entries.append(Line2D([], [], ls="none", marker="x", ms=7, mec=style.AIM, mew=2, label="aim"))

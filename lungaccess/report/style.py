@@ -13,13 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from anatomy.io.files import atomic_write
+from lungaccess.report.colours import DEVICE_COLOURS
 
-# Okabe and Ito's palette: distinct with every common colour vision, and in grey by lightness.
-SCOPE = "#0072B2"
-TUBE = "#E69F00"
-NEEDLE = "#111111"
+# Mostly Okabe and Ito's palette: distinct with every common colour vision, and in grey by lightness.
+SCOPE, TUBE, NEEDLE, TARGET, AIM = (
+    str(DEVICE_COLOURS[name]) for name in ("scope", "outer", "needle", "target", "aim")
+)
 NODULE = "#009E73"
-AIM = "#D55E00"
 AIRWAY = "#6FA8CC"
 LUMEN = "#DCEBF5"
 VESSEL = "#C4717A"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.needle import StartRegion
 
 
-SURFACES_VERSION = 2
+SURFACES_VERSION = 3
 STEPS = 65535
 SMOOTHINGS = 6
 SHRINK, GROW = 0.5, -0.53
@@ -74,7 +74,7 @@ LOOKS = (
         most_faces=200_000,
     ),
     Look(
-        key="nodule", name="Nodules", colour="#009E73", opacity=0.9, shown=True, cell_mm=0.6, most_faces=8_000
+        key="nodule", name="Nodules", colour="#009E73", opacity=0.5, shown=True, cell_mm=0.6, most_faces=8_000
     ),
 )  # fmt: skip
 

@@ -188,6 +188,7 @@ export function openPage(page) {
     },
     slice: (raster) => page.image.source && page.image.source.slice(raster),
     pick: (x, y, options) => page.scene.pick(x, y, options),
+    project: (point) => page.scene.project(point),
     ...(page.data.breath && {
       breathe: (phase) => {
         page.breathe(phase);

@@ -6,10 +6,10 @@ export const DEVICE_COLOURS = {
   "middle": "#EDB42E",
   "inner": "#F4C95D",
   "needle": "#D81B60",
-  "needle_with_room": "#F48FB1",
+  "needle_with_room": "#DDA0F0",
   "target": "#39E0B0",
   "aim": "#FFD23F",
-  "others": ["#56B4E9", "#7B3FA0", "#8A6D3B", "#4F7F2A", "#6B6B6B"]
+  "others": ["#56B4E9", "#F0E442", "#5B3A8E", "#4F7F2A", "#6B6B6B"]
 };
 
 // Lengths in mm of the bands of plans beside the first, so that they differ without their colours, too.

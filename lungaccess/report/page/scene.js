@@ -8,7 +8,7 @@ import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
 export const SCOPE_HALF_ANGLE = (48 * Math.PI) / 180;
-const RIM = 0.55, DARK_GAIN = 1.4, DARK_FAINT_GAIN = 2.6, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
+const RIM = 0.55, FAINT_GAIN = 1.7, DARK_GAIN = 1.4, DARK_FAINT_GAIN = 3.2, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
 const INSIDE = "inside";
 const NO_CUT = [0, 0, 0, 0];
 const OUTLINE_PX = 1.2;
@@ -255,8 +255,11 @@ export class Scene {
   putTogether(view, background, scale) {
     const gl = this.gl, { program, places } = this.programs.together(...view.counts);
     const dark = Math.max(...background) < 0.3;
-    // On a dark ground a surface has to be denser to be seen as well, and what is faint most of all.
-    const gain = (opacity) => (dark ? (opacity < FAINTEST ? DARK_FAINT_GAIN : DARK_GAIN) : 1);
+    // On a dark ground a surface has to be denser to be seen as well, and what is faint most of all;
+    // that does not step back before what is near the focus.
+    const isFocused = this.focus && this.focused;
+    const gain = (opacity) => (opacity < FAINTEST
+      ? (dark ? DARK_FAINT_GAIN : FAINT_GAIN) / (isFocused ? FAR_DENSE : 1) : dark ? DARK_GAIN : 1);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.disable(gl.DEPTH_TEST);
@@ -273,7 +276,7 @@ export class Scene {
     const looks = new Float32Array(4 * MOST_SLICES);
     view.shown.forEach(([, { colour, opacity }], n) => looks.set([...colour, gain(opacity) * opacity], 4 * n));
     gl.uniform4fv(places.looks, looks);
-    gl.uniform3fv(places.dense, this.focus && this.focused ? [FAR_DENSE, NEAR_DENSE - FAR_DENSE, RIM] : [1, 0, RIM]);
+    gl.uniform3fv(places.dense, isFocused ? [FAR_DENSE, NEAR_DENSE - FAR_DENSE, RIM] : [1, 0, RIM]);
     gl.uniform3fv(places.background, background);
     gl.uniform3fv(places.ink, dark ? [0, 0, 0] : [0.1, 0.12, 0.14]);
     gl.uniform1f(places.outline, Math.max(Math.round(OUTLINE_PX * scale), 1));

@@ -3,7 +3,7 @@ import { add, cross, dot, minus, times } from "./vectors.js";
 
 const LEAST_MM = 8, MOST_MM = 600;
 const WHEEL_PX = 60, ZOOM_PER_PX = 0.0015;
-const CLICK_PX = 5;
+const TAP_PX = 5;
 // A dragged pixel of the page changes level and width by so much of the width, but at least by so many HU.
 const WINDOW_SHARE = 0.004, LEAST_WINDOW_HU = 1;
 const SHIFTS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0], PageUp: [0, 0, -1], PageDown: [0, 0, 1] };
@@ -137,7 +137,7 @@ export class SliceViews {
       return;
     }
     const now = [event.clientX, event.clientY], [dx, dy] = [now[0] - finger.last[0], now[1] - finger.last[1]];
-    if (Math.hypot(now[0] - finger.first[0], now[1] - finger.first[1]) > CLICK_PX) finger.far = true;
+    if (Math.hypot(now[0] - finger.first[0], now[1] - finger.first[1]) > TAP_PX) finger.far = true;
     const other = [...this.fingers.entries()].find(([id]) => id !== event.pointerId);
     if (other) {
       const apart = (at) => Math.hypot(at[0] - other[1].last[0], at[1] - other[1].last[1]) || 1;

@@ -8,6 +8,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from lungaccess.report import style
+from lungaccess.report.colours import DEVICE_COLOURS
 from lungaccess.report.html import document
 
 # Linear RGB as people without one kind of cone see it [Machado2009, severity 1].
@@ -35,18 +37,44 @@ def lab(colour: str, vision: np.ndarray) -> np.ndarray:
     return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
+CHARTS = ["#3A9BD5", "#D81B60", "#B8860B", "#785EF0"]
 COLOURS_TOGETHER = {
-    "devices": ("plan.js", ["#0072B2", "#E69F00", "#D81B60"]),
-    "clearance of the needle": ("motion.js", ["#D81B60", "#56B4E9"]),
-    "devices in slices": ("plan.js", ["#3FA9E8", "#E69F00", "#FF4081"]),
-    "charts": ("plan.js", ["#3A9BD5", "#D81B60", "#B8860B", "#785EF0"]),
+    "devices": [DEVICE_COLOURS[name] for name in ("scope", "outer", "needle")],
+    "clearance of the needle": [
+        DEVICE_COLOURS[name] for name in ("scope", "outer", "needle", "needle_with_room")
+    ],
+    "marks": [DEVICE_COLOURS[name] for name in ("needle", "target", "aim")],
+    "plans beside each other": [DEVICE_COLOURS["needle"], *DEVICE_COLOURS["others"][:3]],
+    "charts": CHARTS,
 }
+SAME_EVERYWHERE = (
+    "slices.js",
+    "bronchoscopy.js",
+    "plan.js",
+    "no_plan.js",
+    "plan.html",
+    "no_plan.html",
+    "style.css",
+)
+
+
+def test_pictures_have_the_colours_of_pages_and_no_page_has_others() -> None:
+    assert tuple(DEVICE_COLOURS[name] for name in ("scope", "outer", "needle", "target", "aim")) == (
+        style.SCOPE,
+        style.TUBE,
+        style.NEEDLE,
+        style.TARGET,
+        style.AIM,
+    )
+    # Colours that devices had where they were stated for each place by itself.
+    for name in SAME_EVERYWHERE:
+        assert not re.search("#3FA9E8|#FF4081|#1fb88c", document.asset(name), re.IGNORECASE), name
+    assert all(colour in document.asset("plan.js") for colour in CHARTS)
 
 
 @pytest.mark.parametrize("vision", VISIONS)
 def test_colours_are_told_apart_by_every_vision(vision: str) -> None:
-    for name, (module, colours) in COLOURS_TOGETHER.items():
-        assert all(colour in document.asset(module) for colour in colours), name
+    for name, colours in COLOURS_TOGETHER.items():
         for one, other in combinations(colours, 2):
             gap = np.linalg.norm(lab(one, VISIONS[vision]) - lab(other, VISIONS[vision]))
             assert gap > 20.0, (name, one, other)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from anatomy import structures
 from anatomy.lung import Lung
@@ -16,7 +17,7 @@ from lungaccess.breathing.moving import Moving
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import volumes
-from tests.lungaccess.report import browser
+from tests.lungaccess.report import browser, made_scene
 from tests.lungaccess.report.pages import make_reach, plan_file, reach_file
 
 pytestmark = [
@@ -35,6 +36,22 @@ let red = 0, blue = 0;
 for (let n = 0; n < d.length; n += 4) { red += d[n]; blue += d[n + 2]; }
 return [4 * red / d.length, 4 * blue / d.length]"""
 LUMEN = (14, 58, 87)
+PROJECT = "return window.lungaccessReport.project(arguments[0])"
+LABELS = "return [...document.querySelectorAll('#scene-labels > span')].map((e) => e.textContent)"
+POINTER = """const c = document.getElementById('scene'), at = c.getBoundingClientRect();
+const send = (kind) => c.dispatchEvent(new PointerEvent(kind, { pointerId: 1, bubbles: true,
+  clientX: at.x + arguments[0], clientY: at.y + arguments[1] }));
+c.setPointerCapture = () => {};"""
+POINT = f"{POINTER} send('pointermove');"
+CLICK = f"{POINTER} send('pointerdown'); send('pointerup');"
+LUNGS_ALONE = """const c = document.getElementById('scene'), found = [];
+for (let x = 3; x < c.clientWidth; x += 17) for (let y = 3; y < c.clientHeight; y += 17) {
+  const hit = window.lungaccessReport.pick(x, y);
+  if (hit && hit.hits.every((each) => each.key === 'lung')) found.push([x, y]);
+}
+return found"""
+SLIDE = """const s = document.getElementById(arguments[0]);
+s.value = arguments[1]; s.dispatchEvent(new Event('input'))"""
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +129,12 @@ def test_keys_move_slider_and_view(page: browser.Browser) -> None:
     assert after["yaw"] < before["yaw"]
     assert after["pitch"] > before["pitch"]
     assert after["distance"] < before["distance"]
+    page.press("#scene", "f")
+    assert page.state()["view"]["distance"] == before["distance"]
     page.press("#scene", "0")
+    assert page.state()["view"]["distance"] > 1.5 * before["distance"]
+    page.run("document.querySelector('button[data-fit=plan]').click()")
+    page.frame()
     assert page.state()["view"] == before
 
 
@@ -145,6 +167,161 @@ def test_switches_show_and_hide(page: browser.Browser) -> None:
         # Without waiting for a picture of it: each takes seconds where the processor draws.
         page.run("document.querySelector(`input[data-key='${arguments[0]}']`).click()", key)
     assert page.run(PICTURE, 1, "scene") == before
+
+
+def test_the_first_view_fits_the_plan(page: browser.Browser, plans: tuple[Plan, ...]) -> None:
+    """Tubes and needle are in it, and large."""
+    page.run("document.querySelector('button[data-fit=plan]').click(); window.lungaccessReport.set(1)")
+    curves = plans[0].curves()
+    points = np.concatenate([each.points_lps for each in curves.present[1:]])
+    width, height = page.run(
+        "const c = document.getElementById('scene'); return [c.clientWidth, c.clientHeight]"
+    )
+    places = np.array([page.run(PROJECT, point.tolist()) for point in points[:: max(len(points) // 40, 1)]])
+    assert (places > 0).all()
+    assert (places < [width, height]).all()
+    assert np.linalg.norm(np.ptp(places, axis=0)) > 0.3 * min(width, height)
+
+
+def test_pointing_names_what_is_there_and_how_far_from_the_needle(
+    page: browser.Browser, plans: tuple[Plan, ...]
+) -> None:
+    page.run("window.lungaccessReport.set(1)")
+    plan = plans[0]
+    target = np.array(plan.target_lps)
+    x, y = page.run(PROJECT, target.tolist())
+    found = page.run("return window.lungaccessReport.pick(arguments[0], arguments[1])", x, y)
+    # The balls of target and nodule, and the needle in them: of 1.6 mm, and its near side is hit.
+    solid = next(each for each in found["hits"] if each["kind"] == "solid")
+    assert solid["key"] in ("target", "needle")
+    assert np.linalg.norm(np.array(solid["point"]) - target) < 2.5
+    page.run(POINT, x, y)
+    page.frame()
+    words = page.run("return document.getElementById('pointed').textContent")
+    name, needle, far = words.split(" · ")
+    assert name == {"target": "Target", "needle": "Needle", "nodule": "Nodules"}[found["key"]]
+    assert far == f"{np.linalg.norm(np.array(found['point']) - target):.1f} mm to the target"
+    axis = plan.curves().needle.points_lps
+    assert float(needle.split()[0]) == pytest.approx(
+        np.linalg.norm(axis - np.array(found["point"]), axis=1).min(), abs=0.3
+    )
+    # The keyboard's way: what is in the middle.
+    page.press("#scene", "\ue007")
+    middle = page.run("return document.getElementById('scene-words').textContent")
+    picked = page.run(
+        "const c = document.getElementById('scene'); "
+        "return window.lungaccessReport.pick(c.clientWidth / 2, c.clientHeight / 2)"
+    )
+    assert (middle == "Nothing there") is (picked is None)
+    page.press("#scene", "\ue00c")
+
+
+def test_two_clicks_measure(page: browser.Browser, plans: tuple[Plan, ...]) -> None:
+    page.run("window.lungaccessReport.set(1); document.getElementById('measure').click()")
+    needle = plans[0].curves().needle.points_lps
+    ends = [needle[len(needle) // 5], needle[-1]]
+    points = []
+    for end in ends:
+        x, y = page.run(PROJECT, end.tolist())
+        page.run(CLICK, x, y)
+        page.frame()
+        points.append(
+            page.run("return window.lungaccessReport.pick(arguments[0], arguments[1])", x, y)["point"]
+        )
+    words = page.run("return document.getElementById('scene-words').textContent")
+    length, along = (float(part.split(" mm")[0]) for part in words.split("; "))
+    # Within the radii of what was hit: the needle is drawn thicker than it is, the target is a ball.
+    assert length == pytest.approx(np.linalg.norm(ends[1] - ends[0]), abs=2.5)
+    assert along == pytest.approx(
+        np.linalg.norm(np.diff(needle[len(needle) // 5 :], axis=0), axis=1).sum(), abs=2.5
+    )
+    labels = page.run(
+        "return [...document.querySelectorAll('#scene-labels > span')].map((e) => e.textContent)"
+    )
+    assert f"{length:.1f} mm" in labels
+    assert "measure" in page.state()["solids"]
+    page.press("#scene", "\ue00c")
+    assert "measure" not in page.state()["solids"]
+    assert page.run("return document.getElementById('measure').getAttribute('aria-pressed')") == "false"
+
+
+def test_the_cut_goes_through_the_needle_and_faces_the_viewer(
+    page: browser.Browser, plans: tuple[Plan, ...]
+) -> None:
+    before = page.run(PICTURE, 1, "scene")
+    needle = plans[0].curves().needle.points_lps
+    page.run("document.getElementById('cut').click()")
+    for offset in (0, 12):
+        page.run(SLIDE, "cut-offset", str(offset))
+        for turn in ("ArrowLeft", "ArrowUp"):
+            page.press("#scene", turn)
+            page.run("window.lungaccessReport.set(1)")
+            *normal, level = page.state()["view_tools"]["cut"]
+            assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-6)
+            for end in (needle[0], needle[-1]):
+                assert np.dot(normal, end) + level == pytest.approx(offset, abs=0.02)
+    assert page.run("return document.getElementById('cut-words').textContent") == "12 mm before it"
+    assert page.run(PICTURE, 1, "scene") != before
+    page.run("document.getElementById('cut').click()")
+    page.run(SLIDE, "cut-offset", "0")
+    page.press("#scene", "f")
+    page.run("document.querySelector('button[data-view=front]').click()")
+
+
+def test_what_is_near_can_be_brought_out_or_not(page: browser.Browser) -> None:
+    before = page.run(PICTURE, 1, "scene")
+    page.run("document.getElementById('focus').click()")
+    assert page.run(PICTURE, 1, "scene") != before
+    page.run("document.getElementById('focus').click()")
+    assert page.run(PICTURE, 1, "scene") == before
+
+
+def test_pictures_and_films_are_saved(page: browser.Browser, tmp_path: Path) -> None:
+    page.command("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+    page.run("document.getElementById('save-picture').click()")
+    picture = wait_for_file(page, tmp_path, ".png")
+    image = Image.open(picture)
+    shown = page.run("const c = document.getElementById('scene'); return [c.clientWidth, c.clientHeight]")
+    assert image.size[0] >= shown[0] and image.size[0] / image.size[1] == pytest.approx(
+        shown[0] / shown[1], abs=0.01
+    )
+    assert np.ptp(np.asarray(image.convert("L"))) > 100
+    for kind in ("turn", "deployment"):
+        page.run(CHOOSE, "film-kind", kind)
+        page.run("document.getElementById('save-film').click()")
+        for _ in range(3):
+            page.frame()
+        assert page.run("return document.getElementById('save-film').textContent") == "Stop film"
+        page.run("document.getElementById('save-film').click()")
+        film = wait_for_file(page, tmp_path, ".webm")
+        assert film.read_bytes()[:4] == b"\x1a\x45\xdf\xa3"
+        assert film.stat().st_size > 1000
+        film.unlink()
+    assert page.run("return document.getElementById('save-film').textContent") == "Save film"
+    assert page.messages() == []
+
+
+def wait_for_file(page: browser.Browser, folder: Path, ending: str) -> Path:
+    """Return the file of a download when it is complete."""
+    for _ in range(600):
+        found = [each for each in folder.iterdir() if each.suffix == ending]
+        if found and found[0].stat().st_size:
+            return found[0]
+        page.frame()
+    raise AssertionError(f"no {ending} was saved")
+
+
+def test_several_plans_have_numbers_and_styles(page: browser.Browser) -> None:
+    page.run("window.lungaccessReport.set(1)")
+    assert page.run(LABELS) == []
+    page.run("document.querySelector(`input[data-key='plan-1']`).click(); window.lungaccessReport.set(1)")
+    assert page.run(LABELS) == ["0", "1"]
+    assert "plan 1" in page.state()["solids"]
+    swatches = page.run(
+        "return [0, 1].map((n) => document.querySelector(`[data-key='plan-${n}'] + .swatch`).style.background)"
+    )
+    assert swatches[0] != swatches[1]
+    page.run("document.querySelector(`input[data-key='plan-1']`).click(); window.lungaccessReport.set(1)")
 
 
 def test_another_plan_can_be_followed(page: browser.Browser, plans: tuple[Plan, ...]) -> None:
@@ -276,7 +453,7 @@ def test_the_breath_plays_and_is_held(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.breathe(1)")
 
 
-def test_a_phone_needs_no_sideways_scrolling_and_a_dark_page_is_dark(file: Path) -> None:
+def test_a_phone_needs_no_sideways_scrolling_and_a_dark_page_is_dark_and_shows_lungs(file: Path) -> None:
     with browser.Browser(390, 844, phone=True, dark=True) as phone:
         phone.open(file)
         assert phone.messages() == []
@@ -289,6 +466,36 @@ def test_a_phone_needs_no_sideways_scrolling_and_a_dark_page_is_dark(file: Path)
         assert small == []
         colour = phone.run("return getComputedStyle(document.body).backgroundColor")
         assert max(int(part) for part in re.findall(r"\d+", colour)) < 60
+        seen = contrasts_of_lungs(phone)
+        assert np.quantile(seen, 0.1) > 1.2
+        assert np.median(seen) > 1.3
+
+
+def test_lungs_stand_out_from_a_light_ground(page: browser.Browser) -> None:
+    seen = contrasts_of_lungs(page)
+    page.run("document.querySelector('button[data-fit=plan]').click()")
+    assert np.quantile(seen, 0.1) > 1.05
+    assert np.median(seen) > 1.08
+
+
+def contrasts_of_lungs(page: browser.Browser) -> list[float]:
+    """Return the contrast of the ground and of places of the lungs with nothing else before or behind."""
+    page.run("document.querySelector('button[data-fit=all]').click()")
+    page.run("document.querySelector('button[data-view=front]').click(); window.lungaccessReport.set(1)")
+    found = page.run(LUNGS_ALONE)
+    picture = made_scene.decoded(page.run(PICTURE, 1, "scene"))
+    scale = picture.shape[1] / page.run("return document.getElementById('scene').clientWidth")
+    seen = [contrast(picture[int(y * scale), int(x * scale)], picture[2, 2]) for x, y in found]
+    assert len(seen) > 20
+    return seen
+
+
+def contrast(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the contrast of two colours, 0 to 255, as WCAG 2 defines it."""
+    srgb = np.stack([one, other]) / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    light = linear @ [0.2126, 0.7152, 0.0722]
+    return float((light.max() + 0.05) / (light.min() + 0.05))
 
 
 def test_the_map_opens_and_its_slices_follow_the_sliders(small_lung: Lung, tmp_path: Path) -> None:

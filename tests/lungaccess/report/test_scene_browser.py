@@ -100,14 +100,12 @@ def test_nothing_depends_on_the_order_in_which_structures_were_added(page: brows
 
 def test_plates_are_blended_from_back_to_front(page: browser.Browser) -> None:
     """Against the blending of each layer over those behind it, computed here; two layers of one body, too."""
-    looks = [
-        (30.0, RED, 0.4, "a"),
-        (10.0, BLUE, 0.5, "b"),
-        (-10.0, GREEN, 0.3, "c"),
-        (-30.0, RED, 0.4, "a"),
-    ]
+    looks = [(30.0, RED, 0.4, "a"), (10.0, BLUE, 0.5, "b"), (-10.0, GREEN, 0.3, "c"), (-30.0, RED, 0.4, "a")]
     red = trimesh.util.concatenate(
-        [trimesh.creation.box([60.0, 4.0, 60.0]).apply_translation([0.0, 2.0 - d, 0.0]) for d in (30.0, -30.0)]
+        [
+            trimesh.creation.box([60.0, 4.0, 60.0]).apply_translation([0.0, 2.0 - d, 0.0])
+            for d in (30.0, -30.0)
+        ]
     )
     surfaces = [body(red, "a", RED, 0.4), plate(10.0, "b", BLUE, 0.5), plate(-10.0, "c", GREEN, 0.3)]
     picture = shown(page, surfaces, camera((0.0, -1.0, 0.0)))
@@ -219,7 +217,11 @@ def test_ten_thousand_points_are_painted_and_picked(page: browser.Browser) -> No
     open_ones = []
     for n in nearest_first[:400]:
         others = np.linalg.norm(pixels - pixels[n], axis=1)
-        if ((others < 8.0) & (away < away[n])).any() or not (5 < pixels[n]).all() or not (pixels[n] < 295).all():
+        if (
+            ((others < 8.0) & (away < away[n])).any()
+            or not (pixels[n] > 5).all()
+            or not (pixels[n] < 295).all()
+        ):
             continue
         open_ones.append(n)
     assert len(open_ones) > 40

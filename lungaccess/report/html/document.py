@@ -13,14 +13,9 @@ from anatomy.io.files import write_text
 from lungaccess.report.pack import script_text
 
 SHARED_MODULES = (
-<<<<<<< HEAD
-    "decode.js", "vectors.js", "colours.js", "surfaces.js", "shaders.js", "layers.js", "picking.js", "solids.js",
-    "scene.js", "orbit.js", "voxels.js", "slices.js", "slice_views.js", "slice_panel.js", "structures.js",
-    "view_tools.js", "anatomy_page.js",
-=======
     "decode.js", "vectors.js", "colours.js", "surfaces.js", "shaders.js", "layers.js", "picking.js",
-    "solids.js", "scene.js", "orbit.js", "slices.js", "structures.js", "view_tools.js", "anatomy_page.js",
->>>>>>> a1ee0578ef7b4982c6fca058eb00c89a46a50ffb
+    "solids.js", "scene.js", "orbit.js", "voxels.js", "slices.js", "slice_views.js", "slice_panel.js",
+    "structures.js", "view_tools.js", "anatomy_page.js",
 )  # fmt: skip
 TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
 """Looks at the target; for `scene_figure`."""

@@ -93,12 +93,12 @@ def test_ct_bytes_say_the_hounsfield_units(small_lung: Lung, plans: tuple[Plan, 
     slope, middle = np.array([9.0, -8.0, 6.5]), lps.reshape(-1, 3).mean(axis=0)
     ramp = Volume(grid=grid, array=((lps - middle) @ slope + 100.0).astype(np.float32))
     near = deployment.device_points(plans[0])
-    assert HU_OF_BYTE.shape == (256,)
+    assert volumes.HU_OF_BYTE.shape == (256,)
     for packed in volumes.ct_volumes(ramp, small_lung, near):
         array, centres = voxels(packed)
         inner = tuple(slice(3, -3) for _ in range(3))
         wanted = (centres[inner] - middle) @ slope + 100.0
-        found = HU_OF_BYTE[array[inner]]
+        found = volumes.HU_OF_BYTE[array[inner]]
         for low, high, step in ((-1024, -200, 8), (-200, 300, 5), (300, 1548, 24)):
             within = (wanted > low + 50) & (wanted < high - 50)
             assert within.any()

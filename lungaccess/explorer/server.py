@@ -21,7 +21,7 @@ from anatomy.records import frozen_value
 from lungaccess.explorer.messages import error_message, frame
 from lungaccess.explorer.questions import CANCEL, MOST_CHARACTERS, number_of, read_message
 from lungaccess.explorer.workers import NAMES, Asked, Ended, Given, KeptPlan, PatientSource, Process
-from lungaccess.report.html.document import filled, scene_figure
+from lungaccess.report.html.document import filled, scene_figure, slice_controls
 
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24
@@ -34,6 +34,10 @@ FOLDERS = {"explorer": "lungaccess.explorer", "report": "lungaccess.report"}
 """Packages whose folder `page` holds modules and style sheets, by the first part of their addresses."""
 KINDS = {".js": "text/javascript", ".css": "text/css"}
 PAGE = "explorer.html"
+REACH = (
+    '<label><input type="checkbox" id="reach-slices"> reach in the slices</label>'
+    '<label><input type="checkbox" id="reach-scene"> reach in 3-D</label>'
+)
 CLICKS = "; a click chooses a nodule, a painted exit, or the place in the plane through the cross"
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -318,8 +322,9 @@ def asset_names(folder: str) -> frozenset[str]:
 
 
 def index_text() -> str:
-    """Return the page itself, with the figure of the 3-D view that all pages have."""
-    return filled(page_text("explorer", PAGE), {"scene": scene_figure(more_notes=CLICKS)})
+    """Return the page itself, with what it shares with the pages of reports."""
+    parts = {"scene": scene_figure(more_notes=CLICKS), "slice_controls": slice_controls(more=REACH)}
+    return filled(page_text("explorer", PAGE), parts)
 
 
 def page_text(folder: str, name: str) -> str:

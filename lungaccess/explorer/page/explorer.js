@@ -1,13 +1,13 @@
 // The page of the explorer: what is asked, what is shown, and how both follow from the address.
 import { AnatomyPage, byId, openPage } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
-import { unpackVolume } from "../report/decode.js";
 import { Motion } from "../report/motion.js";
 import { STANDARD, VoxelImage } from "../report/slices.js";
 import { ballAround, sideOf } from "../report/orbit.js";
 import { oncePerFrame } from "../report/structures.js";
 import { alongLine } from "../report/surfaces.js";
-import { add, minus, mix, norm, rgb, times, unit } from "../report/vectors.js";
+import { minus, mix, norm, rgb, unit } from "../report/vectors.js";
+import { placedVolume } from "../report/voxels.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
 import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
@@ -21,9 +21,10 @@ import { Tips } from "./tips.js";
 import { WhatIfPanel } from "./what_if.js";
 import { errorWords, fillRows, lpsText, made, mm, placeWords } from "./widgets.js";
 
-const NORMALS = { axial: 2, coronal: 1, sagittal: 0 };
-const PLAY_S = 12, MOST_STEP_S = 0.25, STEP_MM = 1;
-const KEPT_PLANS = 30;
+const PLAY_S = 12, MOST_STEP_S = 0.25;
+const KEPT_PLANS = 30, REST_MS = 250;
+// Answers that come soon, and are shown before a better picture is drawn.
+const SOON = ["exits", "plan", "place", "appraise"];
 const NEAR_NODULE_MM = 25, SCOPE_POINTS = 16, AROUND_PLAN_MM = 12;
 
 class ExplorerPage extends AnatomyPage {
@@ -31,6 +32,7 @@ class ExplorerPage extends AnatomyPage {
     super({ structures: [], breath: null });
     this.plans = new Map();
     this.asking = {};
+    this.awaited = 0;
     this.times = {};
     this.exits = this.tips = this.reach = this.motion = null;
     this.targetLps = null;
@@ -40,7 +42,6 @@ class ExplorerPage extends AnatomyPage {
     this.redraw = () => later(mark({ scene: true, slices: true }));
     this.redraw.now = () => later.now(mark({ scene: true, slices: true }));
     this.redrawScene = () => later(mark({ scene: true }));
-    this.redrawSlices = () => later(mark({ slices: true }));
     // At once, and as coarsely as a slow machine draws what moves.
     this.redrawFast = () => this.show("moving", mark({ slices: true }));
   }
@@ -59,11 +60,15 @@ class ExplorerPage extends AnatomyPage {
     this.follow();
   }
 
-  // On a slow machine the finest pictures would keep answers waiting: they are for those that are saved.
+  // On a slow machine a picture takes seconds and would keep answers waiting: it gets better when all have come, and the
+  // finest are only saved.
   show(quality) {
     this.stale.scene = true;
     super.show(quality);
-    if (this.scene && this.scene.slow && quality === "rest") clearTimeout(this.better);
+    if (!this.scene || !this.scene.slow || this.tools.recording) return;
+    clearTimeout(this.better);
+    const later = () => (this.awaited ? (this.better = setTimeout(later, REST_MS)) : this.show("rest"));
+    if (quality === "moving") this.better = setTimeout(later, REST_MS);
   }
 
   say(words) {
@@ -82,10 +87,13 @@ class ExplorerPage extends AnatomyPage {
     const number = (this.asking[name] || 0) + 1;
     this.asking[name] = number;
     const isLatest = () => this.asking[name] === number;
+    const counts = SOON.includes(name) ? 1 : 0;
+    this.awaited += counts;
     const last = await this.connection.ask(name, values, (message) => {
       if (!isLatest()) return null;
       return message.answer === "progress" ? this.showProgress(message) : part(message);
     }).done;
+    this.awaited -= counts;
     if (!isLatest()) return { answer: "superseded" };
     this.showProgress(null);
     return last;
@@ -109,7 +117,7 @@ class ExplorerPage extends AnatomyPage {
     byId("warnings").replaceChildren(...facts.warnings.map((words) => made("li", {}, words)));
     byId("nodule").replaceChildren(new Option(facts.targets.length ? "choose" : "none", ""), ...facts.targets.map(({ text, lobe }) =>
       new Option(lobe ? `${text}, ${lobe}` : text, text)));
-    this.place = [...(facts.targets[0] ? facts.targets[0].lps_mm : facts.carina_lps)];
+    this.start = [...(facts.targets[0] ? facts.targets[0].lps_mm : facts.carina_lps)];
     this.state = new State(facts.first_system, () => this.follow());
     this.whatIfPanel = new WhatIfPanel(facts, this.state);
     this.planPanel = new PlanPanel(this);
@@ -125,14 +133,15 @@ class ExplorerPage extends AnatomyPage {
     this.image = image;
     byId("ct-controls").hidden = !image.hasCt;
     this.openSlices();
-    this.connectSlices();
     byId("reach-slices").checked = !image.hasCt;
-    this.redraw();
   }
 
   async takeStructures(structures) {
     this.structures = structures;
-    if (await this.openScene((size) => (1.05 * Math.max(...size)) / Math.tan((15 * Math.PI) / 180) / 2 + size[1] / 2)) {
+    const isOpen = await this.openScene((size) => (1.05 * Math.max(...size)) / Math.tan((15 * Math.PI) / 180) / 2 + size[1] / 2);
+    this.linkSlices({ placed: () => this.describe(), picked: (place) => this.chooseTarget(lpsText(place)) });
+    this.views.lookAt(this.start);
+    if (isOpen) {
       this.orbit.changed = this.redrawScene;
       connectPointer(this);
     }
@@ -148,7 +157,7 @@ class ExplorerPage extends AnatomyPage {
     });
     byId("nodule").addEventListener("change", (event) => event.target.value && this.chooseTarget(event.target.value));
     byId("cross-target").addEventListener("click", () => this.chooseTarget(lpsText(this.place)));
-    for (const id of ["field", "window", "tint", "reach-slices"]) byId(id).addEventListener("change", this.redrawSlices);
+    byId("reach-slices").addEventListener("change", () => this.redrawSlices());
     byId("reach-scene").addEventListener("change", () => this.showReach());
     byId("exits-by").addEventListener("change", () => this.showExits());
     byId("tip-back").addEventListener("click", () => this.moveTip(-1));
@@ -165,37 +174,15 @@ class ExplorerPage extends AnatomyPage {
     this.whatIfPanel.connect();
   }
 
-  connectSlices() {
-    for (const [name, slice] of Object.entries(this.slices)) {
-      const slider = byId(`through-${name}`), axis = NORMALS[name];
-      [slider.min, slider.max] = [Math.ceil(this.facts.low_lps[axis]), Math.floor(this.facts.high_lps[axis])];
-      slider.addEventListener("input", () => this.moveTo(this.place.map((value, n) => (n === axis ? Number(slider.value) : value))));
-      slice.canvas.addEventListener("keydown", (event) => this.sliceKey(event, name));
-    }
-    this.followClicks();
-    for (const slice of Object.values(this.slices)) slice.canvas.addEventListener("click", () => this.chooseTarget(lpsText(this.place)));
+  // Where the cross is.
+  get place() {
+    return this.views ? this.views.place : this.start;
   }
 
-  sliceKey(event, name) {
-    const plane = STANDARD[name], step = event.shiftKey ? 10 * STEP_MM : STEP_MM;
-    const normal = [0, 0, 0];
-    normal[NORMALS[name]] = 1;
-    const moves = {
-      ArrowLeft: times(plane.right, -step), ArrowRight: times(plane.right, step), ArrowUp: times(plane.up, step),
-      ArrowDown: times(plane.up, -step), PageUp: times(normal, step), PageDown: times(normal, -step),
-    };
-    if (moves[event.key]) this.moveTo(add(this.place, moves[event.key]));
-    else if (event.key === "Enter") this.chooseTarget(lpsText(this.place));
-    else return;
-    event.preventDefault();
-  }
-
-  // Move the cross, and say what is there.
+  // Look at a place in all slices, and say what is there.
   moveTo(place) {
-    const { low_lps: low, high_lps: high } = this.facts;
-    this.place = place.map((value, axis) => Math.min(Math.max(value, low[axis]), high[axis]));
-    this.redrawSlices();
-    for (const [name, axis] of Object.entries(NORMALS)) byId(`through-${name}`).value = this.place[axis];
+    this.views.lookAt(place);
+    this.showCross();
     this.describe();
   }
 
@@ -350,8 +337,7 @@ class ExplorerPage extends AnatomyPage {
   takeTarget(lps) {
     if (this.targetLps && norm(minus(this.targetLps, lps)) < 1e-6) return;
     this.targetLps = [...lps];
-    this.place = [...lps];
-    this.moveTo(this.place);
+    this.moveTo(lps);
     if (this.scene) showTarget(this.scene, lps);
     this.fitImage(lps);
   }
@@ -359,7 +345,9 @@ class ExplorerPage extends AnatomyPage {
   // Fetch fine voxels around a point.
   fitImage(around) {
     this.latest("image", { around }, async ({ image }) => {
-      const [labels, ct] = await Promise.all([unpackVolume(image.labels[0]), image.ct ? unpackVolume(image.ct[0]) : null]);
+      const [labels, ct] = await Promise.all([
+        placedVolume(image.labels[0]), image.ct ? placedVolume(image.ct[0], image.hounsfield) : null,
+      ]);
       this.image.labels[1] = labels;
       if (ct) this.image.ct[1] = ct;
       this.redrawSlices();
@@ -529,12 +517,12 @@ class ExplorerPage extends AnatomyPage {
     }
     const { scene, slices } = this.stale;
     this.stale = { scene: false, slices: false };
-    if (scene && this.scene && this.orbit) {
+    if (scene && this.scene && this.orbit && this.views) {
       this.drawDevices(state);
       this.scene.fit();
       this.drawScene();
     }
-    if (slices && this.slices) this.drawSlices(state);
+    if (slices && this.views) this.drawSlices();
     byId("reach-key").hidden = !byId("reach-slices").checked && !byId("reach-scene").checked;
     if (!byId("reach-key").childElementCount && this.facts) this.listReachKey();
   }
@@ -557,14 +545,10 @@ class ExplorerPage extends AnatomyPage {
     showCompared(this.scene, this.compared.shown, MOST_COMPARED, this.orbit.distance);
   }
 
-  drawSlices(state) {
-    this.image.tint = byId("tint").checked;
-    this.image.setWindow(byId("window").value);
+  drawSlices() {
     this.image.overlay = byId("reach-slices").checked && this.reach ? this.reach.painter() : null;
-    const lines = [...comparedLines(this.compared.shown), ...(state ? deviceLines(this.motion, state) : [])];
-    const marks = { lines, target: this.targetLps, cross: this.place };
-    const width = Number(byId("field").value);
-    for (const [name, plane] of Object.entries(STANDARD)) this.slices[name].draw(plane, this.place, width, marks);
+    const of = this.motion ? deviceLines(this.motion, this.motion.at(this.position)) : [];
+    this.views.draw(STANDARD, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps });
   }
 
   // What a test may read.

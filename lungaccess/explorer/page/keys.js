@@ -6,8 +6,8 @@ const KEYS = [
   ["n", "next nodule or target"], ["e / Shift e", "next or previous exit: plan from it"], ["[ and ]", "scope tip back and forward: plan from there"],
   ["x", "exit and tip free again"], ["k", "keep the plan to compare"], ["v", "look at the plan"], ["p", "play the deployment"],
   ["Ctrl Z, Ctrl Shift Z", "undo and redo"], ["?", "this help"],
-  ["in a slice: arrows, page up and down", "move the cross; shift for 10 mm"], ["in a slice: Enter", "make the cross the target"],
-  ["in 3-D: arrows, + and -, 0, f", "turn, zoom, all from the front, the plan; shift moves"], ["in 3-D: Enter, m", "name what is in the middle, measure from there"],
+  ["in a slice: arrows, page up and down", "move the cross by a voxel; shift moves the pictures"], ["in a slice: Enter, or a click", "make the place the target"],
+  ["in 3-D: arrows, + and -, 0, f", "turn, zoom, all from the front, the plan; shift moves"], ["in 3-D: Enter, m, c", "name what is in the middle, measure from there, put the cross there"],
 ];
 
 export function connectHelp() {

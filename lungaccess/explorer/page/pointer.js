@@ -75,8 +75,9 @@ export function connectPointer(page) {
     const { kind, value } = dragged;
     dragged = null;
     page.preview(null);
-    if (value === null || event.type === "pointercancel") return;
-    if (kind === "exit") page.chooseExit(value);
+    if (event.type === "pointercancel") return;
+    if (value === null) page.pickAt(place(event));
+    else if (kind === "exit") page.chooseExit(value);
     else page.state.set({ tip: value, exit: null });
   };
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, letGo);

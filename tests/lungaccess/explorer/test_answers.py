@@ -36,10 +36,10 @@ def plain(text: str) -> dict[str, Any]:
 async def fetched(explorer: Explorer, link: str) -> bytes:
     address = explorer.address
     assert address is not None
-    async with aiohttp.ClientSession(headers={"Cookie": f"{address.cookie}={address.token}"}) as session:
-        async with session.get(address.origin + link) as answer:
-            assert answer.status == 200 and answer.headers["Content-Disposition"].startswith("attachment")
-            return await answer.read()
+    sent = {"Cookie": f"{address.cookie}={address.token}"}
+    async with aiohttp.ClientSession(headers=sent) as session, session.get(address.origin + link) as answer:
+        assert answer.status == 200 and answer.headers["Content-Disposition"].startswith("attachment")
+        return await answer.read()
 
 
 def test_a_click_its_plan_its_files_and_the_command(

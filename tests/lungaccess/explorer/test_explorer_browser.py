@@ -1,4 +1,4 @@
-"""The page in a real browser: what a user does, by mouse and by keys, and what the page asks of the network."""
+"""The page in a real browser: what a user does, by mouse and by keys, and what it asks of the network."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ pytestmark = [
     pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there"),
 ]
 PLANNED = "s.plan && s.plan.final && s.plan.appraised"
+CONTROLS = (
+    "return [...document.querySelectorAll('button, input, select, canvas[tabindex]')]"
+    ".filter((e) => e.checkVisibility())"
+)
 HOSTILE = '<img src=x onerror="document.title=1">'
 
 
@@ -109,11 +113,10 @@ def page(served: Served) -> Iterator[Page]:
         window.target(TARGET)
         yield window
         assert window.messages() == [], "after all tests: no message on the console"
-        hosts = {
-            url.split("/")[2]
-            for url in window.requests()
-            if not url.startswith(("data:", "blob:", "about:", "chrome:"))
-        }
+        asked = [
+            url for url in window.requests() if not url.startswith(("data:", "blob:", "about:", "chrome:"))
+        ]
+        hosts = {url.split("/")[2] for url in asked}
         assert hosts == {f"127.0.0.1:{served.address.port}"}, "nothing is asked of anything else"
 
 
@@ -155,14 +158,16 @@ def test_a_click_in_3d_chooses_an_exit_and_a_drag_moves_it(page: Page) -> None:
     if state["exits"]["count"] < 2:
         pytest.skip("this target has one place of exit")
     first, second = page.run(
-        "const p = window.lungaccessExplorer; return [0, p.exits.count - 1].map((n) => p.scene.project(p.exits.places[n]))"
+        "const { exits, scene } = window.lungaccessExplorer;"
+        "return [0, exits.count - 1].map((n) => scene.project(exits.places[n]))"
     )
     page.press_at("scene", *first)
-    chosen = page.wait(f"s.asked.exit !== null && {PLANNED}")
+    chosen = page.wait(f"s.asked.exit !== null && s.exits && {PLANNED}")
     assert chosen["asked"]["exit"] in chosen["exits"]["entries"]
     assert "no command" in page.text("command-note")
     page.pointer("mousePressed", "scene", *page.run(
-        "const p = window.lungaccessExplorer; return p.scene.project(p.exits.places[p.exits.numberOf(p.state.asked.exit)])"
+        "const { exits, scene, state } = window.lungaccessExplorer;"
+            "return scene.project(exits.places[exits.numberOf(state.asked.exit)])"
     ))  # fmt: skip
     page.pointer("mouseMoved", "scene", *second)
     page.pointer("mouseReleased", "scene", *second)
@@ -180,9 +185,8 @@ def test_keys_step_through_exits_and_tips_and_undo_brings_all_back(page: Page) -
         atol=1e-3,
     )
     page.press("body", "[")
-    tip = page.wait(
-        "s.asked.tip !== null && (s.plan && s.plan.final || !document.getElementById('no-plan').hidden)"
-    )
+    ended = "(s.plan && s.plan.final || !document.getElementById('no-plan').hidden)"
+    tip = page.wait(f"s.asked.tip !== null && {ended}")
     assert tip["asked"]["exit"] is None and tip["points"]["tip"] == 1
     page.run("history.back()")
     back = page.wait(f"s.asked.exit !== null && s.asked.tip === null && {PLANNED}")
@@ -211,10 +215,8 @@ def test_what_if_renews_reach_and_plan_and_names_the_file_of_the_command(page: P
     page.wait("document.getElementById('what-if-error').textContent !== ''")
     assert "at least 5" in page.text("what-if-error")
     page.click("reset")
-    assert (
-        page.wait(f"s.plan && s.plan.system === 'ultrathin' && {PLANNED}")["plan"]["digest"]
-        == before["plan"]["digest"]
-    )
+    again = page.wait(f"s.plan && s.plan.system === 'ultrathin' && {PLANNED}")
+    assert again["plan"]["digest"] == before["plan"]["digest"]
 
 
 def test_plans_are_compared_removed_and_kept_in_the_address(page: Page, served: Served) -> None:
@@ -293,13 +295,12 @@ def test_keys_move_the_cross_and_enter_makes_it_the_target(page: Page) -> None:
 
 def test_every_control_has_a_name_and_can_have_the_focus(page: Page) -> None:
     unnamed = page.run(
-        "return [...document.querySelectorAll('button, input, select, canvas[tabindex]')].filter((e) => e.offsetParent)"
-        ".filter((e) => !(e.getAttribute('aria-label') || e.ariaLabel || e.textContent.trim() || (e.labels && e.labels.length)))"
+        CONTROLS + ".filter((e) => !(e.ariaLabel || e.textContent.trim() || (e.labels && e.labels.length)))"
         ".map((e) => e.outerHTML)"
     )
     assert unnamed == []
     lost = page.run(
-        "return [...document.querySelectorAll('button, input, select, canvas[tabindex]')].filter((e) => e.offsetParent && !e.disabled)"
+        CONTROLS + ".filter((e) => !e.disabled)"
         ".filter((e) => { e.focus(); return document.activeElement !== e; }).map((e) => e.outerHTML)"
     )
     assert lost == []

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
         separated_plans,
         with_front,
     )
+    from lungaccess.coupled.exits import FeasibleExits, feasible_exits
     from lungaccess.coupled.explanation import explain
-    from lungaccess.coupled.feasible_exits import FeasibleExits, feasible_exits
     from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
     from lungaccess.coupled.planner import METHODS, ProgressEvent, atlas_event, plan
     from lungaccess.coupled.presets import (

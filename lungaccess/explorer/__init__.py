@@ -9,6 +9,6 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.explorer.questions import WhatIf
     from lungaccess.explorer.server import Address, Explorer
-    from lungaccess.explorer.workers import PatientSource
+    from lungaccess.explorer.worker import PatientSource
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

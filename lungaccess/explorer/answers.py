@@ -21,7 +21,7 @@ from lungaccess.explorer import questions as ask
 from lungaccess.explorer.changed_system import plan_command, system_of
 from lungaccess.explorer.patient import image_parts, patient_facts, scene_parts, target_of
 from lungaccess.explorer.questions import WhatIf
-from lungaccess.explorer.workers import Asked, KeptPlan, Part, PatientSource, Turn
+from lungaccess.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
@@ -54,7 +54,7 @@ class Answers:
         self._reached: dict[tuple[Any, ...], Int] = {}
 
     def parts(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
-        """Answer a question; see `lungaccess.explorer.workers.Answering`."""
+        """Answer a question; see `lungaccess.explorer.worker.Answering`."""
         answer = getattr(self, f"_{asked.name}")
         yield from answer(asked, turn)
 

@@ -14,7 +14,7 @@ from anatomy.errors import LungaccessError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.typed import Float
-from lungaccess.explorer.workers import PatientSource
+from lungaccess.explorer.worker import PatientSource
 from lungaccess.problem import System, Target, load_system, nodule_target, preset_names, resolve_target
 from lungaccess.report.html.meshes import structure_meshes
 from lungaccess.report.html.volumes import CODES, page_image, read_ct

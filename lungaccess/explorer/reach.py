@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from anatomy.lung import Lung
 from anatomy.typed import Int
 from lungaccess.coupled import Atlas
-from lungaccess.explorer.workers import Part, Turn
+from lungaccess.explorer.worker import Part, Turn
 from lungaccess.problem import System
 from lungaccess.reachability import KINDS, ReachStream
 

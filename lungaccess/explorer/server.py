@@ -19,8 +19,9 @@ from aiohttp import WSMsgType, web
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.records import frozen_value
 from lungaccess.explorer.messages import error_message, frame
+from lungaccess.explorer.processes import NAMES, Process
 from lungaccess.explorer.questions import CANCEL, MOST_CHARACTERS, number_of, read_message
-from lungaccess.explorer.workers import NAMES, Asked, Ended, Given, KeptPlan, PatientSource, Process
+from lungaccess.explorer.worker import Asked, Ended, Given, KeptPlan, PatientSource
 from lungaccess.report.html.document import filled, scene_figure, slice_controls
 
 HOST = "127.0.0.1"

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from lungaccess.coupled import (
         Alternative,
         Atlas,
+        FeasibleExits,
         alternatives,
         build_atlas,
+        feasible_exits,
         open_atlas,
         plan,
         plan_for_window,
@@ -51,8 +53,10 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
     from lungaccess.plans.window import BreathingWindow
     from lungaccess.problem import (
+        Place,
         System,
         Target,
+        describe_place,
         load_patient,
         load_system,
         peripheral_targets,

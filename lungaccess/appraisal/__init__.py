@@ -11,5 +11,6 @@ if TYPE_CHECKING:
     from lungaccess.appraisal.grade import Grade, grade_of_chance
     from lungaccess.appraisal.headline import Geometry, Headline
     from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
+    from lungaccess.appraisal.record import plan_record
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

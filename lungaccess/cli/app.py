@@ -47,6 +47,7 @@ from lungaccess.cli.commands.study import study
 from lungaccess.cli.commands.template import template
 from lungaccess.cli.commands.tour import tour
 from lungaccess.cli.commands.tubes import tubes
+from lungaccess.cli.commands.view import view
 from lungaccess.cli.commands.window import window
 from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXIT_CODES, START_PAGE, epilogue
 from lungaccess.cli.exit_code import ExitCode
@@ -95,7 +96,7 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 for _command in (
     plan, needle, replan, stream, certify, check, info, presets, template, phantom, demo, advise,
     alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report,
-    export, insert, doctor, completion,
+    view, export, insert, doctor, completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 app.command(study)

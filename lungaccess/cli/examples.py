@@ -17,6 +17,7 @@ EXAMPLES = MappingProxyType(
         "plan": "lungaccess plan PATIENT --nodule --budget 5 --out plan",
         "check": "lungaccess check plan/plan.json PATIENT",
         "report": "lungaccess report plan/plan.json PATIENT",
+        "view": "lungaccess view PATIENT --no-browser",
         "steps": "lungaccess steps plan/plan.json PATIENT",
         "risk": "lungaccess risk plan/plan.json PATIENT --samples 2000",
         "window": "lungaccess window plan/plan.json PATIENT",

@@ -226,7 +226,7 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     display = SearchDisplay(search.time_s, search.iterations, request.made_small or "cost")
     best, history = run_search(lung, target, request, display)
     # After the search: the first plan does not wait for these.
-    from lungaccess.appraisal import appraise
+    from lungaccess.appraisal import appraise, plan_record
     from lungaccess.breathing.window import with_window
 
     found = best.plan if best.plan.window is not None else with_window(best.plan, lung)
@@ -243,7 +243,7 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
             system=system_of(found, request.systems),
             target_lps=target.lps_mm,
         )
-    record = plan_tables.plan_record(found, lung, appraisal, request.out, request.files)
+    record = plan_record(found, lung, appraisal, request.out, request.files)
     write_text(request.out / SUMMARY_FILE, terminal.json_text(record))
     if not request.output.json:
         show_plan(found, lung, appraisal)

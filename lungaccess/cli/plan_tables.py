@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.panel import Panel
@@ -25,35 +24,6 @@ if TYPE_CHECKING:
 
 GRADE_STYLES = {Grade.GOOD: "green", Grade.FAIR: "yellow", Grade.UNKNOWN: "yellow", Grade.POOR: "red"}
 MARKS = {True: Text("ok", "green"), False: Text("refused", "bold red"), None: Text("not checked", "yellow")}
-
-
-def plan_record(
-    plan: Plan, lung: Lung, appraisal: Appraisal, folder: Path, files: tuple[str, ...]
-) -> dict[str, Any]:
-    """Return what a command that planned found and wrote; lengths in mm, times in s."""
-    from lungaccess.plans.costs import known_costs
-    from lungaccess.plans.scope_steps import motion_record
-
-    return {
-        "found": True,
-        **appraisal.to_mapping(),
-        "refusals": [each.to_mapping() for each in appraisal.check.refusals],
-        "not_checked": [each.name for each in appraisal.check.unchecked],
-        "folder": str(folder),
-        "files": list(files),
-        "digest": plan.digest,
-        "objective": plan.objective,
-        "cost": plan.cost,
-        "cost_bound": plan.cost_bound or None,
-        "gap": plan.gap,
-        "costs": known_costs(plan.costs, has_map=lung.cost is not None),
-        "system": plan.system.name,
-        "system_choice": list(plan.system_choice),
-        "clearance_mm": {device: dict(values) for device, values in plan.clearance_mm.items()},
-        "iterations": plan.iterations,
-        "timing": dict(plan.timing),
-        "scope_motion": motion_record(plan, lung),
-    }
 
 
 def no_plan_record(failure: NoPlan) -> dict[str, Any]:

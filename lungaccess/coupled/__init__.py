@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.coupled.atlas import Atlas, build_atlas
+    from lungaccess.coupled.atlas import Atlas, atlas_part, build_atlas
     from lungaccess.coupled.atlas_measures import tip_clearances_mm, tube_stability
     from lungaccess.coupled.atlas_store import open_atlas
     from lungaccess.coupled.counterfactuals import (
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         separated_plans,
         with_front,
     )
+    from lungaccess.coupled.exits import FeasibleExits, feasible_exits
     from lungaccess.coupled.explanation import explain
     from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
     from lungaccess.coupled.planner import METHODS, ProgressEvent, atlas_event, plan

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.typed import Float, Int
 from lungaccess.problem.channel import bends_with_tubes_rad
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
@@ -70,6 +73,15 @@ def require_same(atlas: Atlas, lung: Lung, system: System) -> None:
             expected=f"one for {lung.name} and {wanted.name}, with the same masks, scope, tubes and margins",
             remedy="Make it with build_atlas(lung, system)",
         )
+
+
+def atlas_part(atlas: Atlas, entries: Int) -> Atlas:
+    """Return an atlas with some of the deployments of another, by their numbers `(N,)`.
+
+    A search over it begins from these alone: a plan from a chosen exit, or from a chosen tip of the scope.
+    """
+    found = atlas.deployments.only(np.asarray(entries, dtype=np.int64))
+    return replace(atlas, deployments=found, index=StartIndex(found.positions, found.tangents))
 
 
 def motions_of(lung: Lung, system: System, spacing_mm: float = TIP_SPACING_MM) -> ScopeMotions:

@@ -13,6 +13,9 @@ from stages.scope import ScopeMotion
 PASSING_STEP_MM = 0.25
 """Spacing of the points of a body that are taken as a polyline to find where it passes a place."""
 
+SHOWN_STEP_MM, SHOWN_TURN_RAD = 1.0, 0.06
+"""Largest advance and turn between two states of a motion that is shown or told."""
+
 
 def scope_insertion(
     motion: ScopeMotion, tree: AirwayTree, tree_point: int, min_lumen_margin_mm: float
@@ -50,6 +53,11 @@ def scope_motion(plan: Plan) -> ScopeMotion:
         states=plan.scope.states,
         bending_length_mm=plan.system.scope.bending_length_mm,
     )
+
+
+def shown_motion(plan: Plan) -> ScopeMotion:
+    """Return the motion of a plan's bronchoscope with so many states that a film of them is smooth."""
+    return scope_motion(plan).between(SHOWN_STEP_MM, SHOWN_TURN_RAD)
 
 
 def _branches_to(tree: AirwayTree, branch: int) -> list[int]:

@@ -11,7 +11,9 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
-from lungaccess.plans.insertion import scope_motion
+from lungaccess.plans.bifurcations import route_bifurcations
+from lungaccess.plans.clock_face import STRAIGHT_AHEAD, clock_hour
+from lungaccess.plans.insertion import scope_motion, shown_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion
@@ -20,8 +22,6 @@ MERGED_RAD = math.radians(8.0)
 """States are merged while an even motion is so near to them: hands are not steadier [assumption]."""
 AHEAD_MM = 12.0
 """Where the way goes on is told by the place of the tip after so much more advance: about a branch on."""
-STRAIGHT_RAD = math.radians(4.0)
-"""What lies nearer to the middle of the picture is straight ahead."""
 ROUNDED_MM, ROUNDED_DEG = 0.5, 0.5
 """What is smaller is written as 0."""
 STILL = np.linspace(0.0, 1.0, 33)
@@ -145,6 +145,9 @@ def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
             one.as_json() | {"branch_in_words": lung.branch_words(one.branch)}
             for one in scope_steps(scope_motion(plan), lung.tree)
         ],
+        "bifurcations": [
+            one.as_json() for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)
+        ],
         "states": [
             {"advance_mm": float(a), "twist_deg": float(t), "bend_deg": float(b)}
             for a, t, b in zip(advance, twist, bend, strict=True)
@@ -180,8 +183,5 @@ def _is_even(states: Float) -> bool:
 def _goes_on(tips: Float, advance: Float, state: int) -> str:
     """Say where in the picture of a state the tip will be after some more advance."""
     later = min(int(np.searchsorted(advance, advance[state] + AHEAD_MM)), len(tips) - 1)
-    up, right, ahead = tips[state, :3, :3].T @ (tips[later, :3, 3] - tips[state, :3, 3])
-    if math.atan2(math.hypot(up, right), ahead) < STRAIGHT_RAD:
-        return "straight ahead"
-    hour = round(math.degrees(math.atan2(right, up)) / 30.0) % 12
-    return f"towards {hour or 12} o'clock in the picture"
+    hour = clock_hour(tips[state], tips[later, :3, 3])
+    return f"towards {hour} o'clock in the picture" if hour else STRAIGHT_AHEAD

@@ -9,6 +9,7 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.problem.patients import load_organ, load_patient
     from lungaccess.problem.peripheral import peripheral_targets
+    from lungaccess.problem.place import Place, describe_place
     from lungaccess.problem.preset_order import (
         Invasiveness,
         invasiveness,

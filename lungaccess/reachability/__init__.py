@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         map_reach,
         reach_grid,
     )
+    from lungaccess.reachability.reach_stream import STREAM_SPACING_MM, ReachPart, ReachStream
     from lungaccess.reachability.regions import Regions, lung_regions
     from lungaccess.reachability.unreachable import MOST_BOXES, ReachVerdict, UnreachableProof
     from lungaccess.reachability.voxel_plan import plan_to_voxel

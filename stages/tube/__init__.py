@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     )
     from stages.tube.equilibrium import Equilibrium
     from stages.tube.errors import ConvergenceError
+    from stages.tube.exits import exit_points
     from stages.tube.following import DeployedSequence, SnapError, deploy
     from stages.tube.inverse import inverse_kinematics
     from stages.tube.kernels import DesignArrays, ManyShapes, ShapeArrays, TubeEnvironment

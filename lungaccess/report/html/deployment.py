@@ -14,7 +14,9 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
-from lungaccess.plans.insertion import scope_motion
+from lungaccess.plans.bifurcations import route_bifurcations
+from lungaccess.plans.insertion import SHOWN_STEP_MM, shown_motion
+from lungaccess.plans.tip_section import tip_sections
 from lungaccess.report.pack import Packed, pack
 from stages.needle import Objective
 from stages.scope import ScopeMotion
@@ -31,8 +33,8 @@ TUBE_POINTS = 40
 """Points of a stored shape: 1 to 2 mm apart on tubes of a usual length, too near to see the corners."""
 SCOPE_SHOWN_MM = 15.0
 """Length of the scope behind its tip that a view of the devices shows: about its bending section."""
-CAMERA_STEP_MM, CAMERA_TURN_RAD = 1.0, 0.06
-"""Largest advance and turn between two states of the scope; the page interpolates between them."""
+MM_PER_STEP = 0.01
+"""Of a stored distance across the lumen."""
 SECTION_POINTS = 12
 """Points of a stored bending section: 1 to 2 mm apart."""
 CAP_MM = 15.0
@@ -57,7 +59,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.track_radius_mm,
         },
-        "scope": _scope(plan),
+        "scope": _scope(plan, lung),
         "tubes": _tubes(plan),
         "needle": _needle(plan),
         "profile": profile(plan, lung),
@@ -74,17 +76,22 @@ def device_points(plan: Plan) -> Float:
     return np.concatenate([scope.points_lps[near], *(curve.points_lps for curve in others)])
 
 
-def _scope(plan: Plan) -> Packed:
-    """Return the scope in its states: tips, where the camera is, sections, and the shaft behind them."""
-    moving = dense_motion(plan)
+def _scope(plan: Plan, lung: Lung) -> Packed:
+    """Return the scope in its states: tips, where the camera is, sections, the shaft, what is free around the tip.
+
+    "bifurcations" are those of the route, each with how far the scope has moved when it stands before it.
+    """
+    moving = shown_motion(plan)
     tips, length = moving.tips, moving.bending_length_mm
     back = np.linspace(-length, 0.0, SECTION_POINTS)
     bends = moving.states[:, 2] / length
     sections = [poses_on_arc(tip, 0.0, bend, back)[:, :3, 3] for tip, bend in zip(tips, bends, strict=True)]
-    shaft, shaft_mm = poses_on_pieces(moving.lps_from_entry, moving.pieces[:-1], CAMERA_STEP_MM)
+    shaft, shaft_mm = poses_on_pieces(moving.lps_from_entry, moving.pieces[:-1], SHOWN_STEP_MM)
+    moved = moved_mm(moving)
+    around = tip_sections(lung, tips, plan.system.scope.radius_mm)
     return {
         "points": pack(tips[:, :3, 3], "f4"),
-        "arc_length_mm": pack(moved_mm(moving), "f4"),
+        "arc_length_mm": pack(moved, "f4"),
         "forward": pack(tips[:, :3, 2], "f4"),
         "up": pack(tips[:, :3, 0], "f4"),
         "inserted_mm": pack(moving.states[:, 0] + length, "f4"),
@@ -92,12 +99,17 @@ def _scope(plan: Plan) -> Packed:
         "shaft": pack(shaft[:, :3, 3], "f4"),
         "shaft_mm": pack(shaft_mm, "f4"),
         "from_carina_mm": float(plan.scope.length_from_carina_mm),
+        "border_step_mm": MM_PER_STEP,
+        "border": pack(np.rint(around.border_mm / MM_PER_STEP).astype(np.uint16), "u2"),
+        "gap_mm": pack(around.gap_mm, "f4"),
+        "nearest": pack(around.nearest, "u1"),
+        "depth_gap_mm": pack(around.depth_gap_mm, "f4"),
+        "bifurcations": [
+            one.as_json()
+            | {"moved_mm": float(moved[one.state]), "entered_mm": float(moved[one.entered_state])}
+            for one in route_bifurcations(moving, plan.scope.branches, lung)
+        ],
     }
-
-
-def dense_motion(plan: Plan) -> ScopeMotion:
-    """Return the motion of the scope with so many states that a film of them is smooth."""
-    return scope_motion(plan).between(CAMERA_STEP_MM, CAMERA_TURN_RAD)
 
 
 def moved_mm(motion: ScopeMotion) -> Float:

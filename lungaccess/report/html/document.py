@@ -14,7 +14,8 @@ from lungaccess.report.pack import script_text
 
 SHARED_MODULES = (
     "decode.js", "vectors.js", "colours.js", "surfaces.js", "shaders.js", "layers.js", "picking.js",
-    "solids.js", "scene.js", "orbit.js", "slices.js", "structures.js", "view_tools.js", "anatomy_page.js",
+    "solids.js", "scene.js", "orbit.js", "voxels.js", "slices.js", "slice_views.js", "slice_panel.js",
+    "structures.js", "view_tools.js", "anatomy_page.js",
 )  # fmt: skip
 TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
 """Looks at the target; for `scene_figure`."""
@@ -51,6 +52,11 @@ def filled(template: str, parts: Mapping[str, str]) -> str:
 def scene_figure(*, more_views: str = "", more_notes: str = "") -> str:
     """Return the figure of the 3-D view, with further buttons and words as HTML."""
     return filled(asset("scene.html"), {"more_views": more_views, "more_notes": more_notes})
+
+
+def slice_controls(*, more: str = "") -> str:
+    """Return the controls of the slices, with further ones as HTML."""
+    return filled(asset("slices.html"), {"more": more})
 
 
 def write_page(

@@ -11,7 +11,8 @@ import numpy as np
 from anatomy.io.files import atomic_write
 from anatomy.structures import LUMEN
 from anatomy.typed import Array, Float, UInt8
-from lungaccess.report.html.deployment import dense_motion, moved_mm
+from lungaccess.plans.insertion import shown_motion
+from lungaccess.report.html.deployment import moved_mm
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -57,7 +58,7 @@ def bronchoscopy_webp(
     """
     from PIL import Image
 
-    lumen = SmoothLumen(lung, dense_motion(plan).tips[:, :3, 3])
+    lumen = SmoothLumen(lung, shown_motion(plan).tips[:, :3, 3])
     pictures = [Image.fromarray(view(lumen, pose, pixels)) for pose in camera_poses(plan, frames)]
     target = Path(path)
     with atomic_write(target) as temporary:
@@ -70,7 +71,7 @@ def bronchoscopy_webp(
 
 def camera_poses(plan: Plan, frames: int) -> list[Float]:
     """Return `lps_from_camera` (4, 4) at states of the scope, evenly along its motion; +z forward, -y up."""
-    moving = dense_motion(plan)
+    moving = shown_motion(plan)
     moved, tips = moved_mm(moving), moving.tips
     chosen = np.searchsorted(moved, np.linspace(0.0, moved[-1], max(frames, 1)))
     # The top of the picture is +x of the tip, its right +y.

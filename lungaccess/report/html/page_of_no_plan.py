@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.typed import Float
 from lungaccess.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.report.html import words
-from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, write_page
+from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
 from lungaccess.report.html.meshes import structure_meshes
 from lungaccess.report.html.volumes import page_image
 from lungaccess.report.pack import Packed, pack
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
 
 MODULES = ("no_plan.js",)
+PLACES = '<label>Through <select id="place"></select></label>'
+"""Places to which the cross of the slices can be put."""
 
 
 def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[str]) -> Path:
@@ -43,6 +45,7 @@ def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[s
         "title": words.text(f"No plan for {explanation.patient_name}"),
         "headline": words.text(explanation.headline),
         "advice": words.text(explanation.advice or "Nothing that was tried reaches the target"),
+        "slice_controls": slice_controls(more=PLACES),
         "scene": scene_figure(more_views=TARGET_BUTTON),
         "sections": sections_html(explanation),
         "reasons": _reasons(explanation),

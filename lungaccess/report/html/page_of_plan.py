@@ -19,12 +19,12 @@ from lungaccess.plans.chance import Chance
 from lungaccess.procedure import load_procedure, procedure_names
 from lungaccess.report.html import breathing, phase, tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
-from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, write_page
+from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
 from lungaccess.report.html.glance import glance_section
 from lungaccess.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.report.html.risk import risk_section
 from lungaccess.report.html.trade_off import CAPTION, trade_off_svg
-from lungaccess.report.html.volumes import page_image
+from lungaccess.report.html.volumes import image_words, page_image
 from lungaccess.risk import error_preset_names, load_errors
 
 if TYPE_CHECKING:
@@ -36,9 +36,11 @@ if TYPE_CHECKING:
     from lungaccess.risk import ErrorModel
     from stages.needle import StartRegion
 
-MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "breath.js", "plan.js")
+MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "plan.js")
 NO_REGION = "No safe start region"
 THICKER = "; seen from afar, devices are drawn thicker than they are"
+FOLLOW = '<label><input type="checkbox" id="follow" checked> follow the foremost tip</label>'
+"""Of the slices: whether they go with the devices, or with the cross."""
 
 
 @frozen_record
@@ -103,6 +105,7 @@ def plan_page(
     region = start_region_of(plan, lung) if first.accepted else "Not computed for a refused plan"
     drawn, told = (None, region) if isinstance(region, str) else (region, region.words)
     window = breathing.shown_window(plan, lung)
+    data = page_data(plans, appraisals, lung, chosen, drawn)
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
         "glance": glance_section(first),
@@ -114,7 +117,11 @@ def plan_page(
         "limits": tables.limits_section(first),
         "summary": summary(plan),
         "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),
-        "image_source": words.text(image_source(lung, chosen.ct_name if chosen.ct is not None else "")),
+        "image_source": words.text(
+            f"{image_source(lung, chosen.ct_name if chosen.ct is not None else '')}. "
+            f"The page holds {image_words(data)}"
+        ),
+        "slice_controls": slice_controls(more=FOLLOW),
         "made_small": words.text(made_small(plan).capitalize()),
         "plans": _plans_section(plans, appraisals),
         "key_numbers": tables.key_section(plan, lung),
@@ -125,7 +132,7 @@ def plan_page(
         "risk": risk_section(first.risk, told),
         "provenance": tables.provenance_section(plan, lung),
     }
-    return write_page(path, "plan.html", MODULES, page_data(plans, appraisals, lung, chosen, drawn), parts)
+    return write_page(path, "plan.html", MODULES, data, parts)
 
 
 def _plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.grid import Volume
 from lungaccess.report.html import words
-from lungaccess.report.html.document import scene_figure, write_page
+from lungaccess.report.html.document import scene_figure, slice_controls, write_page
 from lungaccess.report.html.meshes import Look, packed_surface, structure_meshes
 from lungaccess.report.html.volumes import page_image
 from lungaccess.report.pack import Packed, pack
@@ -53,6 +53,7 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
             f"Voxels of {first.kinds.grid.spacing_mm[0]:g} mm, each classified at its centre; "
             "not counted: outside the lung, in an obstacle"
         ),
+        "slice_controls": slice_controls(),
         "scene": scene_figure(),
         "volumes": volumes_section(maps),
         "systems": systems_section(maps),

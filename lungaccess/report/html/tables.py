@@ -163,7 +163,8 @@ def key_section(plan: Plan, lung: Lung) -> str:
 
 def instructions_section(plan: Plan, lung: Lung) -> str:
     """Return step by step how hands bring the scope to where the plan has its tip."""
-    from lungaccess.plans.insertion import scope_motion
+    from lungaccess.plans.bifurcations import route_bifurcations
+    from lungaccess.plans.insertion import scope_motion, shown_motion
     from lungaccess.plans.scope_steps import handle_words, scope_steps
 
     steps = scope_steps(scope_motion(plan), lung.tree)
@@ -173,7 +174,11 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
         "is as the scope enters the trachea, and inserted lengths count from there."
     )
     texts = [*(one.text for one in steps), handle_words(plan)]
-    return f"{words.steps(texts)}<p class='note'>{words.text(note)}</p>"
+    ways = [one.text for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)]
+    return (
+        f"<h3>Which way at each bifurcation</h3>{words.steps(ways)}"
+        f"<h3>With the hands</h3>{words.steps(texts)}<p class='note'>{words.text(note)}</p>"
+    )
 
 
 def provenance_section(plan: Plan, lung: Lung) -> str:

@@ -28,8 +28,12 @@ LEAST_COARSE_MM = 1.5
 """Finest voxels of the whole lung on a page, so that the page stays small."""
 AROUND_MM = 28.0
 """Border around the devices that is shown in fine voxels."""
-LOWEST_HU, HU_PER_STEP = -1350.0, 6.25
-"""A CT byte b stands for LOWEST_HU + HU_PER_STEP b: from -1350 to 244 HU."""
+HU_RANGES = ((-1024, 8), (-200, 5), (300, 24))
+"""From each HU on a CT is stored in steps of so many HU: coarse in lung and bone, fine in soft tissue."""
+HU_OF_BYTE: Int = np.concatenate(
+    [np.arange(low, stop, step) for (low, step), stop in zip(HU_RANGES, (-200, 300, 1548 + 1), strict=True)]
+)
+"""The HU for which each byte of a stored CT stands, `(256,)`, from -1024 to 1548."""
 MOST_CT_CHARACTERS = 8_500_000
 """Text of a stored CT at most: a page of 10 MB still opens at once and can be sent."""
 STORED_CT = ("ct.nii.gz", "ct.nii", "ct.nrrd", "ct.mha")
@@ -62,12 +66,27 @@ def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packe
     AnatomyError
         If the CT does not hold the devices.
     """
+    grid = lung.grid if ct is None else ct.grid
     return {
         "codes": CODES,
         "labels": label_volumes(lung, device_lps),
         "ct": None if ct is None else ct_volumes(ct, lung, device_lps),
-        "hounsfield": {"lowest": LOWEST_HU, "per_step": HU_PER_STEP},
+        "hounsfield": HU_OF_BYTE.tolist(),
+        "grid": {"shape": list(grid.shape), "lps_from_ijk": grid.lps_from_ijk.tolist()},
     }
+
+
+def image_words(image: Packed) -> str:
+    """Say how finely a page holds its voxels, and for a CT which values it can show."""
+    coarse, fine = (each["spacing_mm"] for each in image["ct"] or image["labels"])
+    held = f"voxels of {coarse:.1f} mm, of {fine:.1f} mm within {AROUND_MM:.0f} mm of the devices"
+    if image["ct"] is None:
+        return held
+    steps = "; ".join(
+        f"{step} HU from {low} to {stop} HU"
+        for (low, step), stop in zip(HU_RANGES, (*(low for low, _ in HU_RANGES[1:]), HU_OF_BYTE[-1]), strict=True)
+    )
+    return f"{held}, in steps of {steps}; what is beyond is shown as the first or last of these"
 
 
 def label_codes(lung: Lung, low: ArrayLike, high: ArrayLike) -> Volume:
@@ -185,8 +204,8 @@ def _ct_bytes(ct: Volume, grid: Grid) -> UInt8:
     part = np.asarray(ct.array[box], dtype=np.float32)
     if (size > 1).any():
         part = uniform_filter(part, tuple(size.tolist()), mode="nearest")
-    values = resampled(Volume(grid=ct.grid.crop(start, stop), array=part), grid, 1, LOWEST_HU)
-    return np.clip(np.rint((values - LOWEST_HU) / HU_PER_STEP), 0, 255).astype(np.uint8)
+    values = resampled(Volume(grid=ct.grid.crop(start, stop), array=part), grid, 1, float(HU_OF_BYTE[0]))
+    return np.searchsorted(0.5 * (HU_OF_BYTE[1:] + HU_OF_BYTE[:-1]), values).astype(np.uint8)
 
 
 def _packed(grid: Grid, values: ArrayLike, *, differences: bool = False) -> Packed:

@@ -2,6 +2,8 @@
 import { publishColours } from "./colours.js";
 import { Orbit } from "./orbit.js";
 import { Scene } from "./scene.js";
+import { SlicePanel } from "./slice_panel.js";
+import { SliceViews } from "./slice_views.js";
 import { Slice, STANDARD } from "./slices.js";
 import { addSwitch, connectViews, isOnScreen, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
 import { ViewTools } from "./view_tools.js";
@@ -128,6 +130,45 @@ export class AnatomyPage {
     this.slices = Object.fromEntries(names.map((name) => [name, new Slice(byId(`slice-${name}`), this.image)]));
   }
 
+  // Connect the slices with each other, with their controls and with the 3-D view; `drawSlices` draws them.  What is
+  // changed in them is drawn without the 3-D view.
+  linkSlices({ placed = () => {}, picked = () => {} } = {}) {
+    this.redrawSlices = oncePerFrame(() => this.drawSlices());
+    const moved = (place) => {
+      placed(place);
+      this.showCross();
+    };
+    this.views = new SliceViews(this.slices, this.image, {
+      changed: this.redrawSlices, moved, picked,
+      pointed: (place, name) => this.panel.describe(place, name), windowed: () => this.panel.showWindow(),
+    });
+    this.panel = new SlicePanel(document, this.views, (place) => this.distancesOf(place));
+    if (!this.scene) return;
+    const { canvas } = this.scene;
+    this.crossMark = document.createElement("span");
+    this.crossMark.className = "scene-cross";
+    this.crossMark.setAttribute("aria-hidden", "true");
+    canvas.parentNode.append(this.crossMark);
+    const take = (x, y) => {
+      const hit = this.scene.pick(x, y);
+      if (!hit) return;
+      this.views.lookAt(hit.point);
+      moved(hit.point);
+    };
+    canvas.addEventListener("dblclick", (event) => take(event.offsetX, event.offsetY));
+    canvas.addEventListener("keydown", (event) => {
+      if (event.key === "c") take(canvas.clientWidth / 2, canvas.clientHeight / 2);
+    });
+  }
+
+  // Show where the cross of the slices is in the 3-D view.
+  showCross() {
+    if (!this.crossMark) return;
+    const at = this.scene.project(this.views.place);
+    this.crossMark.hidden = !at;
+    if (at) this.crossMark.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px)`;
+  }
+
   // Let a click in a slice choose the place.
   followClicks() {
     for (const slice of Object.values(this.slices)) {
@@ -149,16 +190,18 @@ export class AnatomyPage {
     this.scene.draw(camera, sceneBackground());
     showEdges(byId("scene-figure"), this.orbit);
     if (this.tools) this.tools.afterDrawing();
+    this.showCross();
   }
 
   // What a test may read of every page.
   report() {
-    const { scene, slices } = this;
+    const { scene, slices, views } = this;
     return {
       structures: scene ? Object.fromEntries([...scene.surfaces].map(([key, s]) => [key, s.shown])) : {},
       triangles: scene ? [...scene.surfaces.values()].reduce((sum, s) => sum + s.count / 3, 0) : 0,
       gl_error: scene ? scene.gl.getError() : null,
       view_tools: scene ? { slow: scene.slow, cut: scene.cut, quality: scene.quality, points: [...scene.points.keys()] } : null,
+      slices: views ? { place_lps: views.place, centre_lps: views.centre, width_mm: views.widthMm, window: this.image.levels } : null,
       slice_edges: slices ? Object.fromEntries(Object.entries(slices).map(([key, s]) => [key, s.edges])) : {},
     };
   }
@@ -177,6 +220,7 @@ export function openPage(page) {
       page.moveTo(place);
       page.redraw.now();
     },
+    slice: (raster) => page.image.source && page.image.source.slice(raster),
     pick: (x, y, options) => page.scene.pick(x, y, options),
     project: (point) => page.scene.project(point),
     ...(page.data.breath && {

@@ -1,15 +1,18 @@
-// What the camera at the tip of the scope sees: the airway's surface from inside, and the devices ahead.
+// What the camera at the tip of the scope sees: the airway's surface from inside, the devices ahead, and which way to go.
+import { DEVICE_COLOURS } from "./colours.js";
+import { SCOPE_HALF_ANGLE } from "./scene.js";
 import { Solids } from "./solids.js";
-import { add, rgb, times } from "./vectors.js";
+import { add, cross, dot, minus, norm, rgb, times } from "./vectors.js";
 
-const COLOURS = { outer: "#E69F00", inner: "#F4C95D" };
 const ROOM_MM = 0.35;
+// Openings are named from so far on, and where they are not too near to the border of the round picture.
+const NAMED_MM = 45, NAMED_SHARE = 0.92;
+const TAKEN = "#7DF0B5", OTHER_WAY = "#F2F2F2";
 
 export class Bronchoscopy {
-  constructor(scene, canvas, caption) {
-    this.scene = scene;
-    this.canvas = canvas;
-    this.caption = caption;
+  // prompt: an element for the words of the bifurcation ahead, if there is one.
+  constructor(scene, canvas, caption, prompt = null) {
+    Object.assign(this, { scene, canvas, caption, prompt });
   }
 
   // Draw the view at a state of a motion.  The camera is beside the channel, within the scope.
@@ -18,11 +21,56 @@ export class Bronchoscopy {
     const aside = Math.min(Math.max(0.7 * radius.scope, radius.outer + ROOM_MM), 0.9 * radius.scope);
     const pose = { ...state.camera, eye: add(state.camera.eye, times(state.camera.up, aside)) };
     const solids = new Solids();
-    for (const key of ["outer", "inner"]) solids.tube(state[key], radius[key], rgb(COLOURS[key]));
+    for (const key of ["outer", "inner"]) solids.tube(state[key], radius[key], rgb(DEVICE_COLOURS[key]));
     solids.tube(state.needle, radius.needle, state.needleColours);
     this.scene.drawInside(pose, solids, this.canvas);
     const place = state.scopeMm - (motion.ends.scope - motion.plan.scope.from_carina_mm);
     const where = place < 0 ? `${(-place).toFixed(0)} mm above the carina` : `${place.toFixed(0)} mm beyond the carina`;
     this.caption.textContent = `Scope's tip ${where}`;
+    const ahead = state.stage === 0 ? bifurcationsAhead(motion, state) : [];
+    this.named = ahead.flatMap(({ openings }) => openings).filter((opening) => this.name(opening, pose));
+    if (this.prompt) this.say(ahead, state);
   }
+
+  say(ahead, { moved }) {
+    const words = ahead.map((each) => (each.moved_mm > moved ? `Ahead: ${each.text}` : each.text)).join(" ");
+    if (this.prompt.textContent !== words) this.prompt.textContent = words;
+  }
+
+  // Write the name of an opening onto it, and return whether it is in the picture.
+  name({ place_lps: place, label, taken, hour }, { eye, forward, up }) {
+    const away = minus(place, eye), depth = dot(away, forward), tangent = depth * Math.tan(SCOPE_HALF_ANGLE);
+    const [x, y] = [dot(away, cross(forward, up)) / tangent, dot(away, up) / tangent];
+    if (depth <= 0 || norm(away) > NAMED_MM || Math.hypot(x, y) > NAMED_SHARE) return false;
+    const pen = this.canvas.getContext("2d"), half = this.canvas.width / 2, at = [half * (1 + x), half * (1 - y)];
+    pen.strokeStyle = pen.fillStyle = taken ? TAKEN : OTHER_WAY;
+    pen.lineWidth = taken ? 5 : 2;
+    pen.beginPath();
+    pen.arc(...at, 13, 0, 2 * Math.PI);
+    pen.stroke();
+    pen.font = `${taken ? "bold " : ""}19px system-ui, sans-serif`;
+    pen.textBaseline = "middle";
+    const words = `${taken ? "→ " : ""}${label}${hour ? `, ${hour} h` : ""}`, width = pen.measureText(words).width;
+    const [low, high] = [half - Math.sqrt(half ** 2 - (at[1] - half) ** 2), half + Math.sqrt(half ** 2 - (at[1] - half) ** 2)];
+    const below = at[1] + (at[1] > 1.6 * half ? -26 : 26), left = Math.min(Math.max(at[0] - width / 2, low + 12), Math.max(high - width - 12, low + 12));
+    pen.textAlign = "left";
+    pen.lineWidth = 4;
+    pen.strokeStyle = "#000000";
+    pen.strokeText(words, left, below);
+    pen.fillText(words, left, below);
+    return true;
+  }
+}
+
+// Return on which place of the slider, in thousandths, the scope stands before each bifurcation of its route.
+export function pausesOf(motion) {
+  const whole = motion.routeMm[motion.routeMm.length - 1];
+  return motion.plan.scope.bifurcations.map(({ moved_mm: mm }) => Math.ceil((1000 * motion.starts[1] * mm) / whole - 1e-6));
+}
+
+// Return the bifurcations before which a state stands, or else the next one.
+export function bifurcationsAhead(motion, { moved, position }) {
+  const all = motion.plan.scope.bifurcations, ticks = pausesOf(motion), tick = Math.round(1000 * position);
+  const here = all.filter((each, n) => ticks[n] === tick || (each.moved_mm <= moved && moved < each.entered_mm));
+  return here.length ? here : all.filter((each) => each.moved_mm > moved).slice(0, 1);
 }

@@ -52,7 +52,7 @@ export class Motion {
     const flush = ends.outer * (starts[1] === starts[2] ? 1 : share[1]);
     const innerMm = share[2] > 0 ? ends.outer + (ends.inner - ends.outer) * share[2] : flush;
     const needleMm = ends.needle * share[3];
-    const state = { position, stage, scopeMm, outerMm: Math.min(flush, ends.outer), innerMm, needleMm };
+    const state = { position, stage, moved, scopeMm, outerMm: Math.min(flush, ends.outer), innerMm, needleMm };
     state.scope = this.body(moved, scopeMm);
     state.camera = this.camera(moved);
     [state.outer, state.middle, state.inner] = share[0] < 1 ? [[], [], []] : this.tube(innerMm);

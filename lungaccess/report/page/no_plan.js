@@ -37,7 +37,8 @@ class NoPlanPage extends AnatomyPage {
     this.image = await VoxelImage.of(this.data);
     this.listControls();
     this.openSlices();
-    this.followClicks();
+    this.linkSlices({ placed: (place) => super.moveTo(place) });
+    this.views.lookAt(this.place);
     this.draw();
   }
 
@@ -82,7 +83,11 @@ class NoPlanPage extends AnatomyPage {
     const places = [{ name: "the target", lps: this.data.target_lps }, ...this.data.places];
     places.forEach(({ name }, n) => byId("place").append(new Option(name, n)));
     byId("place").addEventListener("change", (event) => this.moveTo([...places[Number(event.target.value)].lps]));
-    byId("field").addEventListener("change", this.redraw);
+  }
+
+  moveTo(place) {
+    super.moveTo(place);
+    this.views.lookAt(place);
   }
 
   // Hand over only what was switched since the last picture.
@@ -109,12 +114,15 @@ class NoPlanPage extends AnatomyPage {
 
   draw() {
     if (this.scene) this.drawView();
-    if (!this.slices) return;
+    if (this.views) this.drawSlices();
+  }
+
+  drawSlices() {
     const lines = this.data.paths.flatMap(({ lines: curves, colour, radius_mm: radius }, n) =>
       (this.shown[`path ${n}`] ? curves.map((points) => ({ points, radius, colour })) : []));
-    const marks = { lines, target: this.data.target_lps, cross: this.place };
-    const width = Number(byId("field").value);
-    for (const [name, plane] of Object.entries(STANDARD)) this.slices[name].draw(plane, this.place, width, marks);
+    this.views.draw(STANDARD, { lines, target: this.data.target_lps });
+    this.panel.showField();
+    this.panel.describe();
     byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(1)).join(", ")} mm.`;
   }
 

@@ -1,17 +1,18 @@
 // The page of a plan.
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { Breath } from "./breath.js";
-import { Bronchoscopy } from "./bronchoscopy.js";
+import { bifurcationsAhead, Bronchoscopy, pausesOf } from "./bronchoscopy.js";
 import { lineChart } from "./charts.js";
 import { DEVICE_COLOURS, planStyle } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { Motion, STAGES } from "./motion.js";
-import { planeAcross, STANDARD, VoxelImage } from "./slices.js";
+import { bendOf, planeAcross, planeAlong, STANDARD, VoxelImage } from "./slices.js";
 import { ballAround, sideOf } from "./orbit.js";
 import { banded, Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
 import { alongLine } from "./surfaces.js";
-import { minus, mix, norm, rgb, unit } from "./vectors.js";
+import { TipSection } from "./tip_section.js";
+import { cross, dot, minus, mix, norm, rgb, unit } from "./vectors.js";
 
 const { scope: SCOPE, outer: OUTER, middle: MIDDLE, inner: INNER, needle: NEEDLE, target: TARGET, aim: AIM } = DEVICE_COLOURS;
 const DEVICES = [
@@ -35,6 +36,7 @@ const CHART = {
 const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
 const PLAY_S = 14, BREATH_S = 5, MOST_STEP_S = 0.25;
 const LEAST_WIDTH = 0.0016;
+const MOST_ACROSS_MM = 60;
 const TARGET_MM = 1.6, AIM_MM = 1.1;
 
 class PlanPage extends AnatomyPage {
@@ -65,8 +67,10 @@ class PlanPage extends AnatomyPage {
     }
     this.image = await VoxelImage.of(this.data);
     this.image.breath = this.breath;
-    this.openSlices([...Object.keys(STANDARD), "across"]);
-    byId("ct-controls").hidden = !this.image.hasCt;
+    this.sections = await Promise.all(this.data.plans.map(({ scope }) => TipSection.of(scope)));
+    this.openSlices([...Object.keys(STANDARD), "across", "along"]);
+    this.linkSlices({ placed: () => this.follow(false) });
+    byId("along").value = this.motion.hasNeedle ? "needle" : "scope";
     await this.drawCharts();
     this.draw();
   }
@@ -78,7 +82,7 @@ class PlanPage extends AnatomyPage {
   addTarget() {
     const target = this.data.plans[0].target_lps;
     byId("view-target").addEventListener("click", () => this.orbit.approach(target, 170));
-    this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"));
+    this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));
   }
 
   // Look at the devices beyond the scope and at the end of the scope, from the side from which they are seen long.
@@ -179,7 +183,27 @@ class PlanPage extends AnatomyPage {
       });
     }
     if (this.breath) this.connectBreath();
-    for (const id of ["field", "window", "tint"]) byId(id).addEventListener("change", () => this.redraw());
+    byId("follow").addEventListener("change", () => {
+      this.follow(byId("follow").checked);
+      this.redraw();
+    });
+    for (const id of ["along", "along-turn"]) byId(id).addEventListener("input", () => this.redrawSlices());
+    byId("fork-before").addEventListener("click", () => this.goToBifurcation(-1));
+    byId("fork-next").addEventListener("click", () => this.goToBifurcation(1));
+  }
+
+  // Let the slices go with the foremost tip, or with their cross.
+  follow(on) {
+    byId("follow").checked = on;
+    for (const move of this.cursors) move(this.motion.alongMm(this.state));
+  }
+
+  // Go to where the scope stands before the next bifurcation, or the one before.
+  goToBifurcation(way) {
+    this.stop();
+    const now = Number(this.slider.value), ticks = pausesOf(this.motion);
+    const found = way > 0 ? ticks.find((tick) => tick > now) : ticks.filter((tick) => tick < now).pop();
+    if (found !== undefined) this.moveTo(found / 1000);
   }
 
   connectBreath() {
@@ -224,12 +248,16 @@ class PlanPage extends AnatomyPage {
 
   play() {
     let position = Number(this.slider.value) >= 1000 ? 0 : Number(this.slider.value) / 1000;
+    const first = position, ticks = pausesOf(this.motion);
     const step = paced((seconds) => {
       if (this.playing === null) return;
+      const before = position;
       position = Math.min(position + seconds / PLAY_S, 1);
+      const pause = byId("pause").checked && ticks.find((tick) => tick > 1000 * Math.max(before, first) + 1e-6 && tick <= 1000 * position);
+      if (pause) position = pause / 1000;
       this.slider.value = 1000 * position;
       this.show("moving");
-      if (position >= 1) this.stop();
+      if (position >= 1 || pause) this.stop();
       else this.playing = requestAnimationFrame(step);
     });
     byId("play").textContent = "Pause";
@@ -257,7 +285,7 @@ class PlanPage extends AnatomyPage {
       if (!this.leavesOut(byId("inside"))) this.bronchoscopy.draw(state, this.motion);
       this.drawScene();
     }
-    if (this.slices && !this.leavesOut(this.slices.axial.canvas)) this.drawSlices(state);
+    if (this.views && !this.leavesOut(this.views.slices.axial.canvas)) this.drawSlices();
     for (const move of this.cursors) move(this.motion.alongMm(state));
   }
 
@@ -338,10 +366,9 @@ class PlanPage extends AnatomyPage {
     if (this.shown.needle) put(end.needle, 0.8 * radius.needle);
   }
 
-  drawSlices(state) {
-    const { target } = this, { radius_mm: radius } = this.motion.plan;
-    this.image.tint = byId("tint").checked;
-    this.image.setWindow(byId("window").value);
+  drawSlices() {
+    const { target, state, views } = this, { radius_mm: radius } = this.motion.plan, following = byId("follow").checked;
+    if (following) [views.place, views.centre] = [[...state.tip], [...state.tip]];
     const lines = [
       this.shown.scope && { points: state.scope, radius: radius.scope, colour: SCOPE },
       this.shown.tubes && { points: state.outer, radius: radius.outer, colour: OUTER },
@@ -349,11 +376,43 @@ class PlanPage extends AnatomyPage {
       this.shown.tubes && { points: state.inner, radius: radius.inner, colour: INNER },
       this.shown.needle && { points: state.needle, radius: radius.needle, colour: NEEDLE },
     ].filter((line) => line && line.points.length > 1);
-    const marks = { lines, target: this.shown.target ? target : null, cross: state.tip };
-    const width = Number(byId("field").value);
-    for (const [name, plane] of Object.entries(STANDARD)) this.slices[name].draw(plane, state.tip, width, marks);
-    this.slices.across.draw(planeAcross(state.direction), state.tip, Math.min(width, 60), marks);
-    byId("slice-place").textContent = `Through the foremost tip, at LPS ${state.tip.map((v) => v.toFixed(1)).join(", ")} mm.`;
+    const marks = { lines, target: this.shown.target ? target : null };
+    views.draw({ ...STANDARD, across: this.across(state, following), along: this.along(state, following) }, marks);
+    this.panel.showField();
+    this.panel.describe();
+    this.drawTipSection(state);
+    byId("slice-place").textContent = `Through ${following ? "the foremost tip, at" : "the cross, at"} LPS ${views.place.map((v) => v.toFixed(1)).join(", ")} mm.`;
+    if (!following) for (const move of this.cursors) move(alongLine(this.devices, views.place).alongMm);
+  }
+
+  // The plane across the foremost tip, or across the devices where they are nearest to the cross.
+  across(state, following) {
+    const widthMm = Math.min(this.views.widthMm, MOST_ACROSS_MM), line = wholeLine(state);
+    if (following) return { ...planeAcross(state.direction), through: state.tip, widthMm };
+    const { place, direction } = nearestOn(line, this.views.place);
+    return { ...planeAcross(direction), through: place, widthMm };
+  }
+
+  // The plane along the needle, or along the scope, turned about it.
+  along(state, following) {
+    const end = this.stateOf(this.followed, 1), ofNeedle = byId("along").value === "needle" && end.needle.length > 1;
+    const { eye, forward, up } = state.camera;
+    const { direction, beside } = ofNeedle ? bendOf(end.needle, up) : { direction: forward, beside: up };
+    const degrees = Number(byId("along-turn").value), plane = planeAlong(direction, beside, degrees);
+    const first = ofNeedle ? end.needle[0] : eye, normal = cross(plane.right, plane.up);
+    // A plane that is turned about the axis holds the axis: where it is looked at moves along it only.
+    const at = following ? state.tip : this.views.place, through = mix(first, [0, 1, 2].map((k) => first[k] + direction[k]), dot(minus(at, first), direction));
+    const away = ofNeedle ? Math.max(...end.needle.map((place) => Math.abs(dot(minus(place, first), normal)))) : 0;
+    byId("along-words").textContent = `${degrees}°${ofNeedle ? `; the needle leaves the plane by ${away.toFixed(1)} mm at most` : ""}`;
+    this.alongPlane = { ...plane, through };
+    return this.alongPlane;
+  }
+
+  drawTipSection(state) {
+    const canvas = byId("gap"), caption = byId("gap-words");
+    canvas.hidden = this.share !== 0;
+    if (this.share === 0) this.sections[this.followed].draw(canvas, caption, state.moved, this.motion.plan.radius_mm.scope);
+    else caption.textContent = "The cross-section at the scope's tip is known in the phase of the masks alone.";
   }
 
   // Draw what is to spare over the breath, from 0 on: what is nearer than required, or too far, is on the floor.
@@ -425,6 +484,9 @@ class PlanPage extends AnatomyPage {
       ...super.report(),
       plan: this.followed, plans: this.shownPlans, position: state.position, stage: STAGES[state.stage],
       scope_mm: state.scopeMm, outer_mm: state.outerMm, inner_mm: state.innerMm, needle_mm: state.needleMm,
+      following: byId("follow").checked, along: this.alongPlane, pauses: pausesOf(this.motion),
+      section: this.sections[this.followed].at(state.moved), prompts: bifurcationsAhead(this.motion, state).map(({ number }) => number),
+      named: this.bronchoscopy ? this.bronchoscopy.named.map(({ branch }) => branch) : [],
       phase: this.phase, target_lps: this.target, tip_lps: state.tip, needle_lps: state.needle, camera: state.camera, devices: { ...this.shown },
       solids: this.scene ? Object.fromEntries([...this.scene.solids].map(([key, s]) => [key, s.count / 3])) : {},
       view: this.orbit ? { yaw: this.orbit.yaw, pitch: this.orbit.pitch, distance: this.orbit.distance, edges: this.orbit.edges() } : null,
@@ -453,6 +515,24 @@ function swatchOf({ colour, bands }) {
 // Return how far away the whole lung is seen at once, by its size in mm.
 function distanceOfAll(size) {
   return 1.05 * Math.max(...size) / Math.tan((15 * Math.PI) / 180) / 2 + size[1] / 2;
+}
+
+// Return the line of everything that is out, from the scope on.
+function wholeLine({ scope, outer, middle, inner, needle }) {
+  return [...scope, ...outer, ...middle, ...inner, ...needle];
+}
+
+// Return the point of a line that is nearest to a place, and the direction of the line there.
+function nearestOn(line, place) {
+  let found = null;
+  for (let n = 1; n < line.length; n++) {
+    const step = minus(line[n], line[n - 1]), size = dot(step, step);
+    if (size < 1e-9) continue;
+    const share = Math.min(Math.max(dot(minus(place, line[n - 1]), step) / size, 0), 1), at = mix(line[n - 1], line[n], share);
+    const away = norm(minus(place, at));
+    if (!found || away < found.away) found = { away, place: at, direction: unit(step) };
+  }
+  return found;
 }
 
 // Return radii that can be seen from a distance.

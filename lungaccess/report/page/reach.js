@@ -33,8 +33,9 @@ class ReachPage extends AnatomyPage {
     this.image = await VoxelImage.of(this.data);
     this.listControls();
     this.openSlices();
-    this.followClicks();
+    this.linkSlices({ placed: (place) => this.moveTo(place) });
     this.connectSliders();
+    this.views.place = this.place;
     this.draw();
   }
 
@@ -85,22 +86,22 @@ class ReachPage extends AnatomyPage {
   connectSliders() {
     const volume = this.image.labels[0];
     const sizes = [volume.width, volume.height, volume.depth];
-    this.widthMm = Math.max(...sizes) * volume.spacing;
-    this.middle = volume.first.map((first, axis) => first + ((sizes[axis] - 1) * volume.spacing) / 2);
+    this.views.setWidth(Math.max(...sizes) * volume.spacing);
+    this.views.centre = volume.first.map((first, axis) => first + ((sizes[axis] - 1) * volume.spacing) / 2);
     for (let axis = 0; axis < 3; axis++) {
       const slider = byId(`place-${axis}`);
       slider.min = Math.ceil(volume.first[axis]);
       slider.max = Math.floor(volume.first[axis] + (sizes[axis] - 1) * volume.spacing);
       slider.value = this.place[axis];
       slider.addEventListener("input", () => {
-        this.place[axis] = Number(slider.value);
-        this.redraw();
+        this.moveTo(this.place.map((value, n) => (n === axis ? Number(slider.value) : value)));
       });
     }
   }
 
   moveTo(place) {
     super.moveTo(place);
+    this.views.moveTo(place);
     place.forEach((value, axis) => {
       byId(`place-${axis}`).value = value;
     });
@@ -139,14 +140,14 @@ class ReachPage extends AnatomyPage {
 
   draw() {
     if (this.scene) this.drawView();
-    if (!this.slices) return;
+    if (this.views) this.drawSlices();
+  }
+
+  drawSlices() {
     this.image.overlay = this.painter();
-    for (const [name, plane] of Object.entries(STANDARD)) {
-      const away = [...this.middle];
-      const normal = { axial: 2, coronal: 1, sagittal: 0 }[name];
-      away[normal] = this.place[normal];
-      this.slices[name].draw(plane, away, this.widthMm, { cross: this.place });
-    }
+    this.views.draw(STANDARD, {});
+    this.panel.showField();
+    this.panel.describe();
     byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(0)).join(", ")} mm: ${this.words()}.`;
     this.showKey();
   }

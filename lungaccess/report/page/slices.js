@@ -1,20 +1,27 @@
 // Planes through the image: standard ones by radiological convention, and any other.
-import { unpackVolume } from "./decode.js";
-import { add, cross, dot, letters, minus, rgb, times, unit } from "./vectors.js";
+import { add, cross, dot, letters, minus, norm, rgb, times, unit } from "./vectors.js";
+import { linear, nearest, PackedSource, placedVolume, VoxelGrid } from "./voxels.js";
 
 const INK = { label: "#F2F2F2", cross: "#FFFFFF" };
 const STRUCTURE_COLOURS = {
   outside: "#6B6B6B", lung: "#242424", "airway wall": "#6FA8CC", lumen: "#0E3A57", vessel: "#C4717A",
   fissure: "#8F6FB8", nodule: "#009E73",
 };
+// What is painted over a CT at first, and how densely.
 const TINTED = ["airway wall", "vessel", "fissure", "nodule"];
 const TINT = 0.45;
+const GROUND = ["outside", "lung"];
 const NEAR_MM = 2;
 const FAINT = 0.5;
 const LATTICE_PIXELS = 8;
 const NOWHERE = [0, 0, 0];
+const BARS_MM = [1, 2, 5, 10, 20, 50, 100];
+const CROSS_GAP = 9;
+// A line that is bent less lies in every plane through its ends.
+const STRAIGHT_MM = 0.05;
 
-export const WINDOWS = { lung: [-1350, 150], tissue: [-160, 240] };
+export const WINDOWS = { lung: [-1350, 150], tissue: [-160, 240], bone: [-500, 1300] };
+export const LEAST_WIDTH_HU = 10;
 export const STANDARD = {
   axial: { right: [1, 0, 0], up: [0, -1, 0] },
   coronal: { right: [1, 0, 0], up: [0, 0, 1] },
@@ -28,19 +35,47 @@ export function planeAcross(direction) {
   return { right: cross(direction, up), up };
 }
 
+// Return the plane that holds a direction, which goes up in the picture; `beside` is in it to the right, and it is then
+// turned about the direction by degrees.
+export function planeAlong(direction, beside, degrees = 0) {
+  const up = unit(direction), first = unit(minus(beside, times(up, dot(beside, up)))), second = cross(up, first);
+  const angle = (degrees * Math.PI) / 180;
+  return { right: add(times(first, Math.cos(angle)), times(second, Math.sin(angle))), up };
+}
+
+// Return the direction from the first to the last point of a line, and the side to which it bends most; `otherwise` is
+// the side of a straight one.
+export function bendOf(points, otherwise) {
+  const first = points[0], direction = unit(minus(points[points.length - 1], first));
+  let beside = [0, 0, 0];
+  for (const place of points) {
+    const away = minus(place, first), aside = minus(away, times(direction, dot(away, direction)));
+    if (norm(aside) > norm(beside)) beside = aside;
+  }
+  return { direction, beside: norm(beside) > STRAIGHT_MM ? unit(beside) : otherwise };
+}
+
 // The voxels of a page: structures, a CT if there is one, and a further layer painted over them.
 export class VoxelImage {
   static async of(data) {
     const image = new VoxelImage();
-    const load = (packed) => Promise.all((packed || []).map(unpackVolume));
-    [image.labels, image.ct] = await Promise.all([load(data.labels), load(data.ct)]);
+    const load = (packed, table) => Promise.all((packed || []).map((each) => placedVolume(each, table)));
+    [image.labels, image.ct] = await Promise.all([load(data.labels), load(data.ct, data.hounsfield)]);
+    image.grid = data.grid ? new VoxelGrid(data.grid.shape, data.grid.lps_from_ijk) : image.labels[0].grid;
+    image.codes = data.codes;
+    image.source = image.hasCt ? new PackedSource(image.ct) : null;
+    // A source that has more than the page; its slices are shown when they come.
+    image.finer = null;
     image.table = new Uint8Array(3 * 256);
+    image.ground = new Uint8Array(256);
     image.tinted = new Uint8Array(256);
+    image.opacity = new Float32Array(256);
     for (const [name, code] of Object.entries(data.codes)) {
       image.table.set(rgb(STRUCTURE_COLOURS[name]).map((value) => 255 * value), 3 * code);
+      image.ground[code] = GROUND.includes(name) ? 1 : 0;
       image.tinted[code] = TINTED.includes(name) ? 1 : 0;
+      image.opacity[code] = image.hasCt ? TINT * image.tinted[code] : 1;
     }
-    image.hounsfield = data.hounsfield;
     image.overlay = null;
     image.breath = null;
     image.share = 0;
@@ -53,21 +88,62 @@ export class VoxelImage {
     return this.ct.length > 0;
   }
 
+  // Show a window of WINDOWS; any other name leaves it as it is.
   setWindow(name) {
-    const [low, high] = WINDOWS[name];
-    this.greys = new Uint8ClampedArray(256);
-    if (!this.hasCt) return;
-    const { lowest, per_step: step } = this.hounsfield;
-    for (let n = 0; n < 256; n++) this.greys[n] = (255 * (lowest + step * n - low)) / (high - low);
+    if (WINDOWS[name]) [this.low, this.high] = WINDOWS[name];
   }
 
-  // Write the colour of the image at a point to out[at...at + 2].
-  paint(x, y, z, out, at) {
-    const code = this.hasCt && !this.tint && !this.overlay ? 0 : nearest(this.labels, x, y, z);
+  // Show the values from level - width / 2 to level + width / 2, HU.
+  setLevels(level, width) {
+    const half = Math.max(width, LEAST_WIDTH_HU) / 2;
+    [this.low, this.high] = [level - half, level + half];
+  }
+
+  get levels() {
+    return { level: (this.low + this.high) / 2, width: this.high - this.low };
+  }
+
+  // Return the name of the window that is shown; "" if it is none of WINDOWS.
+  get windowName() {
+    const found = Object.entries(WINDOWS).find(([, [low, high]]) => low === this.low && high === this.high);
+    return found ? found[0] : "";
+  }
+
+  // Return name, colour and opacity of the structures that can be painted over others.
+  structures() {
+    return Object.entries(this.codes).filter(([, code]) => !this.ground[code])
+      .map(([name, code]) => ({ name, colour: STRUCTURE_COLOURS[name], opacity: this.opacity[code] }));
+  }
+
+  setOpacity(name, share) {
+    this.opacity[this.codes[name]] = share;
+  }
+
+  // Return where a place of the picture is in the masks: the same, but for the breath.
+  inMasks(place) {
+    return this.breath && this.share !== 0 ? this.breath.pulledBack(place, this.share) : place;
+  }
+
+  structureAt(place) {
+    const code = nearest(this.labels, ...this.inMasks(place));
+    return Object.keys(this.codes).find((name) => this.codes[name] === code);
+  }
+
+  // Return the HU at a place, null without a CT or beyond it.
+  huAt(place) {
+    const value = this.source ? this.source.value(this.inMasks(place)) : NaN;
+    return Number.isNaN(value) ? null : value;
+  }
+
+  // Write the colour of the image at a point to out[at...at + 2]; `hu` is the value there, if it is known already.
+  paint(x, y, z, out, at, hu) {
+    const { hasCt } = this;
+    const code = hasCt && !this.tint && !this.overlay ? 0 : nearest(this.labels, x, y, z);
     let red = this.table[3 * code], green = this.table[3 * code + 1], blue = this.table[3 * code + 2];
-    if (this.hasCt) {
-      const grey = this.greys[linear(this.ct, x, y, z)];
-      const share = this.tint && this.tinted[code] ? TINT : 0;
+    if (hasCt || !this.ground[code]) {
+      const share = this.tint && !this.ground[code] ? this.opacity[code] : 0;
+      const value = hasCt ? (255 * ((hu === undefined ? linear(this.ct, x, y, z) : hu) - this.low)) / (this.high - this.low) : 0;
+      const grey = hasCt ? Math.min(Math.max(value, 0), 255) || 0 : this.table[3 * this.codes.lung];
       red = grey + share * (red - grey);
       green = grey + share * (green - grey);
       blue = grey + share * (blue - grey);
@@ -80,36 +156,6 @@ export class VoxelImage {
   }
 }
 
-// Return the value of the voxel that holds a point, of the last volume that does; 0 beyond all.
-export function nearest(volumes, x, y, z) {
-  for (let n = volumes.length - 1; n >= 0; n--) {
-    const v = volumes[n];
-    const i = Math.round((x - v.first[0]) / v.spacing);
-    const j = Math.round((y - v.first[1]) / v.spacing);
-    const k = Math.round((z - v.first[2]) / v.spacing);
-    if (i >= 0 && j >= 0 && k >= 0 && i < v.width && j < v.height && k < v.depth) {
-      return v.voxels[(k * v.height + j) * v.width + i];
-    }
-  }
-  return 0;
-}
-
-function linear(volumes, x, y, z) {
-  for (let n = volumes.length - 1; n >= 0; n--) {
-    const v = volumes[n];
-    const fx = (x - v.first[0]) / v.spacing, fy = (y - v.first[1]) / v.spacing, fz = (z - v.first[2]) / v.spacing;
-    const i = Math.floor(fx), j = Math.floor(fy), k = Math.floor(fz);
-    if (i < 0 || j < 0 || k < 0 || i + 1 >= v.width || j + 1 >= v.height || k + 1 >= v.depth) continue;
-    const u = fx - i, t = fy - j, s = fz - k;
-    const at = (k * v.height + j) * v.width + i, row = v.width, slice = v.width * v.height, a = v.voxels;
-    const lower = (1 - t) * ((1 - u) * a[at] + u * a[at + 1]) + t * ((1 - u) * a[at + row] + u * a[at + row + 1]);
-    const up = at + slice;
-    const upper = (1 - t) * ((1 - u) * a[up] + u * a[up + 1]) + t * ((1 - u) * a[up + row] + u * a[up + row + 1]);
-    return Math.round((1 - s) * lower + s * upper);
-  }
-  return 0;
-}
-
 // One plane on a canvas, with the devices, the target and the patient's sides at its edges.
 export class Slice {
   constructor(canvas, image) {
@@ -118,20 +164,63 @@ export class Slice {
     this.pen = canvas.getContext("2d");
   }
 
-  // Draw the plane { right, up } through a centre, so many mm wide.
+  // Draw the plane { right, up } through a centre, so many mm wide, and again when a finer source has its values.
   // marks: { lines: [{ points, radius, colour }], target, targetRadius, cross: [x, y, z] }
   draw(plane, centre, widthMm, marks) {
-    const { width, height } = this.canvas;
-    this.plane = { ...plane, centre, scale: width / widthMm };
+    this.plane = { ...plane, centre, scale: this.canvas.width / widthMm };
+    this.marks = marks;
+    this.show(this.fine && this.fine.key === this.key() ? this.fine.values : null);
+    this.refine();
+  }
+
+  // Return the pixels of the plane as a source takes them.
+  raster() {
+    const { width, height } = this.canvas, { right, up, scale } = this.plane;
+    return {
+      origin: this.pixelCentre(0, 0, 1 / scale), across: times(right, 1 / scale), down: times(up, -1 / scale), columns: width, rows: height,
+    };
+  }
+
+  key() {
+    return JSON.stringify(this.raster());
+  }
+
+  // Ask the finer source, one slice at a time, until what is shown is of it.
+  async refine() {
+    const { image } = this;
+    if (!image.finer || this.asking || (image.breath && image.share !== 0)) return;
+    this.asking = true;
+    try {
+      while (!this.fine || this.fine.key !== this.key()) {
+        const raster = this.raster(), values = await image.finer.slice(raster);
+        if (!values) return;
+        this.fine = { key: JSON.stringify(raster), values };
+        if (this.fine.key === this.key()) this.show(values);
+      }
+    } finally {
+      this.asking = false;
+    }
+  }
+
+  // Return the HU at a place of the plane: of the finer source if it is shown, else of the page; null without a CT.
+  huAt(place) {
+    if (!this.fine || this.fine.key !== this.key()) return this.image.huAt(place);
+    const { width, height } = this.canvas, [column, row] = this.project(place).map(Math.floor);
+    const value = column >= 0 && row >= 0 && column < width && row < height ? this.fine.values[row * width + column] : NaN;
+    return Number.isNaN(value) ? null : value;
+  }
+
+  // Paint the pixels, of these values in HU or else of those of the page, and all marks.
+  show(values) {
+    const { width, height } = this.canvas, { marks } = this, step = 1 / this.plane.scale;
     const pixels = this.pen.createImageData(width, height);
-    const step = widthMm / width;
-    const across = times(plane.right, step);
+    const across = times(this.plane.right, step);
     const shifts = this.shifts(width, height, step);
     for (let row = 0; row < height; row++) {
       let [x, y, z] = this.pixelCentre(0, row, step);
       for (let column = 0, at = 4 * row * width; column < width; column++, at += 4) {
         const [sx, sy, sz] = shifts ? shifts(column, row) : NOWHERE;
-        this.image.paint(x + sx, y + sy, z + sz, pixels.data, at);
+        this.image.paint(x + sx, y + sy, z + sz, pixels.data, at, values ? values[at / 4] : undefined);
         x += across[0];
         y += across[1];
         z += across[2];
@@ -142,7 +231,7 @@ export class Slice {
     if (marks.target) this.target(marks.target);
     if (marks.cross) this.cross(marks.cross);
     this.letters();
-    this.bar(widthMm);
+    this.bar(width * step);
   }
 
   pixelCentre(column, row, step) {
@@ -225,16 +314,20 @@ export class Slice {
     pen.globalAlpha = 1;
   }
 
+  // The cross: where the other planes cut this one.
   cross(place) {
-    const [x, y] = this.project(place);
-    const pen = this.pen;
+    const [x, y, away] = this.project(place), { width, height } = this.canvas, pen = this.pen;
     pen.strokeStyle = INK.cross;
-    pen.globalAlpha = 0.55;
+    pen.globalAlpha = away <= NEAR_MM ? 0.6 : 0.3;
     pen.lineWidth = 1;
     pen.beginPath();
-    for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-      pen.moveTo(x + 8 * dx, y + 8 * dy);
-      pen.lineTo(x + 22 * dx, y + 22 * dy);
+    for (const [from, to] of [[0, x - CROSS_GAP], [x + CROSS_GAP, width]]) {
+      pen.moveTo(from, y);
+      pen.lineTo(Math.max(from, to), y);
+    }
+    for (const [from, to] of [[0, y - CROSS_GAP], [y + CROSS_GAP, height]]) {
+      pen.moveTo(x, from);
+      pen.lineTo(x, Math.max(from, to));
     }
     pen.stroke();
     pen.globalAlpha = 1;
@@ -252,7 +345,7 @@ export class Slice {
   }
 
   bar(widthMm) {
-    const mm = widthMm > 150 ? 50 : widthMm > 80 ? 20 : 10;
+    const mm = Math.max(BARS_MM[0], ...BARS_MM.filter((each) => each <= 0.3 * widthMm));
     const pen = this.pen;
     const y = this.canvas.height - 9;
     pen.strokeStyle = INK.label;

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         lateral_sweep,
         planar_point,
         planar_points,
+        planar_points_of_many,
         tip_pose,
         tube_pieces,
         turned_ends,

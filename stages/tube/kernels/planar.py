@@ -48,6 +48,13 @@ def planar_points(tubes, outer, inner, arc_lengths, out):
 
 
 @numba.njit(cache=True)
+def planar_points_of_many(tubes, outers, inners, arc_lengths, out):
+    """Fill `out` (N, 2) with `planar_point` of N deployments, each at its own of `arc_lengths` (N,)."""
+    for n in range(arc_lengths.shape[0]):
+        out[n, 0], out[n, 1] = planar_point(tubes, outers[n], inners[n], arc_lengths[n])
+
+
+@numba.njit(cache=True)
 def tube_pieces(tubes, outer, inner):
     """Return the four arcs of the centreline, some empty: begin and end in mm, curvature, radius."""
     straight = max(inner - tubes[CURVED_LENGTH], 0.0)

@@ -20,7 +20,10 @@ FLAGS = (
     "--hide-scrollbars", "--disable-dev-shm-usage",
 )  # fmt: skip
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"
-KEYS = {"ArrowLeft": "\ue012", "ArrowRight": "\ue014", "ArrowUp": "\ue013", "Home": "\ue011", "Tab": "\ue004"}
+KEYS = {
+    "ArrowLeft": "\ue012", "ArrowRight": "\ue014", "ArrowUp": "\ue013", "Home": "\ue011", "Tab": "\ue004",
+    "Enter": "\ue007", "PageUp": "\ue00e",
+}  # fmt: skip
 STARTS = 200
 
 
@@ -63,7 +66,8 @@ class Browser:
         if phone:
             metrics = {"width": width, "height": height, "pixelRatio": 2.0, "touch": True}
             options["mobileEmulation"] = {"deviceMetrics": metrics}
-        wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
+        logs = {"browser": "ALL", "performance": "ALL"}
+        wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": logs}
         made = self._send("POST", "/session", {"capabilities": {"alwaysMatch": wanted}})
         self._base += f"/session/{made['sessionId']}"
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
@@ -99,10 +103,10 @@ class Browser:
             self._driver.wait()
             self._folder.cleanup()
 
-    def open(self, page: Path) -> None:
-        """Open a file, and wait until it says that it is ready."""
+    def open(self, page: Path | str) -> None:
+        """Open a file or an address, and wait until it says that it is ready."""
         self._send("POST", "/timeouts", {"script": 300_000, "pageLoad": 300_000})
-        self._send("POST", "/url", {"url": page.resolve().as_uri()})
+        self._send("POST", "/url", {"url": page if isinstance(page, str) else page.resolve().as_uri()})
         problem = self.run_async(
             "window.lungaccessReport.ready.then(() => done(''), (error) => done(String(error.stack)))"
         )
@@ -138,6 +142,20 @@ class Browser:
         """Return warnings and errors of the console since the last call."""
         entries = self._send("POST", "/se/log", {"type": "browser"})
         return [each["message"] for each in entries if each["level"] in ("WARNING", "SEVERE")]
+
+    def requests(self) -> list[str]:
+        """Return the addresses of all requests and sockets since the last call."""
+        entries = (
+            json.loads(each["message"])["message"]
+            for each in self._send("POST", "/se/log", {"type": "performance"})
+        )
+        found = []
+        for each in entries:
+            if each["method"] == "Network.requestWillBeSent":
+                found.append(each["params"]["request"]["url"])
+            elif each["method"] == "Network.webSocketCreated":
+                found.append(each["params"]["url"])
+        return found
 
     def command(self, name: str, parameters: dict[str, Any]) -> Any:
         """Send a command of the DevTools protocol."""

@@ -1,0 +1,155 @@
+"""How soon the explorer answers, and whether its memory stays flat: random clicks over its own socket.
+
+Run `python -m experiments.explorer_speed PATIENT [--clicks 500] [--cache FOLDER]`; it prints the rows of
+docs/measurements/explorer.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+
+from anatomy.structures import obstacle_bits
+from lungaccess import load_patient
+from lungaccess.explorer import Address, Explorer, PatientSource
+from lungaccess.explorer.messages import read_frame
+
+LAST = ("end", "error", "superseded")
+FEW = 50
+RADII_MM = (121.0, 90.0, 60.0, 150.0)
+SEED = 0
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Measured:
+    """Times in ms by what was measured."""
+
+    rows: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, what: str, value: float) -> None:
+        self.rows.setdefault(what, []).append(value)
+
+    def print(self) -> None:
+        for what, values in self.rows.items():
+            print(f"| {what} | {np.median(values):.0f} | {np.max(values):.0f} | {len(values)} |")
+
+
+def targets(patient: Path, cache: Path | None, count: int) -> np.ndarray:
+    """Return random points of free tissue, LPS mm, in nodules and in all of the lung alike."""
+    lung = load_patient(patient, cache=cache)
+    rng = np.random.default_rng(SEED)
+    found: list[np.ndarray] = []
+    shape = np.array(lung.grid.shape)
+    while len(found) < count:
+        ijk = rng.integers(0, shape)
+        if lung.labels[tuple(ijk)] & obstacle_bits(True) == 0:
+            found.append(lung.grid.lps(ijk[None])[0])
+    return np.array(found)
+
+
+def memory_mb(pid: int) -> float:
+    """Return the memory of a process that is its own, MB."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return float(status.split("RssAnon:")[1].split()[0]) / 1024.0
+
+
+def processor_s(pid: int) -> float:
+    """Return the processor time of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+
+
+class Page:
+    """A page without a browser."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._socket, self._number = socket, 0
+
+    async def click(
+        self, measured: Measured | None, stop_at: dict[str, str], **asked: dict[str, Any]
+    ) -> None:
+        """Ask several questions at once; measure until the answer of each that `stop_at` names."""
+        began = time.perf_counter()
+        names = {}
+        for name, values in asked.items():
+            self._number += 1
+            names[self._number] = name
+            await self._socket.send_str(json.dumps({"ask": name, "id": self._number, **values}))
+        while names:
+            message, _arrays = read_frame((await self._socket.receive()).data)
+            name = names.get(message["id"])
+            if name is None:
+                continue
+            elapsed = 1000.0 * (time.perf_counter() - began)
+            if measured is not None and message["answer"] == stop_at.get(name):
+                measured.add(f"{name}: first answer", elapsed)
+                stop_at = {key: value for key, value in stop_at.items() if key != name}
+            if message["answer"] in LAST:
+                if measured is not None:
+                    measured.add(f"{name}: all of it", elapsed)
+                del names[message["id"]]
+
+
+async def measure(source: PatientSource, points: np.ndarray) -> None:
+    """Click, change the needle, and watch the memory."""
+    explorer = Explorer(source)
+    address: Address = await explorer.start()
+    headers = {"Cookie": f"{address.cookie}={address.token}", "Origin": address.origin}
+    async with (
+        aiohttp.ClientSession() as session,
+        session.ws_connect(f"{address.origin}/socket", headers=headers, max_msg_size=0) as socket,
+    ):
+        page, measured = Page(socket), Measured()
+        await page.click(None, {}, prepare={})
+        plans = explorer.processes["plans"]
+        assert plans is not None
+        memory, used = [], []
+        for n, point in enumerate(points):
+            target = "lps:" + ",".join(f"{value:.1f}" for value in point)
+            before = processor_s(plans)
+            await page.click(
+                measured if n < FEW else None, {"exits": "exits", "plan": "plan"}, exits={"target": target},
+                plan={"target": target, "iterations": 100},
+            )  # fmt: skip
+            used.append(processor_s(plans) - before)
+            memory.append(memory_mb(plans))
+        measured.print()
+        print(f"processor time of a click, all of it: median {1000 * np.median(used):.0f} ms")
+        tenth = max(len(memory) // 10, 1)
+        print(
+            f"memory of the process of plans after {len(memory)} clicks: {memory[-1]:.0f} MB; "
+            f"after each tenth: {', '.join(f'{value:.0f}' for value in memory[tenth - 1 :: tenth])} MB"
+        )
+        measured = Measured()
+        around = points[0].tolist()
+        await page.click(None, {}, reach={"around": around})
+        for radius in RADII_MM * 3:
+            asked = {"around": around, "what_if": {"needle_radius_mm": radius}}
+            await page.click(measured, {"reach": "reach"}, reach=asked)
+        measured.print()
+    await explorer.stop()
+
+
+def main() -> None:
+    """Read the arguments and measure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("patient", type=Path)
+    parser.add_argument("--clicks", type=int, default=500)
+    parser.add_argument("--cache", type=Path)
+    given = parser.parse_args()
+    source = PatientSource(folder=given.patient, system="lung-default", cache=given.cache)
+    asyncio.run(measure(source, targets(given.patient, given.cache, given.clicks)))
+
+
+if __name__ == "__main__":
+    main()

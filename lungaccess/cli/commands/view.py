@@ -1,0 +1,75 @@
+"""The command `lungaccess view`: the explorer of a patient on a page of this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from anatomy.errors import SettingsError
+from lungaccess.cli import terminal
+from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.numbers import Port
+from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
+
+
+def view(
+    patient: PatientFolder,
+    *,
+    system: Annotated[
+        str, Parameter(help="System that is shown first: name of a preset, or path of a TOML file.")
+    ] = DEFAULT_SYSTEM,
+    ct: Annotated[
+        Path | None,
+        Parameter(
+            help="CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, "
+            "if there is one, else the structures of the masks."
+        ),
+    ] = None,
+    port: Annotated[Port | None, Parameter(help="Port of this machine; a free one if not given.")] = None,
+    browser: Annotated[bool, Parameter(help="Whether the page is opened in the browser.")] = True,
+    thick_slices: Annotated[
+        bool, Parameter(help="Explore masks from slices of more than 3 mm, which lack small structures.")
+    ] = False,
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
+    """Explore a patient: click a target, see the feasible exits and better and better plans, ask what if.
+
+    The page is served to this machine alone, at the address that is printed, until Ctrl-C; nothing is fetched
+    from elsewhere.  Needs the extra `view`.
+    """
+    import asyncio
+    import webbrowser
+
+    from lungaccess.problem import load_system, shipped_names
+    from lungaccess.report.html.volumes import find_ct, read_ct
+
+    try:
+        from lungaccess.explorer import Address, Explorer, PatientSource
+    except ModuleNotFoundError as error:
+        raise SettingsError(
+            f"The explorer needs {error.name}, which is not installed",
+            expected="the extra `view`",
+            remedy="pip install 'lungaccess[view]'",
+        ) from error
+    first = load_system(system)
+    if ct is not None:
+        read_ct(ct)  # Here, where a file that is none is refused before anything is shown.
+    output.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
+    own = () if system in shipped_names() else ((Path(system).resolve(), first),)
+    source = PatientSource(
+        folder=patient.resolve(), system=first.name, own=own, cache=output.cache,
+        ct=find_ct(patient) if ct is None else ct,
+    )  # fmt: skip
+
+    def started(address: Address) -> None:
+        if output.json:
+            terminal.show_json({"address": address.url, "port": address.port})
+        else:
+            terminal.say(f"The explorer is at {address.url}\nCtrl-C ends it.")
+        if browser:
+            webbrowser.open(address.url)
+
+    asyncio.run(Explorer(source, port or 0).serve(started))
+    return ExitCode.OK

@@ -1,0 +1,14 @@
+"""The explorer: a local page on which a target is clicked and its plans are seen at once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.explorer.questions import WhatIf
+    from lungaccess.explorer.server import Address, Explorer
+    from lungaccess.explorer.worker import PatientSource
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

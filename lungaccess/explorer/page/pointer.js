@@ -1,0 +1,125 @@
+// What a click in the 3-D view chooses, and how exit and scope tip are dragged.
+import { add, dot, minus, norm, times } from "../report/vectors.js";
+import { lpsText } from "./widgets.js";
+
+const HANDLE_PX = 14;
+
+export function connectPointer(page) {
+  const { scene, orbit } = page, canvas = scene.canvas;
+  let dragged = null;
+
+  const place = (event) => {
+    const box = canvas.getBoundingClientRect();
+    return [event.clientX - box.left, event.clientY - box.top];
+  };
+  const near = (point, at) => {
+    const seen = scene.project(point);
+    return seen ? Math.hypot(seen[0] - at[0], seen[1] - at[1]) : Infinity;
+  };
+  const nearestOf = (count, placeOf, at) => {
+    let least = Infinity, found = -1;
+    for (let n = 0; n < count; n++) {
+      const away = near(placeOf(n), at);
+      if (away < least) [least, found] = [away, n];
+    }
+    return { found, away: least };
+  };
+
+  // Return what can be dragged at a place: the chosen exit, or the tip of the scope.
+  const handleAt = (at) => {
+    if (!scene.view) return null;
+    const { exits, tips, plan, state: { asked } } = page;
+    const tip = tips && (tips.place(asked.tip) || (plan && plan.scope_tip_lps));
+    if (tip && near(tip, at) <= HANDLE_PX) return "tip";
+    const chosen = exits ? exits.numberOf(asked.exit) : -1;
+    const exit = chosen >= 0 ? exits.places[chosen] : plan && exits && exits.count ? plan.exit_lps : null;
+    return exit && near(exit, at) <= HANDLE_PX ? "exit" : null;
+  };
+
+  const dragTo = (at) => {
+    if (dragged.kind === "exit") {
+      const { exits } = page;
+      const { found } = nearestOf(exits.count, (n) => exits.places[n], at);
+      dragged.value = exits.entries[found];
+      page.hint(`Exit ${found + 1}: let go to plan from it`);
+      page.preview(exits.places[found]);
+    } else {
+      const { tips } = page, usable = dragged.usable;
+      const { found } = nearestOf(usable.length, (n) => tips.place(usable[n]), at);
+      dragged.value = usable[found];
+      page.hint("Scope tip: let go to plan from there");
+      page.preview(tips.place(dragged.value));
+    }
+  };
+
+  // Before the camera hears of it: a handle moves instead of the view.
+  canvas.parentElement.addEventListener("pointerdown", (event) => {
+    if (event.target !== canvas || event.button !== 0) return;
+    const at = place(event), kind = event.shiftKey ? null : handleAt(at);
+    if (!kind) return;
+    const { tips } = page;
+    const usable = kind === "tip" ? Array.from({ length: tips.count }, (_, n) => n).filter((n) => !tips.turned[n] && tips.deployments[n]) : [];
+    dragged = { kind, usable, value: null };
+    canvas.setPointerCapture(event.pointerId);
+    event.stopPropagation();
+  }, { capture: true });
+
+  canvas.addEventListener("pointermove", (event) => {
+    const at = place(event);
+    if (dragged) dragTo(at);
+    else if (!event.buttons) canvas.style.cursor = handleAt(at) ? "move" : "";
+  });
+
+  const letGo = (event) => {
+    if (!dragged) return;
+    const { kind, value } = dragged;
+    dragged = null;
+    page.preview(null);
+    if (event.type === "pointercancel") return;
+    if (value === null) page.pickAt(place(event));
+    else if (kind === "exit") page.chooseExit(value);
+    else page.state.set({ tip: value, exit: null });
+  };
+  for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, letGo);
+
+  const { clicked } = orbit;
+  orbit.clicked = (event) => {
+    const { measuring } = page.tools;
+    clicked(event);
+    if (!measuring && event.button === 0) page.pickAt(place(event));
+  };
+
+  page.preview = (point) => {
+    scene.setPoints("preview", point ? { places: point, colours: [1, 1, 1], radii: 2.4 } : null);
+    page.redrawScene();
+  };
+  page.hint = (words) => page.tools.say(words);
+
+  // Choose what is at a place of the view: an exit, a nodule, or a place in the plane through the cross.
+  page.pickAt = (at) => {
+    if (!scene.view) return;
+    const { exits } = page;
+    if (exits && exits.count) {
+      const { found, away } = nearestOf(exits.count, (n) => exits.places[n], at);
+      if (away <= HANDLE_PX / 2) {
+        page.chooseExit(exits.entries[found]);
+        return;
+      }
+    }
+    const hit = scene.pick(...at, { pickable: ["nodule"] }), found = hit && hit.hits.find(({ key }) => key === "nodule");
+    if (found) {
+      const nodules = page.facts.targets.filter(({ text }) => text.startsWith("nodule "));
+      nodules.sort((a, b) => norm(minus(a.lps_mm, found.point)) - norm(minus(b.lps_mm, found.point)));
+      if (nodules.length) {
+        page.chooseTarget(nodules[0].text);
+        return;
+      }
+    }
+    const { eye, forward } = orbit.camera();
+    const [x, y] = [(2 * at[0]) / canvas.clientWidth - 1, 1 - (2 * at[1]) / canvas.clientHeight];
+    const ray = scene.picker.ray(x, y);
+    const depth = dot(minus(page.place, eye), forward) / dot(ray, forward);
+    page.moveTo(add(eye, times(ray, depth)));
+    page.chooseTarget(lpsText(page.place));
+  };
+}

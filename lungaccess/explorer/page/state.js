@@ -1,0 +1,94 @@
+// What the page shows, as the part of its address behind #: it can be kept, sent and undone.
+
+// What a plan follows from; numbers are null where the system's own value holds.
+const NUMBERS = { scope: "scope_diameter_mm", radius: "needle_radius_mm", length: "needle_length_mm", margin: "margin_mm" };
+const START = {
+  target: "", system: "", scope: null, radius: null, length: null, margin: null, fissures: null, iterations: 1000, seed: 0,
+  tip: null, exit: null,
+};
+export const MOST_COMPARED = 5;
+
+export class State {
+  // Read the address; changed is called after each change, also by the buttons of the browser.
+  constructor(system, changed) {
+    this.first = { ...START, system };
+    this.changed = changed;
+    this.read();
+    window.addEventListener("popstate", () => {
+      this.read();
+      this.changed();
+    });
+  }
+
+  read() {
+    const text = new URLSearchParams(location.hash.slice(1));
+    this.asked = plainFrom(text, this.first);
+    this.compared = text.getAll("with").slice(0, MOST_COMPARED).map((each) => plainFrom(new URLSearchParams(each), this.first));
+  }
+
+  // Change something, so that it can be undone.
+  set(changes) {
+    Object.assign(this.asked, changes);
+    this.push();
+  }
+
+  // Keep a list of compared plans.
+  compare(list) {
+    this.compared = list.slice(0, MOST_COMPARED);
+    this.push();
+  }
+
+  push() {
+    const address = `#${this.text}`;
+    if (address !== location.hash) history.pushState(null, "", address);
+    this.changed();
+  }
+
+  get text() {
+    const text = plainText(this.asked, this.first);
+    for (const each of this.compared) text.append("with", plainText(each, this.first).toString());
+    return text.toString();
+  }
+}
+
+// Return what is asked of a text; what it does not state, or states wrongly, is as at first.
+function plainFrom(text, first) {
+  const asked = { ...first };
+  for (const key of Object.keys(first)) {
+    if (!text.has(key)) continue;
+    const value = text.get(key);
+    if (key === "fissures") asked.fissures = { yes: true, no: false }[value] ?? null;
+    else if (key === "target" || key === "system") asked[key] = value.slice(0, 200);
+    else if (value !== "" && Number.isFinite(Number(value))) asked[key] = Number(value);
+  }
+  return asked;
+}
+
+function plainText(asked, first) {
+  const text = new URLSearchParams();
+  for (const [key, value] of Object.entries(asked)) {
+    if (value === first[key] || value === null) continue;
+    text.set(key, key === "fissures" ? (value ? "yes" : "no") : String(value));
+  }
+  return text;
+}
+
+// Return what of a state is changed of its system, as the server reads it.
+export function whatIf(asked) {
+  const made = { system: asked.system };
+  for (const [key, name] of Object.entries(NUMBERS)) if (asked[key] !== null) made[name] = asked[key];
+  if (asked.fissures !== null) made.fissures_allowed = asked.fissures;
+  return made;
+}
+
+// Return the question of a plan.
+export function planQuestion(asked) {
+  const made = { target: asked.target, what_if: whatIf(asked), iterations: asked.iterations, seed: asked.seed };
+  if (asked.exit !== null) made.entry = asked.exit;
+  else if (asked.tip !== null) made.scope_tip = asked.tip;
+  return made;
+}
+
+// Return a text that is the same for states with the same plan.
+export const planKey = (asked) => JSON.stringify(planQuestion(asked));
+export const systemKey = (asked) => JSON.stringify(whatIf(asked));

@@ -1,0 +1,31 @@
+// Small parts of the page: elements with text, tables, and words.  Text is never markup.
+
+export function made(name, attributes = {}, ...content) {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (key in element && key !== "list") element[key] = value;
+    else element.setAttribute(key, value);
+  }
+  element.append(...content);
+  return element;
+}
+
+export const button = (text, name, press, attributes = {}) =>
+  made("button", { type: "button", ariaLabel: name, onclick: press, ...attributes }, text);
+
+// Fill a table body with rows of cells, each text or an element; the first cell of a row is its heading.
+export function fillRows(body, rows) {
+  body.replaceChildren(...rows.map(([first, ...cells]) =>
+    made("tr", {}, made("th", { scope: "row" }, first), ...cells.map((cell) => made("td", {}, cell ?? "")))));
+}
+
+export const mm = (value, digits = 1) => (value === null || value === undefined ? "" : `${value.toFixed(digits)} mm`);
+export const lpsText = (point) => `lps:${point.map((value) => Number(value.toFixed(1))).join(",")}`;
+export const placeWords = (point) => point.map((value) => value.toFixed(1)).join(", ");
+
+// Return the words of a typed error of the server.
+export function errorWords({ found, expected, remedy }) {
+  const stop = (text) => (text ? `${text.replace(/\.$/, "")}.` : "");
+  return [stop(found), expected && `Expected: ${stop(expected)}`, stop(remedy)].filter(Boolean).join(" ");
+}

@@ -1,0 +1,90 @@
+"""What is at a point of the lung: its tissue, its lobe, and how far every structure is away."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.errors import TargetError
+from anatomy.lung import Lung
+from anatomy.records import frozen_record
+from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
+from anatomy.typed import Float
+
+CAP_MM = 30.0
+"""Distances are measured up to here: farther structures do not limit a needle."""
+TISSUES = (
+    (OUTSIDE, "outside the lung"), (LUMEN, "airway lumen"), (AIRWAY, "airway wall"), (VESSEL, "vessel"),
+    (FISSURE, "fissure"),
+)  # fmt: skip
+"""The first one of a voxel names its tissue."""
+
+
+@frozen_record
+class Place:
+    """A point of the lung.
+
+    Parameters
+    ----------
+    lps_mm : (3,) float64, LPS mm
+    tissue : str
+        What its voxel is: one of `TISSUES`, "nodule" or "lung tissue".
+    lobe : str
+        Its lobe, or the nearest within 10 mm; "" if not known.
+    distance_mm : mapping of str to float
+        Distance to the nearest voxel of "airway", "vessel", "pleura" and, where the patient has a mask of
+        them, "fissure", voxels as solid boxes; `CAP_MM` where it is that or more, 0 inside.
+    generation : int
+        Of the airway branch nearest to the point.
+    may_be_target : bool
+        Whether a needle may end here, as far as the voxel goes.
+    """
+
+    lps_mm: Float
+    tissue: str
+    lobe: str
+    distance_mm: Mapping[str, float]
+    generation: int
+    may_be_target: bool
+
+
+def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
+    """Return what is at a point `(3,)` LPS mm.
+
+    Raises
+    ------
+    TargetError
+        If the point is not three finite numbers.
+    """
+    point = np.array(lps_mm, dtype=np.float64)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise TargetError(
+            f"The place {point.tolist()} is not a point", expected="three finite numbers, LPS mm"
+        )
+    label = lung.label_at(point)
+    structures = {"airway": AIRWAY | LUMEN, "vessel": VESSEL, "pleura": OUTSIDE}
+    if lung.has_fissures:
+        structures["fissure"] = FISSURE
+    nearest = int(np.argmin(np.linalg.norm(lung.tree.points_lps - point, axis=1)))
+    return Place(
+        lps_mm=point,
+        tissue=next((name for bit, name in TISSUES if label & bit), _free_tissue(lung, point)),
+        lobe=lung.lobe_at(point),
+        distance_mm={
+            name: float(lung.exact_clearance_mm(point[None], bits, cap_mm=CAP_MM)[0])
+            for name, bits in structures.items()
+        },
+        generation=int(lung.tree.generation[lung.tree.branch_of_point[nearest]]),
+        may_be_target=label & obstacle_bits(False) == 0,
+    )
+
+
+def _free_tissue(lung: Lung, point: Float) -> str:
+    """Name tissue that is no structure."""
+    if lung.nodules is None:
+        return "lung tissue"
+    ijk = np.floor(lung.nodules.grid.ijk(point) + 0.5).astype(np.int64)
+    inside = bool(((ijk >= 0) & (ijk < lung.nodules.grid.shape)).all())
+    return "nodule" if inside and bool(lung.nodules.array[tuple(ijk)]) else "lung tissue"

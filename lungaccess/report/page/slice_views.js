@@ -1,0 +1,190 @@
+// Slices that belong together: one cross in all of them, moved, scrolled, zoomed and windowed by mouse, fingers and keys.
+import { add, cross, dot, minus, times } from "./vectors.js";
+
+const LEAST_MM = 8, MOST_MM = 600;
+const WHEEL_PX = 60, ZOOM_PER_PX = 0.0015;
+const TAP_PX = 5;
+// A dragged pixel of the page changes level and width by so much of the width, but at least by so many HU.
+const WINDOW_SHARE = 0.004, LEAST_WINDOW_HU = 1;
+const SHIFTS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0], PageUp: [0, 0, -1], PageDown: [0, 0, 1] };
+const FAST = 10;
+const ZOOM = 1.25;
+
+// The view of one slice: right and up of its plane, and what looks at the viewer.
+const facing = ({ right, up }) => cross(right, up);
+
+export class SliceViews {
+  // slices: { name: Slice }.  Functions that are told of what happens, all but `changed` optional:
+  //   changed(): something has to be drawn again;      moved(place, name): the cross was moved in a slice;
+  //   picked(place, name): a click or Enter chose a place, LPS mm;   pointed(place, name): the pointer is there, null when it left;
+  //   windowed(): the window of the CT was changed.
+  constructor(slices, image, { changed, moved = () => {}, picked = () => {}, pointed = () => {}, windowed = () => {} }) {
+    Object.assign(this, { slices, image, changed, moved, picked, pointed, windowed });
+    this.place = [0, 0, 0];
+    this.centre = [0, 0, 0];
+    this.widthMm = 140;
+    // What a drag does: "cross", "window" or "pan".
+    this.dragging = "cross";
+    this.fingers = new Map();
+    this.rolled = 0;
+    for (const [name, slice] of Object.entries(slices)) this.connect(name, slice);
+  }
+
+  connect(name, slice) {
+    const { canvas } = slice;
+    const listen = (kind, act, options) => canvas.addEventListener(kind, (event) => act.call(this, event, name, slice), options);
+    canvas.tabIndex = 0;
+    canvas.classList.add("moved");
+    listen("wheel", this.wheel, { passive: false });
+    listen("pointerdown", this.press);
+    listen("pointermove", this.drag);
+    listen("pointerup", this.release);
+    listen("pointercancel", (event) => this.fingers.delete(event.pointerId));
+    listen("pointerleave", () => this.pointed(null, name));
+    listen("contextmenu", (event) => event.preventDefault());
+    listen("dblclick", () => this.lookAt(this.place));
+    listen("keydown", this.key);
+  }
+
+  // Put the cross to a place; the pictures stay where they are unless it would be beyond them.
+  moveTo(place) {
+    this.place = [...place];
+    const reach = 0.45 * this.widthMm;
+    if (place.some((value, axis) => Math.abs(value - this.centre[axis]) > reach)) this.centre = [...place];
+    this.changed();
+  }
+
+  // Put cross and the middle of all pictures to a place.
+  lookAt(place) {
+    this.place = [...place];
+    this.centre = [...place];
+    this.changed();
+  }
+
+  setWidth(mm) {
+    this.widthMm = Math.min(Math.max(mm, LEAST_MM), MOST_MM);
+    this.changed();
+  }
+
+  zoom(factor, about = this.centre) {
+    const width = Math.min(Math.max(this.widthMm * factor, LEAST_MM), MOST_MM);
+    this.centre = add(about, times(minus(this.centre, about), width / this.widthMm));
+    this.widthMm = width;
+    this.changed();
+  }
+
+  // Draw planes: { name: { right, up, through, widthMm } }, through the cross and as wide as all if they do not say.
+  draw(planes, marks) {
+    for (const [name, { right, up, through = this.place, widthMm = this.widthMm }] of Object.entries(planes)) {
+      const away = minus(this.centre, through);
+      const middle = add(through, add(times(right, dot(away, right)), times(up, dot(away, up))));
+      this.slices[name].draw({ right, up }, middle, widthMm, { ...marks, cross: this.place });
+    }
+  }
+
+  // Return the place under a pointer.
+  placeAt(event, slice) {
+    const scale = slice.canvas.width / slice.canvas.clientWidth;
+    return slice.pointAt(event.offsetX * scale, event.offsetY * scale);
+  }
+
+  // Move the cross by whole layers of voxels: to the viewer's right, up, and towards the viewer.
+  step(slice, [right, up, near], many = 1) {
+    const { plane } = slice;
+    const shift = [[plane.right, right], [plane.up, up], [facing(plane), near]].filter(([, count]) => count)
+      .map(([direction, count]) => times(direction, many * count * this.image.grid.stepAlong(direction)));
+    return shift.reduce(add, this.place);
+  }
+
+  wheel(event, name, slice) {
+    event.preventDefault();
+    const px = event.deltaMode === 1 ? 40 * event.deltaY : event.deltaMode === 2 ? 400 * event.deltaY : event.deltaY;
+    if (event.ctrlKey || event.metaKey) {
+      this.zoom(Math.exp(ZOOM_PER_PX * px), this.placeAt(event, slice));
+      return;
+    }
+    this.rolled += px;
+    const layers = Math.trunc(this.rolled / WHEEL_PX);
+    this.rolled -= layers * WHEEL_PX;
+    if (layers) this.set(this.step(slice, [0, 0, layers]), name);
+  }
+
+  set(place, name) {
+    this.moveTo(place);
+    this.moved(place, name);
+  }
+
+  press(event, name, slice) {
+    if (event.button === 1) event.preventDefault();
+    slice.canvas.setPointerCapture(event.pointerId);
+    const at = [event.clientX, event.clientY];
+    this.fingers.set(event.pointerId, { first: at, last: at, far: this.fingers.size > 0 });
+    if (this.fingers.size > 1) for (const finger of this.fingers.values()) finger.far = true;
+    if (this.kindOf(event) === "cross" && event.pointerType === "mouse") this.set(this.placeAt(event, slice), name);
+  }
+
+  // What a pointer that is down does.
+  kindOf(event) {
+    if (event.buttons === 2 || event.button === 2) return "window";
+    if (event.buttons === 4 || event.button === 1 || event.shiftKey) return "pan";
+    return this.dragging;
+  }
+
+  drag(event, name, slice) {
+    const finger = this.fingers.get(event.pointerId);
+    if (!finger) {
+      this.pointed(this.placeAt(event, slice), name);
+      return;
+    }
+    const now = [event.clientX, event.clientY], [dx, dy] = [now[0] - finger.last[0], now[1] - finger.last[1]];
+    if (Math.hypot(now[0] - finger.first[0], now[1] - finger.first[1]) > TAP_PX) finger.far = true;
+    const other = [...this.fingers.entries()].find(([id]) => id !== event.pointerId);
+    if (other) {
+      const apart = (at) => Math.hypot(at[0] - other[1].last[0], at[1] - other[1].last[1]) || 1;
+      this.zoom(apart(finger.last) / apart(now), this.placeAt(event, slice));
+      this.pan(dx / 2, dy / 2, slice);
+    } else if (finger.far) {
+      const kind = this.kindOf(event);
+      if (kind === "pan") this.pan(dx, dy, slice);
+      else if (kind === "window") this.window(dx, -dy);
+      else this.set(this.placeAt(event, slice), name);
+    }
+    finger.last = now;
+  }
+
+  pan(dx, dy, { plane, canvas }) {
+    const mm = canvas.width / canvas.clientWidth / plane.scale;
+    this.centre = add(this.centre, add(times(plane.right, -dx * mm), times(plane.up, dy * mm)));
+    this.changed();
+  }
+
+  // Widen the window of the CT, and raise its level.
+  window(wider, higher) {
+    if (!this.image.hasCt) return;
+    const { level, width } = this.image.levels, hu = Math.max(WINDOW_SHARE * width, LEAST_WINDOW_HU);
+    this.image.setLevels(level + hu * higher, width + hu * wider);
+    this.windowed();
+    this.changed();
+  }
+
+  release(event, name, slice) {
+    const finger = this.fingers.get(event.pointerId);
+    this.fingers.delete(event.pointerId);
+    if (!finger || finger.far || event.button !== 0 || event.shiftKey || this.dragging !== "cross") return;
+    const place = this.placeAt(event, slice);
+    this.set(place, name);
+    this.picked(place, name);
+  }
+
+  key(event, name, slice) {
+    const shift = SHIFTS[event.key];
+    if (shift && event.shiftKey && !shift[2]) this.pan(-20 * shift[0], 20 * shift[1], slice);
+    else if (shift) this.set(this.step(slice, shift, shift[2] && event.shiftKey ? FAST : 1), name);
+    else if (event.key === "+" || event.key === "=") this.zoom(1 / ZOOM, this.place);
+    else if (event.key === "-") this.zoom(ZOOM, this.place);
+    else if (event.key === "0") this.lookAt(this.place);
+    else if (event.key === "Enter") this.picked([...this.place], name);
+    else return;
+    event.preventDefault();
+  }
+}

@@ -1,0 +1,75 @@
+// The cross-section of the airway at the tip of the scope: the border of the lumen around the scope of its true width.
+import { DEVICE_COLOURS } from "./colours.js";
+import { unpack } from "./decode.js";
+
+const WALL = "#6FA8CC", LUMEN = "#0E3A57", GAP = "#FFD23F", TIGHT = "#FF8F8A", PAPER = "#F2F2F2";
+const BARS = [0.5, 1, 2, 5];
+const ROOM = 1.15;
+
+export class TipSection {
+  static async of(scope) {
+    const section = new TipSection();
+    section.step = scope.border_step_mm;
+    section.count = scope.border.shape[1];
+    [section.border, section.gap, section.nearest, section.depthGap, section.along] = await Promise.all(
+      [scope.border, scope.gap_mm, scope.nearest, scope.depth_gap_mm, scope.arc_length_mm].map(unpack));
+    return section;
+  }
+
+  // Return the section of the stored state that is nearest after so much motion.
+  at(moved) {
+    const { along, count } = this;
+    let n = 0;
+    while (n + 1 < along.length && Math.abs(along[n + 1] - moved) <= Math.abs(along[n] - moved)) n += 1;
+    const border = Array.from(this.border.subarray(n * count, (n + 1) * count), (steps) => this.step * steps);
+    return { state: n, border, gap: this.gap[n], nearest: this.nearest[n], depthGap: this.depthGap[n] };
+  }
+
+  // Draw it on a canvas with up in the picture as in the bronchoscopy, and say what is free.
+  draw(canvas, caption, moved, radius) {
+    const { border, gap, nearest, depthGap } = this.at(moved), pen = canvas.getContext("2d"), side = canvas.width;
+    const scale = side / 2 / (ROOM * Math.max(...border, 1.5 * radius)), middle = side / 2;
+    const place = (n, mm) => {
+      const angle = (2 * Math.PI * n) / this.count;
+      return [middle + scale * mm * Math.sin(angle), middle - scale * mm * Math.cos(angle)];
+    };
+    pen.fillStyle = WALL;
+    pen.fillRect(0, 0, side, side);
+    pen.beginPath();
+    border.forEach((mm, n) => pen.lineTo(...place(n, mm)));
+    pen.closePath();
+    pen.fillStyle = LUMEN;
+    pen.fill();
+    pen.strokeStyle = PAPER;
+    pen.lineWidth = 2;
+    pen.stroke();
+    pen.beginPath();
+    pen.arc(middle, middle, scale * radius, 0, 2 * Math.PI);
+    pen.fillStyle = DEVICE_COLOURS.scope;
+    pen.fill();
+    pen.stroke();
+    pen.beginPath();
+    pen.moveTo(...place(nearest, radius));
+    pen.lineTo(...place(nearest, border[nearest]));
+    pen.strokeStyle = gap > 0 ? GAP : TIGHT;
+    pen.lineWidth = 5;
+    pen.stroke();
+    this.bar(pen, side, scale);
+    const hour = Math.round((12 * nearest) / this.count) % 12 || 12;
+    const free = gap > 0 ? `${gap.toFixed(1)} mm free at ${hour} o'clock` : `the border of the lumen crosses the scope at ${hour} o'clock`;
+    const proved = depthGap > 0 ? `at least ${depthGap.toFixed(1)} mm` : "not proved";
+    caption.textContent = `Across the scope's tip (${(2 * radius).toFixed(1)} mm wide), seen along it, as in the bronchoscopy: ${free} in this plane; all around: ${proved}`;
+    canvas.setAttribute("aria-label", caption.textContent);
+  }
+
+  bar(pen, side, scale) {
+    const mm = Math.max(...BARS.filter((each) => each * scale <= 0.3 * side), BARS[0]);
+    pen.fillStyle = PAPER;
+    pen.fillRect(9, side - 12, mm * scale, 3);
+    pen.font = "15px system-ui, sans-serif";
+    pen.strokeStyle = "#000000";
+    pen.lineWidth = 4;
+    pen.strokeText(`${mm} mm`, 9, side - 19);
+    pen.fillText(`${mm} mm`, 9, side - 19);
+  }
+}

@@ -2,9 +2,9 @@
 import { DEVICE_COLOURS } from "./colours.js";
 import { unpack } from "./decode.js";
 
-const WALL = "#6FA8CC", LUMEN = "#0E3A57", GAP = "#FFD23F", TIGHT = "#FF8F8A", PAPER = "#F2F2F2";
-const BARS = [0.5, 1, 2, 5];
-const ROOM = 1.15;
+const SECTION_WALL = "#6FA8CC", SECTION_LUMEN = "#0E3A57", FREE_INK = "#FFD23F", CROSSED = "#FF8F8A", SECTION_INK = "#F2F2F2";
+const SECTION_BARS_MM = [0.5, 1, 2, 5];
+const SECTION_ROOM = 1.15;
 
 export class TipSection {
   static async of(scope) {
@@ -28,19 +28,19 @@ export class TipSection {
   // Draw it on a canvas with up in the picture as in the bronchoscopy, and say what is free.
   draw(canvas, caption, moved, radius) {
     const { border, gap, nearest, depthGap } = this.at(moved), pen = canvas.getContext("2d"), side = canvas.width;
-    const scale = side / 2 / (ROOM * Math.max(...border, 1.5 * radius)), middle = side / 2;
+    const scale = side / 2 / (SECTION_ROOM * Math.max(...border, 1.5 * radius)), middle = side / 2;
     const place = (n, mm) => {
       const angle = (2 * Math.PI * n) / this.count;
       return [middle + scale * mm * Math.sin(angle), middle - scale * mm * Math.cos(angle)];
     };
-    pen.fillStyle = WALL;
+    pen.fillStyle = SECTION_WALL;
     pen.fillRect(0, 0, side, side);
     pen.beginPath();
     border.forEach((mm, n) => pen.lineTo(...place(n, mm)));
     pen.closePath();
-    pen.fillStyle = LUMEN;
+    pen.fillStyle = SECTION_LUMEN;
     pen.fill();
-    pen.strokeStyle = PAPER;
+    pen.strokeStyle = SECTION_INK;
     pen.lineWidth = 2;
     pen.stroke();
     pen.beginPath();
@@ -51,7 +51,7 @@ export class TipSection {
     pen.beginPath();
     pen.moveTo(...place(nearest, radius));
     pen.lineTo(...place(nearest, border[nearest]));
-    pen.strokeStyle = gap > 0 ? GAP : TIGHT;
+    pen.strokeStyle = gap > 0 ? FREE_INK : CROSSED;
     pen.lineWidth = 5;
     pen.stroke();
     this.bar(pen, side, scale);
@@ -63,8 +63,8 @@ export class TipSection {
   }
 
   bar(pen, side, scale) {
-    const mm = Math.max(...BARS.filter((each) => each * scale <= 0.3 * side), BARS[0]);
-    pen.fillStyle = PAPER;
+    const mm = Math.max(...SECTION_BARS_MM.filter((each) => each * scale <= 0.3 * side), SECTION_BARS_MM[0]);
+    pen.fillStyle = SECTION_INK;
     pen.fillRect(9, side - 12, mm * scale, 3);
     pen.font = "15px system-ui, sans-serif";
     pen.strokeStyle = "#000000";

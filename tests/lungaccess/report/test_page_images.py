@@ -90,16 +90,17 @@ def test_label_volumes_agree_with_the_labels(data: dict[str, Any], small_lung: L
 def test_ct_bytes_say_the_hounsfield_units(small_lung: Lung, plans: tuple[Plan, ...]) -> None:
     grid = small_lung.grid
     lps = grid.lps(np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1))
-    slope, middle = np.array([9.0, -8.0, 6.5]), lps.reshape(-1, 3).mean(axis=0)
-    ramp = Volume(grid=grid, array=((lps - middle) @ slope + 100.0).astype(np.float32))
+    slope, middle = np.array([3.0, -2.0, 1.5]), lps.reshape(-1, 3).mean(axis=0)
     near = deployment.device_points(plans[0])
     assert volumes.HU_OF_BYTE.shape == (256,)
-    for packed in volumes.ct_volumes(ramp, small_lung, near):
-        array, centres = voxels(packed)
-        inner = tuple(slice(3, -3) for _ in range(3))
-        wanted = (centres[inner] - middle) @ slope + 100.0
-        found = volumes.HU_OF_BYTE[array[inner]]
-        for low, high, step in ((-1024, -200, 8), (-200, 300, 5), (300, 1548, 24)):
+    for low, high, step in ((-1024, -200, 8), (-200, 300, 5), (300, 1548, 24)):
+        centre = 0.5 * (low + high)
+        ramp = Volume(grid=grid, array=((lps - middle) @ slope + centre).astype(np.float32))
+        for packed in volumes.ct_volumes(ramp, small_lung, near):
+            array, centres = voxels(packed)
+            inner = tuple(slice(3, -3) for _ in range(3))
+            wanted = (centres[inner] - middle) @ slope + centre
+            found = volumes.HU_OF_BYTE[array[inner]]
             within = (wanted > low + 50) & (wanted < high - 50)
             assert within.any()
             # Half a step of rounding, and half a voxel where several are averaged to one.

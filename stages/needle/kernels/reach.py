@@ -366,7 +366,7 @@ def reach_by_arcs(
                 kinds[n] = NO_CLEARANCE
                 continue
             kinds[n] = UNREACHED
-            state = (math.inf, _NOBODY, 0)
+            state = (math.inf, entries[n], 0)
             begin = 0
             while state[2] < wanted:
                 if begin == total:

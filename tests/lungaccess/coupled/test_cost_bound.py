@@ -263,8 +263,8 @@ def _attacked(lung: Lung, target: Target, atlas: la.Atlas, count: int, seed: int
 
 
 def test_no_box_costs_more_than_an_arc_from_it(small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
-    _looked_at, highest = _attacked(small_lung, target, atlas, 1500, 0)
-    assert 0.9 < highest <= 1.0 + 1e-3
+    _looked_at, highest = _attacked(small_lung, target, atlas, 400, 0)
+    assert 0.8 < highest <= 1.0 + 1e-3
 
 
 @pytest.mark.slow
@@ -272,7 +272,7 @@ def test_no_box_of_many_costs_more_than_an_arc_from_it(
     small_lung: Lung, target: Target, atlas: la.Atlas
 ) -> None:
     _looked_at, highest = _attacked(small_lung, target, atlas, 20_000, 1)
-    assert 0.9 < highest <= 1.0 + 1e-3
+    assert 0.8 < highest <= 1.0 + 1e-3
 
 
 def test_a_plan_states_its_gap_and_the_same_run_states_the_same(

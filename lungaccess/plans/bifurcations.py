@@ -96,7 +96,9 @@ class Bifurcation:
     def text(self) -> str:
         """Say in a sentence which opening to take."""
         taken, *others = self.openings
-        where = f"{self.from_carina_mm:.0f} mm beyond the carina" if round(self.from_carina_mm) else "the carina"
+        where = (
+            f"{self.from_carina_mm:.0f} mm beyond the carina" if round(self.from_carina_mm) else "the carina"
+        )
         rest = f" Not {'; not '.join(one.words for one in others)}." if others else ""
         return (
             f"Bifurcation {self.number} of {self.count}, {where}, {self.inserted_mm:.0f} mm inserted: "

@@ -12,9 +12,9 @@ from anatomy.errors import SettingsError
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
+from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
-from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.insertion import SHOWN_STEP_MM, shown_motion
 from lungaccess.plans.tip_section import tip_sections
 from lungaccess.report.pack import Packed, pack

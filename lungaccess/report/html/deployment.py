@@ -77,7 +77,7 @@ def device_points(plan: Plan) -> Float:
 
 
 def _scope(plan: Plan, lung: Lung) -> Packed:
-    """Return the scope in its states: tips, where the camera is, sections, the shaft, what is free around the tip.
+    """Return the scope in its states: tips, camera, sections, the shaft, and what is free around the tip.
 
     "bifurcations" are those of the route, each with how far the scope has moved when it stands before it.
     """

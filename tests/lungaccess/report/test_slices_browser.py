@@ -1,4 +1,4 @@
-"""The slices and the bronchoscopist's view in a real browser: cross, window, oblique planes, prompts, pauses."""
+"""Slices and the bronchoscopist's view in a real browser: cross, window, oblique planes, prompts."""
 
 from __future__ import annotations
 

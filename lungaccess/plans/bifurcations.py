@@ -96,7 +96,9 @@ class Bifurcation:
     def text(self) -> str:
         """Say in a sentence which opening to take."""
         taken, *others = self.openings
-        where = f"{self.from_carina_mm:.0f} mm beyond the carina" if round(self.from_carina_mm) else "the carina"
+        where = (
+            f"{self.from_carina_mm:.0f} mm beyond the carina" if round(self.from_carina_mm) else "the carina"
+        )
         rest = f" Not {'; not '.join(one.words for one in others)}." if others else ""
         return (
             f"Bifurcation {self.number} of {self.count}, {where}, {self.inserted_mm:.0f} mm inserted: "
@@ -111,8 +113,8 @@ class Bifurcation:
 def route_bifurcations(motion: ScopeMotion, branches: Int, lung: Lung) -> tuple[Bifurcation, ...]:
     """Return the bifurcations on a route, from the trachea on.
 
-    Hours are those of the picture, whose top is where a positive bend turns the tip, in the state in which the
-    tip is first `BEFORE_MM` before the bifurcation, or as soon as it is past the one before.
+    Hours are those of the picture, whose top is where a positive bend turns the tip, in the state in which
+    the tip is first `BEFORE_MM` before the bifurcation, or as soon as it is past the one before.
 
     Parameters
     ----------
@@ -158,7 +160,7 @@ def branch_label(tree: AirwayTree, branch: int) -> str:
 
 
 def branch_name(lung: Lung, branch: int) -> str:
-    """Return what is known of a branch: number and generation, main bronchi by side, else the lobe it supplies.
+    """Return what is known of a branch: number and generation, a main bronchus by its side, else its lobe.
 
     The tree has no names of segments, so none is given.  A lobe is named only where all ends of the branch
     and of those beyond it lie in it.
@@ -228,7 +230,7 @@ def _openings(lung: Lung, lps_from_tip: Float, parent: int, child: int) -> tuple
         seen.append((branch, float(depth[from_point]), place, clock_hour(lps_from_tip, place)))
     sides = [_side_of_picture(hour) for *_, hour in seen]
     made = []
-    for (branch, at, place, hour), side in zip(seen, sides, strict=True):
+    for (branch, _depth, place, hour), side in zip(seen, sides, strict=True):
         same = sorted(
             (other[1], n) for n, (other, its) in enumerate(zip(seen, sides, strict=True)) if its == side
         )

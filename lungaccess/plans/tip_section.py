@@ -22,8 +22,8 @@ class TipSections:
     Parameters
     ----------
     border_mm : (M, K) float64
-        Distance from the axis of the tip to the first voxel that is no lumen, in its plane, clockwise from the
-        top of the picture; 0 where the axis itself is beyond the lumen, at most `FARTHEST_MM`.
+        Distance from the axis of the tip to the first voxel that is no lumen, in its plane, clockwise from
+        the top of the picture; 0 where the axis itself is beyond the lumen, at most `FARTHEST_MM`.
     gap_mm : (M,) float64
         Least of them minus the radius of the scope: free on the side of `nearest`.
     nearest : (M,) int64

@@ -12,9 +12,9 @@ from anatomy.errors import SettingsError
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float
+from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
-from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.insertion import SHOWN_STEP_MM, shown_motion
 from lungaccess.plans.tip_section import tip_sections
 from lungaccess.report.pack import Packed, pack
@@ -77,7 +77,7 @@ def device_points(plan: Plan) -> Float:
 
 
 def _scope(plan: Plan, lung: Lung) -> Packed:
-    """Return the scope in its states: tips, where the camera is, sections, the shaft, what is free around the tip.
+    """Return the scope in its states: tips, camera, sections, the shaft, and what is free around the tip.
 
     "bifurcations" are those of the route, each with how far the scope has moved when it stands before it.
     """

@@ -84,7 +84,9 @@ def image_words(image: Packed) -> str:
         return held
     steps = "; ".join(
         f"{step} HU from {low} to {stop} HU"
-        for (low, step), stop in zip(HU_RANGES, (*(low for low, _ in HU_RANGES[1:]), HU_OF_BYTE[-1]), strict=True)
+        for (low, step), stop in zip(
+            HU_RANGES, (*(low for low, _ in HU_RANGES[1:]), HU_OF_BYTE[-1]), strict=True
+        )
     )
     return f"{held}, in steps of {steps}; what is beyond is shown as the first or last of these"
 

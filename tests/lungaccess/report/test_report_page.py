@@ -101,7 +101,12 @@ def test_scripts_find_only_elements_that_the_page_has() -> None:
         views = "" if page is page_of_reach else document.TARGET_BUTTON
         html = document.asset(template) + document.scene_figure(more_views=views) + document.slice_controls()
         if page is page_of_plan:
-            html += page_of_plan.FOLLOW + phase.player(WINDOW, True) + phase.chart(WINDOW) + phase.clock_svg(WINDOW, True)
+            html += (
+                page_of_plan.FOLLOW
+                + phase.player(WINDOW, True)
+                + phase.chart(WINDOW)
+                + phase.clock_svg(WINDOW, True)
+            )
         html += page_of_no_plan.PLACES if page is page_of_no_plan else ""
         present = set(re.findall(r'id="([\w-]+)"', html + document.asset("frame.html")))
         wanted = set(re.findall(r'(?:byId|getElementById)\("([\w-]+)"\)', script))

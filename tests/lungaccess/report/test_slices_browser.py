@@ -1,4 +1,4 @@
-"""The slices and the bronchoscopist's view in a real browser: cross, window, oblique planes, prompts, pauses."""
+"""Slices and the bronchoscopist's view in a real browser: cross, window, oblique planes, prompts."""
 
 from __future__ import annotations
 
@@ -31,10 +31,15 @@ const [kind, column, row, more] = [arguments[1], arguments[2], arguments[3], arg
 const at = [box.x + column * box.width / c.width, box.y + row * box.height / c.height];
 c.setPointerCapture = () => {};
 const Kind = kind === 'wheel' ? WheelEvent : PointerEvent;
-const event = new Kind(kind, { clientX: at[0], clientY: at[1], pointerId: 1, pointerType: 'mouse', bubbles: true, cancelable: true, ...more });
+const all = { pointerId: 1, pointerType: 'mouse', bubbles: true, cancelable: true, ...more };
+const event = new Kind(kind, { clientX: at[0], clientY: at[1], ...all });
 c.dispatchEvent(event)"""
 GREYS = """const c = document.getElementById(arguments[0]);
-const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+const copy = document.createElement('canvas');
+[copy.width, copy.height] = [c.width, c.height];
+const pen = copy.getContext('2d', { willReadFrequently: true });
+pen.drawImage(c, 0, 0);
+const d = pen.getImageData(0, 0, c.width, c.height).data;
 return Array.from({ length: d.length / 4 }, (_, n) => d[4 * n])"""
 DEVICES = ("scope", "tubes", "needle", "target")
 SIDE = 360
@@ -55,7 +60,13 @@ def window(page: Path) -> Iterator[browser.Browser]:
 
 @pytest.fixture
 def fresh(window: browser.Browser) -> browser.Browser:
-    for name, value in (("field", "140"), ("window", "lung"), ("follow", True), ("drag", "cross"), ("along-turn", 0)):
+    for name, value in (
+        ("field", "140"),
+        ("window", "lung"),
+        ("follow", True),
+        ("drag", "cross"),
+        ("along-turn", 0),
+    ):
         window.run(CHOOSE, name, value)
     window.run("window.lungaccessReport.set(1)")
     window.frame()
@@ -104,7 +115,9 @@ def test_wheel_zoom_pan_and_keys_work_without_a_click_first(fresh: browser.Brows
     width = fresh.state()["slices"]["width_mm"]
     assert width == pytest.approx(140 * np.exp(-0.3))
     centre = np.array(fresh.state()["slices"]["centre_lps"])
-    fresh.run(POINTER, "slice-coronal", "pointerdown", 100, 100, {"button": 0, "buttons": 1, "shiftKey": True})
+    fresh.run(
+        POINTER, "slice-coronal", "pointerdown", 100, 100, {"button": 0, "buttons": 1, "shiftKey": True}
+    )
     fresh.run(POINTER, "slice-coronal", "pointermove", 130, 90, {"buttons": 1, "shiftKey": True})
     fresh.run(POINTER, "slice-coronal", "pointerup", 130, 90, {"button": 0, "shiftKey": True})
     fresh.frame()
@@ -120,7 +133,10 @@ def test_the_window_maps_hounsfield_units_to_greys(fresh: browser.Browser) -> No
     """By its presets, its fields and a drag with the right button."""
     fresh.run(CHOOSE, "tint", False)
     for key in DEVICES:
-        fresh.run("const b = document.querySelector(`input[data-key='${arguments[0]}']`); if (b.checked) b.click()", key)
+        fresh.run(
+            "const b = document.querySelector(`input[data-key='${arguments[0]}']`); if (b.checked) b.click()",
+            key,
+        )
     raster = {"origin": None, "across": None, "down": None, "columns": SIDE, "rows": SIDE}
     tip, mm = np.array(fresh.state()["tip_lps"]), 140 / SIDE
     raster["origin"] = (tip + mm * np.array([0.5 - SIDE / 2, 0.5 - SIDE / 2, 0])).tolist()
@@ -156,7 +172,9 @@ def values(page: browser.Browser, raster: dict[str, Any]) -> np.ndarray:
     return np.array([np.nan if each is None else each for each in found], dtype=float)
 
 
-def test_oblique_slices_have_the_values_between_the_voxels(fresh: browser.Browser, data: dict[str, Any]) -> None:
+def test_oblique_slices_have_the_values_between_the_voxels(
+    fresh: browser.Browser, data: dict[str, Any]
+) -> None:
     """Compared with another interpolation of the stored volumes: 1 grey of the narrowest preset is 1.6 HU."""
     rng = np.random.default_rng(3)
     table = np.array(data["hounsfield"], dtype=float)
@@ -168,8 +186,16 @@ def test_oblique_slices_have_the_values_between_the_voxels(fresh: browser.Browse
         right, up = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
         columns, rows, mm = 40, 30, 0.45
         origin = middle - mm * (columns / 2 * right + rows / 2 * up)
-        raster = {"origin": origin.tolist(), "across": (mm * right).tolist(), "down": (mm * up).tolist(), "columns": columns, "rows": rows}
-        places = origin + mm * (np.arange(columns)[None, :, None] * right + np.arange(rows)[:, None, None] * up)
+        raster = {
+            "origin": origin.tolist(),
+            "across": (mm * right).tolist(),
+            "down": (mm * up).tolist(),
+            "columns": columns,
+            "rows": rows,
+        }
+        places = origin + mm * (
+            np.arange(columns)[None, :, None] * right + np.arange(rows)[:, None, None] * up
+        )
         kji = ((places - first) / step).reshape(-1, 3)[:, ::-1].T
         wanted = map_coordinates(fine, kji, order=1)
         assert np.ptp(wanted) > 50
@@ -232,7 +258,7 @@ def test_the_cross_is_exact_to_a_voxel_on_any_grid(tmp_path: Path, mirrored: boo
         found = opened.run(
             """const [shape, rows, places, voxels] = arguments, grid = new made.VoxelGrid(shape, rows);
             const source = new made.PackedSource([made.made(grid, Int16Array.from(voxels))]);
-            return places.map((place) => [grid.voxel(place), grid.lps(grid.ijk(place)), source.value(place)])""",
+            return places.map((p) => [grid.voxel(p), grid.lps(grid.ijk(p)), source.value(p)])""",
             list(shape), matrix.tolist(), places.tolist(), image.ravel(order="F").tolist(),
         )  # fmt: skip
         assert opened.messages() == []
@@ -251,7 +277,8 @@ def test_a_double_click_in_the_3d_view_puts_the_cross_there(fresh: browser.Brows
     place = fresh.run(
         """const c = document.getElementById('scene'), at = [c.clientWidth / 2, c.clientHeight / 2];
         const hit = window.lungaccessReport.pick(...at), box = c.getBoundingClientRect();
-        c.dispatchEvent(new MouseEvent('dblclick', { clientX: box.x + at[0], clientY: box.y + at[1], bubbles: true }));
+        const place = { clientX: box.x + at[0], clientY: box.y + at[1], bubbles: true };
+        c.dispatchEvent(new MouseEvent('dblclick', place));
         return hit && hit.point"""
     )
     fresh.frame()
@@ -314,7 +341,9 @@ def test_playing_pauses_before_every_bifurcation(fresh: browser.Browser, data: d
     assert fresh.messages() == []
 
 
-def test_the_cross_section_shows_what_is_free(fresh: browser.Browser, plans: tuple[Plan, ...], small_lung: Lung) -> None:
+def test_the_cross_section_shows_what_is_free(
+    fresh: browser.Browser, plans: tuple[Plan, ...], small_lung: Lung
+) -> None:
     tip, radius = shown_motion(plans[0]).tips[-1], plans[0].system.scope.radius_mm
     section = fresh.state()["section"]
     border = np.array(section["border"])
@@ -326,4 +355,6 @@ def test_the_cross_section_shows_what_is_free(fresh: browser.Browser, plans: tup
         assert (((codes[tuple(ijk.T)] & LUMEN) != 0) == lumen).mean() > 0.9
     assert section["gap"] == pytest.approx(border.min() - radius, abs=0.01)
     assert section["depthGap"] <= section["gap"] + 0.06
-    assert f"{section['gap']:.1f} mm free" in fresh.run("return document.getElementById('gap-words').textContent")
+    assert f"{section['gap']:.1f} mm free" in fresh.run(
+        "return document.getElementById('gap-words').textContent"
+    )

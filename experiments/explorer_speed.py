@@ -123,16 +123,14 @@ async def measure(source: PatientSource, points: np.ndarray) -> None:
             used.append(processor_s(plans) - before)
             memory.append(memory_mb(plans))
         clicks.print()
-        print(
-            f"processor time of a click: median {1000 * np.median(used):.0f}, most {1000 * max(used):.0f} ms"
-        )
+        usual, most = 1000 * np.median(used), 1000 * max(used)
+        print(f"processor time of a click: median {usual:.0f}, most {most:.0f} ms")
         tenth = max(len(memory) // 10, 1)
-        print(
-            f"memory, MB, after each tenth: {', '.join(f'{value:.0f}' for value in memory[tenth - 1 :: tenth])}"
-        )
+        kept = ", ".join(f"{value:.0f}" for value in memory[tenth - 1 :: tenth])
+        print(f"memory, MB, after each tenth: {kept}")
         changes, around = Measured(), points[0].tolist()
         await page.click(nothing, {}, reach={"around": around})
-        for radius in RADII_MM * 12:
+        for radius in RADII_MM * 5:
             asked = {"around": around, "what_if": {"needle_radius_mm": radius}}
             await page.click(changes, {"reach": "reach"}, reach=asked)
         changes.print()

@@ -24,7 +24,6 @@ from lungaccess.explorer import Address, Explorer, PatientSource
 from lungaccess.explorer.messages import read_frame
 
 LAST = ("end", "error", "superseded")
-FEW = 50
 RADII_MM = (121.0, 90.0, 60.0, 150.0)
 SEED = 0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -75,10 +74,11 @@ class Page:
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket, self._number = socket, 0
 
-    async def click(
-        self, measured: Measured | None, stop_at: dict[str, str], **asked: dict[str, Any]
-    ) -> None:
-        """Ask several questions at once; measure until the answer of each that `stop_at` names."""
+    async def click(self, measured: Measured, stop_at: dict[str, str], **asked: dict[str, Any]) -> None:
+        """Ask several questions at once; wait for the answer of each that `stop_at` names, or its last one.
+
+        A plan is not waited for where no exit is feasible: the search may then take long.
+        """
         began = time.perf_counter()
         names = {}
         for name, values in asked.items():
@@ -90,14 +90,12 @@ class Page:
             name = names.get(message["id"])
             if name is None:
                 continue
-            elapsed = 1000.0 * (time.perf_counter() - began)
-            if measured is not None and message["answer"] == stop_at.get(name):
-                measured.add(f"{name}: first answer", elapsed)
-                stop_at = {key: value for key, value in stop_at.items() if key != name}
-            if message["answer"] in LAST:
-                if measured is not None:
-                    measured.add(f"{name}: all of it", elapsed)
+            if message["answer"] == stop_at.get(name):
+                measured.add(name, 1000.0 * (time.perf_counter() - began))
+            if message["answer"] in (stop_at.get(name), *LAST):
                 del names[message["id"]]
+            if message["answer"] == "exits" and message["complete"] and not message["deployments"]:
+                names = {}
 
 
 async def measure(source: PatientSource, points: np.ndarray) -> None:
@@ -109,34 +107,33 @@ async def measure(source: PatientSource, points: np.ndarray) -> None:
         aiohttp.ClientSession() as session,
         session.ws_connect(f"{address.origin}/socket", headers=headers, max_msg_size=0) as socket,
     ):
-        page, measured = Page(socket), Measured()
-        await page.click(None, {}, prepare={})
+        page, nothing = Page(socket), Measured()
+        await page.click(nothing, {}, prepare={})
         plans = explorer.processes["plans"]
-        assert plans is not None
-        memory, used = [], []
-        for n, point in enumerate(points):
+        if plans is None:
+            raise RuntimeError("the process of plans was not started")
+        clicks, memory, used = Measured(), [], []
+        for point in points:
             target = "lps:" + ",".join(f"{value:.1f}" for value in point)
             before = processor_s(plans)
             await page.click(
-                measured if n < FEW else None, {"exits": "exits", "plan": "plan"}, exits={"target": target},
+                clicks, {"exits": "exits", "plan": "plan"}, exits={"target": target},
                 plan={"target": target, "iterations": 100},
             )  # fmt: skip
             used.append(processor_s(plans) - before)
             memory.append(memory_mb(plans))
-        measured.print()
-        print(f"processor time of a click, all of it: median {1000 * np.median(used):.0f} ms")
+        clicks.print()
+        usual, most = 1000 * np.median(used), 1000 * max(used)
+        print(f"processor time of a click: median {usual:.0f}, most {most:.0f} ms")
         tenth = max(len(memory) // 10, 1)
-        print(
-            f"memory of the process of plans after {len(memory)} clicks: {memory[-1]:.0f} MB; "
-            f"after each tenth: {', '.join(f'{value:.0f}' for value in memory[tenth - 1 :: tenth])} MB"
-        )
-        measured = Measured()
-        around = points[0].tolist()
-        await page.click(None, {}, reach={"around": around})
-        for radius in RADII_MM * 3:
+        kept = ", ".join(f"{value:.0f}" for value in memory[tenth - 1 :: tenth])
+        print(f"memory, MB, after each tenth: {kept}")
+        changes, around = Measured(), points[0].tolist()
+        await page.click(nothing, {}, reach={"around": around})
+        for radius in RADII_MM * 5:
             asked = {"around": around, "what_if": {"needle_radius_mm": radius}}
-            await page.click(measured, {"reach": "reach"}, reach=asked)
-        measured.print()
+            await page.click(changes, {"reach": "reach"}, reach=asked)
+        changes.print()
     await explorer.stop()
 
 

@@ -528,7 +528,7 @@ class ExplorerPage extends AnatomyPage {
   }
 
   listReachKey() {
-    const names = { "direct arc": "reached by a single arc", undecided: "not reached by a single arc", unreachable: "no needle can end there" };
+    const names = { "direct arc": "reached by a single arc", unreachable: "no needle can end there" };
     byId("reach-key").append(...Object.entries(names).map(([kind, words]) => {
       const swatch = made("span", { className: "swatch" });
       swatch.style.background = this.facts.reach_colours[kind];

@@ -8,7 +8,10 @@ export class ReachLayer {
     this.kinds = new Uint8Array(grid.shape[0] * grid.shape[1] * grid.shape[2]);
     this.share = 0;
     this.colours = [];
-    for (const [name, code] of Object.entries(grid.kinds)) this.colours[code] = colours[name].map((value) => 255 * SHOWN * value);
+    // What is only not reached by a single arc keeps the colours of its tissue.
+    for (const [name, code] of Object.entries(grid.kinds)) {
+      this.colours[code] = name === "undecided" ? null : colours[name].map((value) => 255 * SHOWN * value);
+    }
     this.reached = [grid.kinds["direct arc"], grid.kinds.search];
   }
 
@@ -30,12 +33,12 @@ export class ReachLayer {
     };
   }
 
-  // Return the points of the 3-D view, of all voxels that are known.
+  // Return the points of the 3-D view, of all voxels that have a colour.
   points() {
     const { kinds, colours, grid: { shape: [, nj, nk], lps_from_ijk: m, spacing_mm: spacing } } = this;
     const places = [], shades = [];
     kinds.forEach((kind, n) => {
-      if (!kind) return;
+      if (!kind || !colours[kind]) return;
       const i = Math.floor(n / (nj * nk)), j = Math.floor(n / nk) % nj, k = n % nk;
       for (let row = 0; row < 3; row++) places.push(m[row][0] * i + m[row][1] * j + m[row][2] * k + m[row][3]);
       shades.push(...colours[kind].map((value) => value / 255));

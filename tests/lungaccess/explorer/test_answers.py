@@ -45,7 +45,7 @@ async def fetched(explorer: Explorer, link: str) -> bytes:
 def test_a_click_its_plan_its_files_and_the_command(
     patient: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One page from the click to the files; the plan is that of the command, byte for byte but for its times."""
+    """One page from the click to the files; the plan is that of the command but for its times."""
     seen: dict[str, Any] = {}
 
     async def talk(client: Client, explorer: Explorer) -> None:

@@ -77,7 +77,7 @@ class Page(browser.Browser):
         return str(self.run("return document.getElementById(arguments[0]).textContent", element))
 
     def pointer(self, kind: str, canvas: str, x: float, y: float) -> None:
-        """Move, press or release the mouse at a place of a canvas, in pixels of the page from its upper left."""
+        """Move, press or release the mouse at a place of a canvas, in pixels from its upper left."""
         left, top = self.run(
             "const c = document.getElementById(arguments[0]); c.scrollIntoView({ block: 'center' });"
             "const box = c.getBoundingClientRect(); return [box.left, box.top]",
@@ -264,7 +264,8 @@ def test_a_wrong_target_is_explained_and_undone(page: Page) -> None:
 
 def test_the_export_is_the_plan_that_is_shown(page: Page) -> None:
     page.run(
-        "window.saved = null; HTMLAnchorElement.prototype.click = function () { fetch(this.href).then((r) => r.text())"
+        "window.saved = null; HTMLAnchorElement.prototype.click = function () {"
+        " fetch(this.href).then((r) => r.text())"
         ".then((text) => { window.saved = [this.download, text]; }); }"
     )
     page.choose("export", "plan.json")

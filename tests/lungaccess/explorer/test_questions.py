@@ -31,17 +31,39 @@ def test_a_question_is_read() -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "", "null", "[]", "{", '{"ask": "plan"}', '{"ask": "everything", "id": 1}', '{"ask": ["plan"], "id": 1}',
-        '{"ask": "__init__", "id": 1}', json.dumps(PLAN | {"id": -1}), json.dumps(PLAN | {"id": True}),
-        json.dumps(PLAN | {"id": "1"}), json.dumps(PLAN | {"target": ""}), json.dumps(PLAN | {"target": "x" * 201}),
-        json.dumps(PLAN | {"iterations": 10**9}), json.dumps(PLAN | {"iterations": 1.5}),
-        json.dumps(PLAN | {"what_if": {"needle_radius_mm": 1.0}}), json.dumps(PLAN | {"what_if": {"scope": 1.0}}),
-        json.dumps(PLAN | {"worker": "answers"}), json.dumps(PLAN | {"entry": -1}), json.dumps(PLAN | {"slot": "x" * 99}),
-        '{"ask": "place", "id": 1, "point": [NaN, 0, 0]}', '{"ask": "place", "id": 1, "point": [1e999, 0, 0]}',
-        '{"ask": "place", "id": 1, "point": [1, 2]}', '{"ask": "export", "id": 1, "plan": "a", "what": "/etc/passwd"}',
-        "[" * 50_000, '{"ask": "plan", "id": 1, "target": "' + "x" * 30_000 + '"}',
+        "",
+        "null",
+        "[]",
+        "{",
+        '{"ask": "plan"}',
+        '{"ask": "everything", "id": 1}',
+        '{"ask": ["plan"], "id": 1}',
+        '{"ask": "__init__", "id": 1}',
+        *(
+            json.dumps(PLAN | wrong)
+            for wrong in (
+                {"id": -1},
+                {"id": True},
+                {"id": "1"},
+                {"target": ""},
+                {"target": "x" * 201},
+                {"iterations": 10**9},
+                {"iterations": 1.5},
+                {"what_if": {"needle_radius_mm": 1.0}},
+                {"what_if": {"scope": 1.0}},
+                {"worker": "answers"},
+                {"entry": -1},
+                {"slot": "x" * 99},
+            )
+        ),
+        '{"ask": "place", "id": 1, "point": [NaN, 0, 0]}',
+        '{"ask": "place", "id": 1, "point": [1e999, 0, 0]}',
+        '{"ask": "place", "id": 1, "point": [1, 2]}',
+        '{"ask": "export", "id": 1, "plan": "a", "what": "/etc/passwd"}',
+        "[" * 50_000,
+        '{"ask": "plan", "id": 1, "target": "' + "x" * 30_000 + '"}',
     ],
-)  # fmt: skip
+)
 def test_anything_else_is_refused_in_words(text: str) -> None:
     with pytest.raises(SettingsError) as refused:
         read_message(text)

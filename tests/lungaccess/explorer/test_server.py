@@ -1,4 +1,4 @@
-"""The server: nothing without the token, nothing to others, nothing that is markup; its processes end with it."""
+"""The server: nothing without the token, nothing to others, no markup; its processes end with it."""
 
 from __future__ import annotations
 
@@ -87,7 +87,8 @@ def test_with_the_token_the_page_and_its_modules_are_served_and_kept_nowhere() -
 @pytest.mark.parametrize(
     "path",
     [
-        "/explorer/explorer.html", "/explorer/..%2fserver.py", "/report/%2e%2e/pack.py", "/tests/x.js", "/explorer/",
+        "/explorer/explorer.html", "/explorer/..%2fserver.py", "/report/%2e%2e/pack.py", "/tests/x.js",
+        "/explorer/",
         "/download/..%2f..%2fetc/passwd", "/explorer/%00.js",
     ],
 )  # fmt: skip

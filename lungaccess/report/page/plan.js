@@ -281,8 +281,13 @@ class PlanPage extends AnatomyPage {
       button.setAttribute("aria-pressed", String(Number(button.dataset.stage) === state.stage));
     }
     if (this.scene) this.drawDevices(state);
-    if (this.views) this.drawSlices();
-    for (const move of this.cursors) move(this.motion.alongMm(state));
+    // What moves the camera alone leaves the slices as they are.
+    const shows = JSON.stringify([this.slider.value, this.phase, this.followed, this.shown, byId("follow").checked]);
+    if (this.views && shows !== this.slicesShow) {
+      this.slicesShow = shows;
+      for (const move of this.cursors) move(this.motion.alongMm(state));
+      this.drawSlices();
+    }
   }
 
   // Return what is where at a place of the slider, in the phase of the breath.

@@ -14,6 +14,7 @@ import pytest
 from scipy import ndimage
 
 import lungaccess as la
+from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.motion.prepare import prepare_motion
@@ -126,13 +127,14 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         tree=_tree(trunk),
         breath_hold=None,
         motion=None,
+        lobes=None,
         lobe_at=lambda point_lps: "left lower lobe" if point_lps[0] > 0.0 else "",
         branch_words=lambda branch: f"{branch} (left lower lobe)",
         warnings=("The toy is [made by hand].",),
     )
 
 
-def _tree(trunk: list[Any]) -> Any:
+def _tree(trunk: list[Any]) -> AirwayTree:
     parent_branch, generation = [-1, 0, 0, 1, 1], [0, 1, 1, 2, 2]
     points, parents, branches, radii, start = [], [], [], [], [0]
     for number, (a, b, radius) in enumerate(trunk):
@@ -143,15 +145,22 @@ def _tree(trunk: list[Any]) -> Any:
         branches += [number] * 30
         radii += [radius] * 30
         start.append(start[-1] + 30)
-    return SimpleNamespace(
-        points_lps=np.concatenate(points),
+    places = np.concatenate(points)
+    steps = np.linalg.norm(places - places[np.maximum(parents, 0)], axis=1)
+    distance = np.zeros(len(places))
+    for point in range(1, len(places)):
+        distance[point] = distance[parents[point]] + steps[point]
+    forward = [np.array(b, dtype=float) - np.array(a, dtype=float) for a, b, _ in trunk]
+    return AirwayTree(
+        points_lps=places,
         parent_point=np.array(parents),
         branch_of_point=np.array(branches),
+        branch_start=np.array(start),
+        branch_parent=np.array(parent_branch),
         generation=np.array(generation),
         radius_mm=np.array(radii),
-        n_branches=5,
-        carina_lps=np.array([0, 5.0, 30]),
-        report=SimpleNamespace(gaps_bridged=()),
+        distance_from_root_mm=distance,
+        tangents=np.array([forward[each] / np.linalg.norm(forward[each]) for each in branches]),
     )
 
 

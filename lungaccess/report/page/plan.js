@@ -285,8 +285,8 @@ class PlanPage extends AnatomyPage {
       if (!this.leavesOut(byId("inside"))) this.bronchoscopy.draw(state, this.motion);
       this.drawScene();
     }
-    if (this.views && !this.leavesOut(this.views.slices.axial.canvas)) this.drawSlices();
     for (const move of this.cursors) move(this.motion.alongMm(state));
+    if (this.views && !this.leavesOut(this.views.slices.axial.canvas)) this.drawSlices();
   }
 
   // Return what is where at a place of the slider, in the phase of the breath.

@@ -114,3 +114,7 @@ def test_programs_get_every_state(toy_plan: Plan, toy_lung: Any) -> None:
     assert np.allclose(np.array(states) * [1.0, np.pi / 180.0, np.pi / 180.0], toy_plan.scope.states)
     assert record["steps"][-1]["branch"] == toy_plan.scope.branches[-1]
     assert record["steps"][-1]["inserted_mm"] == toy_plan.scope.states[-1, 0]
+    taken = [each["openings"][0]["branch"] for each in record["bifurcations"]]
+    assert taken == toy_plan.scope.branches[1:].tolist()
+    assert "take the one " in record["bifurcations"][0]["text"]
+    assert "the left main bronchus (branch 1, generation 1)" in record["bifurcations"][0]["text"]

@@ -142,7 +142,7 @@ def test_every_control_can_have_the_focus(page: browser.Browser) -> None:
     lost = page.run(
         """const all = [...document.querySelectorAll('input, select, button, summary, canvas[tabindex]')];
         const focused = (e) => { e.focus({ preventScroll: true }); return document.activeElement === e; };
-        return all.filter((e) => e.offsetParent && !focused(e)).map((e) => e.outerHTML)"""
+        return all.filter((e) => e.checkVisibility({ contentVisibilityAuto: true }) && !focused(e)).map((e) => e.outerHTML)"""
     )
     assert lost == []
 
@@ -441,6 +441,8 @@ def test_the_lumen_breathes_in_the_slices(
 
 def test_playing_moves_the_slider(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.set(0)")
+    # A machine on which a frame lasts long comes to a bifurcation in the first one.
+    page.run("document.getElementById('pause').checked = false")
     page.run("document.getElementById('play').click()")
     # No longer than it takes to move: on a slow machine few frames last as long as the whole motion.
     frames = 0

@@ -58,6 +58,7 @@ def frames(page: Path) -> list[Image.Image]:
     with Browser(1200, 1000) as window:
         window.open(page)
         window.run(LET_GO)
+        window.run("document.querySelector('button[data-view=front]').click()")
         window.run("document.getElementById('view-target').click()")
         for _ in range(CLOSER):
             window.press("#scene", "+")

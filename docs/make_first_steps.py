@@ -29,6 +29,8 @@ WIDTH_PX, COLOURS = 1100, 256
 """Wide enough to read on a page, small enough to be stored."""
 LEAST_HU, GREATEST_HU = -1350.0, 150.0
 """The usual window for lungs."""
+TALL_PX = 5000
+"""Of a window that holds a whole page: one that grew would draw it anew, and coarsely where it moves."""
 STEP = re.compile(
     r"(```console\n(?P<command>[^\n]+)\n```\n\n)<!-- output: (?P<lines>\d+) lines -->\n```text\n.*?```",
     re.DOTALL,
@@ -46,6 +48,7 @@ SECTIONS = {
     "slices": "section:has(#h-slices)",
     "charts": "section:has(#h-charts)",
     "risk": "section:has(#h-risk)",
+    "cut": "#scene-figure .view",
 }
 """Parts of the report page that are shown."""
 BOX = """const at = document.querySelector(arguments[0]).getBoundingClientRect();
@@ -98,21 +101,36 @@ def draw_ct(file: Path, out: Path) -> None:
     Image.fromarray(grey.astype(np.uint8)).resize((2 * both.shape[1], 2 * both.shape[0])).save(out)
 
 
+def settle(window: Browser) -> None:
+    """Wait until the 3-D view is as fine as it gets: where the processor draws, once nothing moves."""
+    while True:
+        window.frame()
+        view = window.state()["view_tools"]
+        if view["quality"] == "fine" or not view["slow"]:
+            return
+
+
 def photograph(page: Path, folder: Path) -> None:
-    """Store pictures of the sections of a report page, with the needle half-way."""
+    """Store pictures of the sections of a report page, and of one in the dark and on a phone."""
     with Browser(1200, 1000) as window:
+        size = {"width": 1200, "height": TALL_PX, "deviceScaleFactor": 1, "mobile": False}
+        window.command("Emulation.setDeviceMetricsOverride", size)
         window.open(page)
         window.run(LET_GO)
         window.run("window.lungaccessReport.set(0.9)")
-        window.frame()
         for name, part in SECTIONS.items():
+            if name == "cut":
+                window.run("window.lungaccessReport.set(1); document.getElementById('cut').click()")
+            settle(window)
             clip = window.run(BOX, part)
             shot = window.command("Page.captureScreenshot", {"clip": clip, "captureBeyondViewport": True})
             (folder / f"{name}.png").write_bytes(base64.b64decode(shot["data"]))
             store(folder / f"{name}.png", name)
-    for name, window in (("dark", Browser(1200, 800, dark=True)), ("phone", Browser(390, 844, phone=True))):
+    for name, window in (("dark", Browser(1200, 1000, dark=True)), ("phone", Browser(390, 844, phone=True))):
         with window:
             window.open(page)
+            window.run("document.querySelector('section.stage').scrollIntoView()")
+            settle(window)
             window.screenshot(folder / f"{name}.png")
         store(folder / f"{name}.png", name)
 

@@ -18,7 +18,7 @@ def _device_colours() -> dict[str, str | list[str]]:
 
 
 DEVICE_COLOURS = MappingProxyType(_device_colours())
-"""``#rrggbb`` of scope, outer, middle, inner, needle, needle_with_room, target and aim; a list for others: plans."""
+"""``#rrggbb`` of scope, outer, middle, inner, needle, needle_with_room, target and aim; others: a list."""
 
 MISS, NEAREST, OTHER = "#8E24AA", "#2F8FD0", "#009E73"
 """The path that violates least, the plan to the nearest point, plans of other systems; on light and dark."""

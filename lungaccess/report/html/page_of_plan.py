@@ -20,6 +20,7 @@ from lungaccess.procedure import load_procedure, procedure_names
 from lungaccess.report.html import breathing, phase, tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
 from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
+from lungaccess.report.html.glance import glance_section
 from lungaccess.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.report.html.risk import risk_section
 from lungaccess.report.html.trade_off import CAPTION, trade_off_svg
@@ -107,6 +108,7 @@ def plan_page(
     data = page_data(plans, appraisals, lung, chosen, drawn)
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
+        "glance": glance_section(first),
         "headline": words.headline(first.headline),
         "breathing": phase.window_headline(plan, lung, first.accepted),
         "phase_player": phase.player(window, first.accepted),

@@ -70,11 +70,13 @@ def bullets(items: Iterable[object]) -> str:
 
 
 def headline(said: Headline) -> str:
-    """Return a headline as a paragraph whose colour and mark follow the worse of its two parts."""
+    """Return a headline whose colour and mark follow the worse of its parts; what it rests on is folded."""
     details = "".join(f"<p class='note'>{text(each)}</p>" for each in said.details)
+    folded = f"<details><summary>What the estimate rests on</summary>{details}</details>" if details else ""
     return (
         f'<div class="headline grade-{said.grade.key}"><p><span class="mark">{said.grade.mark}</span> '
-        f"<strong>{text(said.verdict.capitalize())}.</strong> {text(said.text)}</p>{details}</div>"
+        f"<strong>{text(said.verdict.capitalize())}.</strong> "
+        f'<span class="said">{text(said.text)}</span></p>{folded}</div>'
     )
 
 

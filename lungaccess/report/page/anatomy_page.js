@@ -5,11 +5,12 @@ import { Scene } from "./scene.js";
 import { SlicePanel } from "./slice_panel.js";
 import { SliceViews } from "./slice_views.js";
 import { Slice, STANDARD } from "./slices.js";
-import { addSwitch, connectViews, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { addSwitch, connectViews, isOnScreen, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
 import { ViewTools } from "./view_tools.js";
 
-// A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another one.
-const REST_MS = 200, FINE_MS = 900;
+// A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another
+// one.  A moment is at least so many ms, and a few times as long as the last picture took.
+const REST_MS = 300, FINE_MS = 900, PICTURES = 4;
 
 export const byId = (id) => document.getElementById(id);
 
@@ -23,16 +24,42 @@ export class AnatomyPage {
     this.breath = null;
     publishColours();
     this.redraw = oncePerFrame((atOnce) => this.show(atOnce ? "rest" : "moving"));
+    this.redrawView = oncePerFrame((atOnce) => this.show(atOnce ? "rest" : "moving", false));
   }
 
-  // Draw all in a quality of the 3-D view, and on a slow machine better when nothing moves any more.
-  show(quality) {
+  // Draw all, or the 3-D view alone, in a quality of that; on a slow machine better when nothing moves any more.
+  show(quality, all = true) {
+    // While a page opens it is drawn once, at the end.
+    if (this.isOpening) return;
     clearTimeout(this.better);
     if (this.scene) this.scene.quality = quality;
-    this.draw();
-    if (!this.scene || !this.scene.slow || quality === "fine" || (this.tools && this.tools.recording)) return;
+    const now = performance.now(), took = Math.min(now - (this.shownAt || 0), REST_MS);
+    this.shownAt = now;
+    if (all) this.draw();
+    else this.drawView();
+    this.drawBetter(quality, all, took);
+  }
+
+  // On a slow machine, draw better when nothing has moved for a moment.
+  drawBetter(quality, all = false, took = 0) {
+    if (!this.scene || !this.scene.slow || (this.tools && this.tools.recording)) return;
+    // Else the pictures of a movement wait in a queue and come late.
+    if (quality === "moving") this.scene.finish();
+    // What else was drawn in a hurry is drawn better with it.
+    this.hasHurried = quality !== "fine" && (this.hasHurried || all);
+    if (quality === "fine") return;
     const [next, ms] = quality === "moving" ? ["rest", REST_MS] : ["fine", FINE_MS];
-    this.better = setTimeout(() => this.show(next), ms);
+    this.better = setTimeout(() => this.show(next, this.hasHurried), Math.max(ms, PICTURES * took));
+  }
+
+  // Return whether a picture is left out for now: it cannot be seen, and a slow machine is in a hurry.
+  leavesOut(canvas) {
+    return Boolean(this.scene && this.scene.slow && this.scene.quality === "moving" && !isOnScreen(canvas));
+  }
+
+  // Draw the 3-D view, where that is not all that there is.
+  drawView() {
+    this.draw();
   }
 
   // Open the 3-D view, and return whether there is one; distanceOf takes the size of the lung in mm.
@@ -49,9 +76,12 @@ export class AnatomyPage {
     for (const packed of this.structures) await this.scene.addSurface(packed, this.breath);
     const box = this.structures.find(({ key }) => key === "lung") || this.structures[0];
     const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
-    this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redraw);
+    this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redrawView);
     connectViews(byId("scene-figure"), this.orbit);
-    new ResizeObserver(this.redraw).observe(canvas);
+    new ResizeObserver(() => {
+      const [width, height] = this.scene.fitted || [];
+      if (canvas.clientWidth !== width || canvas.clientHeight !== height) this.redraw.now();
+    }).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", this.redraw);
     if (byId("save-picture")) this.tools = new ViewTools(this, byId("scene-figure"));
     return true;
@@ -179,13 +209,15 @@ export class AnatomyPage {
 
 // Open a page, and let tests and tools see and move it; docs/how_to/report.md says how.
 export function openPage(page) {
+  page.isOpening = true;
   window.lungaccessReport = {
-    ready: page.open(),
+    ready: page.open().then(() => {
+      page.isOpening = false;
+      page.drawBetter("rest");
+    }),
     state: () => page.report(),
     set: (place) => {
       page.moveTo(place);
-      // The slices, too, even if they show this already.
-      page.slicesShow = null;
       page.redraw.now();
     },
     slice: (raster) => page.image.source && page.image.source.slice(raster),

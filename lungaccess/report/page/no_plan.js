@@ -11,7 +11,6 @@ const START_MM = 1.1;
 const FAINT_START_MM = 0.6;
 const TARGET_MM = 2.2;
 const PATH_MM = 1.2;
-const ROWS = 4;
 
 // Return points as lists of three numbers.
 async function pointsOf(packed) {
@@ -62,12 +61,6 @@ class NoPlanPage extends AnatomyPage {
     const target = new Solids();
     target.ball(this.data.target_lps, TARGET_MM, rgb(DEVICE_COLOURS.target));
     this.solids.set("target", target);
-    for (const { key, colour, places } of this.data.starts) {
-      const balls = new Solids();
-      const radius = key === "out of reach" ? FAINT_START_MM : START_MM;
-      for (const place of places) balls.ball(place, radius, rgb(colour), ROWS);
-      this.solids.set(`start ${key}`, balls);
-    }
     this.data.paths.forEach(({ lines, colour, radius_mm: radius }, n) => {
       const tubes = new Solids();
       for (const line of lines) tubes.tube(line, Math.max(radius, PATH_MM), rgb(colour));
@@ -104,14 +97,23 @@ class NoPlanPage extends AnatomyPage {
       this.scene.setSolids(key, this.shown[key] ? solids : null);
       this.drawn[key] = this.shown[key];
     }
+    for (const { key, colour, places } of this.data.starts) {
+      const name = `start ${key}`;
+      if (this.drawn[name] === this.shown[name]) continue;
+      const radii = key === "out of reach" ? FAINT_START_MM : START_MM, colours = places.flatMap(() => rgb(colour));
+      this.scene.setPoints(name, this.shown[name] ? { places: places.flat(), colours, radii } : null);
+      this.drawn[name] = this.shown[name];
+    }
+  }
+
+  drawView() {
+    this.switchSolids();
+    this.scene.fit();
+    this.drawScene();
   }
 
   draw() {
-    if (this.scene) {
-      this.switchSolids();
-      this.scene.fit();
-      this.drawScene();
-    }
+    if (this.scene) this.drawView();
     if (this.views) this.drawSlices();
   }
 

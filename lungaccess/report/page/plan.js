@@ -280,14 +280,13 @@ class PlanPage extends AnatomyPage {
     for (const button of document.querySelectorAll("button[data-stage]")) {
       button.setAttribute("aria-pressed", String(Number(button.dataset.stage) === state.stage));
     }
-    if (this.scene) this.drawDevices(state);
-    // What moves the camera alone leaves the slices as they are.
-    const shows = JSON.stringify([this.slider.value, this.phase, this.followed, this.shown, byId("follow").checked]);
-    if (this.views && shows !== this.slicesShow) {
-      this.slicesShow = shows;
-      for (const move of this.cursors) move(this.motion.alongMm(state));
-      this.drawSlices();
+    if (this.scene) {
+      this.putDevices(state);
+      if (!this.leavesOut(byId("inside"))) this.bronchoscopy.draw(state, this.motion);
+      this.drawScene();
     }
+    for (const move of this.cursors) move(this.motion.alongMm(state));
+    if (this.views && !this.leavesOut(this.slices.axial.canvas)) this.drawSlices();
   }
 
   // Return what is where at a place of the slider, in the phase of the breath.
@@ -328,7 +327,13 @@ class PlanPage extends AnatomyPage {
     if (this.drawClearance && shown !== this.clearanceAt) this.drawClearance(shown);
   }
 
-  drawDevices(state) {
+  drawView() {
+    if (!this.state) return;
+    this.putDevices(this.state);
+    this.drawScene();
+  }
+
+  putDevices(state) {
     const { scene, shown } = this;
     const radius = thickened(this.motion.plan.radius_mm, this.orbit.distance);
     const followed = this.shownPlans[this.followed];
@@ -346,8 +351,6 @@ class PlanPage extends AnatomyPage {
     put("aim", shown.aim && this.aim, (s) => s.ball(this.aim, AIM_MM, rgb(AIM)));
     put("target", shown.target, (s) => s.ball(this.target, TARGET_MM, rgb(TARGET)));
     scene.fit();
-    this.bronchoscopy.draw(state, this.motion);
-    this.drawScene();
   }
 
   // The plans beside the one followed, each in a colour and in bands of its own.

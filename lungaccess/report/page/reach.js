@@ -133,11 +133,13 @@ class ReachPage extends AnatomyPage {
     };
   }
 
+  drawView() {
+    this.scene.fit();
+    this.drawScene();
+  }
+
   draw() {
-    if (this.scene) {
-      this.scene.fit();
-      this.drawScene();
-    }
+    if (this.scene) this.drawView();
     if (this.views) this.drawSlices();
   }
 

@@ -3,19 +3,19 @@ import { unpack } from "./decode.js";
 import { Layers } from "./layers.js";
 import { FAINTEST, Picker } from "./picking.js";
 import { MOST_SLICES, programs } from "./shaders.js";
-import { facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
+import { coarser, facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
 export const SCOPE_HALF_ANGLE = (48 * Math.PI) / 180;
-const RIM = 0.55, FAINT_GAIN = 1.7, DARK_GAIN = 1.4, DARK_FAINT_GAIN = 3.2, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
+const RIM = 0.55, FAINT_GAIN = 1.5, DARK_GAIN = 1.4, DARK_FAINT_GAIN = 3.2, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
 const INSIDE = "inside";
 const NO_CUT = [0, 0, 0, 0];
 const OUTLINE_PX = 1.2;
 const LEAST_POINT_PX = 3;
 const SLACK_MM = 20;
 const MOST_PIXELS = 2_600_000;
-const SLOW_MS = 60;
+const SLOW_MS = 30;
 // Pixels of the canvas for one of the page; on a slow machine fewer, at rest and still fewer while something moves.
 const FINE = 2, RESTING = 1, COARSE = 0.6;
 
@@ -55,13 +55,15 @@ export class Scene {
       ...(breath ? [attribute(gl, 2, breath.displacements(places, packed), gl.FLOAT, false, 3, 0)] : []),
       gl.createBuffer(),
     ];
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[buffers.length - 1]);
+    const fine = buffers[buffers.length - 1];
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, fine);
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.removeSurface(packed.key);
     const surface = {
       array,
       buffers,
+      fine,
       count: faces.length,
       name: packed.name,
       colour: rgb(packed.colour),
@@ -71,6 +73,7 @@ export class Scene {
       shown: packed.shown,
       ofMasks: packed.key.startsWith("start-"),
       places,
+      faces,
       outward: isInsideOut(places, faces, packed.size_mm) ? -1 : 1,
     };
     this.surfaces.set(packed.key, surface);
@@ -166,10 +169,16 @@ export class Scene {
     }
   }
 
+  // Whether to draw coarsely: while something moves on a slow machine, and on one of which nothing is known yet.
+  get isHurried() {
+    return this.slow === null || (this.slow && this.quality === "moving");
+  }
+
   // Bring the canvas to its size on the page, as fine as the quality says.
   fit() {
     const { clientWidth, clientHeight } = this.canvas;
-    const wished = this.slow ? { moving: COARSE, rest: RESTING, fine: FINE }[this.quality] : FINE;
+    this.fitted = [clientWidth, clientHeight];
+    const wished = this.isHurried ? COARSE : this.slow && this.quality === "rest" ? RESTING : FINE;
     const scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(clientWidth * clientHeight, 1)));
     const width = Math.max(Math.round(clientWidth * scale), 1);
     const height = Math.max(Math.round(clientHeight * scale), 1);
@@ -183,12 +192,20 @@ export class Scene {
   draw(camera, background) {
     this.paint(camera, background);
     if (this.slow !== null || !this.surfaces.size) return;
-    // The second picture is that of a machine which has its programs.
+    // The second, coarse picture is timed: then the machine has its programs.
+    this.finish();
     const start = performance.now();
     this.changes += 1;
     this.paint(camera, background);
-    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
+    this.finish();
     this.slow = performance.now() - start > SLOW_MS;
+    this.fit();
+    this.paint(camera, background);
+  }
+
+  // Wait until all is drawn.
+  finish() {
+    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
   }
 
   paint(camera, background) {
@@ -202,7 +219,7 @@ export class Scene {
     const isFaint = ([, surface]) => surface.opacity < FAINTEST;
     view.shown = [...shown.filter((each) => !isFaint(each)), ...shown.filter(isFaint)];
     // Of what is faint, as lungs and fissures, the nearest layer says all.
-    view.counts = [shown.length, this.slow && this.quality === "moving" ? 0 : shown.filter((each) => !isFaint(each)).length];
+    view.counts = [shown.length, this.isHurried ? 0 : shown.filter((each) => !isFaint(each)).length];
     const isNew = this.layers.fit(width, height, view.shown.length);
     gl.disable(gl.BLEND);
     gl.disable(gl.SCISSOR_TEST);
@@ -246,7 +263,7 @@ export class Scene {
         else gl.enable(gl.CULL_FACE);
         gl.frontFace(surface.outward > 0 ? gl.CCW : gl.CW);
         gl.uniform1i(places.slice, n);
-        this.drawSurface(surface, program);
+        this.drawSurface(surface, program, this.isHurried);
       });
     });
     gl.disable(gl.CULL_FACE);
@@ -364,14 +381,27 @@ export class Scene {
     if (places.span) this.gl.uniform2fv(places.span, view.span);
   }
 
-  drawSurface(surface, { places }) {
+  drawSurface(surface, { places }, isCoarse = false) {
     const gl = this.gl;
     gl.uniform3fv(places.low, surface.low);
     gl.uniform3fv(places.size, surface.size);
     gl.uniform1f(places.share, this.share);
     if (places.outward) gl.uniform1f(places.outward, surface.outward);
     gl.bindVertexArray(surface.array);
-    gl.drawElements(gl.TRIANGLES, surface.count, gl.UNSIGNED_INT, 0);
+    if (isCoarse) this.useCoarse(surface);
+    gl.drawElements(gl.TRIANGLES, isCoarse ? surface.coarse.count : surface.count, gl.UNSIGNED_INT, 0);
+    if (isCoarse) gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.fine);
+  }
+
+  // Draw fewer triangles of a surface, which are made when they are first wanted.
+  useCoarse(surface) {
+    const gl = this.gl;
+    if (surface.coarse) return gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
+    const faces = coarser(surface.places, surface.faces, surface.size);
+    surface.coarse = { buffer: gl.createBuffer(), count: faces.length };
+    surface.buffers.push(surface.coarse.buffer);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
+    return gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
   }
 }
 

@@ -91,7 +91,7 @@ void main() {
   known = vec4(number, twoBytes(depthOf(eye.z)), 0.0);
 }`;
 
-// A point is a disc that is shaded as a ball.
+// A point is a disc that is shaded as a ball.  Alpha says that it has no outline: many small ones would be all outline.
 const POINT_VERTEX = `#version 300 es
 layout(location=0) in vec3 place;
 layout(location=1) in vec3 shade;
@@ -124,7 +124,7 @@ void main() {
   if (rest < 0.0) discard;
   float straight = sqrt(rest);
   result = vec4(colour * (0.45 + 0.55 * straight), 1.0);
-  known = vec4(number, twoBytes(depthOf(centre.z + straight * ball)), 0.0);
+  known = vec4(number, twoBytes(depthOf(centre.z + straight * ball)), 1.0);
 }`;
 
 const SCREEN_VERTEX = `#version 300 es
@@ -164,15 +164,18 @@ vec4 look(vec4 colour, vec4 texel, float depth, float deepest) {
   vec3 lit = colour.rgb * (side < 0.0 ? 0.32 + 0.42 * straight : 0.45 + 0.6 * straight);
   return vec4(lit + (background - lit) * clamp(depth * haze.x + haze.y, 0.0, haze.z), alpha);
 }
+float outlined(ivec2 at) {
+  vec4 texel = texelFetch(known, at, 0);
+  return stored(texel) + texel.a * NOTHING;
+}
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
   float deepest = stored(texelFetch(known, at, 0));
   vec3 behind = deepest < NOTHING ? texelFetch(solids, at, 0).rgb : background;
   vec4 c${last} = vec4(ink, 0.0), texel;
   ivec2 end = textureSize(known, 0) - 1, low = max(at - int(outline), 0), high = min(at + int(outline), end);
-  float d${last} = min(
-    min(stored(texelFetch(known, ivec2(high.x, at.y), 0)), stored(texelFetch(known, ivec2(low.x, at.y), 0))),
-    min(stored(texelFetch(known, ivec2(at.x, high.y), 0)), stored(texelFetch(known, ivec2(at.x, low.y), 0)))) - 0.5;
+  float d${last} = min(min(outlined(ivec2(high.x, at.y)), outlined(ivec2(low.x, at.y))),
+    min(outlined(ivec2(at.x, high.y)), outlined(ivec2(at.x, low.y)))) - 0.5;
   float edge = (deepest - d${last}) * step_mm > 0.8 ? 0.75 : 0.0;
   if (deepest < NOTHING) behind = mix(behind, ink, edge);
   else c${last}.a = edge;${slots.map(layer).join("")}

@@ -52,6 +52,12 @@ export function connectViews(figure, orbit) {
   }
 }
 
+// Return whether any of an element can be seen.
+export function isOnScreen(element) {
+  const { top, bottom } = element.getBoundingClientRect();
+  return bottom > 0 && top < window.innerHeight;
+}
+
 // Write the patient's sides at the edges of the scene.
 export function showEdges(figure, orbit) {
   const names = orbit.edges();

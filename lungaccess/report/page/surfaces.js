@@ -1,6 +1,8 @@
 // Packed surfaces: their triangles, their normals, and which of their places are near a line.
 import { dot, minus, times } from "./vectors.js";
 
+// Every so-manieth triangle is looked at for the mean edge; a cell is so many edges wide.
+const SAMPLED = 97, CELL_EDGES = 2.5;
 // Within WHOLLY_MM of the line a place counts wholly, beyond NOT_MM not at all.
 const WHOLLY_MM = 5, NOT_MM = 15;
 
@@ -54,6 +56,34 @@ export function isInsideOut(places, faces, size) {
     volume += ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx);
   }
   return volume * scale[0] * scale[1] * scale[2] < 0;
+}
+
+// Return triangles between fewer of the same vertices: in cells of a few edges one stands for all, and what shrinks to a
+// line is left out.
+export function coarser(places, faces, size) {
+  let sum = 0, count = 0;
+  for (let f = 0; f < faces.length; f += 3 * SAMPLED, count++) {
+    const [a, b] = [3 * faces[f], 3 * faces[f + 1]];
+    sum += Math.hypot(...[0, 1, 2].map((axis) => ((places[a + axis] - places[b + axis]) * size[axis]) / 65535));
+  }
+  const steps = size.map((mm) => (mm * Math.max(count, 1)) / (65535 * CELL_EDGES * Math.max(sum, 1e-9)));
+  const [ni, nj] = steps.map((step) => Math.floor(65535 * step) + 1);
+  const first = new Map(), chosen = new Uint32Array(places.length / 3);
+  for (let n = 0; n < chosen.length; n++) {
+    const [i, j, k] = [0, 1, 2].map((axis) => Math.floor(places[3 * n + axis] * steps[axis]));
+    const cell = i + ni * (j + nj * k);
+    if (!first.has(cell)) first.set(cell, n);
+    chosen[n] = first.get(cell);
+  }
+  const kept = new Uint32Array(faces.length);
+  let end = 0;
+  for (let f = 0; f < faces.length; f += 3) {
+    const a = chosen[faces[f]], b = chosen[faces[f + 1]], c = chosen[faces[f + 2]];
+    if (a === b || b === c || c === a) continue;
+    kept.set([a, b, c], end);
+    end += 3;
+  }
+  return kept.slice(0, end);
 }
 
 // Return for each vertex how near it is to a line of points, 0 to 255.

@@ -5,7 +5,7 @@ import { add, dot, minus, norm, rgb, times, unit } from "./vectors.js";
 const MEASURE_INK = "#FFD23F";
 const FILM_S = 12;
 const FILM_FPS = 25;
-const FILM_TYPES = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
+const FILM_TYPES = ["video/webm;codecs=vp8", "video/webm", "video/mp4"];
 const PARALLEL = 0.98;
 
 // Return the plane through a point, and along an axis if there is one, that faces the viewer, moved towards the viewer.
@@ -29,12 +29,12 @@ export class ViewTools {
   connectCut() {
     const changed = () => {
       this.find("cut-row").hidden = !this.find("cut").checked;
-      this.page.redraw();
+      this.page.redrawView();
     };
     for (const id of ["cut", "cut-offset"]) this.find(id).addEventListener("input", changed);
     this.find("focus").addEventListener("input", () => {
       this.page.scene.focused = this.find("focus").checked;
-      this.page.redraw();
+      this.page.redrawView();
     });
   }
 
@@ -154,7 +154,7 @@ export class ViewTools {
     for (const point of this.measured) solids.ball(point, 2 * radius, ink);
     solids.tube(this.measured, 0.7 * radius, ink);
     this.page.scene.setSolids("measure", solids);
-    this.page.redraw();
+    this.page.redrawView();
   }
 
   clear() {
@@ -186,11 +186,18 @@ export class ViewTools {
 
   // Return a PNG of the view as it is, with the letters of the sides and the labels.
   picture() {
-    this.page.show("fine");
-    const { canvas } = this, sheet = document.createElement("canvas");
-    [sheet.width, sheet.height] = [canvas.width, canvas.height];
-    const pen = sheet.getContext("2d"), scale = canvas.width / canvas.clientWidth, frame = canvas.getBoundingClientRect();
-    pen.drawImage(canvas, 0, 0);
+    this.page.show("fine", false);
+    const sheet = document.createElement("canvas");
+    [sheet.width, sheet.height] = [this.canvas.width, this.canvas.height];
+    this.copyTo(sheet);
+    return new Promise((resolve) => sheet.toBlob(resolve, "image/png"));
+  }
+
+  // Draw the view as it is, with letters and labels, over all of another canvas.
+  copyTo(sheet) {
+    const { canvas } = this, pen = sheet.getContext("2d");
+    const scale = sheet.width / canvas.clientWidth, frame = canvas.getBoundingClientRect();
+    pen.drawImage(canvas, 0, 0, sheet.width, sheet.height);
     const style = getComputedStyle(document.documentElement), ink = style.getPropertyValue("--ink").trim();
     pen.textAlign = "center";
     pen.textBaseline = "middle";
@@ -204,7 +211,6 @@ export class ViewTools {
       pen.strokeText(element.textContent, ...at);
       pen.fillText(element.textContent, ...at);
     }
-    return new Promise((resolve) => sheet.toBlob(resolve, "image/png"));
   }
 
   filmType() {
@@ -214,21 +220,26 @@ export class ViewTools {
 
   // Return a film of one turn, or of what the page moves: in the time it takes, with as many pictures as can be drawn.
   async film(kind, seconds = FILM_S) {
-    const recorder = new MediaRecorder(this.canvas.captureStream(FILM_FPS), { mimeType: this.filmType(), videoBitsPerSecond: 8e6 });
+    const sheet = document.createElement("canvas");
+    // Even numbers, as encoders want them; the view itself may change its size.
+    [sheet.width, sheet.height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((px) => 2 * Math.ceil(px / 2));
+    this.copyTo(sheet);
+    const recorder = new MediaRecorder(sheet.captureStream(FILM_FPS), { mimeType: this.filmType(), videoBitsPerSecond: 8e6 });
     const parts = [], ended = new Promise((resolve) => recorder.addEventListener("stop", resolve));
     recorder.addEventListener("dataavailable", (event) => parts.push(event.data));
     this.recording = recorder;
     this.find("save-film").textContent = "Stop film";
     const { yaw } = this.page.orbit;
-    // All pictures are of the size of a view that moves.
-    this.page.show("moving");
     recorder.start();
     const start = performance.now();
     while (recorder.state === "recording") {
       const share = Math.min((performance.now() - start) / (1000 * seconds), 1);
       if (kind === "turn") this.page.orbit.yaw = yaw + 2 * Math.PI * share;
       else this.page.filmAt(kind, share);
-      this.page.show("moving");
+      this.page.show("moving", kind !== "turn");
+      // Else pictures wait in a queue, and the film ends before they are drawn.
+      this.page.scene.finish();
+      this.copyTo(sheet);
       await new Promise(requestAnimationFrame);
       if (share >= 1) recorder.stop();
     }

@@ -89,7 +89,7 @@ def ray(view: dict[str, Any], x: float, y: float) -> np.ndarray:
 
 
 def shown(page: Browser, surfaces: list[dict[str, Any]], view: dict[str, Any], **tubes: Any) -> np.ndarray:
-    """Return the picture `(rows, columns, 3)` of bodies in a new scene; tubes are points, radius and colour."""
+    """Return the picture `(rows, columns, 3)` of bodies in a new scene; a tube: points, radius, colour."""
     page.run("for (const key of [...made.scene.surfaces.keys()]) made.scene.removeSurface(key)")
     page.run("for (const key of [...made.scene.solids.keys()]) made.scene.setSolids(key, null)")
     page.run("for (const key of [...made.scene.points.keys()]) made.scene.setPoints(key, null)")

@@ -16,6 +16,7 @@ import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import VESSEL
 from lungaccess.appraisal import SHOWN_LIMITS
+from lungaccess.appraisal.headline import of_hundred
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.curves import arc_lengths
@@ -31,6 +32,7 @@ from lungaccess.report.html import (
     tables,
     words,
 )
+from lungaccess.report.html.glance import glance_section
 from lungaccess.report.html.page_of_reach import STEPS_PER_MM, packed_map
 from tests.lungaccess.report.pages import SIZE_LIMIT, WINDOW, make_reach, reach_file, report_data
 
@@ -138,6 +140,7 @@ def test_names_cannot_become_markup(plans: tuple[Plan, ...], small_lung: Lung, t
     text = written.read_text()
     assert "<script>alert" not in text
     assert "Refused by the independent check" in text and "grade-poor" in text
+    assert "✗</span> refused</strong>" in text
     assert not elements(written).open
     assert "<" not in pack.script_text({evil: [evil]})
 
@@ -255,6 +258,11 @@ def test_the_page_begins_with_headline_and_limits(
     said = la.appraise(plans[0], small_lung, draws=200)
     assert words.headline(said.headline) in header
     assert words.text(said.headline.text) in header
+    assert glance_section(said) in header
+    tiles = dict(re.findall(r"<span class='what'>(.*?)</span><strong>(.*?)</strong>", glance_section(said)))
+    assert tiles["Geometry"].endswith("</span> proved and checked")
+    assert tiles["Chance of success"].endswith(f"{of_hundred(said.headline.success.value)} of 100")
+    assert tiles["Nearest limit"] == f"{said.limits[0].used_words} used"
     for each in said.limits[:SHOWN_LIMITS]:
         row = f'<th scope="row">{words.text(each.what)}</th><td>{each.found_words}</td>'
         assert row in header

@@ -218,8 +218,6 @@ export function openPage(page) {
     state: () => page.report(),
     set: (place) => {
       page.moveTo(place);
-      // The slices, too, even if they show this already.
-      page.slicesShow = null;
       page.redraw.now();
     },
     slice: (raster) => page.image.source && page.image.source.slice(raster),

@@ -286,7 +286,7 @@ class PlanPage extends AnatomyPage {
       this.drawScene();
     }
     for (const move of this.cursors) move(this.motion.alongMm(state));
-    if (this.views && !this.leavesOut(this.views.slices.axial.canvas)) this.drawSlices();
+    if (this.views && !this.leavesOut(this.slices.axial.canvas)) this.drawSlices();
   }
 
   // Return what is where at a place of the slider, in the phase of the breath.

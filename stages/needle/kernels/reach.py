@@ -104,7 +104,7 @@ def _inverted_aside(start, q):
 
 
 @inner_kernel
-def _apart(aside, spread, c):
+def _greatest_spread(aside, spread, c):
     """Return how far arcs from one start may be apart where they are `c` away from it; inf if not bounded.
 
     `aside` is that of one of the arcs, and that of the others differs from it by at most `spread`.
@@ -115,10 +115,10 @@ def _apart(aside, spread, c):
 
 @inner_kernel
 def _is_blocked_at(obstacles, limits, start, aside, spread, c):
-    """Tell whether all arcs of a bundle are blocked at the distance `c` from their start, see `_apart`."""
+    """Tell whether all arcs of a bundle are blocked at the distance `c` from their start."""
     required = limits.required_mm
     if spread > 0.0:
-        required -= _apart(aside, spread, c)
+        required -= _greatest_spread(aside, spread, c)
     if required <= 0.0:
         return False
     x, y, z = _point_at_chord(start, aside, c)

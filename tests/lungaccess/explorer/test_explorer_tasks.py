@@ -58,7 +58,8 @@ def test_choose_the_exit_with_the_most_clearance(planned: Page) -> None:
     planned.choose("exits-by", "clearance")
     clearances = planned.run(
         "document.getElementById('exits-box').open = true;"
-        "return [...document.querySelectorAll('#exits tr')].map((row) => parseFloat(row.cells[2].textContent))"
+        "return [...document.querySelectorAll('#exits tr')]"
+        ".map((row) => parseFloat(row.cells[2].textContent))"
     )
     best = int(np.argmax(clearances))
     planned.run("document.querySelectorAll('#exits tr')[arguments[0]].querySelector('button').click()", best)

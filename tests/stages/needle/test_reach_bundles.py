@@ -13,7 +13,7 @@ from stages.needle.path import CURVATURE, ROLL, direct_path
 
 def test_arcs_to_the_points_of_a_ball_are_never_farther_apart_than_stated() -> None:
     rng = np.random.default_rng(5)
-    inverted, apart = kernel._inverted_aside.py_func, kernel._apart.py_func
+    inverted, apart = kernel._inverted_aside.py_func, kernel._greatest_spread.py_func
     spread, at_chord = kernel._spread.py_func, kernel._point_at_chord.py_func
     tightest, looked = 0.0, 0
     for _ in range(20_000):

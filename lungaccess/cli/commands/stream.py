@@ -53,6 +53,7 @@ def stream(
     stored = Plan.load(plan)
     with Link(host, port, connects=connect) as link:
         lung = output.load(patient)
+        stored.require_lung(lung)
         report = check(stored, lung)
         if not report.accepted:
             if output.json:

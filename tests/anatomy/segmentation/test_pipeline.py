@@ -147,6 +147,7 @@ def test_nothing_is_done_twice(patient: Phantom, made: Segmentation, copy: Path)
         assert (getattr(again.parts, name) == getattr(made.parts, name)).all()
 
 
+@pytest.mark.slow
 def test_the_same_ct_gives_the_same_images(patient: Phantom, made: Segmentation, tmp_path: Path) -> None:
     assert _voxels(_again(patient, made, tmp_path / "other").folder) == _voxels(made.folder)
 

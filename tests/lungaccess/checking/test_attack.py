@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +21,17 @@ from experiments.support.mutants.all import MUTATIONS
 from experiments.support.mutants.mutant import Case
 from lungaccess.checking import Checker, check
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 PLANS_A_SYSTEM = 5
 MUTANTS_OF_A_KIND = 4
+WITHOUT_EXPLANATION = (
+    "lungaccess.coupled.explanation.explain",
+    lambda *_, **__: la.NoPlan("No plan", reasons={}),
+)
+"""Why there is no plan is of no interest here."""
 
 
 def systems() -> list[la.System]:
@@ -47,20 +56,33 @@ def checks(small_lung: Lung) -> Any:
 
 @pytest.fixture(scope="module")
 def made(small_lung: Lung) -> list[tuple[Any, Any, Plan]]:
-    """Systems, targets and plans, made in all the ways there are."""
+    """Systems, targets and plans: made in all the ways there are, and one of several arcs for each system."""
     found = []
     for number, system in enumerate(systems()):
         rng = np.random.default_rng(number)
         coarse = {"rotations": 12, "stop_spacing_mm": 4.0, "site_spacing_mm": 3.0}
         atlas = la.build_atlas(small_lung, system, **(coarse if system.tubes.planar else COARSE))
-        mine: list[tuple[Any, Any, Plan]] = []
-        while len(mine) < PLANS_A_SYSTEM or not any(len(plan.needle.arcs) > 1 for _, _, plan in mine):
-            target = random_plans.random_target(small_lung, atlas, rng)
-            if target is not None:
-                plans = random_plans.plans_to(small_lung, system, target, atlas, rng)
-                mine += [(system, plan.target_lps, plan) for plan in plans]
-        found += mine
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(*WITHOUT_EXPLANATION)
+            drawn = drawn_plans(small_lung, system, atlas, rng, random_plans.plans_to)
+            mine = list(islice(drawn, PLANS_A_SYSTEM))
+            mine.append(next(drawn_plans(small_lung, system, atlas, rng, bent_plans)))
+        found += [(system, plan.target_lps, plan) for plan in mine]
     return found
+
+
+def drawn_plans(lung: Lung, system: la.System, atlas: Any, rng: Any, way: Any) -> Iterator[Plan]:
+    """Yield plans to random targets, without end; `way` plans to one target."""
+    while True:
+        target = random_plans.random_target(lung, atlas, rng)
+        if target is not None:
+            yield from way(lung, system, target, atlas, rng)
+
+
+def bent_plans(lung: Lung, system: la.System, target: Target, atlas: Any, rng: Any) -> Iterator[Plan]:
+    """Yield plans of several arcs from deployments near a target."""
+    task = Task(lung=lung, system=system, target=target, objective="length", method="bent", seed=0)
+    yield from random_plans.bent_plans(task, atlas, rng)
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +102,7 @@ def cases(made: list[tuple[Any, Any, Plan]], checks: Any, small_lung: Lung) -> l
 def test_every_plan_is_accepted(cases: list[tuple[Any, Any, Case]]) -> None:
     assert [case.report.refusals for _, _, case in cases] == [()] * len(cases)
     assert len({case.plan.method for _, _, case in cases}) > 1
+    assert any(len(case.plan.needle.arcs) > 1 for _, _, case in cases)
     assert any(case.plan.fissures_are_obstacles for _, _, case in cases)
 
 
@@ -122,9 +145,7 @@ def test_a_run_that_was_interrupted_goes_on(
     small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(random_plans, "PLANS_A_BATCH", 2)
-    monkeypatch.setattr(
-        "lungaccess.coupled.explanation.explain", lambda *_, **__: la.NoPlan("No plan", reasons={})
-    )
+    monkeypatch.setattr(*WITHOUT_EXPLANATION)
     monkeypatch.setattr(random_plans, "random_system", lambda _rng: la.load_system("ultrathin"))
     files = [tmp_path / name for name in ("at-once.jsonl", "in-parts.jsonl")]
     for file, parts in zip(files, [(4,), (2, 4)], strict=True):

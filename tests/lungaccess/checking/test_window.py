@@ -82,7 +82,7 @@ def test_a_window_agrees_with_brute_force(planned: Plan, moving: Any) -> None:
     assert 0.05 < window.share < 0.95
     assert window.undecided_share < 0.01
     assert "lumen" not in {each.reason for each in window.limits}  # Which brute force does not look at.
-    for phase in np.linspace(0.0, 1.0, 60):
+    for phase in np.linspace(0.0, 1.0, 24):
         spare, miss = brute.clearance(phase).min(), brute.miss_mm(phase)
         if window.holds(phase):
             assert spare > -1e-3

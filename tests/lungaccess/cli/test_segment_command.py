@@ -63,6 +63,7 @@ def test_a_ct_becomes_a_patient_that_info_reads(
     assert cli.main(["info", str(out), "--cache", str(tmp_path / "cache")]) == ExitCode.OK
 
 
+@pytest.mark.slow
 def test_the_second_run_says_that_nothing_was_to_do(
     ct_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

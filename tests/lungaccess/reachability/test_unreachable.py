@@ -97,7 +97,7 @@ def plans(small_lung: Lung, system: System) -> list[la.Plan]:
     rng = np.random.default_rng(0)
     inside = np.argwhere(small_lung.labels == 0)
     found = []
-    for point in small_lung.grid.lps(inside[rng.choice(len(inside), 20, replace=False)]):
+    for point in small_lung.grid.lps(inside[rng.choice(len(inside), 14, replace=False)]):
         try:
             target = point_target(small_lung, point)
             found.append(next(la.plan(small_lung, system, target, atlas=atlas, seed=0, iterations=20)))
@@ -167,7 +167,7 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
         middles = np.concatenate([values, frame @ place])
         return np.concatenate([middles + rng.uniform(-1.0, 1.0, 8) * halves, halves])
 
-    tips = random_tips(proof, rng, 20_000)
+    tips = random_tips(proof, rng, 6_000)
     for piece, place in tips:
         inner = rng.uniform(2.0, 46.0)
         values = np.array([*rng.normal(0.0, 0.4, 2), rng.uniform(-3.1, 3.1), rng.uniform(0.0, inner), inner])
@@ -188,9 +188,9 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
         for _ in range(8):
             box = box_around(piece.frame, place, values)
             assert not all_blocked(environment, tubes, piece.frame, box), (place, values, box, why)
-    assert n_blocked > 3000
-    assert sum(at_limits.values()) > 100
-    assert at_limits[NEAR_VESSEL] > 30
+    assert n_blocked > 900
+    assert sum(at_limits.values()) > 30
+    assert at_limits[NEAR_VESSEL] > 9
 
 
 def test_what_a_plan_reaches_is_never_ruled_out(
@@ -198,10 +198,10 @@ def test_what_a_plan_reaches_is_never_ruled_out(
 ) -> None:
     """Not as a whole, and no box that holds the plan's deployment, of whatever size."""
     rng = np.random.default_rng(5)
-    assert len(plans) >= 6
+    assert len(plans) >= 4
     for plan in plans:
         target, pose = plan.target_lps, plan.scope.lps_from_scope_tip
-        assert not proof.prove(target, most_boxes=30_000).proved
+        assert not proof.prove(target, most_boxes=10_000).proved
         environment = proof._environment(target)
         tested = 0
         for piece in pieces_of(proof, small_lung, pose[:3, 3]):
@@ -291,8 +291,9 @@ def test_a_weak_system_is_proved_not_to_reach_what_it_does_not(small_lung: Lung,
         if verdict.proved:
             proved += 1
             assert shares[-1] == 1.0
-            again = proof.prove(point, most_boxes=300_000)
-            assert (again.proved, again.boxes) == (True, verdict.boxes)
+            if proved == 1:
+                again = proof.prove(point, most_boxes=300_000)
+                assert (again.proved, again.boxes) == (True, verdict.boxes)
             with pytest.raises(la.LungaccessError):
                 next(la.plan(small_lung, weak, point_target(small_lung, point), atlas=atlas, iterations=50))
     assert proved >= 2

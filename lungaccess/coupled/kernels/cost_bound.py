@@ -52,6 +52,10 @@ from stages.tube.kernels import (
 
 COST_STEP_MM = 0.7
 """Longest step of the bounds of an integral where both ends are known well."""
+KNOWN_MM = 1.0
+"""Between tip and target paths are looked at as a whole where tips differ by less."""
+HALFWAY_LOSS = 0.1
+"""How much it counts to know paths halfway, beside knowing their tips: what costs still are tells it already."""
 FIRST_STEP_MM = 1.0
 """Step along the tangent of a tip that is known to less; twice as much otherwise."""
 LONGEST_START_MM, MOST_UNSURE_MM = 30.0, 12.0
@@ -281,15 +285,16 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box):
     box[LOSS + 1] = box[HALF_ROTATION] * abs(x)
     box[LOSS + 2] = unlike * half_outer * max(inner - outer + half_outer, 0.0)
     box[LOSS + 3] = half_inner * (1.0 + (most * inner if inner + half_inner > tubes[CURVED_LENGTH] else 0.0))
-    box[LOSS + 5] = 0.0
+    box[LOSS + 4] = box[LOSS + 5] = 0.0
     most_far = far + away + off
     box[WIDE] = max(angle_at(kappa, most_far) - angle_at(kappa, 0.5 * most_far), 0.0)
-    if box[HALF_ACROSS] < 0.0 or far <= away + off or 0.5 * kappa * most_far > LARGEST_SINE:
-        box[LOSS + 4] = 0.06 * kappa * far * far
-        bound = as_far_as(environment, target, tip, off, away, least)
-    else:
-        bound = _by_halfway(environment, target, tip, tangent, swing, off, away, least, box)
-    bound = max(bound, ahead_cost)
+    bound = ahead_cost
+    if away < KNOWN_MM:
+        if box[HALF_ACROSS] < 0.0 or far <= away + off or 0.5 * kappa * most_far > LARGEST_SINE:
+            box[LOSS + 4] = HALFWAY_LOSS * 0.06 * kappa * far * far
+            bound = max(bound, as_far_as(environment, target, tip, off, away, least))
+        else:
+            bound = max(bound, _by_halfway(environment, target, tip, tangent, swing, off, away, least, box))
     if bound >= limit or away >= FOLLOWED_MM:
         return bound
     return math.inf if tubes_blocked(environment.surroundings, tubes, pose, box, sweep) else bound
@@ -320,8 +325,8 @@ def _by_halfway(environment, target, tip, tangent, swing, off, away, least, box)
     ahead = (via[0] - tip[0], via[1] - tip[1], via[2] - tip[2])
     if leans_too_far(kappa, tangent, ahead, swing, unsure + away):
         return math.inf
-    box[LOSS + 4] = 0.5 * reach * box[HALF_ACROSS]
-    box[LOSS + 5] = 0.5 * reach * box[HALF_UP]
+    box[LOSS + 4] = HALFWAY_LOSS * 0.5 * reach * box[HALF_ACROSS]
+    box[LOSS + 5] = HALFWAY_LOSS * 0.5 * reach * box[HALF_UP]
     far_via = reach - unsure
     total = as_far_as(environment, target, via, off, unsure, max(0.5 * least - 1.5 * off, far_via - off))
     ahead_via = math.sqrt(dot(ahead, ahead)) - unsure - away

@@ -11,13 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from lungaccess.coupled.kernels.cost_to_go import (
-    LARGEST_SINE,
-    CostToGo,
-    angle_at,
-    cost_from,
-    most_distance,
-)
+from lungaccess.coupled.kernels.cost_to_go import LARGEST_SINE, CostToGo, angle_at, cost_from, most_distance
 from lungaccess.coupled.kernels.deployment_box import (
     ACROSS,
     AWAY,
@@ -55,7 +49,7 @@ COST_STEP_MM = 0.7
 KNOWN_MM = 1.0
 """Between tip and target paths are looked at as a whole where tips differ by less."""
 HALFWAY_LOSS = 0.1
-"""How much it counts to know paths halfway, beside knowing their tips: what costs still are tells it already."""
+"""How much it counts to know paths halfway, beside knowing their tips."""
 FIRST_STEP_MM = 1.0
 """Step along the tangent of a tip that is known to less; twice as much otherwise."""
 LONGEST_START_MM, MOST_UNSURE_MM = 30.0, 12.0

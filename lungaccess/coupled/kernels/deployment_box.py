@@ -127,8 +127,8 @@ def point_of(tubes, pose, box, s):
 def least_sweep(tubes, box):
     """Return a sideways sweep (mm) that no deployment of a box goes below; see `stages.tube.lateral_sweep`.
 
-    It looks at where the inner tube's curve ends, and at the sample at which the middle deployment sweeps most.
-    docs/explanation/cost_bound.md derives how both change with the insertions.
+    It looks at where the inner tube's curve ends, and at the sample at which the middle deployment sweeps
+    most.  docs/explanation/cost_bound.md derives how both change with the insertions.
     """
     curved, inner, outer = tubes[CURVED_LENGTH], box[INNER], box[OUTER]
     longest, first_outer = inner + box[HALF_INNER], max(outer - box[HALF_OUTER], 0.0)

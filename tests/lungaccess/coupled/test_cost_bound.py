@@ -369,6 +369,7 @@ def test_no_box_costs_more_than_an_accepted_arc_from_it(small_lung: Lung, atlas:
     assert 0.8 < highest <= 1.0 + 1e-3
 
 
+@pytest.mark.slow
 def test_a_plan_states_its_gap_and_the_same_run_states_the_same(
     small_lung: Lung, target: Target, atlas: la.Atlas
 ) -> None:

@@ -9,7 +9,9 @@ import numpy as np
 
 from anatomy.errors import SettingsError
 from anatomy.structures import AIRWAY
+from anatomy.typed import Float
 from lungaccess.coupled.atlas import Atlas
+from lungaccess.coupled.cost_to_go import cost_to_go
 from lungaccess.coupled.kernels.box_queue import ENDED, MOST_BOXES, WAITING, begin_queue, divide
 from lungaccess.coupled.kernels.cost_bound import BoundEnvironment
 from lungaccess.coupled.kernels.deployment_box import (
@@ -129,7 +131,7 @@ class CostBound:
 
     def _begin(self, cost: float, tips: int) -> None:
         if self._state is None:
-            self._environment = _environment(self._task)
+            self._environment = _environment(self._task, self._tips[:, 0], cost)
             self._insertions = np.zeros(int(self._longest / INSERTION_STEP_MM) + 1)
             greatest_insertions(self._tubes, self._longest, INSERTION_SPACING_MM, self._insertions)
             most = self._most_boxes
@@ -190,11 +192,14 @@ class GapGoal:
         return cost <= (1.0 + self._gap) * self.bound.improve(cost, BOXES_A_STEP)
 
 
-def _environment(task: Task) -> BoundEnvironment:
+def _environment(task: Task, tips: Float, limit: float) -> BoundEnvironment:
     lung = task.lung
     evaluator = CandidateEvaluator(task)
     limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
     tubes = tube_environment(lung, with_fissures=task.with_fissures)
+    weights = objective.inverse_clearance, objective.length
+    x, y, z = task.target.lps_mm.tolist()
+    togo = cost_to_go(tubes.field, tubes.geometry, limits, weights, (x, y, z), tips[:, :3], limit)
     return BoundEnvironment(
         obstacles=tubes.field,
         geometry=tubes.geometry,
@@ -213,4 +218,7 @@ def _environment(task: Task) -> BoundEnvironment:
         goal_tolerance_mm=limits.goal_tolerance_mm,
         per_clearance=objective.inverse_clearance,
         per_mm=objective.length,
+        required_mm=limits.required_mm,
+        exempt_mm=limits.exempt_mm,
+        togo=togo,
     )

@@ -37,7 +37,7 @@ WAITING, UNUSED = 0, 1
 """Of the numbers of a queue: boxes that wait, and rows that hold none."""
 ENDED, EMPTY, FULL, WHOLE = 0, 1, 2, 3
 """Why dividing ended: after so many boxes; none is below the limit; no row is left; the lowest is small."""
-BEGUN_MM = 14.0
+BEGUN_MM = 40.0
 """Tips differ by less in the boxes with which a bound begins."""
 MOST_STACKED = 200
 TIP_SIDES = 4

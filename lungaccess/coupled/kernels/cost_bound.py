@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from anatomy.kernels.field import UNITS_PER_MM
+from lungaccess.coupled.kernels.cost_to_go import LARGEST_SINE, CostToGo, angle_at, cost_from, most_distance
 from lungaccess.coupled.kernels.deployment_box import (
     ACROSS,
     AWAY,
@@ -32,7 +32,7 @@ from lungaccess.coupled.kernels.deployment_box import (
     pose_of,
     tubes_blocked,
 )
-from lungaccess.coupled.kernels.tips_in_reach import angle_at, dot, leans_too_far, least_distance
+from lungaccess.coupled.kernels.tips_in_reach import dot, leans_too_far, least_distance
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
 from stages.tube.kernels import (
     CURVED_LENGTH,
@@ -44,12 +44,16 @@ from stages.tube.kernels import (
     planar_point,
 )
 
-ROUNDING = 1e-4
-"""Share by which distance transforms are made smaller before they are rounded down; they have less."""
-LARGEST_SINE = 0.99
-"""Of half the turn of an arc over a line; paths over longer ones do not lie near it."""
 COST_STEP_MM = 0.7
 """Longest step of the bounds of an integral where both ends are known well."""
+KNOWN_MM = 1.0
+"""Between tip and target paths are looked at as a whole where tips differ by less."""
+HALFWAY_LOSS = 0.1
+"""How much it counts to know paths halfway, beside knowing their tips."""
+FIRST_STEP_MM = 1.0
+"""Step along the tangent of a tip that is known to less; twice as much otherwise."""
+LONGEST_START_MM, MOST_UNSURE_MM = 30.0, 12.0
+"""Paths are followed along the tangent so far, and where they are known so well."""
 FOLLOWED_MM = 8.0
 """The path of the tubes is looked at where their tips differ by less."""
 
@@ -67,6 +71,10 @@ class BoundEnvironment(NamedTuple):
         Limits of the needle; `max_length_mm` is no more than half a circle of the curvature `kappa`.
     per_clearance, per_mm : float
         The objective: weight of 1 / clearance, and least cost of a mm by all else.
+    required_mm, exempt_mm : float
+        Clearance that the needle keeps, beyond so much of its length.
+    togo : CostToGo
+        What paths still cost.
     """
 
     obstacles: np.ndarray
@@ -77,43 +85,9 @@ class BoundEnvironment(NamedTuple):
     goal_tolerance_mm: float
     per_clearance: float
     per_mm: float
-
-
-@inner_kernel
-def most_distance(field, geometry, x, y, z):
-    """Return a distance in mm that the true distance never exceeds; inf off the grid and next to its border.
-
-    Let X be the corner nearest to the point p, and o the obstacle point nearest to X.  No obstacle point
-    is nearer to another corner than that corner's distance, which bounds how far o lies beyond X.
-    """
-    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
-    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
-    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
-    u -= 0.5 - geometry[0, 5]
-    v -= 0.5 - geometry[1, 5]
-    w -= 0.5 - geometry[2, 5]
-    ni, nj, nk = field.shape
-    if not (1.0 <= u < ni - 2 and 1.0 <= v < nj - 2 and 1.0 <= w < nk - 2):
-        return math.inf
-    i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
-    here = (float(field[i, j, k]) * (1.0 + ROUNDING) + 2.0) / UNITS_PER_MM
-    square = here * here
-    total = beside = 0.0
-    for axis in range(3):
-        if axis == 0:
-            off = u - i
-            other = field[i - 1 if off > 0.0 else i + 1, j, k]
-        elif axis == 1:
-            off = v - j
-            other = field[i, j - 1 if off > 0.0 else j + 1, k]
-        else:
-            off = w - k
-            other = field[i, j, k - 1 if off > 0.0 else k + 1]
-        share, size2 = abs(off), geometry[axis, 4]
-        there = float(other) / UNITS_PER_MM
-        total += share * (square - there * there + size2)
-        beside += share * share * size2
-    return min(math.sqrt(max(square + total + beside, 0.0)), here + math.sqrt(beside))
+    required_mm: float
+    exempt_mm: float
+    togo: CostToGo
 
 
 @inner_kernel
@@ -170,6 +144,61 @@ def as_far_as(environment, begin, end, begin_off, end_off, least):
             middle += CLEARANCE_FLOOR_MM  # Of max(clearance, floor), whose inverse is convex.
         total += 1.0 / max(middle + aside, CLEARANCE_FLOOR_MM)
     return least * (environment.per_clearance * total / steps + environment.per_mm)
+
+
+@inner_kernel
+def along_tangent(environment, tip, tangent, swing, away, far, limit):
+    """Bound the cost of every path from near a tip, which follows its direction at first, then any way.
+
+    Parameters
+    ----------
+    tip, tangent : tuple of 3 float
+        LPS mm, and a unit vector.
+    swing, away : float
+        How well direction (rad) and place (mm) are known.
+    far : float
+        Every path is at least so long, mm.
+    limit : float
+        It ends early once the bound is as high.
+
+    Returns
+    -------
+    float
+        inf if there is no path.
+    """
+    kappa, exempt = environment.kappa, environment.exempt_mm
+    x, y, z = tip
+    off = environment.goal_tolerance_mm
+    best = cost_from(environment.togo, x, y, z, away + off, exempt)
+    step = FIRST_STEP_MM if away < FIRST_STEP_MM else 2.0 * FIRST_STEP_MM
+    length = total = 0.0
+    unsure = away
+    while best < limit and unsure < MOST_UNSURE_MM and length + step < min(far, LONGEST_START_MM):
+        middle, end = length + 0.5 * step, length + step
+        before, unsure = unsure, away + end * (swing + 0.5 * kappa * end)
+        clear = most_distance(
+            environment.obstacles,
+            environment.geometry,
+            x + middle * tangent[0],
+            y + middle * tangent[1],
+            z + middle * tangent[2],
+        )
+        if middle > exempt and clear + unsure < environment.required_mm:
+            return math.inf
+        # Mean clearances: how far paths are from the tangent is a convex function of their length.
+        clear = max(clear, CLEARANCE_FLOOR_MM) + 0.25 * step + 0.5 * (before + unsure)
+        total += step * (environment.per_clearance / clear + environment.per_mm)
+        length = end
+        rest = cost_from(
+            environment.togo,
+            x + length * tangent[0],
+            y + length * tangent[1],
+            z + length * tangent[2],
+            unsure + off,
+            max(exempt - length, 0.0),
+        )
+        best = max(best, total + rest)
+    return best
 
 
 @inner_kernel
@@ -242,19 +271,24 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box):
     least = max(least_distance(tubes, kappa, pose, box, tip, tangent, target, off), far - away - off)
     if least == math.inf or least > environment.max_length_mm:
         return math.inf
+    ahead_cost = along_tangent(environment, tip, tangent, swing, away, far - away - off, limit)
+    if ahead_cost >= limit:
+        return math.inf
     x, z = planar_point(tubes, outer, inner, inner)
     box[LOSS] = place + tilt * math.hypot(x, z)
     box[LOSS + 1] = box[HALF_ROTATION] * abs(x)
     box[LOSS + 2] = unlike * half_outer * max(inner - outer + half_outer, 0.0)
     box[LOSS + 3] = half_inner * (1.0 + (most * inner if inner + half_inner > tubes[CURVED_LENGTH] else 0.0))
-    box[LOSS + 5] = 0.0
+    box[LOSS + 4] = box[LOSS + 5] = 0.0
     most_far = far + away + off
     box[WIDE] = max(angle_at(kappa, most_far) - angle_at(kappa, 0.5 * most_far), 0.0)
-    if box[HALF_ACROSS] < 0.0 or far <= away + off or 0.5 * kappa * most_far > LARGEST_SINE:
-        box[LOSS + 4] = 0.06 * kappa * far * far
-        bound = as_far_as(environment, target, tip, off, away, least)
-    else:
-        bound = _by_halfway(environment, target, tip, tangent, swing, off, away, least, box)
+    bound = ahead_cost
+    if away < KNOWN_MM:
+        if box[HALF_ACROSS] < 0.0 or far <= away + off or 0.5 * kappa * most_far > LARGEST_SINE:
+            box[LOSS + 4] = HALFWAY_LOSS * 0.06 * kappa * far * far
+            bound = max(bound, as_far_as(environment, target, tip, off, away, least))
+        else:
+            bound = max(bound, _by_halfway(environment, target, tip, tangent, swing, off, away, least, box))
     if bound >= limit or away >= FOLLOWED_MM:
         return bound
     return math.inf if tubes_blocked(environment.surroundings, tubes, pose, box, sweep) else bound
@@ -285,8 +319,8 @@ def _by_halfway(environment, target, tip, tangent, swing, off, away, least, box)
     ahead = (via[0] - tip[0], via[1] - tip[1], via[2] - tip[2])
     if leans_too_far(kappa, tangent, ahead, swing, unsure + away):
         return math.inf
-    box[LOSS + 4] = 0.5 * reach * box[HALF_ACROSS]
-    box[LOSS + 5] = 0.5 * reach * box[HALF_UP]
+    box[LOSS + 4] = HALFWAY_LOSS * 0.5 * reach * box[HALF_ACROSS]
+    box[LOSS + 5] = HALFWAY_LOSS * 0.5 * reach * box[HALF_UP]
     far_via = reach - unsure
     total = as_far_as(environment, target, via, off, unsure, max(0.5 * least - 1.5 * off, far_via - off))
     ahead_via = math.sqrt(dot(ahead, ahead)) - unsure - away

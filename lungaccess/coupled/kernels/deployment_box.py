@@ -24,9 +24,9 @@ from stages.tube.kernels import (
     MARGIN,
     OUTER_RADIUS,
     OVERLAP_CURVATURE,
-    lateral_sweep,
+    SWEEP_SAMPLES,
+    off_track,
     planar_point,
-    sweep_slope,
 )
 
 BOUND, TIP, FIRST, LAST, ROTATION, OUTER, INNER, ACROSS, UP = range(9)
@@ -42,7 +42,9 @@ SPARE = 1e-6
 TUBE_STEP_MM = 0.5
 """Step at which tubes of a small box are looked at."""
 LOOSE_SWEEP_MM = 0.3
-"""The whole sweep is looked at where it is known so well."""
+"""The samples of the sweep are looked at where they are known so well."""
+SWEEPS_EVERY = 4
+"""Of the samples of the sweep, one of so many is looked at."""
 LEAST_STEP_MM = 0.1
 """The same where they leave their airway."""
 WIDEST_LOOK_MM = 2.5
@@ -125,23 +127,30 @@ def point_of(tubes, pose, box, s):
 def least_sweep(tubes, box):
     """Return a sideways sweep (mm) that no deployment of a box goes below; see `stages.tube.lateral_sweep`.
 
-    It looks at the point of the body that is the first to go straight, for which the insertions change shapes
-    by no more than the length beyond their bend times the change of its angle.
+    It looks at where the inner tube's curve ends, and at the sample at which the middle deployment sweeps
+    most.  docs/explanation/cost_bound.md derives how both change with the insertions.
     """
-    curved, inner, outer = tubes[CURVED_LENGTH], box[INNER], min(box[OUTER], box[INNER])
-    if inner - box[HALF_INNER] <= curved:
+    curved, inner, outer = tubes[CURVED_LENGTH], box[INNER], box[OUTER]
+    longest, first_outer = inner + box[HALF_INNER], max(outer - box[HALF_OUTER], 0.0)
+    if inner - box[HALF_INNER] <= curved or outer > inner:
         return 0.0
-    before_x, before_z = planar_point(tubes, min(curved, outer), curved, curved)
-    after_x, after_z = planar_point(tubes, outer, inner, curved)
     unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
-    most = max(abs(tubes[OVERLAP_CURVATURE]), abs(tubes[INNER_CURVATURE]))
-    loose = most * curved * box[HALF_INNER]
-    loose += 2.0 * unlike * curved * (box[HALF_OUTER] + max(box[OUTER] - outer, 0.0))
-    least = max(math.hypot(after_x - before_x, after_z - before_z) - loose - SPARE, 0.0)
-    loose = sweep_slope(most * curved) * (box[HALF_INNER] + box[HALF_OUTER] + box[OUTER] - outer)
-    if loose < LOOSE_SWEEP_MM:
-        least = max(least, lateral_sweep(tubes, outer, inner) - loose - SPARE)
-    return least
+    opening = abs(tubes[OVERLAP_CURVATURE])
+    if longest - curved > first_outer:
+        opening = max(opening, abs(tubes[INNER_CURVATURE]))
+    least = off_track(tubes, outer, inner, curved) - opening * curved * box[HALF_INNER]
+    least -= 2.0 * unlike * max(curved - first_outer, 0.0) * box[HALF_OUTER]
+    if opening * curved * box[HALF_INNER] < LOOSE_SWEEP_MM:
+        greatest = share = 0.0
+        for m in range(SWEEPS_EVERY, SWEEP_SAMPLES + 1, SWEEPS_EVERY):
+            off = off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES)
+            if off > greatest:
+                greatest, share = off, m / SWEEP_SAMPLES
+        by_inner = opening * (curved + share * ((1.0 - share) * longest + curved))
+        greatest -= by_inner * box[HALF_INNER]
+        greatest -= 2.0 * unlike * max(share * longest - first_outer, 0.0) * box[HALF_OUTER]
+        least = max(least, greatest)
+    return max(least - SPARE, 0.0)
 
 
 @inner_kernel

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from anatomy.kernels.compiling import inner_kernel
+from lungaccess.coupled.kernels.cost_to_go import angle_at
 from lungaccess.coupled.kernels.deployment_box import (
     HALF_INNER,
     HALF_OUTER,
@@ -17,12 +18,6 @@ from lungaccess.coupled.kernels.deployment_box import (
     SPARE,
 )
 from stages.tube.kernels import CORNER_MM, CURVED_LENGTH, INNER_CURVATURE, OVERLAP_CURVATURE, planar_point
-
-
-@inner_kernel
-def angle_at(kappa, length):
-    """Return the angle (rad) from a chord to the arc of greatest curvature over it, at most a right one."""
-    return math.asin(min(0.5 * kappa * length, 1.0))
 
 
 @inner_kernel

@@ -16,7 +16,7 @@ from stages.tube.kernels.planar import (
     sampled_sweep,
 )
 
-INSERTION_STEP_MM = 0.5
+INSERTION_STEP_MM = 0.05
 """Of the outer tube, in the table of greatest insertions."""
 
 SAMPLED_EVERY = 25

@@ -80,7 +80,7 @@ def tip_pose(tubes, base, normal, outer, inner):
 
 
 @numba.njit(cache=True)
-def _off_track(tubes, outer, inner, tip):
+def off_track(tubes, outer, inner, tip):
     """Return how far the point at arc length `tip` ends up from where the tip first got there, in mm."""
     x0, z0 = planar_point(tubes, min(tip, outer), tip, tip)
     x1, z1 = planar_point(tubes, outer, inner, tip)
@@ -107,10 +107,10 @@ def sampled_sweep(tubes, outer, inner, every):
         return 0.0
     # It peaks sharply where the straight part leaves the scope or the outer tube; elsewhere it is smooth.
     worst = max(
-        _off_track(tubes, outer, inner, curved), _off_track(tubes, outer, inner, min(outer + curved, inner))
+        off_track(tubes, outer, inner, curved), off_track(tubes, outer, inner, min(outer + curved, inner))
     )
     for m in range(every, SWEEP_SAMPLES + 1, every):
-        worst = max(worst, _off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
+        worst = max(worst, off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
     return worst
 
 

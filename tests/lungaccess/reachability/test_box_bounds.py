@@ -106,7 +106,7 @@ def test_no_tube_of_a_box_is_farther_from_its_samples_than_they_say(tubes: Float
 
 
 def test_insertions_that_sweep_little_are_in_the_table(tubes: Float) -> None:
-    table = np.zeros(121)
+    table = np.zeros(int(60.0 / INSERTION_STEP_MM) + 1)
     greatest_insertions(tubes, 60.0, 0.02, table)
     assert table.max() < 60.0
     rng = np.random.default_rng(3)

@@ -127,6 +127,10 @@ class Answers:
             },
         )  # fmt: skip
 
+    def _ready(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        self._atlas(self._system(asked.question.what_if), turn)
+        yield from ()
+
     def _exits(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
         question = asked.question
         system = self._system(question.what_if)

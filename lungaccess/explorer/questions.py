@@ -15,8 +15,9 @@ from anatomy.settings import parse, quantity, settings, text
 MOST_CHARACTERS = 20_000
 """A message of the page is shorter by far."""
 MOST_ITERATIONS = 20_000
-PLANS, REACH, ANSWERS = "plans", "reach", "answers"
-"""The processes that answer: what follows a click, the reach of the system, and what takes seconds."""
+CLICKS, PLANS, REACH, ANSWERS = "clicks", "plans", "reach", "answers"
+"""The processes that answer: what a click shows at once, the search for a plan, the reach of the system, and
+what takes seconds.  The first never waits for a step of a search."""
 
 Point = Annotated[tuple[float, float, float], Field(description="a point, LPS mm")]
 Number = Annotated[int, Field(strict=True, ge=0, le=2**53)]
@@ -67,7 +68,7 @@ class _Question:
 
     id: Number
     slot: Annotated[str, Len(0, 40)] = ""
-    worker: ClassVar[str] = PLANS
+    worker: ClassVar[str] = CLICKS
 
 
 @settings
@@ -105,6 +106,14 @@ class PrepareQuestion(_Question):
 
 
 @settings
+class ReadyQuestion(_Question):
+    """The atlas of a system in the process that plans, so that the first plan does not wait for it."""
+
+    what_if: WhatIf = WhatIf()
+    worker: ClassVar[str] = PLANS
+
+
+@settings
 class ExitsQuestion(_Question):
     """The feasible exits of a target, `ras:x,y,z`, `lps:x,y,z`, `nodule N` or a name."""
 
@@ -124,6 +133,7 @@ class PlanQuestion(_Question):
     seed: Number = 0
     scope_tip: Number | None = None
     entry: Number | None = None
+    worker: ClassVar[str] = PLANS
 
 
 @settings
@@ -169,6 +179,7 @@ QUESTIONS: Mapping[str, type[_Question]] = {
     "image": ImageQuestion,
     "place": PlaceQuestion,
     "prepare": PrepareQuestion,
+    "ready": ReadyQuestion,
     "exits": ExitsQuestion,
     "plan": PlanQuestion,
     "reach": ReachQuestion,

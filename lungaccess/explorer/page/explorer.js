@@ -84,9 +84,8 @@ class ExplorerPage extends AnatomyPage {
 
   // Ask so that a later question with the same name takes the place of this one.
   async latest(name, values, part) {
-    const number = (this.asking[name] || 0) + 1;
-    this.asking[name] = number;
-    const isLatest = () => this.asking[name] === number;
+    this.forget(name);
+    const number = this.asking[name], isLatest = () => this.asking[name] === number;
     const counts = SOON.includes(name) ? 1 : 0;
     this.awaited += counts;
     const last = await this.connection.ask(name, values, (message) => {
@@ -97,6 +96,11 @@ class ExplorerPage extends AnatomyPage {
     if (!isLatest()) return { answer: "superseded" };
     this.showProgress(null);
     return last;
+  }
+
+  // Take no more of what is answered to the latest question of a name.
+  forget(name) {
+    this.asking[name] = (this.asking[name] || 0) + 1;
   }
 
   showProgress(message) {
@@ -223,13 +227,16 @@ class ExplorerPage extends AnatomyPage {
     byId("nodule").value = this.facts.targets.some(({ text }) => text === asked.target) ? asked.target : "";
     byId("target-text").value = asked.target;
     byId("target-error").hidden = true;
-    this.prepare();
-    if (asked.target) this.seek();
-    else this.clear();
+    if (asked.target) this.seek(this.prepare());
+    else {
+      this.prepare();
+      this.clear();
+    }
     this.compared.follow();
   }
 
   clear() {
+    this.seeking = null;
     this.exits = this.motion = this.targetLps = this.plan = null;
     this.planPanel.clear("Choose a target: click into a slice, or pick a nodule.");
     this.showExits();
@@ -237,11 +244,17 @@ class ExplorerPage extends AnatomyPage {
     this.fitImage(this.place);
   }
 
-  // Prepare the system, then show what it reaches.
-  async prepare() {
+  // Prepare the system, then show what it reaches; resolves when its atlas is known, with whether it is.
+  prepare() {
     const key = systemKey(this.state.asked);
-    if (this.systemKey === key) return;
-    this.systemKey = key;
+    if (this.systemKey !== key) {
+      this.systemKey = key;
+      this.preparing = this.prepareAnew();
+    }
+    return this.preparing;
+  }
+
+  async prepareAnew() {
     const began = performance.now();
     const last = await this.latest("prepare", { what_if: whatIf(this.state.asked) }, (found) => {
       this.tips = new Tips(found);
@@ -250,8 +263,11 @@ class ExplorerPage extends AnatomyPage {
       this.showExits();
     });
     this.whatIfPanel.fail(last.answer === "error" ? errorWords(last.error) : "");
-    if (last.answer === "end") this.seekReach(began);
-    else if (last.answer === "error") this.systemKey = null;
+    if (last.answer === "error") this.systemKey = null;
+    if (last.answer !== "end") return last;
+    this.latest("ready", { what_if: whatIf(this.state.asked) }, () => null);
+    this.seekReach(began);
+    return last;
   }
 
   async seekReach(began) {
@@ -278,16 +294,33 @@ class ExplorerPage extends AnatomyPage {
     this.redrawSlices();
   }
 
-  // Ask for exits and plan; what is known already is shown at once.
-  seek() {
-    const { asked } = this.state, question = planQuestion(asked);
+  // Ask for exits and plan once the system is prepared; what is known already is shown at once.
+  async seek(preparing) {
+    const { asked } = this.state, question = planQuestion(asked), key = planKey(asked), known = this.plans.get(key);
     const click = this.times.click || performance.now();
     this.times.click = null;
     this.times.exits = this.times.plan = null;
     this.exits = null;
-    const exits = { target: asked.target, what_if: question.what_if };
-    if (asked.tip !== null && asked.exit === null) exits.scope_tip = asked.tip;
-    this.latest("exits", exits, (found) => {
+    // What still comes of the questions before is not taken.
+    for (const name of ["exits", "plan"]) this.forget(name);
+    if (known) this.takePlan(known, key);
+    else {
+      this.planPanel.searching();
+      this.say("Planning…");
+    }
+    const isNow = this.seeking = {}, { answer, error } = await preparing;
+    if (isNow !== this.seeking || answer === "superseded") return;
+    if (error) {
+      this.planFailed(error);
+      return;
+    }
+    this.seekExits(question, asked, click);
+    if (!known || !known.final) this.seekPlan(question, key, click);
+  }
+
+  seekExits({ target, what_if }, { tip, exit }, click) {
+    const more = tip !== null && exit === null ? { scope_tip: tip } : {};
+    this.latest("exits", { target, what_if, ...more }, (found) => {
       this.exits = new Exits(found);
       this.takeTarget(found.target_lps);
       this.showExits();
@@ -296,16 +329,9 @@ class ExplorerPage extends AnatomyPage {
         this.times.exits = performance.now() - click;
       }
     }).then((last) => this.exitsEnded(last));
-    const key = planKey(asked), known = this.plans.get(key);
-    if (known) this.takePlan(known, key);
-    else {
-      this.planPanel.searching();
-      this.say("Planning…");
-    }
-    if (known && known.final) {
-      this.asking.plan = (this.asking.plan || 0) + 1;
-      return;
-    }
+  }
+
+  seekPlan(question, key, click) {
     this.latest("plan", question, async (found) => {
       if (found.answer === "no_plan") this.takeNoPlan(found);
       else {

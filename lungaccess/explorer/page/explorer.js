@@ -2,11 +2,12 @@
 import { AnatomyPage, byId, openPage } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
 import { Motion } from "../report/motion.js";
-import { STANDARD, VoxelImage } from "../report/slices.js";
+import { STANDARD } from "../report/slices.js";
 import { ballAround, sideOf } from "../report/orbit.js";
 import { oncePerFrame } from "../report/structures.js";
 import { alongLine } from "../report/surfaces.js";
 import { minus, mix, norm, rgb, unit } from "../report/vectors.js";
+import { VoxelImage } from "../report/voxel_image.js";
 import { placedVolume } from "../report/voxels.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
@@ -571,10 +572,10 @@ class ExplorerPage extends AnatomyPage {
     showCompared(this.scene, this.compared.shown, MOST_COMPARED, this.orbit.distance);
   }
 
-  drawSlices() {
+  drawSlices(isCoarse = this.hurriesSlices()) {
     this.image.overlay = byId("reach-slices").checked && this.reach ? this.reach.painter() : null;
     const of = this.motion ? deviceLines(this.motion, this.motion.at(this.position)) : [];
-    this.views.draw(STANDARD, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps });
+    this.views.draw(STANDARD, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps }, isCoarse);
   }
 
   // What a test may read.

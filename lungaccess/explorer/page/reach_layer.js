@@ -16,12 +16,18 @@ export class ReachLayer {
   }
 
   take({ share, arrays: { voxels, kinds } }) {
+    this.paint = null;
     for (let n = 0; n < voxels.length; n++) this.kinds[voxels[n]] = kinds[n];
     this.share = share;
   }
 
-  // Return what paints the map over a slice.
+  // Return what paints the map over a slice: the same function as long as the map is the same.
   painter() {
+    this.paint ??= this.made();
+    return this.paint;
+  }
+
+  made() {
     const { kinds, colours, grid: { shape: [ni, nj, nk], ijk_from_lps: m } } = this;
     return (x, y, z) => {
       const i = Math.round(m[0][0] * x + m[0][1] * y + m[0][2] * z + m[0][3]);

@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from lungaccess.explorer import PatientSource
 from tests.lungaccess.explorer.windows import PLANNED, Page, Served
 
 ITERATIONS = 100
+WINDOW = 800, 600
+"""Small: where the processor draws, pictures take most of the time."""
 SLICES = ("slice-axial", "slice-coronal", "slice-sagittal")
 SHOWN = (
     "!document.getElementById('target-error').hidden || !document.getElementById('no-plan').hidden"
@@ -44,6 +46,7 @@ class Session:
     memory: dict[str, list[float]] = field(default_factory=dict)
     messages: list[str] = field(default_factory=list)
     hosts: set[str] = field(default_factory=set)
+    clicks: int = 0
     requests: int = 0
     plans: int = 0
     compared: int = 0
@@ -59,7 +62,13 @@ class Session:
         return values[-1] / values[len(values) // 5]
 
 
-def click_through(window: Page, served: Served, points: np.ndarray, parts: int, compare: int) -> Session:
+Telling = Callable[[Session], None]
+"""Is told what was seen so far, after each part of a session."""
+
+
+def click_through(
+    window: Page, served: Served, points: np.ndarray, parts: int, compare: int, told: Telling
+) -> Session:
     """Click many targets, by mouse in a slice and by coordinates in turns; compare every so-manieth plan."""
     made, rng = Session(), np.random.default_rng(0)
     window.run("window.lungaccessExplorer.state.set({ iterations: arguments[0] })", ITERATIONS)
@@ -82,6 +91,8 @@ def click_through(window: Page, served: Served, points: np.ndarray, parts: int, 
             take_memory(window, served, made)
             made.messages += window.messages()
             take_requests(window, made)
+            made.clicks = n
+            told(made)
     return made
 
 
@@ -132,13 +143,14 @@ def take_requests(window: Page, made: Session) -> None:
     made.hosts |= {url.split("/")[2] for url in asked}
 
 
-def show(made: Session, seconds: float) -> None:
-    """Print what was seen."""
+def show(made: Session) -> None:
+    """Print what was seen so far."""
+    print(f"after {made.clicks} clicks:")
     for name, values in made.memory.items():
         print(f"| {name} | {', '.join(f'{value:.0f}' for value in values)} | {made.growth(name):.2f} |")
     print(f"{made.plans} plans to stated points; {made.compared} compared, {len(made.differing)} differ")
     print(f"{made.requests} requests, to {', '.join(sorted(made.hosts))}; {len(made.messages)} messages")
-    print(f"{seconds:.0f} s", *made.differing, *made.messages[:5], sep="\n")
+    print(*made.differing, *made.messages[:5], sep="\n", flush=True)
 
 
 def main() -> None:
@@ -150,13 +162,12 @@ def main() -> None:
     parser.add_argument("--cache", type=Path)
     given: Any = parser.parse_args()
     source = PatientSource(folder=given.patient, system="lung-default", cache=given.cache)
-    points, began = targets(given.patient, given.cache, given.clicks), time.monotonic()
+    points = targets(given.patient, given.cache, given.clicks)
     served = Served(source)
     try:
-        with Page(1100, 800) as window:
+        with Page(*WINDOW) as window:
             window.open(served.address.url)
-            made = click_through(window, served, points, 20, given.compare)
-        show(made, time.monotonic() - began)
+            click_through(window, served, points, 20, given.compare, show)
     finally:
         served.stop()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from experiments.explorer_speed import targets
-from tests.lungaccess.explorer.session import GROWTH, click_through
+from tests.lungaccess.explorer.session import GROWTH, WINDOW, click_through
 from tests.lungaccess.explorer.windows import Page, Served
 from tests.lungaccess.report import browser
 
@@ -21,9 +21,9 @@ CLICKS = 30
 
 def test_a_session_keeps_its_memory_and_its_plans(served: Served, patient: Path) -> None:
     points = targets(patient, patient.parent / "cache", CLICKS)
-    with Page(1100, 800) as window:
+    with Page(*WINDOW) as window:
         window.open(served.address.url)
-        made = click_through(window, served, points, 5, 4)
+        made = click_through(window, served, points, 5, 4, lambda _made: None)
     assert made.compared >= 2 and made.differing == []
     assert made.messages == []
     assert made.hosts == {f"127.0.0.1:{served.address.port}"}

@@ -20,7 +20,7 @@ from lungaccess.coupled import Atlas, ProgressEvent, feasible_exits, open_atlas,
 from lungaccess.explorer import questions as ask
 from lungaccess.explorer.changed_system import plan_command, system_of
 from lungaccess.explorer.chosen_place import ChosenPlace
-from lungaccess.explorer.patient import image_parts, patient_facts, scene_parts, target_of
+from lungaccess.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
 from lungaccess.explorer.questions import WhatIf
 from lungaccess.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
 from lungaccess.one_stage import tips_near
@@ -99,6 +99,15 @@ class Answers:
 
     def _image(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         yield Part({"answer": "image", **image_parts(self.lung, self._source, asked.question.around)})
+
+    def _slice(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        from lungaccess.explorer.ct_slice import ct_slice
+
+        question, ct = asked.question, patient_ct(self._source.ct)
+        if ct is None:
+            raise SettingsError("The patient came without a CT", remedy="Start the explorer with --ct")
+        plane = question.origin, question.across, question.down
+        yield Part({"answer": "slice"}, {"hu": ct_slice(ct, *plane, question.columns, question.rows)})
 
     def _place(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         place = describe_place(self.lung, asked.question.point)

@@ -20,6 +20,7 @@ CLICKS, PLANS, REACH, ANSWERS = "clicks", "plans", "reach", "answers"
 what takes seconds.  The first never waits for a step of a search."""
 
 Point = Annotated[tuple[float, float, float], Field(description="a point, LPS mm")]
+Pixels = Annotated[int, Field(strict=True, ge=1, le=2048, description="pixels of a canvas")]
 Number = Annotated[int, Field(strict=True, ge=0, le=2**53)]
 FileKind = Literal[
     "plan.json", "summary.json", "report.html", "slicer.zip", "overview.png", "tree.png",
@@ -88,6 +89,18 @@ class ImageQuestion(_Question):
     """Fine voxels around a point."""
 
     around: Point
+    worker: ClassVar[str] = ANSWERS
+
+
+@settings
+class SliceQuestion(_Question):
+    """The CT at the pixels of a plane, as `lungaccess.explorer.ct_slice.ct_slice` takes it."""
+
+    origin: Point
+    across: Point
+    down: Point
+    columns: Pixels
+    rows: Pixels
     worker: ClassVar[str] = ANSWERS
 
 
@@ -177,6 +190,7 @@ QUESTIONS: Mapping[str, type[_Question]] = {
     "patient": PatientQuestion,
     "scene": SceneQuestion,
     "image": ImageQuestion,
+    "slice": SliceQuestion,
     "place": PlaceQuestion,
     "prepare": PrepareQuestion,
     "ready": ReadyQuestion,

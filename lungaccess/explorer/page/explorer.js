@@ -11,6 +11,7 @@ import { VoxelImage } from "../report/voxel_image.js";
 import { placedVolume } from "../report/voxels.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
+import { CtSource } from "./ct_source.js";
 import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
 import { Exits } from "./exits.js";
 import { connectHelp, connectKeys } from "./keys.js";
@@ -136,6 +137,7 @@ class ExplorerPage extends AnatomyPage {
 
   takeImage(image) {
     this.image = image;
+    if (this.facts.has_ct) image.finer = new CtSource(this.connection);
     byId("ct-controls").hidden = !image.hasCt;
     this.openSlices();
     byId("reach-slices").checked = !image.hasCt;
@@ -588,6 +590,7 @@ class ExplorerPage extends AnatomyPage {
         appraised: Boolean(this.plan.appraisal), scope_tip_lps: this.plan.scope_tip_lps, exit_lps: this.plan.exit_lps, system: this.plan.system } : null,
       tip_lps: state ? state.tip : null, compared: this.compared.report(), times_ms: { ...this.times },
       reach: this.reach ? { share: this.reach.share, system: this.reach.grid.system } : null,
+      finer: this.slices ? Object.fromEntries(Object.entries(this.slices).map(([name, slice]) => [name, slice.isFine])) : {},
       place: this.placeFound || null, points: this.scene ? Object.fromEntries([...this.scene.points].map(([key, p]) => [key, p.count])) : {},
     };
   }

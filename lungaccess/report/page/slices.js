@@ -60,7 +60,7 @@ export class Slice {
     this.plane = { ...plane, centre, scale: this.canvas.width / widthMm };
     this.marks = marks;
     this.isCoarse = isCoarse;
-    this.show(this.fine && this.fine.key === this.key() ? this.fine.values : null);
+    this.show(this.isFine ? this.fine.values : null);
     if (!isCoarse) this.refine();
   }
 
@@ -83,7 +83,7 @@ export class Slice {
     if (!image.finer || this.asking || (image.breath && image.share !== 0)) return;
     this.asking = true;
     try {
-      while (!this.fine || this.fine.key !== this.key()) {
+      while (!this.isFine) {
         const key = this.key(), values = await image.finer.slice(this.raster());
         if (!values) return;
         this.fine = { key, values };
@@ -94,9 +94,14 @@ export class Slice {
     }
   }
 
+  // Whether the finer source's values of this very plane are known.
+  get isFine() {
+    return Boolean(this.fine && this.plane && this.fine.key === this.key());
+  }
+
   // Return the HU at a place of the plane: of the finer source if it is shown, else of the page; null without a CT.
   huAt(place) {
-    if (!this.fine || this.fine.key !== this.key()) return this.image.huAt(place);
+    if (!this.isFine) return this.image.huAt(place);
     const { width, height } = this.canvas, [column, row] = this.project(place).map(Math.floor);
     const value = column >= 0 && row >= 0 && column < width && row < height ? this.fine.values[row * width + column] : NaN;
     return Number.isNaN(value) ? null : value;

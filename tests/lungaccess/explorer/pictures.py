@@ -1,4 +1,4 @@
-"""What a picture of the explorer costs where the processor draws: slider, turning, and the cross of the slices.
+"""What a picture of the explorer costs where the processor draws: slider, turning, cross of the slices.
 
 Run `python -m tests.lungaccess.explorer.pictures PATIENT [--cache FOLDER]`; it prints the rows of
 docs/measurements/explorer.md.  Processor time is that of all processes of the browser.

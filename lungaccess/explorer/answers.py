@@ -200,7 +200,8 @@ class Answers:
                 else:
                     yield None
         except NoPlan as failure:
-            yield Part({"answer": "no_plan", "elapsed_s": time.monotonic() - began, **_why(failure)})
+            elapsed_s, point = time.monotonic() - began, target.lps_mm.tolist()
+            yield Part({"answer": "no_plan", "elapsed_s": elapsed_s, "target_lps": point, **_why(failure)})
             return
         if last is None:
             return

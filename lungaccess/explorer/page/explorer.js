@@ -258,6 +258,9 @@ class ExplorerPage extends AnatomyPage {
   }
 
   async prepareAnew() {
+    // What was painted holds for the system before.
+    if (this.reach) this.reach = this.reach.outdated();
+    this.showReach();
     const began = performance.now();
     const last = await this.latest("prepare", { what_if: whatIf(this.state.asked) }, (found) => {
       this.tips = new Tips(found);
@@ -275,9 +278,9 @@ class ExplorerPage extends AnatomyPage {
 
   async seekReach(began) {
     let layer = null;
-    await this.latest("reach", { what_if: whatIf(this.state.asked), around: this.targetLps || this.place }, (part) => {
+    const last = await this.latest("reach", { what_if: whatIf(this.state.asked), around: this.targetLps || this.place }, (part) => {
       if (part.answer === "reach grid") {
-        layer = new ReachLayer(part, Object.fromEntries(Object.entries(this.facts.reach_colours).map(([name, colour]) => [name, rgb(colour)])));
+        layer = new ReachLayer(part, Object.fromEntries(Object.entries(this.facts.reach_colours).map(([name, colour]) => [name, rgb(colour)])), this.reach);
         return;
       }
       layer.take(part);
@@ -285,10 +288,20 @@ class ExplorerPage extends AnatomyPage {
       this.reach = layer;
       this.showReach();
     });
+    if (last.answer !== "error") return;
+    this.reach = null;
+    this.showReach(errorWords(last.error));
   }
 
-  showReach() {
-    byId("reach-words").textContent = this.reach ? this.reach.words() : "";
+  // Whether the system has a needle: without one the tubes themselves reach the target.
+  get hasNeedle() {
+    const { system } = this.whatIfPanel;
+    return !system || system.needle_length_mm !== null;
+  }
+
+  showReach(words = null) {
+    if (!this.views) return;
+    byId("reach-words").textContent = words ?? (this.reach ? this.reach.words(this.hasNeedle ? "a single arc" : "the tubes") : "");
     const shown = byId("reach-scene").checked && this.reach;
     if (this.scene && (shown || this.scene.points.has("reach"))) {
       this.scene.setPoints("reach", shown ? this.reach.points() : null);
@@ -322,6 +335,10 @@ class ExplorerPage extends AnatomyPage {
   }
 
   seekExits({ target, what_if }, { tip, exit }, click) {
+    if (!this.hasNeedle) {
+      this.showExits("This system has no needle: its tubes go to the target themselves, and no exit is to be chosen. The reach shows what they can do.");
+      return;
+    }
     const more = tip !== null && exit === null ? { scope_tip: tip } : {};
     this.latest("exits", { target, what_if, ...more }, (found) => {
       this.exits = new Exits(found);
@@ -392,6 +409,7 @@ class ExplorerPage extends AnatomyPage {
     if (this.plans.size > KEPT_PLANS) this.plans.delete(this.plans.keys().next().value);
     if (key !== planKey(this.state.asked)) return;
     const first = this.motion === null;
+    this.takeTarget(plan.motion.plan.target_lps);
     this.plan = plan;
     this.motion = plan.motion;
     this.planPanel.show(plan);
@@ -413,6 +431,7 @@ class ExplorerPage extends AnatomyPage {
 
   takeNoPlan(found) {
     this.motion = this.plan = null;
+    this.takeTarget(found.target_lps);
     this.planPanel.noPlan(found);
     this.say("No plan was found.");
     this.showPlan();

@@ -24,8 +24,8 @@ from experiments.explorer_speed import memory_mb, targets
 from lungaccess.explorer import PatientSource
 from tests.lungaccess.explorer.windows import PLANNED, Page, Served
 
-ITERATIONS = 100
-WINDOW = 800, 600
+ITERATIONS = 50
+WINDOW = 480, 400
 """Small: where the processor draws, pictures take most of the time."""
 SLICES = ("slice-axial", "slice-coronal", "slice-sagittal")
 SHOWN = (

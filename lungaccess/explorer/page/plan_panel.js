@@ -80,7 +80,7 @@ export class PlanPanel {
     }
     lineChart(byId("curve"), {
       x: { name: "ms" }, y: { name: "cost", from: 0.9 * Math.min(...ys) },
-      series: [{ name: "best cost", colour: "#0072B2", xs, ys, stairs: true }],
+      series: [{ name: "best cost", colour: "#3A9BD5", xs, ys, stairs: true }],
       top: Math.max(...ys) * 1.02,
     });
   }

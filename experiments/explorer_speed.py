@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +25,8 @@ from lungaccess.explorer.messages import read_frame
 LAST = ("end", "error", "superseded")
 RADII_MM = (121.0, 90.0, 60.0, 150.0)
 SEED = 0
-TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+CLICK = {"exits": "clicks", "plan": "plans"}
+"""The process that answers each question of a click."""
 
 
 @dataclass
@@ -62,24 +62,24 @@ def memory_mb(pid: int) -> float:
     return float(status.split("RssAnon:")[1].split()[0]) / 1024.0
 
 
-def processor_s(pid: int) -> float:
-    """Return the processor time of a process."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+def processor_ms(pid: int) -> np.ndarray:
+    """Return the processor time of the main thread of a process, and how long it waited for a processor."""
+    used, waited, _slices = Path(f"/proc/{pid}/schedstat").read_text().split()
+    return np.array([int(used), int(waited)]) / 1e6
 
 
 class Page:
     """A page without a browser."""
 
-    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
-        self._socket, self._number = socket, 0
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse, explorer: Explorer) -> None:
+        self._socket, self._explorer, self._number = socket, explorer, 0
 
     async def click(self, measured: Measured, stop_at: dict[str, str], **asked: dict[str, Any]) -> None:
         """Ask several questions at once; wait for the answer of each that `stop_at` names, or its last one.
 
         A plan is not waited for where no exit is feasible: the search may then take long.
         """
-        began = time.perf_counter()
+        began, before = time.perf_counter(), self._processor_ms()
         names = {}
         for name, values in asked.items():
             self._number += 1
@@ -92,10 +92,19 @@ class Page:
                 continue
             if message["answer"] == stop_at.get(name):
                 measured.add(name, 1000.0 * (time.perf_counter() - began))
+                if name in before:
+                    used, waited = self._processor_ms()[name] - before[name]
+                    measured.add(f"{name}: processor time of its process", used)
+                    measured.add(f"{name}: its process waited for a processor", waited)
             if message["answer"] in (stop_at.get(name), *LAST):
                 del names[message["id"]]
             if message["answer"] == "exits" and message["complete"] and not message["deployments"]:
                 names = {}
+
+    def _processor_ms(self) -> dict[str, np.ndarray]:
+        """Return the processor times of the processes that answer a click."""
+        pids = self._explorer.processes
+        return {ask: processor_ms(pid) for ask, name in CLICK.items() if (pid := pids[name]) is not None}
 
 
 async def measure(source: PatientSource, points: np.ndarray) -> None:
@@ -107,27 +116,23 @@ async def measure(source: PatientSource, points: np.ndarray) -> None:
         aiohttp.ClientSession() as session,
         session.ws_connect(f"{address.origin}/socket", headers=headers, max_msg_size=0) as socket,
     ):
-        page, nothing = Page(socket), Measured()
+        page, nothing = Page(socket, explorer), Measured()
         await page.click(nothing, {}, prepare={})
-        plans = explorer.processes["plans"]
-        if plans is None:
-            raise RuntimeError("the process of plans was not started")
-        clicks, memory, used = Measured(), [], []
+        await page.click(nothing, {}, ready={})
+        clicks, memory = Measured(), []
         for point in points:
             target = "lps:" + ",".join(f"{value:.1f}" for value in point)
-            before = processor_s(plans)
             await page.click(
                 clicks, {"exits": "exits", "plan": "plan"}, exits={"target": target},
                 plan={"target": target, "iterations": 100},
             )  # fmt: skip
-            used.append(processor_s(plans) - before)
-            memory.append(memory_mb(plans))
+            pids = explorer.processes
+            memory.append([memory_mb(pid) for name in CLICK.values() if (pid := pids[name]) is not None])
         clicks.print()
-        usual, most = 1000 * np.median(used), 1000 * max(used)
-        print(f"processor time of a click: median {usual:.0f}, most {most:.0f} ms")
         tenth = max(len(memory) // 10, 1)
-        kept = ", ".join(f"{value:.0f}" for value in memory[tenth - 1 :: tenth])
-        print(f"memory, MB, after each tenth: {kept}")
+        for name, values in zip(CLICK.values(), np.transpose(memory), strict=True):
+            kept = ", ".join(f"{value:.0f}" for value in values[tenth - 1 :: tenth])
+            print(f"memory of {name}, MB, after each tenth: {kept}")
         changes, around = Measured(), points[0].tolist()
         await page.click(nothing, {}, reach={"around": around})
         for radius in RADII_MM * 5:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         advise_scope,
         deploy_tubes,
         plan_near_exit,
+        plan_near_scope_tip,
         plan_needle,
         plan_tour,
         replan_from_scope,

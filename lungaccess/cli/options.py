@@ -142,8 +142,8 @@ class TargetOptions:
 
 @Parameter(name="*")
 @frozen_value
-class ExitOptions:
-    """Where the tubes leave the airway."""
+class PlaceOptions:
+    """Where the tubes leave the airway, or where the tip of the scope stands."""
 
     exit: Annotated[
         str | None,
@@ -155,16 +155,51 @@ class ExitOptions:
     exit_within: Annotated[
         NotNegative, Parameter(help="How far from that point the tubes may leave the lumen, mm.")
     ] = 5.0
+    scope_tip: Annotated[
+        str | None, Parameter(help="Let the tip of the scope stand near this point, stated as for --exit.")
+    ] = None
+    scope_tip_within: Annotated[
+        NotNegative, Parameter(help="How far from that point the tip may stand, mm.")
+    ] = 1.5
 
-    def stated(self) -> Float | None:
-        """Return the point `(3,)` LPS mm that the user states, None for none; errors as `TargetOptions`."""
-        from anatomy.io.frames import parse_point
-        from anatomy.io.markups import parse_reference, read_named_point
+    def stated(self) -> StatedPlace | None:
+        """Return the place that the user states, None for none; errors as `TargetOptions`.
 
-        if self.exit is None:
+        Raises
+        ------
+        SettingsError
+            If both are stated.
+        """
+        if self.exit is not None and self.scope_tip is not None:
+            raise SettingsError(
+                "--exit and --scope-tip are both stated",
+                expected="one place that the plan goes through",
+                remedy="Leave one of them out",
+            )
+        if self.exit is not None:
+            return StatedPlace(option="--exit", lps_mm=_point(self.exit), within_mm=self.exit_within)
+        if self.scope_tip is None:
             return None
-        saved = parse_reference(self.exit)
-        return parse_point(self.exit) if saved is None else read_named_point(saved).lps_mm
+        point = _point(self.scope_tip)
+        return StatedPlace(option="--scope-tip", lps_mm=point, within_mm=self.scope_tip_within)
+
+
+@frozen_value
+class StatedPlace:
+    """A point `(3,)` LPS mm that a plan has to go through, how near, and the option that states it."""
+
+    option: Literal["--exit", "--scope-tip"]
+    lps_mm: Float
+    within_mm: float
+
+
+def _point(text: str) -> Float:
+    """Return a point that a user states, or has saved in 3D Slicer, LPS mm."""
+    from anatomy.io.frames import parse_point
+    from anatomy.io.markups import parse_reference, read_named_point
+
+    saved = parse_reference(text)
+    return parse_point(text) if saved is None else read_named_point(saved).lps_mm
 
 
 @Parameter(name="*")

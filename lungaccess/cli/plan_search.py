@@ -12,13 +12,12 @@ from anatomy.io.files import write_text
 from anatomy.records import frozen_value
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import PatientOptions, SearchOptions
+from lungaccess.cli.options import PatientOptions, SearchOptions, StatedPlace
 from lungaccess.cli.progress import SearchDisplay, progress
 from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from anatomy.typed import Float
     from lungaccess.appraisal import Appraisal
     from lungaccess.coupled import Atlas, ProgressEvent
     from lungaccess.plans.plan import Plan
@@ -95,8 +94,8 @@ class PlanRequest:
     """What to plan and where to; of several systems the least invasive that reaches the target is chosen.
 
     For success the chance that the procedure succeeds is made large, instead of a cost small; for the widest
-    window its share of the breath.  Phases are those that the window of the plan has to hold.  An exit is
-    where the tubes have to leave the airway, `(3,)` LPS mm, and how far from it they may.
+    window its share of the breath.  Phases are those that the window of the plan has to hold.  A place is
+    where the tubes have to leave the airway, or the tip of the scope has to stand.
     """
 
     systems: tuple[System, ...]
@@ -110,8 +109,7 @@ class PlanRequest:
     for_success: bool = False
     phases: tuple[float, float] | None = None
     widest: bool = False
-    exit_lps: Float | None = None
-    exit_within_mm: float = 0.0
+    place: StatedPlace | None = None
 
     @property
     def made_small(self) -> str:
@@ -161,7 +159,7 @@ def run_search(
 def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Found]:
     """Yield better and better plans with the request's system, or with the one that is chosen of several."""
     from lungaccess.coupled import atlas_event, open_atlas, plan, plan_for_window, plan_with_presets
-    from lungaccess.one_stage import plan_near_exit
+    from lungaccess.one_stage import plan_near_exit, plan_near_scope_tip
     from lungaccess.success import plan_for_success
 
     def atlas_of(system: System) -> Atlas:
@@ -199,10 +197,11 @@ def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistor
         "processes": search.processes,
         "gap": search.gap,
     }
-    if request.exit_lps is not None:
-        plans = plan_near_exit(
-            lung, system, target, request.exit_lps, within_mm=request.exit_within_mm, atlas=atlas_of(system),
-            counterfactuals=False, **options,
+    if request.place is not None:
+        near = plan_near_exit if request.place.option == "--exit" else plan_near_scope_tip
+        plans = near(
+            lung, system, target, request.place.lps_mm, within_mm=request.place.within_mm,
+            atlas=atlas_of(system), counterfactuals=False, **options,
         )  # fmt: skip
     elif len(request.systems) > 1:
         plans = plan_with_presets(lung, target, systems=request.systems, atlas_of=atlas_of, **options)

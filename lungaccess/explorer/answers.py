@@ -14,26 +14,26 @@ import numpy as np
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.lung import Lung
 from anatomy.settings_file import settings_toml
-from anatomy.typed import Int
+from anatomy.typed import Float, Int
 from lungaccess.breathing.window import with_window
-from lungaccess.coupled import Atlas, ProgressEvent, atlas_part, feasible_exits, open_atlas, plan
+from lungaccess.coupled import Atlas, ProgressEvent, feasible_exits, open_atlas, plan
 from lungaccess.explorer import questions as ask
 from lungaccess.explorer.changed_system import plan_command, system_of
-from lungaccess.explorer.patient import image_parts, patient_facts, scene_parts, target_of
+from lungaccess.explorer.chosen_place import ChosenPlace
+from lungaccess.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
 from lungaccess.explorer.questions import WhatIf
 from lungaccess.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
+from lungaccess.one_stage import tips_near
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
 from lungaccess.report.html.deployment import packed_plan
-from stages.tube import shapes_digest
+from stages.tube import exit_points, shapes_digest
 
 KEPT_ATLASES = 3
 """In memory; others come from the cache within a second."""
 TELL_EVERY_S = 0.25
 """Exits and plans that become better are sent so often: more often, nobody sees the difference."""
-PLACE_MM = 1.5
-"""Tips of the scope within this distance of a chosen one are one place of the scope."""
 
 
 class Answers:
@@ -100,6 +100,15 @@ class Answers:
     def _image(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         yield Part({"answer": "image", **image_parts(self.lung, self._source, asked.question.around)})
 
+    def _slice(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        from lungaccess.explorer.ct_slice import ct_slice
+
+        question, ct = asked.question, patient_ct(self._source.ct)
+        if ct is None:
+            raise SettingsError("The patient came without a CT", remedy="Start the explorer with --ct")
+        plane = question.origin, question.across, question.down
+        yield Part({"answer": "slice"}, {"hu": ct_slice(ct, *plane, question.columns, question.rows)})
+
     def _place(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         place = describe_place(self.lung, asked.question.point)
         yield Part(
@@ -127,13 +136,17 @@ class Answers:
             },
         )  # fmt: skip
 
+    def _ready(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        self._atlas(self._system(asked.question.what_if), turn)
+        yield from ()
+
     def _exits(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
         question = asked.question
         system = self._system(question.what_if)
         target = target_of(self.lung, question.target)
         system.require_needle("The list of feasible exits")
         atlas = self._atlas(system, turn)
-        tips = None if question.scope_tip is None else _tips_at(atlas, question.scope_tip)
+        tips = None if question.scope_tip is None else tips_near(atlas, _tip(atlas, question.scope_tip))
         began = told = time.monotonic()
         for found in feasible_exits(self.lung, system, target, atlas=atlas, scope_tips=tips):
             now = time.monotonic()
@@ -165,9 +178,8 @@ class Answers:
         system = self._system(question.what_if)
         target = target_of(self.lung, question.target)
         atlas = self._atlas(system, turn)
-        iterations = question.iterations
-        if question.entry is not None or question.scope_tip is not None:
-            atlas, iterations = _chosen(atlas, question), 0
+        place = _place_of(atlas, question)
+        search = plan if place is None else place.search
         began = time.monotonic()
         curve: list[tuple[float, float, float]] = []
         told, last, shown = -np.inf, None, None
@@ -176,24 +188,25 @@ class Answers:
             turn.give_way()
 
         try:
-            for found in plan(
+            for found in search(
                 self.lung, system, target, objective=question.objective, seed=question.seed,
-                iterations=iterations, atlas=atlas, counterfactuals=False, on_progress=on_progress,
+                iterations=question.iterations, atlas=atlas, counterfactuals=False, on_progress=on_progress,
             ):  # fmt: skip
                 last = found
                 curve.append((time.monotonic() - began, float(found.iterations), float(found.cost)))
                 if time.monotonic() - told >= TELL_EVERY_S:
                     told, shown = time.monotonic(), found
-                    yield self._plan_part(asked, found, curve, system, final=False)
+                    yield self._plan_part(asked, found, curve, system, place, final=False)
                 else:
                     yield None
         except NoPlan as failure:
-            yield Part({"answer": "no_plan", "elapsed_s": time.monotonic() - began, **_why(failure)})
+            elapsed_s, point = time.monotonic() - began, target.lps_mm.tolist()
+            yield Part({"answer": "no_plan", "elapsed_s": elapsed_s, "target_lps": point, **_why(failure)})
             return
         if last is None:
             return
         final = last if last.window is not None else with_window(last, self.lung)
-        yield self._plan_part(asked, final, curve, system, final=True, known=shown is final)
+        yield self._plan_part(asked, final, curve, system, place, final=True, known=shown is final)
 
     def _plan_part(
         self,
@@ -201,6 +214,7 @@ class Answers:
         found: Plan,
         curve: list[tuple[float, float, float]],
         system: System,
+        place: ChosenPlace | None,
         *,
         final: bool,
         known: bool = False,
@@ -222,10 +236,12 @@ class Answers:
                 for device, each in found.clearance_mm.items()
             },
             "required_mm": {name: float(mm) for name, mm in found.required_clearance_mm.items()},
-            "command": plan_command(self._source.folder, question, system, own, self._source.cache),
+            "command": plan_command(
+                self._source.folder, question, system, own, self._source.cache, place
+            ),
         }  # fmt: skip
         if not known:
-            message["packed"] = packed_plan(found, self.lung, "")
+            message["packed"] = packed_plan(found, self.lung, "", cross_sections=False)
         kept = KeptPlan(digest=found.digest, text=found.to_json(), curve=tuple(curve))
         return Part(message, plan=kept)
 
@@ -283,8 +299,8 @@ class Answers:
         return Plan.from_json(asked.plan.text)
 
 
-def _chosen(atlas: Atlas, question: ask.PlanQuestion) -> Atlas:
-    """Return the part of an atlas that a question names: one deployment, or those of one place of the scope.
+def _place_of(atlas: Atlas, question: ask.PlanQuestion) -> ChosenPlace | None:
+    """Return the place that a plan is asked to go through: the exit of a deployment, or a tip of the scope.
 
     Raises
     ------
@@ -293,16 +309,18 @@ def _chosen(atlas: Atlas, question: ask.PlanQuestion) -> Atlas:
     """
     if question.entry is not None:
         _require_below(question.entry, atlas.deployments.count, "deployment")
-        return atlas_part(atlas, np.array([question.entry]))
-    tips = _tips_at(atlas, int(question.scope_tip or 0))
-    return atlas_part(atlas, np.flatnonzero(np.isin(atlas.deployments.site, tips)))
+        chosen = np.array([question.entry])
+        points = exit_points(atlas.system.tubes, atlas.motions.tips, atlas.deployments, chosen)
+        return ChosenPlace.of("exit", points[0])
+    if question.scope_tip is not None:
+        return ChosenPlace.of("scope tip", _tip(atlas, question.scope_tip))
+    return None
 
 
-def _tips_at(atlas: Atlas, tip: int) -> Int:
-    """Return the tips of the place of a tip: the same place looking in several directions."""
-    points = atlas.motions.tips[:, :3]
-    _require_below(tip, len(points), "tip of the scope")
-    return np.flatnonzero(np.linalg.norm(points - points[tip], axis=1) <= PLACE_MM)
+def _tip(atlas: Atlas, tip: int) -> Float:
+    """Return the place `(3,)` of a tip of the scope."""
+    _require_below(tip, atlas.motions.count, "tip of the scope")
+    return atlas.motions.tips[tip, :3]
 
 
 def _require_below(number: int, count: int, what: str) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from anatomy.errors import SettingsError
+from lungaccess.explorer.chosen_place import ChosenPlace
 from lungaccess.explorer.questions import PlanQuestion, WhatIf
 from lungaccess.problem import System, load_system, shipped_names
 
@@ -86,17 +87,22 @@ def _parts(system: System, what_if: WhatIf) -> dict[str, Any]:
 
 
 def plan_command(
-    patient: Path, question: PlanQuestion, system: System, own: Mapping[str, Path], cache: Path | None
+    patient: Path,
+    question: PlanQuestion,
+    system: System,
+    own: Mapping[str, Path],
+    cache: Path | None,
+    place: ChosenPlace | None = None,
 ) -> str:
-    """Return the line that makes the same plan, byte for byte; "" for a plan from a chosen exit or tip.
+    """Return the line that makes the same plan, byte for byte.
 
     Parameters
     ----------
     own : mapping of str to path
         Files of the systems that are no presets, by name.
+    place : ChosenPlace, optional
+        That the plan goes through.
     """
-    if question.entry is not None or question.scope_tip is not None:
-        return ""
     what_if = question.what_if
     if system.name in own:
         device = [str(own[system.name])]
@@ -110,7 +116,8 @@ def plan_command(
         device = [SYSTEM_FILE]
     kind, _, number = question.target.partition(" ")
     target = ["--nodule", number] if kind == "nodule" else ["--target", question.target]
-    words = ["lungaccess", "plan", str(patient), *target, "--system", *device]
+    through = [] if place is None else place.words
+    words = ["lungaccess", "plan", str(patient), *target, *through, "--system", *device]
     if question.objective != "default":
         words += ["--objective", question.objective]
     words += ["--iterations", str(question.iterations), "--seed", str(question.seed)]

@@ -110,7 +110,7 @@ def _system(system: System) -> dict[str, Any]:
 def scene_parts(lung: Lung, source: PatientSource) -> Iterator[dict[str, Any]]:
     """Yield the voxels of the whole lung, then its surfaces."""
     around = np.asarray(lung.tree.carina_lps)
-    image = page_image(lung, around[None], _ct(source.ct))
+    image = page_image(lung, around[None], patient_ct(source.ct))
     yield {"image": _some(image, slice(0, 1))}
     yield {"structures": structure_meshes(lung)}
 
@@ -119,7 +119,7 @@ def image_parts(lung: Lung, source: PatientSource, around_lps: ArrayLike) -> dic
     """Return the fine voxels around a point; within the images, where the point lies beyond them."""
     low, high = _box(lung)
     around = np.clip(np.asarray(around_lps, dtype=np.float64), low, high)
-    return {"image": _some(page_image(lung, around[None], _ct(source.ct)), slice(1, 2))}
+    return {"image": _some(page_image(lung, around[None], patient_ct(source.ct)), slice(1, 2))}
 
 
 def _some(image: dict[str, Any], which: slice) -> dict[str, Any]:
@@ -133,5 +133,6 @@ def _some(image: dict[str, Any], which: slice) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def _ct(path: Path | None) -> Volume | None:
+def patient_ct(path: Path | None) -> Volume | None:
+    """Return the CT that the explorer was started with, read once; None without one."""
     return None if path is None else read_ct(path)

@@ -14,10 +14,10 @@ from anatomy.child_process import end_with_parent
 from anatomy.errors import AnatomyError
 from lungaccess.explorer.answers import Answers
 from lungaccess.explorer.messages import error_message, frame
-from lungaccess.explorer.questions import ANSWERS, PLANS, REACH
+from lungaccess.explorer.questions import ANSWERS, CLICKS, PLANS, REACH
 from lungaccess.explorer.worker import Asked, Ended, Given, PatientSource, Worker
 
-NAMES = (PLANS, REACH, ANSWERS)
+NAMES = (CLICKS, PLANS, REACH, ANSWERS)
 ENDS_WITHIN_S = 5.0
 """A process that does not end by itself within this time is ended."""
 

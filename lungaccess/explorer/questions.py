@@ -15,10 +15,12 @@ from anatomy.settings import parse, quantity, settings, text
 MOST_CHARACTERS = 20_000
 """A message of the page is shorter by far."""
 MOST_ITERATIONS = 20_000
-PLANS, REACH, ANSWERS = "plans", "reach", "answers"
-"""The processes that answer: what follows a click, the reach of the system, and what takes seconds."""
+CLICKS, PLANS, REACH, ANSWERS = "clicks", "plans", "reach", "answers"
+"""The processes that answer: what a click shows at once, the search for a plan, the reach of the system, and
+what takes seconds.  The first never waits for a step of a search."""
 
 Point = Annotated[tuple[float, float, float], Field(description="a point, LPS mm")]
+Pixels = Annotated[int, Field(strict=True, ge=1, le=2048, description="pixels of a canvas")]
 Number = Annotated[int, Field(strict=True, ge=0, le=2**53)]
 FileKind = Literal[
     "plan.json", "summary.json", "report.html", "slicer.zip", "overview.png", "tree.png",
@@ -67,7 +69,7 @@ class _Question:
 
     id: Number
     slot: Annotated[str, Len(0, 40)] = ""
-    worker: ClassVar[str] = PLANS
+    worker: ClassVar[str] = CLICKS
 
 
 @settings
@@ -91,6 +93,18 @@ class ImageQuestion(_Question):
 
 
 @settings
+class SliceQuestion(_Question):
+    """The CT at the pixels of a plane, as `lungaccess.explorer.ct_slice.ct_slice` takes it."""
+
+    origin: Point
+    across: Point
+    down: Point
+    columns: Pixels
+    rows: Pixels
+    worker: ClassVar[str] = ANSWERS
+
+
+@settings
 class PlaceQuestion(_Question):
     """What is at a point."""
 
@@ -102,6 +116,14 @@ class PrepareQuestion(_Question):
     """All that scope and tubes can do: the atlas, and the tips of the scope."""
 
     what_if: WhatIf = WhatIf()
+
+
+@settings
+class ReadyQuestion(_Question):
+    """The atlas of a system in the process that plans, so that the first plan does not wait for it."""
+
+    what_if: WhatIf = WhatIf()
+    worker: ClassVar[str] = PLANS
 
 
 @settings
@@ -124,6 +146,7 @@ class PlanQuestion(_Question):
     seed: Number = 0
     scope_tip: Number | None = None
     entry: Number | None = None
+    worker: ClassVar[str] = PLANS
 
 
 @settings
@@ -167,8 +190,10 @@ QUESTIONS: Mapping[str, type[_Question]] = {
     "patient": PatientQuestion,
     "scene": SceneQuestion,
     "image": ImageQuestion,
+    "slice": SliceQuestion,
     "place": PlaceQuestion,
     "prepare": PrepareQuestion,
+    "ready": ReadyQuestion,
     "exits": ExitsQuestion,
     "plan": PlanQuestion,
     "reach": ReachQuestion,

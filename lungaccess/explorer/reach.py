@@ -38,7 +38,7 @@ def reach_parts(
         }
     )  # fmt: skip
     key = (system.scope, system.tubes, system.margins, atlas.with_fissures)
-    known = reached.get(key)
+    known = None if system.needle is None else reached.get(key)
     reached.clear()  # Of one atlas only: a page changes the needle far more often than the scope.
     kept = reached[key] = (
         np.full(int(np.prod(grid.shape)), -1, dtype=np.int64) if known is None else known.copy()

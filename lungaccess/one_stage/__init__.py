@@ -8,7 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.one_stage.from_scope import ScopeReplanner
-    from lungaccess.one_stage.near_exit import plan_near_exit
+    from lungaccess.one_stage.near_place import TIP_WITHIN_MM, plan_near_exit, plan_near_scope_tip, tips_near
     from lungaccess.one_stage.needle import (
         NeedleAnswer,
         NeedleQuestion,

@@ -18,9 +18,9 @@ from lungaccess.cli.options import (
     SUCCESS,
     WINDOW,
     ErrorOptions,
-    ExitOptions,
     PatientFolder,
     PatientOptions,
+    PlaceOptions,
     SearchOptions,
     SystemOptions,
     TargetOptions,
@@ -37,7 +37,7 @@ def plan(
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     search: SearchOptions = SearchOptions(),
-    through: ExitOptions = ExitOptions(),
+    through: PlaceOptions = PlaceOptions(),
     errors: ErrorOptions = ErrorOptions(),
     thick_slices: Annotated[
         bool,
@@ -71,12 +71,12 @@ def plan(
         search = replace(search, objective=SearchOptions().objective)
     if phases is not None:
         _require_plain("--phases", search, system)
-    exit_lps = through.stated()
-    if exit_lps is not None:
-        _require_plain("--exit", search, system)
+    place = through.stated()
+    if place is not None:
+        _require_plain(place.option, search, system)
         if for_success or widest or phases is not None:
             raise SettingsError(
-                "--exit is asked for with success, a window or phases",
+                f"{place.option} is asked for with success, a window or phases",
                 expected="a cost that is made small",
                 remedy="Leave one of them out",
             )
@@ -98,7 +98,7 @@ def plan(
     request = PlanRequest(
         systems=systems, target=stated, search=search, errors=model, out=out, output=output,
         pictures=pictures, procedure=procedure, for_success=for_success, phases=phases, widest=widest,
-        exit_lps=exit_lps, exit_within_mm=through.exit_within,
+        place=place,
     )  # fmt: skip
     try:
         return plan_and_report(lung, request)

@@ -2,14 +2,16 @@
 import { AnatomyPage, byId, openPage } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
 import { Motion } from "../report/motion.js";
-import { STANDARD, VoxelImage } from "../report/slices.js";
+import { STANDARD } from "../report/slices.js";
 import { ballAround, sideOf } from "../report/orbit.js";
 import { oncePerFrame } from "../report/structures.js";
 import { alongLine } from "../report/surfaces.js";
 import { minus, mix, norm, rgb, unit } from "../report/vectors.js";
+import { VoxelImage } from "../report/voxel_image.js";
 import { placedVolume } from "../report/voxels.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
+import { CtSource } from "./ct_source.js";
 import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
 import { Exits } from "./exits.js";
 import { connectHelp, connectKeys } from "./keys.js";
@@ -84,9 +86,8 @@ class ExplorerPage extends AnatomyPage {
 
   // Ask so that a later question with the same name takes the place of this one.
   async latest(name, values, part) {
-    const number = (this.asking[name] || 0) + 1;
-    this.asking[name] = number;
-    const isLatest = () => this.asking[name] === number;
+    this.forget(name);
+    const number = this.asking[name], isLatest = () => this.asking[name] === number;
     const counts = SOON.includes(name) ? 1 : 0;
     this.awaited += counts;
     const last = await this.connection.ask(name, values, (message) => {
@@ -97,6 +98,11 @@ class ExplorerPage extends AnatomyPage {
     if (!isLatest()) return { answer: "superseded" };
     this.showProgress(null);
     return last;
+  }
+
+  // Take no more of what is answered to the latest question of a name.
+  forget(name) {
+    this.asking[name] = (this.asking[name] || 0) + 1;
   }
 
   showProgress(message) {
@@ -131,6 +137,7 @@ class ExplorerPage extends AnatomyPage {
 
   takeImage(image) {
     this.image = image;
+    if (this.facts.has_ct) image.finer = new CtSource(this.connection);
     byId("ct-controls").hidden = !image.hasCt;
     this.openSlices();
     byId("reach-slices").checked = !image.hasCt;
@@ -223,13 +230,16 @@ class ExplorerPage extends AnatomyPage {
     byId("nodule").value = this.facts.targets.some(({ text }) => text === asked.target) ? asked.target : "";
     byId("target-text").value = asked.target;
     byId("target-error").hidden = true;
-    this.prepare();
-    if (asked.target) this.seek();
-    else this.clear();
+    if (asked.target) this.seek(this.prepare());
+    else {
+      this.prepare();
+      this.clear();
+    }
     this.compared.follow();
   }
 
   clear() {
+    this.seeking = null;
     this.exits = this.motion = this.targetLps = this.plan = null;
     this.planPanel.clear("Choose a target: click into a slice, or pick a nodule.");
     this.showExits();
@@ -237,11 +247,20 @@ class ExplorerPage extends AnatomyPage {
     this.fitImage(this.place);
   }
 
-  // Prepare the system, then show what it reaches.
-  async prepare() {
+  // Prepare the system, then show what it reaches; resolves when its atlas is known, with whether it is.
+  prepare() {
     const key = systemKey(this.state.asked);
-    if (this.systemKey === key) return;
-    this.systemKey = key;
+    if (this.systemKey !== key) {
+      this.systemKey = key;
+      this.preparing = this.prepareAnew();
+    }
+    return this.preparing;
+  }
+
+  async prepareAnew() {
+    // What was painted holds for the system before.
+    if (this.reach) this.reach = this.reach.outdated();
+    this.showReach();
     const began = performance.now();
     const last = await this.latest("prepare", { what_if: whatIf(this.state.asked) }, (found) => {
       this.tips = new Tips(found);
@@ -250,15 +269,18 @@ class ExplorerPage extends AnatomyPage {
       this.showExits();
     });
     this.whatIfPanel.fail(last.answer === "error" ? errorWords(last.error) : "");
-    if (last.answer === "end") this.seekReach(began);
-    else if (last.answer === "error") this.systemKey = null;
+    if (last.answer === "error") this.systemKey = null;
+    if (last.answer !== "end") return last;
+    this.latest("ready", { what_if: whatIf(this.state.asked) }, () => null);
+    this.seekReach(began);
+    return last;
   }
 
   async seekReach(began) {
     let layer = null;
-    await this.latest("reach", { what_if: whatIf(this.state.asked), around: this.targetLps || this.place }, (part) => {
+    const last = await this.latest("reach", { what_if: whatIf(this.state.asked), around: this.targetLps || this.place }, (part) => {
       if (part.answer === "reach grid") {
-        layer = new ReachLayer(part, Object.fromEntries(Object.entries(this.facts.reach_colours).map(([name, colour]) => [name, rgb(colour)])));
+        layer = new ReachLayer(part, Object.fromEntries(Object.entries(this.facts.reach_colours).map(([name, colour]) => [name, rgb(colour)])), this.reach);
         return;
       }
       layer.take(part);
@@ -266,10 +288,20 @@ class ExplorerPage extends AnatomyPage {
       this.reach = layer;
       this.showReach();
     });
+    if (last.answer !== "error") return;
+    this.reach = null;
+    this.showReach(errorWords(last.error));
   }
 
-  showReach() {
-    byId("reach-words").textContent = this.reach ? this.reach.words() : "";
+  // Whether the system has a needle: without one the tubes themselves reach the target.
+  get hasNeedle() {
+    const { system } = this.whatIfPanel;
+    return !system || system.needle_length_mm !== null;
+  }
+
+  showReach(words = null) {
+    if (!this.views) return;
+    byId("reach-words").textContent = words ?? (this.reach ? this.reach.words(this.hasNeedle ? "a single arc" : "the tubes") : "");
     const shown = byId("reach-scene").checked && this.reach;
     if (this.scene && (shown || this.scene.points.has("reach"))) {
       this.scene.setPoints("reach", shown ? this.reach.points() : null);
@@ -278,16 +310,37 @@ class ExplorerPage extends AnatomyPage {
     this.redrawSlices();
   }
 
-  // Ask for exits and plan; what is known already is shown at once.
-  seek() {
-    const { asked } = this.state, question = planQuestion(asked);
+  // Ask for exits and plan once the system is prepared; what is known already is shown at once.
+  async seek(preparing) {
+    const { asked } = this.state, question = planQuestion(asked), key = planKey(asked), known = this.plans.get(key);
     const click = this.times.click || performance.now();
     this.times.click = null;
     this.times.exits = this.times.plan = null;
     this.exits = null;
-    const exits = { target: asked.target, what_if: question.what_if };
-    if (asked.tip !== null && asked.exit === null) exits.scope_tip = asked.tip;
-    this.latest("exits", exits, (found) => {
+    // What still comes of the questions before is not taken.
+    for (const name of ["exits", "plan"]) this.forget(name);
+    if (known) this.takePlan(known, key);
+    else {
+      this.planPanel.searching();
+      this.say("Planning…");
+    }
+    const isNow = this.seeking = {}, { answer, error } = await preparing;
+    if (isNow !== this.seeking || answer === "superseded") return;
+    if (error) {
+      this.planFailed(error);
+      return;
+    }
+    this.seekExits(question, asked, click);
+    if (!known || !known.final) this.seekPlan(question, key, click);
+  }
+
+  seekExits({ target, what_if }, { tip, exit }, click) {
+    if (!this.hasNeedle) {
+      this.showExits("This system has no needle: its tubes go to the target themselves, and no exit is to be chosen. The reach shows what they can do.");
+      return;
+    }
+    const more = tip !== null && exit === null ? { scope_tip: tip } : {};
+    this.latest("exits", { target, what_if, ...more }, (found) => {
       this.exits = new Exits(found);
       this.takeTarget(found.target_lps);
       this.showExits();
@@ -296,16 +349,9 @@ class ExplorerPage extends AnatomyPage {
         this.times.exits = performance.now() - click;
       }
     }).then((last) => this.exitsEnded(last));
-    const key = planKey(asked), known = this.plans.get(key);
-    if (known) this.takePlan(known, key);
-    else {
-      this.planPanel.searching();
-      this.say("Planning…");
-    }
-    if (known && known.final) {
-      this.asking.plan = (this.asking.plan || 0) + 1;
-      return;
-    }
+  }
+
+  seekPlan(question, key, click) {
     this.latest("plan", question, async (found) => {
       if (found.answer === "no_plan") this.takeNoPlan(found);
       else {
@@ -363,6 +409,7 @@ class ExplorerPage extends AnatomyPage {
     if (this.plans.size > KEPT_PLANS) this.plans.delete(this.plans.keys().next().value);
     if (key !== planKey(this.state.asked)) return;
     const first = this.motion === null;
+    this.takeTarget(plan.motion.plan.target_lps);
     this.plan = plan;
     this.motion = plan.motion;
     this.planPanel.show(plan);
@@ -384,6 +431,7 @@ class ExplorerPage extends AnatomyPage {
 
   takeNoPlan(found) {
     this.motion = this.plan = null;
+    this.takeTarget(found.target_lps);
     this.planPanel.noPlan(found);
     this.say("No plan was found.");
     this.showPlan();
@@ -545,10 +593,10 @@ class ExplorerPage extends AnatomyPage {
     showCompared(this.scene, this.compared.shown, MOST_COMPARED, this.orbit.distance);
   }
 
-  drawSlices() {
+  drawSlices(isCoarse = this.hurriesSlices()) {
     this.image.overlay = byId("reach-slices").checked && this.reach ? this.reach.painter() : null;
     const of = this.motion ? deviceLines(this.motion, this.motion.at(this.position)) : [];
-    this.views.draw(STANDARD, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps });
+    this.views.draw(STANDARD, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps }, isCoarse);
   }
 
   // What a test may read.
@@ -561,6 +609,7 @@ class ExplorerPage extends AnatomyPage {
         appraised: Boolean(this.plan.appraisal), scope_tip_lps: this.plan.scope_tip_lps, exit_lps: this.plan.exit_lps, system: this.plan.system } : null,
       tip_lps: state ? state.tip : null, compared: this.compared.report(), times_ms: { ...this.times },
       reach: this.reach ? { share: this.reach.share, system: this.reach.grid.system } : null,
+      finer: this.slices ? Object.fromEntries(Object.entries(this.slices).map(([name, slice]) => [name, slice.isFine])) : {},
       place: this.placeFound || null, points: this.scene ? Object.fromEntries([...this.scene.points].map(([key, p]) => [key, p.count])) : {},
     };
   }

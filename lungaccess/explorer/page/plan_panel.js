@@ -67,11 +67,9 @@ export class PlanPanel {
     this.drawCurve(plan);
     byId("plan-actions").hidden = !plan.final;
     byId("command-box").hidden = !plan.final;
-    byId("command").textContent = plan.command || "";
-    byId("copy").hidden = byId("command").hidden = !plan.command;
-    byId("command-note").textContent = !plan.command
-      ? "A plan from a chosen exit or scope tip has no command. Export plan.json: `lungaccess check`, `report`, `export` and `replan --scope` read it."
-      : `The plan is the same, byte for byte but for its times.${plan.command.includes("system.toml") ? " Export system.toml first." : ""}`;
+    byId("command").textContent = plan.command;
+    byId("command-note").textContent =
+      `The plan is the same, byte for byte but for its times.${plan.command.includes("system.toml") ? " Export system.toml first." : ""}`;
   }
 
   drawCurve({ curve }) {
@@ -82,7 +80,7 @@ export class PlanPanel {
     }
     lineChart(byId("curve"), {
       x: { name: "ms" }, y: { name: "cost", from: 0.9 * Math.min(...ys) },
-      series: [{ name: "best cost", colour: "#0072B2", xs, ys, stairs: true }],
+      series: [{ name: "best cost", colour: "#3A9BD5", xs, ys, stairs: true }],
       top: Math.max(...ys) * 1.02,
     });
   }

@@ -45,8 +45,11 @@ FLOOR_MM = 0.1
 """1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1]."""
 
 
-def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
-    """Return everything by which a page shows one plan in motion and along its path."""
+def packed_plan(plan: Plan, lung: Lung, name: str, *, cross_sections: bool = True) -> Packed:
+    """Return everything by which a page shows one plan in motion and along its path.
+
+    The cross-sections of the airway around the tip of the scope take longer than all others.
+    """
     return {
         "name": name,
         "digest": plan.digest,
@@ -59,7 +62,7 @@ def packed_plan(plan: Plan, lung: Lung, name: str) -> Packed:
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.track_radius_mm,
         },
-        "scope": _scope(plan, lung),
+        "scope": {**_scope(plan, lung), **(_around_tip(plan, lung) if cross_sections else {})},
         "tubes": _tubes(plan),
         "needle": _needle(plan),
         "profile": profile(plan, lung),
@@ -77,7 +80,7 @@ def device_points(plan: Plan) -> Float:
 
 
 def _scope(plan: Plan, lung: Lung) -> Packed:
-    """Return the scope in its states: tips, camera, sections, the shaft, and what is free around the tip.
+    """Return the scope in its states: tips, camera, sections and the shaft.
 
     "bifurcations" are those of the route, each with how far the scope has moved when it stands before it.
     """
@@ -88,7 +91,6 @@ def _scope(plan: Plan, lung: Lung) -> Packed:
     sections = [poses_on_arc(tip, 0.0, bend, back)[:, :3, 3] for tip, bend in zip(tips, bends, strict=True)]
     shaft, shaft_mm = poses_on_pieces(moving.lps_from_entry, moving.pieces[:-1], SHOWN_STEP_MM)
     moved = moved_mm(moving)
-    around = tip_sections(lung, tips, plan.system.scope.radius_mm)
     return {
         "points": pack(tips[:, :3, 3], "f4"),
         "arc_length_mm": pack(moved, "f4"),
@@ -99,16 +101,23 @@ def _scope(plan: Plan, lung: Lung) -> Packed:
         "shaft": pack(shaft[:, :3, 3], "f4"),
         "shaft_mm": pack(shaft_mm, "f4"),
         "from_carina_mm": float(plan.scope.length_from_carina_mm),
-        "border_step_mm": MM_PER_STEP,
-        "border": pack(np.rint(around.border_mm / MM_PER_STEP).astype(np.uint16), "u2"),
-        "gap_mm": pack(around.gap_mm, "f4"),
-        "nearest": pack(around.nearest, "u1"),
-        "depth_gap_mm": pack(around.depth_gap_mm, "f4"),
         "bifurcations": [
             one.as_json()
             | {"moved_mm": float(moved[one.state]), "entered_mm": float(moved[one.entered_state])}
             for one in route_bifurcations(moving, plan.scope.branches, lung)
         ],
+    }
+
+
+def _around_tip(plan: Plan, lung: Lung) -> Packed:
+    """Return what is free around the tip of the scope in each state."""
+    around = tip_sections(lung, shown_motion(plan).tips, plan.system.scope.radius_mm)
+    return {
+        "border_step_mm": MM_PER_STEP,
+        "border": pack(np.rint(around.border_mm / MM_PER_STEP).astype(np.uint16), "u2"),
+        "gap_mm": pack(around.gap_mm, "f4"),
+        "nearest": pack(around.nearest, "u1"),
+        "depth_gap_mm": pack(around.depth_gap_mm, "f4"),
     }
 
 

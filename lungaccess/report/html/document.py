@@ -14,8 +14,8 @@ from lungaccess.report.pack import script_text
 
 SHARED_MODULES = (
     "decode.js", "vectors.js", "colours.js", "surfaces.js", "shaders.js", "layers.js", "picking.js",
-    "solids.js", "scene.js", "orbit.js", "voxels.js", "slices.js", "slice_views.js", "slice_panel.js",
-    "structures.js", "view_tools.js", "anatomy_page.js",
+    "solids.js", "scene.js", "orbit.js", "voxels.js", "voxel_image.js", "slices.js", "slice_views.js",
+    "slice_panel.js", "structures.js", "view_tools.js", "anatomy_page.js",
 )  # fmt: skip
 TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
 """Looks at the target; for `scene_figure`."""

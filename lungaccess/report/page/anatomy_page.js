@@ -57,6 +57,16 @@ export class AnatomyPage {
     return Boolean(this.scene && this.scene.slow && this.scene.quality === "moving" && !isOnScreen(canvas));
   }
 
+  // Return whether slices are painted coarsely for now: something moves, and the machine is slow; they are then painted
+  // well when nothing has moved for a moment.
+  hurriesSlices() {
+    const { scene, views } = this;
+    if (!scene || !scene.slow || (scene.quality !== "moving" && !views.fingers.size)) return false;
+    clearTimeout(this.betterSlices);
+    this.betterSlices = setTimeout(() => this.drawSlices(false), REST_MS);
+    return true;
+  }
+
   // Draw the 3-D view, where that is not all that there is.
   drawView() {
     this.draw();

@@ -2,10 +2,11 @@
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { DEVICE_COLOURS } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
-import { STANDARD, VoxelImage } from "./slices.js";
+import { STANDARD } from "./slices.js";
 import { Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
 import { minus, norm, rgb } from "./vectors.js";
+import { VoxelImage } from "./voxel_image.js";
 
 const START_MM = 1.1;
 const FAINT_START_MM = 0.6;
@@ -117,10 +118,10 @@ class NoPlanPage extends AnatomyPage {
     if (this.views) this.drawSlices();
   }
 
-  drawSlices() {
+  drawSlices(isCoarse = this.hurriesSlices()) {
     const lines = this.data.paths.flatMap(({ lines: curves, colour, radius_mm: radius }, n) =>
       (this.shown[`path ${n}`] ? curves.map((points) => ({ points, radius, colour })) : []));
-    this.views.draw(STANDARD, { lines, target: this.data.target_lps });
+    this.views.draw(STANDARD, { lines, target: this.data.target_lps }, isCoarse);
     this.panel.showField();
     this.panel.describe();
     byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(1)).join(", ")} mm.`;

@@ -6,13 +6,14 @@ import { lineChart } from "./charts.js";
 import { DEVICE_COLOURS, planStyle } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { Motion, STAGES } from "./motion.js";
-import { bendOf, planeAcross, planeAlong, STANDARD, VoxelImage } from "./slices.js";
+import { bendOf, planeAcross, planeAlong, STANDARD } from "./slices.js";
 import { ballAround, sideOf } from "./orbit.js";
 import { banded, Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
 import { alongLine } from "./surfaces.js";
 import { TipSection } from "./tip_section.js";
 import { cross, dot, minus, mix, norm, rgb, unit } from "./vectors.js";
+import { VoxelImage } from "./voxel_image.js";
 
 const { scope: SCOPE, outer: OUTER, middle: MIDDLE, inner: INNER, needle: NEEDLE, target: TARGET, aim: AIM } = DEVICE_COLOURS;
 const DEVICES = [
@@ -366,7 +367,7 @@ class PlanPage extends AnatomyPage {
     if (this.shown.needle) put(end.needle, 0.8 * radius.needle);
   }
 
-  drawSlices() {
+  drawSlices(isCoarse = this.hurriesSlices()) {
     const { target, state, views } = this, { radius_mm: radius } = this.motion.plan, following = byId("follow").checked;
     if (following) [views.place, views.centre] = [[...state.tip], [...state.tip]];
     const lines = [
@@ -377,7 +378,7 @@ class PlanPage extends AnatomyPage {
       this.shown.needle && { points: state.needle, radius: radius.needle, colour: NEEDLE },
     ].filter((line) => line && line.points.length > 1);
     const marks = { lines, target: this.shown.target ? target : null };
-    views.draw({ ...STANDARD, across: this.across(state, following), along: this.along(state, following) }, marks);
+    views.draw({ ...STANDARD, across: this.across(state, following), along: this.along(state, following) }, marks, isCoarse);
     this.panel.showField();
     this.panel.describe();
     this.drawTipSection(state);

@@ -1,9 +1,10 @@
 // The page of a reachability map.
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { reportData, unpack } from "./decode.js";
-import { STANDARD, VoxelImage } from "./slices.js";
+import { STANDARD } from "./slices.js";
 import { addSwitch } from "./structures.js";
 import { minus, mix, norm, rgb } from "./vectors.js";
+import { VoxelImage } from "./voxel_image.js";
 
 // Viridis in five steps: even in lightness, for every colour vision.
 const RAMP = ["#440154", "#3B528B", "#21918C", "#5EC962", "#FDE725"].map(rgb);
@@ -143,9 +144,9 @@ class ReachPage extends AnatomyPage {
     if (this.views) this.drawSlices();
   }
 
-  drawSlices() {
+  drawSlices(isCoarse = this.hurriesSlices()) {
     this.image.overlay = this.painter();
-    this.views.draw(STANDARD, {});
+    this.views.draw(STANDARD, {}, isCoarse);
     this.panel.showField();
     this.panel.describe();
     byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(0)).join(", ")} mm: ${this.words()}.`;

@@ -74,11 +74,11 @@ export class SliceViews {
   }
 
   // Draw planes: { name: { right, up, through, widthMm } }, through the cross and as wide as all if they do not say.
-  draw(planes, marks) {
+  draw(planes, marks, isCoarse = false) {
     for (const [name, { right, up, through = this.place, widthMm = this.widthMm }] of Object.entries(planes)) {
       const away = minus(this.centre, through);
       const middle = add(through, add(times(right, dot(away, right)), times(up, dot(away, up))));
-      this.slices[name].draw({ right, up }, middle, widthMm, { ...marks, cross: this.place });
+      this.slices[name].draw({ right, up }, middle, widthMm, { ...marks, cross: this.place }, isCoarse);
     }
   }
 

@@ -1,27 +1,17 @@
 // Planes through the image: standard ones by radiological convention, and any other.
-import { add, cross, dot, letters, minus, norm, rgb, times, unit } from "./vectors.js";
-import { linear, nearest, PackedSource, placedVolume, VoxelGrid } from "./voxels.js";
+import { add, cross, dot, letters, minus, norm, times, unit } from "./vectors.js";
 
 const INK = { label: "#F2F2F2", cross: "#FFFFFF" };
-const STRUCTURE_COLOURS = {
-  outside: "#6B6B6B", lung: "#242424", "airway wall": "#6FA8CC", lumen: "#0E3A57", vessel: "#C4717A",
-  fissure: "#8F6FB8", nodule: "#009E73",
-};
-// What is painted over a CT at first, and how densely.
-const TINTED = ["airway wall", "vessel", "fissure", "nodule"];
-const TINT = 0.45;
-const GROUND = ["outside", "lung"];
 const NEAR_MM = 2;
 const FAINT = 0.5;
 const LATTICE_PIXELS = 8;
 const NOWHERE = [0, 0, 0];
+const KEY_DIGITS = 6, COARSE_PIXELS = 3;
 const BARS_MM = [1, 2, 5, 10, 20, 50, 100];
 const CROSS_GAP = 9;
 // A line that is bent less lies in every plane through its ends.
 const STRAIGHT_MM = 0.05;
 
-export const WINDOWS = { lung: [-1350, 150], tissue: [-160, 240], bone: [-500, 1300] };
-export const LEAST_WIDTH_HU = 10;
 export const STANDARD = {
   axial: { right: [1, 0, 0], up: [0, -1, 0] },
   coronal: { right: [1, 0, 0], up: [0, 0, 1] },
@@ -55,107 +45,6 @@ export function bendOf(points, otherwise) {
   return { direction, beside: norm(beside) > STRAIGHT_MM ? unit(beside) : otherwise };
 }
 
-// The voxels of a page: structures, a CT if there is one, and a further layer painted over them.
-export class VoxelImage {
-  static async of(data) {
-    const image = new VoxelImage();
-    const load = (packed, table) => Promise.all((packed || []).map((each) => placedVolume(each, table)));
-    [image.labels, image.ct] = await Promise.all([load(data.labels), load(data.ct, data.hounsfield)]);
-    image.grid = data.grid ? new VoxelGrid(data.grid.shape, data.grid.lps_from_ijk) : image.labels[0].grid;
-    image.codes = data.codes;
-    image.source = image.hasCt ? new PackedSource(image.ct) : null;
-    // A source that has more than the page; its slices are shown when they come.
-    image.finer = null;
-    image.table = new Uint8Array(3 * 256);
-    image.ground = new Uint8Array(256);
-    image.tinted = new Uint8Array(256);
-    image.opacity = new Float32Array(256);
-    for (const [name, code] of Object.entries(data.codes)) {
-      image.table.set(rgb(STRUCTURE_COLOURS[name]).map((value) => 255 * value), 3 * code);
-      image.ground[code] = GROUND.includes(name) ? 1 : 0;
-      image.tinted[code] = TINTED.includes(name) ? 1 : 0;
-      image.opacity[code] = image.hasCt ? TINT * image.tinted[code] : 1;
-    }
-    image.overlay = null;
-    image.breath = null;
-    image.share = 0;
-    image.tint = true;
-    image.setWindow("lung");
-    return image;
-  }
-
-  get hasCt() {
-    return this.ct.length > 0;
-  }
-
-  // Show a window of WINDOWS; any other name leaves it as it is.
-  setWindow(name) {
-    if (WINDOWS[name]) [this.low, this.high] = WINDOWS[name];
-  }
-
-  // Show the values from level - width / 2 to level + width / 2, HU.
-  setLevels(level, width) {
-    const half = Math.max(width, LEAST_WIDTH_HU) / 2;
-    [this.low, this.high] = [level - half, level + half];
-  }
-
-  get levels() {
-    return { level: (this.low + this.high) / 2, width: this.high - this.low };
-  }
-
-  // Return the name of the window that is shown; "" if it is none of WINDOWS.
-  get windowName() {
-    const found = Object.entries(WINDOWS).find(([, [low, high]]) => low === this.low && high === this.high);
-    return found ? found[0] : "";
-  }
-
-  // Return name, colour and opacity of the structures that can be painted over others.
-  structures() {
-    return Object.entries(this.codes).filter(([, code]) => !this.ground[code])
-      .map(([name, code]) => ({ name, colour: STRUCTURE_COLOURS[name], opacity: this.opacity[code] }));
-  }
-
-  setOpacity(name, share) {
-    this.opacity[this.codes[name]] = share;
-  }
-
-  // Return where a place of the picture is in the masks: the same, but for the breath.
-  inMasks(place) {
-    return this.breath && this.share !== 0 ? this.breath.pulledBack(place, this.share) : place;
-  }
-
-  structureAt(place) {
-    const code = nearest(this.labels, ...this.inMasks(place));
-    return Object.keys(this.codes).find((name) => this.codes[name] === code);
-  }
-
-  // Return the HU at a place, null without a CT or beyond it.
-  huAt(place) {
-    const value = this.source ? this.source.value(this.inMasks(place)) : NaN;
-    return Number.isNaN(value) ? null : value;
-  }
-
-  // Write the colour of the image at a point to out[at...at + 2]; `hu` is the value there, if it is known already.
-  paint(x, y, z, out, at, hu) {
-    const { hasCt } = this;
-    const code = hasCt && !this.tint && !this.overlay ? 0 : nearest(this.labels, x, y, z);
-    let red = this.table[3 * code], green = this.table[3 * code + 1], blue = this.table[3 * code + 2];
-    if (hasCt || !this.ground[code]) {
-      const share = this.tint && !this.ground[code] ? this.opacity[code] : 0;
-      const value = hasCt ? (255 * ((hu === undefined ? linear(this.ct, x, y, z) : hu) - this.low)) / (this.high - this.low) : 0;
-      const grey = hasCt ? Math.min(Math.max(value, 0), 255) || 0 : this.table[3 * this.codes.lung];
-      red = grey + share * (red - grey);
-      green = grey + share * (green - grey);
-      blue = grey + share * (blue - grey);
-    }
-    const over = this.overlay && !this.tinted[code] ? this.overlay(x, y, z) : null;
-    out[at] = over ? over[0] : red;
-    out[at + 1] = over ? over[1] : green;
-    out[at + 2] = over ? over[2] : blue;
-    out[at + 3] = 255;
-  }
-}
-
 // One plane on a canvas, with the devices, the target and the patient's sides at its edges.
 export class Slice {
   constructor(canvas, image) {
@@ -166,11 +55,13 @@ export class Slice {
 
   // Draw the plane { right, up } through a centre, so many mm wide, and again when a finer source has its values.
   // marks: { lines: [{ points, radius, colour }], target, targetRadius, cross: [x, y, z] }
-  draw(plane, centre, widthMm, marks) {
+  // A coarse picture has the colour of every so-manieth pixel.
+  draw(plane, centre, widthMm, marks, isCoarse = false) {
     this.plane = { ...plane, centre, scale: this.canvas.width / widthMm };
     this.marks = marks;
-    this.show(this.fine && this.fine.key === this.key() ? this.fine.values : null);
-    this.refine();
+    this.isCoarse = isCoarse;
+    this.show(this.isFine ? this.fine.values : null);
+    if (!isCoarse) this.refine();
   }
 
   // Return the pixels of the plane as a source takes them.
@@ -181,8 +72,9 @@ export class Slice {
     };
   }
 
+  // Return a text that is the same for rasters that differ by less than can be seen.
   key() {
-    return JSON.stringify(this.raster());
+    return JSON.stringify(this.raster(), (_name, value) => (typeof value === "number" ? Number(value.toFixed(KEY_DIGITS)) : value));
   }
 
   // Ask the finer source, one slice at a time, until what is shown is of it.
@@ -191,20 +83,25 @@ export class Slice {
     if (!image.finer || this.asking || (image.breath && image.share !== 0)) return;
     this.asking = true;
     try {
-      while (!this.fine || this.fine.key !== this.key()) {
-        const raster = this.raster(), values = await image.finer.slice(raster);
+      while (!this.isFine) {
+        const key = this.key(), values = await image.finer.slice(this.raster());
         if (!values) return;
-        this.fine = { key: JSON.stringify(raster), values };
-        if (this.fine.key === this.key()) this.show(values);
+        this.fine = { key, values };
+        if (key === this.key()) this.show(values);
       }
     } finally {
       this.asking = false;
     }
   }
 
+  // Whether the finer source's values of this very plane are known.
+  get isFine() {
+    return Boolean(this.fine && this.plane && this.fine.key === this.key());
+  }
+
   // Return the HU at a place of the plane: of the finer source if it is shown, else of the page; null without a CT.
   huAt(place) {
-    if (!this.fine || this.fine.key !== this.key()) return this.image.huAt(place);
+    if (!this.isFine) return this.image.huAt(place);
     const { width, height } = this.canvas, [column, row] = this.project(place).map(Math.floor);
     const value = column >= 0 && row >= 0 && column < width && row < height ? this.fine.values[row * width + column] : NaN;
     return Number.isNaN(value) ? null : value;
@@ -212,26 +109,40 @@ export class Slice {
 
   // Paint the pixels, of these values in HU or else of those of the page, and all marks.
   show(values) {
-    const { width, height } = this.canvas, { marks } = this, step = 1 / this.plane.scale;
-    const pixels = this.pen.createImageData(width, height);
-    const across = times(this.plane.right, step);
-    const shifts = this.shifts(width, height, step);
-    for (let row = 0; row < height; row++) {
-      let [x, y, z] = this.pixelCentre(0, row, step);
-      for (let column = 0, at = 4 * row * width; column < width; column++, at += 4) {
-        const [sx, sy, sz] = shifts ? shifts(column, row) : NOWHERE;
-        this.image.paint(x + sx, y + sy, z + sz, pixels.data, at, values ? values[at / 4] : undefined);
-        x += across[0];
-        y += across[1];
-        z += across[2];
-      }
+    const { marks, painted } = this, look = [this.key(), values, ...this.image.look];
+    // Marks move far more often than the plane behind them.
+    const isSame = painted && look.length === painted.look.length && look.every((each, n) => each === painted.look[n]);
+    if (!isSame || (painted.isCoarse && !this.isCoarse)) {
+      this.paint(values);
+      this.painted = { look, isCoarse: this.isCoarse };
     }
-    this.pen.putImageData(pixels, 0, 0);
+    this.pen.putImageData(this.pixels, 0, 0);
     for (const line of marks.lines || []) this.line(line);
     if (marks.target) this.target(marks.target);
     if (marks.cross) this.cross(marks.cross);
     this.letters();
-    this.bar(width * step);
+    this.bar(this.canvas.width / this.plane.scale);
+  }
+
+  // Paint the pixels of the plane.
+  paint(values) {
+    const { width, height } = this.canvas, step = 1 / this.plane.scale, many = this.isCoarse ? COARSE_PIXELS : 1;
+    if (!this.pixels || this.pixels.width !== width || this.pixels.height !== height) this.pixels = this.pen.createImageData(width, height);
+    const { data } = this.pixels, words = new Uint32Array(data.buffer);
+    const across = times(this.plane.right, many * step);
+    const shifts = this.shifts(width, height, step);
+    for (let row = 0; row < height; row += many) {
+      let [x, y, z] = this.pixelCentre(0, row, step);
+      for (let column = 0; column < width; column += many) {
+        const at = row * width + column, [sx, sy, sz] = shifts ? shifts(column, row) : NOWHERE;
+        this.image.paint(x + sx, y + sy, z + sz, data, 4 * at, values ? values[at] : undefined);
+        if (many > 1) words.fill(words[at], at, Math.min(at + many, (row + 1) * width));
+        x += across[0];
+        y += across[1];
+        z += across[2];
+      }
+      for (let next = row + 1; next < Math.min(row + many, height); next++) words.copyWithin(next * width, row * width, (row + 1) * width);
+    }
   }
 
   pixelCentre(column, row, step) {

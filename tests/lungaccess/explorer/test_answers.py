@@ -73,12 +73,17 @@ def test_a_click_its_plan_its_files_and_the_command(
             link = next(m["address"] for m, _ in found if m["answer"] == "link")
             seen[what] = await fetched(explorer, link)
         chosen, _none = (
-            await client.ask("plan", target=TARGET, what_if=SYSTEM, entry=int(arrays["entry"][0]))
+            await client.ask(
+                "plan", target=TARGET, what_if=SYSTEM, entry=int(arrays["entry"][0]), iterations=ITERATIONS
+            )
         )[-2]
-        assert chosen["final"] and chosen["command"] == ""
-        np.testing.assert_allclose(chosen["exit_lps"], arrays["points"][0], atol=1e-3)
+        assert chosen["final"]
+        assert np.linalg.norm(np.array(chosen["exit_lps"]) - arrays["points"][0]) <= 2.0 + 1e-3
         tip = int(arrays["tip"][0])
-        held, _none = (await client.ask("plan", target=TARGET, what_if=SYSTEM, scope_tip=tip))[-2]
+        held, _none = (
+            await client.ask("plan", target=TARGET, what_if=SYSTEM, scope_tip=tip, iterations=ITERATIONS)
+        )[-2]
+        seen["through"] = [chosen, held]
         away = np.linalg.norm(np.array(held["scope_tip_lps"]) - tips["tips"][tip, :3])
         assert away <= 1.5 + 1e-3
 
@@ -87,8 +92,9 @@ def test_a_click_its_plan_its_files_and_the_command(
         _written(tmp_path / "s.zip", seen["slicer.zip"])
     )
     monkeypatch.chdir(tmp_path)
-    words = _words(seen["plan"]["command"])
-    assert main([*words, "--no-pictures"]) == 0
+    for each in (*seen["through"], seen["plan"]):
+        assert main([*_words(each["command"]), "--no-pictures"]) == 0
+        assert Plan.load(tmp_path / "plan" / "plan.json").digest == each["digest"]
     assert plain((tmp_path / "plan" / "plan.json").read_text()) == plain(seen["plan.json"].decode())
     assert json.loads(seen["summary.json"])["digest"] == Plan.load(tmp_path / "plan" / "plan.json").digest
     _are_feasible(patient, seen["exits"])

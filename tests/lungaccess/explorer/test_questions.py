@@ -15,6 +15,7 @@ from anatomy.errors import SettingsError
 from anatomy.settings import parse
 from anatomy.settings_file import settings_toml
 from lungaccess.explorer.changed_system import plan_command, system_of
+from lungaccess.explorer.chosen_place import ChosenPlace
 from lungaccess.explorer.messages import frame, read_frame
 from lungaccess.explorer.questions import CANCEL, QUESTIONS, PlanQuestion, WhatIf, number_of, read_message
 from lungaccess.problem.system import System, shipped_names
@@ -151,7 +152,9 @@ def test_the_command_names_the_devices(what_if: WhatIf, device: str) -> None:
     assert line == (
         f"""lungaccess plan '/p/it'"'"'s' --target lps:1.5,2,3 {device} --iterations 7 --seed 5 --out plan"""
     )
-    assert not plan_command(Path("p"), replace(question, entry=4), system, {}, None)
+    place = ChosenPlace.of("scope tip", np.array([1.0, -2.34567, 25.0]))
+    through = plan_command(Path("p"), question, system, {"mine": Path("mine.toml")}, None, place)
+    assert " --target lps:1.5,2,3 --scope-tip lps:1.0,-2.346,25.0 --scope-tip-within 1.5 --system " in through
 
 
 def test_every_question_has_an_answer() -> None:

@@ -192,7 +192,7 @@ def is_running(pid: int) -> bool:
 def test_a_process_that_dies_is_told_and_started_again() -> None:
     async def talk(client: Client, explorer: Explorer) -> None:
         await client.ask("place", point=[0, 0, 0])
-        first = explorer.processes["plans"]
+        first = explorer.processes["clicks"]
         assert first is not None
         number = await client.send("exits", target="nodule 1")
         os.kill(first, signal.SIGSTOP)
@@ -201,7 +201,7 @@ def test_a_process_that_dies_is_told_and_started_again() -> None:
         found = [*await client.answers(asked), *await client.answers(number)]
         assert found[-1][0]["answer"] == "error"
         assert (await client.ask("patient"))[-1][0]["error"]["kind"] == "FileError"
-        assert explorer.processes["plans"] not in (None, first)
+        assert explorer.processes["clicks"] not in (None, first)
 
     with_client(NOBODY, talk)
 

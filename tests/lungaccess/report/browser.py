@@ -73,6 +73,11 @@ class Browser:
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.command("Emulation.setEmulatedMedia", {"features": scheme})
 
+    @property
+    def driver_pid(self) -> int:
+        """Number of the process that starts the browser."""
+        return self._driver.pid
+
     def _wait(self) -> None:
         for _ in range(STARTS):
             try:

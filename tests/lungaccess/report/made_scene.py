@@ -20,7 +20,7 @@ SIDE_PX = 300
 DISTANCE_MM = 300.0
 HALF_ANGLE = np.radians(15.0)
 GROUND = (0.9, 0.92, 0.94)
-MODULES = document.SHARED_MODULES[: document.SHARED_MODULES.index("slices.js")]
+MODULES = document.SHARED_MODULES[: document.SHARED_MODULES.index("voxel_image.js")]
 PAGE = """<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,">
 <style>body {{ margin: 0 }} canvas {{ width: {side}px; height: {side}px; display: block }}</style>
 <canvas id="scene"></canvas>

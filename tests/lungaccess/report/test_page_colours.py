@@ -49,6 +49,7 @@ COLOURS_TOGETHER = {
 }
 SAME_EVERYWHERE = (
     "slices.js",
+    "voxel_image.js",
     "bronchoscopy.js",
     "plan.js",
     "no_plan.js",

@@ -17,12 +17,11 @@ from anatomy.errors import FrameError, SettingsError
 from anatomy.io.markups import Reference, read_named_curve, read_named_pose
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
-from lungaccess.one_stage.near_exit import exit_points
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.target import stated_target
 from lungaccess.slicer import check_curve
-from stages.tube import DeploymentValidator
+from stages.tube import DeploymentValidator, exit_points
 
 Edit = Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
 Edited = Callable[[str, Edit], Any]
@@ -190,7 +189,9 @@ def test_exits_of_the_atlas_are_those_of_its_deployments(small_atlas: la.Atlas) 
         lung, system.tubes, system.margins, with_fissures=small_atlas.with_fissures
     )
     chosen = np.linspace(0, every.count - 1, 5).astype(np.int64)
-    for entry, found in zip(chosen.tolist(), exit_points(small_atlas, chosen), strict=True):
+    for entry, found in zip(
+        chosen.tolist(), exit_points(system.tubes, small_atlas.motions.tips, every, chosen), strict=True
+    ):
         tip = small_atlas.motions.tips[every.site[entry]]
         frame = poses.pose(tip[:3], tip[3:6], tip[6:9])
         deployment = validator.choose(frame, *every.choice(entry))
@@ -202,7 +203,9 @@ def test_exits_of_the_atlas_are_those_of_its_deployments(small_atlas: la.Atlas) 
 def test_a_moved_exit_starts_a_new_plan_from_there(
     exported: Path, small_plan: Plan, small_atlas: la.Atlas, command: Any, tmp_path: Path
 ) -> None:
-    places = exit_points(small_atlas, np.arange(0, small_atlas.deployments.count, 50))
+    every = small_atlas.deployments
+    chosen = np.arange(0, every.count, 50)
+    places = exit_points(small_atlas.system.tubes, small_atlas.motions.tips, every, chosen)
     away = np.linalg.norm(places - small_plan.tube.exit.point_lps, axis=1)
     wanted = places[np.argmin(np.abs(away - 6.0))]
     content = json.loads((exported / "points.mrk.json").read_text())

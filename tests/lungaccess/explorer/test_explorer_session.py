@@ -1,0 +1,31 @@
+"""Many clicks in one session: memory stays flat, nothing is asked elsewhere, plans are the command's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from experiments.explorer_speed import targets
+from tests.lungaccess.explorer.session import GROWTH, WINDOW, click_through
+from tests.lungaccess.explorer.windows import Page, Served
+from tests.lungaccess.report import browser
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there"),
+]
+CLICKS = 30
+
+
+def test_a_session_keeps_its_memory_and_its_plans(served: Served, patient: Path) -> None:
+    points = targets(patient, patient.parent / "cache", CLICKS)
+    with Page(*WINDOW) as window:
+        window.open(served.address.url)
+        made = click_through(window, served, points, 5, 4, lambda _made: None)
+    assert made.compared >= 2 and made.differing == []
+    assert made.messages == []
+    assert made.hosts == {f"127.0.0.1:{served.address.port}"}
+    for name in ("clicks", "plans", "answers", "page: heap"):
+        assert made.growth(name) <= 2.0 * GROWTH - 1.0, (name, made.memory[name])

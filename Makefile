@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --retrie
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help demo test first-contact lint format docs dist try bench results results-quick clean
+.PHONY: help demo test first-contact lint format docs publish-docs dist try bench results results-quick clean
 
 help:
 	@echo "make demo    plan on a synthetic patient, results in demo-output/"
@@ -16,6 +16,7 @@ help:
 	@echo "make lint    ruff and mypy only"
 	@echo "make format  let ruff rewrite the code"
 	@echo "make docs    build the documentation into site/"
+	@echo "make publish-docs PUBLISHED=FOLDER  the pages of this version beside those of others"
 	@echo "make dist    build wheel and sdist into dist/, and check what is in them"
 	@echo "make try     the wheel in new environments, on all versions of Python at hand (half an hour)"
 	@echo "make bench   run the benchmarks"
@@ -56,6 +57,11 @@ first-contact: $(VENV)/.installed-test
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs site
+
+# PUBLISHED is a folder for a host of static files, with a folder a version and a list of them.
+publish-docs: docs
+	@test -n "$(PUBLISHED)" || { echo "Name the folder: make publish-docs PUBLISHED=FOLDER" >&2; exit 1; }
+	$(BIN)/python packaging/publish_docs.py site "$(PUBLISHED)"
 
 dist: $(VENV)/.installed-test
 	$(BIN)/python packaging/release.py dist

@@ -160,7 +160,7 @@ def fast_tests(python: Path, dependencies: str) -> bool:
     pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     told = ["-c", str(ROOT / constraints)] if constraints else []
     subprocess.run([*pip, *told, *MATRIX["tests"]["packages"]], check=True)
-    pytest = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", *MATRIX["tests"]["folders"]]
+    pytest = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", *MATRIX["tests"]["places"]]
     return subprocess.run(pytest, cwd=ROOT).returncode == 0
 
 

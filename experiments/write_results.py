@@ -199,8 +199,8 @@ def _state(found: Found) -> str:
             words.append(f"{setting} setting: **not run, or failed**")
         else:
             spent = f"{number(made['cpu_s'])} s of CPU, {number(made['wall_s'])} s by the clock"
-            left = f", **unfinished: {made['progress']}**" if made.get("progress") else ""
-            words.append(f"{setting} setting: {spent}{left}")
+            left = f"**unfinished: {made['progress']}**" if made.get("progress") else ""
+            words.append(f"{setting} setting: {left or spent}")
     text = "; ".join(words)
     return text[0].upper() + text[1:] + "."
 

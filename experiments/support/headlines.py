@@ -21,6 +21,7 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
         "Patient1, flexure-needle, fissures crossed, atlas: within 60 s",
         "Patient1, ultrathin, fissures forbidden, atlas: within 60 s",
         "Patient2, ultrathin, fissures crossed, atlas: within 60 s",
+        "Patient2, flexure-needle, fissures crossed, atlas: within 60 s",
         "Patient1, ultrathin, fissures crossed, Algorithm 1: within 1 s",
     ),
     "kuntz2015_quality": ("fig. 6: 15 plans to one goal", "factor that line 8 saves, all time"),

@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --retrie
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help demo test first-contact lint format docs bench results results-quick clean
+.PHONY: help demo test first-contact lint format docs publish-docs dist try bench results results-quick clean
 
 help:
 	@echo "make demo    plan on a synthetic patient, results in demo-output/"
@@ -16,6 +16,9 @@ help:
 	@echo "make lint    ruff and mypy only"
 	@echo "make format  let ruff rewrite the code"
 	@echo "make docs    build the documentation into site/"
+	@echo "make publish-docs PUBLISHED=FOLDER  the pages of this version beside those of others"
+	@echo "make dist    build wheel and sdist into dist/, and check what is in them"
+	@echo "make try     the wheel in new environments, on all versions of Python at hand (half an hour)"
 	@echo "make bench   run the benchmarks"
 	@echo "make results-quick  all studies in the quick setting, and RESULTS.md"
 	@echo "make results        all studies in the full setting (hours), and RESULTS.md"
@@ -54,6 +57,18 @@ first-contact: $(VENV)/.installed-test
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs site
+
+# PUBLISHED is a folder for a host of static files, with a folder a version and a list of them.
+publish-docs: docs
+	@test -n "$(PUBLISHED)" || { echo "Name the folder: make publish-docs PUBLISHED=FOLDER" >&2; exit 1; }
+	$(BIN)/python packaging/publish_docs.py site "$(PUBLISHED)"
+
+dist: $(VENV)/.installed-test
+	$(BIN)/python packaging/release.py dist
+
+# TRY_ARGS="--python 3.12 --dependencies newest" tries one environment of packaging/matrix.toml.
+try: $(VENV)/.installed-test
+	$(BIN)/python packaging/release.py try $(TRY_ARGS)
 
 bench: $(VENV)/.installed-dev
 	cd benchmarks && export ASV_PYTHONPATH="$(CURDIR)" && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr $(BENCH_ARGS)

@@ -20,9 +20,18 @@ copyright = f"2026, {author}"
 release = importlib.metadata.version("lungaccess")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build", "pictures"]
+exclude_patterns = ["_build", "_templates", "pictures"]
 html_theme = "furo"
-html_title = "lungaccess"
+html_title = f"lungaccess {release}"
+templates_path = ["_templates"]
+html_static_path = ["_static"]
+html_js_files = ["versions.js"]
+html_sidebars = {
+    "**": [
+        "sidebar/brand.html", "sidebar/versions.html", "sidebar/search.html", "sidebar/scroll-start.html",
+        "sidebar/navigation.html", "sidebar/scroll-end.html",
+    ]
+}  # fmt: skip
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
@@ -83,6 +92,13 @@ def tidy(_app: object, what: str, _name: str, value: object, _options: object, l
     lines[:] = [re.sub(r"^(\s*)\.\. \[(\w+)\]", r"\1\2", line) for line in lines]
 
 
+def state_version(app: Sphinx, failure: Exception | None) -> None:
+    """Write the version beside the pages, for packaging/publish_docs.py."""
+    if failure is None and app.builder.format == "html":
+        Path(app.outdir, "version.txt").write_text(f"{release}\n", encoding="utf-8")
+
+
 def setup(app: Sphinx) -> None:
     """Connect to Sphinx."""
+    app.connect("build-finished", state_version)
     app.connect("autodoc-process-docstring", tidy, priority=400)

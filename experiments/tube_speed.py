@@ -3,8 +3,9 @@
     python -m experiments.tube_speed [--quick] [--seed 1] [--results FOLDER]
 
 Equilibria a second of one to three precurved tubes that never snap, with base angles given, stability and tip
-frame, in one call and one by one, beside the CasADi model of the same physics; error and time by step; errors
-against closed forms and, where LUNGACCESS_DATA is set, against tips that a public C++ code computed.
+frame, in one call and one by one, beside the CasADi model of the same physics; the same for designs drawn at
+random, some of which are near snapping; error and time by step; errors against closed forms and, where
+LUNGACCESS_DATA is set, against tips that a public C++ code computed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.scenes import configurations, mechanics
+from benchmarks.scenes import configurations, mechanics, random_mechanics
 from experiments.support.anatomies import data_folder, require_data
 from experiments.support.machine import median_cpu_s
 from experiments.support.results import Result, setting_of, study_parser, write_result
@@ -34,6 +35,7 @@ FINE_CASADI_STEPS = 40
 PUBLIC_CODES = "the fastest public codes known to us: 5,000 to 29,000, on other machines"
 LENGTH_MM = 40.0
 REPEATS = 5
+RANDOM_DESIGNS = 40
 
 
 def add_speed(result: Result, many: int, few: int) -> dict[str, list[float]]:
@@ -81,6 +83,29 @@ def _add_speed(result: Result, count: int, speed: dict[str, float], made: TubeMe
         f"{tubes}: tip against the CasADi model, largest", max(apart), unit="mm",
         note=f"{few} equilibria, {FINE_CASADI_STEPS} steps between landmarks",
     )  # fmt: skip
+
+
+def add_random_designs(result: Result, many: int) -> None:
+    """Add equilibria a second of designs drawn at random, in one call a design."""
+    each = many // RANDOM_DESIGNS
+    for count in COUNTS[1:]:
+        designs = random_mechanics(count, RANDOM_DESIGNS)
+        drawn = [configurations(made, each, result.seeds[0] + n) for n, made in enumerate(designs)]
+
+        def work(designs: Any = designs, drawn: Any = drawn) -> None:
+            for made, joints in zip(designs, drawn, strict=True):
+                made.batch(*joints)
+
+        work()
+        speeds = []
+        for made, joints in zip(designs, drawn, strict=True):
+            seconds = median_cpu_s(lambda: made.batch(*joints), REPEATS)  # noqa: B023
+            speeds.append(each / seconds)
+        result.add(
+            f"{count} random tubes: equilibria a second, one call",
+            RANDOM_DESIGNS * each / median_cpu_s(work, REPEATS),
+            note=f"{RANDOM_DESIGNS} designs; slowest {min(speeds):.0f}, fastest {max(speeds):.0f}",
+        )
 
 
 def _apart_mm(a: np.ndarray, b: np.ndarray) -> float:
@@ -194,6 +219,7 @@ def main() -> None:
         },
     )  # fmt: skip
     speeds = add_speed(result, many, few)
+    add_random_designs(result, many)
     steps = add_steps(result, many)
     if data_folder() is None:
         result.not_reproduced.append("Differences from stored reference tips: LUNGACCESS_DATA is not set.")

@@ -1,9 +1,10 @@
-"""Make RESULTS.md from the result files of the studies.
+"""Make RESULTS.md and the full tables from the result files of the studies.
 
     python -m experiments.write_results [--results FOLDER] [--out RESULTS.md]
 
-One section a paper, then our own studies, then machines and versions.  The full setting is shown where it was
-run, with the quick one beside it.  The same files give the same bytes.
+RESULTS.md is one page: the headline rows of each study.  FOLDER/tables.md has every row: one section a paper,
+then our own studies, then machines and versions.  The full setting is shown where it was run, with the quick
+one beside it.  The same files give the same bytes.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 from anatomy.errors import FileError
 from anatomy.io.files import atomic_write, read_text
+from experiments.support.headlines import HEADLINES, MEASURED_ON
 from experiments.support.results import Row, cells, number
 
 PAPERS = {
@@ -45,12 +47,19 @@ OUR_OWN = (
 )
 SETTINGS = ("full", "quick")
 OUR_TITLE = "Our own studies"
-HEAD = """# Results
+TABLES = "tables.md"
+HEADLINES_HEAD = """# Results
 
-Made by `python -m experiments.write_results` from the files in `{folder}/`; do not edit.  `make results` runs
-all studies in the full setting, and `make results-quick` in the quick one
-([how](docs/measurements/results.md)).  "Ratio" is ours divided by the paper's, of the full setting where
-there is one.  What was not reproduced is said below each table, with the reason.
+The headline rows of every study.  [All rows]({tables}), with conditions, seeds and what was not reproduced,
+are one page further.  "Ratio" is ours divided by the paper's.  The data are named below each full table: two
+segmented lungs, two CTs and synthetic patients, and the numbers promise nothing for others.
+[How they are made]({how}).  Made by `python -m experiments.write_results`; do not edit.
+"""
+TABLES_HEAD = """# Results: all rows
+
+Made by `python -m experiments.write_results` from the files beside this page; do not edit.  The headline rows
+stand on [one page]({headlines}).  "Ratio" is ours divided by the paper's, of the full setting where there is
+one.  What was not reproduced is said below each table, with the reason.
 """
 
 Found = dict[str, dict[str, Any]]
@@ -85,34 +94,76 @@ def _read(file: Path) -> dict[str, Any]:
     return stored
 
 
-def page(found: dict[str, Found], folder: str) -> str:
+def headlines(found: dict[str, Found], tables: str, docs: str) -> str:
     """Return the text of RESULTS.md.
 
     Parameters
     ----------
     found : dict
         Results by name and setting, see `read_all`.
-    folder : str
-        Where they are, as links from RESULTS.md name it.
+    tables, docs : str
+        The page of all rows and the folder of the documentation, as links from RESULTS.md name them.
     """
-    parts = [HEAD.format(folder=folder), _overview(found)]
+    how = f"{docs}/measurements/results.md"
+    lines = [HEADLINES_HEAD.format(tables=tables, how=how).rstrip("\n"), ""]
+    head = ["study", "quantity", "paper", "ours", "ratio", "setting"]
+    lines += [_line(head), _line(["---"] * len(head))]
+    for name in _names(found):
+        lines += [_line([f"[`{name}`]({tables}#{name})", *each]) for each in _headlines(name, found, docs)]
+    return "\n".join(lines) + "\n"
+
+
+def _headlines(name: str, found: dict[str, Found], docs: str) -> list[list[str]]:
+    """Return the cells of a study's headline rows, or one that says why there is none."""
+    made = found.get(name, {})
+    if not made:
+        page = MEASURED_ON.get(name)
+        where = f"; measured once: [page]({docs}{page.removeprefix('docs')})" if page else ""
+        return [[f"**no result is kept**{where}", "", "", "", "none"]]
+    shown = made.get("full") or made["quick"]
+    state = shown.get("progress") or ""
+    state = f"{shown['setting']}, **unfinished: {state}**" if state else shown["setting"]
+    by_quantity = {row.quantity: row for row in shown["rows"]}
+    rows = [by_quantity[each] for each in HEADLINES.get(name, ()) if each in by_quantity]
+    rows = rows or shown["rows"][:1]
+    return [[*cells(row)[:4], state] for row in rows]
+
+
+def page(found: dict[str, Found], headlines: str) -> str:
+    """Return the text of the page of all rows, which lies in the folder of the results.
+
+    Parameters
+    ----------
+    found : dict
+        Results by name and setting, see `read_all`.
+    headlines : str
+        RESULTS.md, as a link from this page names it.
+    """
+    parts = [TABLES_HEAD.format(headlines=headlines), _overview(found)]
     for paper, names in PAPERS.items():
         parts.append(f"## {paper}\n")
-        parts += [section(name, found.get(name, {}), folder) for name in names]
+        parts += [section(name, found.get(name, {})) for name in names]
     parts.append(f"## {OUR_TITLE}\n")
     known = [name for names in PAPERS.values() for name in names]
-    others = sorted(set(found) - set(known) - set(OUR_OWN))
-    parts += [section(name, found.get(name, {}), folder) for name in (*OUR_OWN, *others)]
+    parts += [section(name, found.get(name, {})) for name in _names(found) if name not in known]
     parts.append(_machines(found))
     return "\n".join(parts)
 
 
-def section(name: str, found: Found, folder: str) -> str:
+def _names(found: dict[str, Found]) -> list[str]:
+    """Return the names of all studies in the order of the pages, with those that only have a result last."""
+    known = [*(name for names in PAPERS.values() for name in names), *OUR_OWN]
+    return [*known, *sorted(set(found) - set(known))]
+
+
+def section(name: str, found: Found) -> str:
     """Return the section of one study; it says so where a setting has no result."""
+    anchor = f'<a id="{name}"></a>\n\n'
     if not found:
-        return f"### `{name}`\n\n**No result.**  `python -m experiments.{name}` was not run, or failed.\n"
+        lacking = f"**No result.**  `python -m experiments.{name}` was not run, or failed.\n"
+        return f"{anchor}### `{name}`\n\n{lacking}"
     shown = found.get("full") or found["quick"]
-    lines = [f"### {shown['title']}: `{name}`\n", _state(found) + "\n"]
+    lines = [f"{anchor}### {shown['title']}: `{name}`\n", _state(found) + "\n"]
     if shown["source"]:
         lines.append(f"Compared with: {shown['source']}.\n")
     lines += _table(found) + [""]
@@ -121,7 +172,7 @@ def section(name: str, found: Found, folder: str) -> str:
     if shown["not_reproduced"]:
         lines += ["Not reproduced:\n", *[f"- {words}" for words in shown["not_reproduced"]], ""]
     if shown.get("figure"):
-        lines.append(f"![{shown['title']}]({folder}/{shown['setting']}/{shown['figure']})\n")
+        lines.append(f"![{shown['title']}]({shown['setting']}/{shown['figure']})\n")
     return "\n".join(lines)
 
 
@@ -148,7 +199,8 @@ def _state(found: Found) -> str:
             words.append(f"{setting} setting: **not run, or failed**")
         else:
             spent = f"{number(made['cpu_s'])} s of CPU, {number(made['wall_s'])} s by the clock"
-            words.append(f"{setting} setting: {spent}")
+            left = f"**unfinished: {made['progress']}**" if made.get("progress") else ""
+            words.append(f"{setting} setting: {left or spent}")
     text = "; ".join(words)
     return text[0].upper() + text[1:] + "."
 
@@ -186,12 +238,17 @@ def _line(columns: list[str]) -> str:
 
 def _overview(found: dict[str, Found]) -> str:
     """Return which studies were run in which setting."""
-    known = [name for names in PAPERS.values() for name in names]
     lines = ["| study | full | quick |", "| --- | --- | --- |"]
-    for name in [*known, *OUR_OWN, *sorted(set(found) - set(known) - set(OUR_OWN))]:
-        marks = ["yes" if setting in found.get(name, {}) else "**missing**" for setting in SETTINGS]
+    for name in _names(found):
+        marks = [_mark(found.get(name, {}).get(setting)) for setting in SETTINGS]
         lines.append(f"| `{name}` | {' | '.join(marks)} |")
     return "\n".join(lines) + "\n"
+
+
+def _mark(made: dict[str, Any] | None) -> str:
+    if made is None:
+        return "**missing**"
+    return f"**unfinished: {made['progress']}**" if made.get("progress") else "yes"
 
 
 def _machines(found: dict[str, Found]) -> str:
@@ -216,15 +273,20 @@ def _machine(machine: dict[str, Any]) -> str:
 
 
 def write_page(results: Path, out: Path) -> None:
-    """Read the results of a folder and write RESULTS.md in one step."""
-    link = Path(os.path.relpath(results, out.parent)).as_posix()
-    text = page(read_all(results), link)
-    with atomic_write(out) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    """Read the results of a folder and write the page of all rows there, and RESULTS.md, each in one step."""
+    found, tables = read_all(results), results / TABLES
+    pages = {tables: page(found, _link(out, tables)), out: headlines(found, _link(tables, out), "docs")}
+    for file, text in pages.items():
+        with atomic_write(file) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _link(to: Path, page: Path) -> str:
+    return Path(os.path.relpath(to, page.parent)).as_posix()
 
 
 def main() -> None:
-    """Write RESULTS.md."""
+    """Write both pages."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

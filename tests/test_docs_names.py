@@ -101,7 +101,7 @@ def test_each_place_of_a_paper_has_an_implementation_that_exists() -> None:
 
 
 def test_each_test_and_study_of_a_paper_exists() -> None:
-    results = (ROOT / "RESULTS.md").read_text(encoding="utf-8")
+    results = (ROOT / "results" / "tables.md").read_text(encoding="utf-8")
     for place, _implementation, test, study, result in paper_rows():
         for name in IN_TICKS.findall(test):
             match = TEST.match(name)

@@ -137,7 +137,9 @@ def span(
     length = np.linalg.norm(mm[a] - mm[b], axis=1)
     cost = length / np.maximum(np.minimum(depth_mm[a], depth_mm[b]), 1e-3) ** 2 * factor
     cost = np.clip(cost, *COST_RANGE)
-    graph = coo_array((cost, (a, b)), shape=(len(mm), len(mm))).tocsr()
+    # Older versions of scipy (1.13 to 1.16) span graphs with indices of 32 bits only.
+    edges = a.astype(np.int32), b.astype(np.int32)
+    graph = coo_array((cost, edges), shape=(len(mm), len(mm))).tocsr()
     spanned = minimum_spanning_tree(graph).tocoo()
     neighbours: list[list[int]] = [[] for _ in range(len(mm))]
     chosen = set()

@@ -72,6 +72,8 @@ class Result:
         The table.
     not_reproduced : list of str
         What of the paper was not reproduced, and why.
+    progress : str
+        How far a run is that is not finished, such as "400 of 1600 runs"; empty for one that is.
     figure : matplotlib Figure, optional
         Stored as a PNG of at most 150 kB.
     """
@@ -84,6 +86,7 @@ class Result:
     seeds: list[int] = field(default_factory=list)
     rows: list[Row] = field(default_factory=list)
     not_reproduced: list[str] = field(default_factory=list)
+    progress: str = ""
     figure: Figure | None = None
     _began: tuple[float, float] = field(
         default_factory=lambda: (time.perf_counter(), cpu_seconds()), repr=False
@@ -106,6 +109,7 @@ class Result:
         }  # fmt: skip
         return {
             **kept,
+            **({"progress": self.progress} if self.progress else {}),
             "rows": [{k: _finite(v) for k, v in asdict(row).items()} for row in self.rows],
             "figure": None if self.figure is None else f"{self.name}.png",
             "wall_s": round(time.perf_counter() - wall, 1),

@@ -1,4 +1,4 @@
-"""Rows of a benchmark as CSV or JSON, one a run."""
+"""Rows of a benchmark as CSV or JSON, one a run; JSON has the paths, too."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def require_table_file(path: Path) -> None:
 
 
 def write_rows(rows: Iterable[BenchmarkRow], path: Path) -> None:
-    """Write the rows by the suffix of the file; what is not known stays empty, or null.
+    """Write the rows by the suffix of the file; what is not known stays empty, or null; a table has no arcs.
 
     Raises
     ------
@@ -39,6 +39,7 @@ def write_rows(rows: Iterable[BenchmarkRow], path: Path) -> None:
         if path.suffix == ".json":
             stream.write(json.dumps({"runs": records}, indent=2, allow_nan=False) + "\n")
             return
-        writer = csv.DictWriter(stream, [field.name for field in fields(BenchmarkRow)])
+        columns = [field.name for field in fields(BenchmarkRow) if field.name != "arcs"]
+        writer = csv.DictWriter(stream, columns, extrasaction="ignore")
         writer.writeheader()
         writer.writerows(records)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -44,6 +44,9 @@ class BenchmarkRow:
         Whether it is proved that no path exists.
     reason : str
         Why there is no path; "" if there is one.
+    arcs : tuple of mapping
+        The last path from the published start: "length_mm", "roll_rad" and "curvature_per_mm" of each arc, as
+        `stages.needle.ArcPath` has them; no arcs if there is none.
     """
 
     patient: str
@@ -60,6 +63,7 @@ class BenchmarkRow:
     needed_clearance_mm: float | None = None
     proved: bool = False
     reason: str = ""
+    arcs: tuple[Mapping[str, float], ...] = ()
 
 
 def run_query(
@@ -143,6 +147,7 @@ def _row(
         first_length_mm=_length(first, query),
         length_mm=_length(found.path, query),
         clearance_mm=_clearance(environment, query, found.path),
+        arcs=tuple(found.path.arc_records()),
     )
 
 

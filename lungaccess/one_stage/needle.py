@@ -109,10 +109,7 @@ class NeedleAnswer(PathSearch):
             "accumulated_turn_rad": path.accumulated_turn_rad,
             "costs": self.known_costs,
             "lps_from_start": path.lps_from_start.tolist(),
-            "arcs": [
-                {"length_mm": length, "roll_rad": roll, "curvature_per_mm": curvature}
-                for length, roll, curvature in path.arcs.tolist()
-            ],
+            "arcs": path.arc_records(),
         }
         return record
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anatomy.errors import PlanFileError, SettingsError
 from anatomy.io.files import DAMAGE, reason
@@ -27,6 +28,9 @@ SCHEMA = "lungaccess-plan-2"
 """Name and version of the file format; a reader refuses any other."""
 LINES = "lungaccess-plan-1"
 """The format whose plans state a line for the scope."""
+
+ARRAY_TYPES = (np.ndarray, NDArray)
+"""What `anatomy.typed` is made of: numpy resolves its name of arrays before 2.5, and keeps it since."""
 
 P = TypeVar("P", bound=Record)
 _REMEDY = "Run `lungaccess plan` again"
@@ -178,7 +182,7 @@ def _decode(wanted: Any, value: Any, where: str) -> Any:
     if is_dataclass(wanted):
         return _record(typing.cast(type, wanted), value, where)
     origin, arguments = typing.get_origin(wanted), typing.get_args(wanted)
-    if origin is np.ndarray:
+    if origin in ARRAY_TYPES:
         return _numbers(value, where)
     if origin is tuple:
         return tuple(_decode(arguments[0], v, f"{where}[{n}]") for n, v in enumerate(_is(list, value, where)))

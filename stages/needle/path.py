@@ -41,6 +41,13 @@ class ArcPath:
         object.__setattr__(self, "lps_from_start", read_only(np.array(self.lps_from_start, dtype=np.float64)))
         object.__setattr__(self, "arcs", read_only(np.asarray(self.arcs, dtype=np.float64).reshape(-1, 3)))
 
+    def arc_records(self) -> list[dict[str, float]]:
+        """Return the arcs as files hold them: length, roll and curvature of each, by name."""
+        return [
+            {"length_mm": length, "roll_rad": roll, "curvature_per_mm": curvature}
+            for length, roll, curvature in self.arcs.tolist()
+        ]
+
     @property
     def length_mm(self) -> float:
         """Length of all arcs."""

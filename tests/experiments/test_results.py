@@ -18,6 +18,7 @@ from anatomy.errors import FileError
 from anatomy.lung import Lung
 from experiments import pan2025_tour, run_all, write_results
 from experiments.support import anatomies, results
+from experiments.support.headlines import HEADLINES
 from experiments.support.results import PNG_BYTES, Result, Row, cells, number, write_result
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -77,7 +78,7 @@ def test_a_stored_result_is_complete(tmp_path: Path) -> None:
 def test_no_result_names_the_machine_or_a_folder(tmp_path: Path) -> None:
     file = write_result(made(figure=figure_of(np.eye(8))), tmp_path)
     write_results.write_page(tmp_path, tmp_path / "RESULTS.md")
-    for text in (file.read_text(), (tmp_path / "RESULTS.md").read_text()):
+    for text in (file.read_text(), *(page.read_text() for page in tmp_path.glob("*.md"))):
         assert not re.search(r"(?<![\w.\]`(])/\w+/", text)
         assert str(tmp_path) not in text
         assert str(CHECKOUT) not in text
@@ -117,11 +118,11 @@ def test_a_picture_is_the_same_twice(tmp_path: Path) -> None:
 def test_the_page_has_every_row_condition_and_reason(tmp_path: Path) -> None:
     write_result(made(figure=figure_of(np.eye(8))), tmp_path / "results")
     write_results.write_page(tmp_path / "results", tmp_path / "RESULTS.md")
-    text = (tmp_path / "RESULTS.md").read_text()
+    text = (tmp_path / "results" / "tables.md").read_text()
     for line in (
         "| time, s | 10 | 0.00790 | 1 / 1266 | a \\| b |", "| no number of theirs |  | 3 |  |  |",
         "- anatomy: phantom", "- seeds: 1 to 3, 7", "- their CT", "Compared with: fig. 6.",
-        "](results/full/rosell2012.png)", "quick setting: **not run, or failed**",
+        "](full/rosell2012.png)", "quick setting: **not run, or failed**",
         "| quantity | paper | ours, full | ratio | note |",
     ):  # fmt: skip
         assert line in text
@@ -131,13 +132,49 @@ def test_the_page_has_every_row_condition_and_reason(tmp_path: Path) -> None:
 def test_the_page_tells_which_studies_are_missing(tmp_path: Path) -> None:
     write_result(made(), tmp_path)
     write_results.write_page(tmp_path, tmp_path / "RESULTS.md")
-    text = (tmp_path / "RESULTS.md").read_text()
+    text = (tmp_path / "tables.md").read_text()
     assert "| `rosell2012` | yes | **missing** |" in text
     for name in run_all.STUDIES:
         assert f"`{name}`" in text
         if name != "rosell2012":
             assert f"| `{name}` | **missing** | **missing** |" in text
             assert f"`python -m experiments.{name}` was not run, or failed" in text
+
+
+def test_results_md_has_every_study_and_few_rows(tmp_path: Path) -> None:
+    result = made()
+    result.rows[0] = Row(quantity=HEADLINES["rosell2012"][0], ours=0.02, paper=31.0, unit="s")
+    write_result(result, tmp_path / "results")
+    write_result(made("pan2025_tour", "quick", progress="3 of 9 runs"), tmp_path / "results")
+    write_results.write_page(tmp_path / "results", tmp_path / "RESULTS.md")
+    text = (tmp_path / "RESULTS.md").read_text()
+    link = "[`rosell2012`](results/tables.md#rosell2012)"
+    assert f"| {link} | {HEADLINES['rosell2012'][0]}, s | 31 | 0.0200 | 1 / 1550 | full |" in text
+    assert text.count(link) == 1
+    assert "| quick, **unfinished: 3 of 9 runs** |" in text
+    assert "**unfinished: 3 of 9 runs**" in (tmp_path / "results" / "tables.md").read_text()
+    for name in run_all.STUDIES:
+        assert f"](results/tables.md#{name}) |" in text
+    assert text.count("**no result is kept**") == len(run_all.STUDIES) - 2
+
+
+def test_each_headline_is_a_row_of_the_stored_results() -> None:
+    found = write_results.read_all(CHECKOUT / "results")
+    for name, quantities in HEADLINES.items():
+        made = found.get(name, {})
+        if "full" in made and not made["full"].get("progress"):
+            assert set(quantities) <= {row.quantity for row in made["full"]["rows"]}, name
+    assert set(HEADLINES) | set(write_results.MEASURED_ON) == set(run_all.STUDIES)
+    assert all((CHECKOUT / page).is_file() for page in write_results.MEASURED_ON.values())
+
+
+def test_the_stored_pages_are_those_of_the_stored_results(tmp_path: Path) -> None:
+    found = write_results.read_all(CHECKOUT / "results")
+    assert (CHECKOUT / "results" / "tables.md").read_text() == write_results.page(found, "../RESULTS.md")
+    assert (CHECKOUT / "RESULTS.md").read_text() == write_results.headlines(
+        found, "results/tables.md", "docs"
+    )
+    assert len((CHECKOUT / "RESULTS.md").read_text().splitlines()) < 60
 
 
 def test_both_settings_stand_side_by_side(tmp_path: Path) -> None:
@@ -147,7 +184,7 @@ def test_both_settings_stand_side_by_side(tmp_path: Path) -> None:
     for result in (made(), quick):
         write_result(result, tmp_path)
     write_results.write_page(tmp_path, tmp_path / "RESULTS.md")
-    text = (tmp_path / "RESULTS.md").read_text()
+    text = (tmp_path / "tables.md").read_text()
     assert "| time, s | 10 | 0.00790 | 0.500 | 1 / 1266 | a \\| b |" in text
     assert "| quick only |  |  | 4 |  |  |" in text
     assert "| no number of theirs |  | 3 | 3 |  |  |" in text
@@ -158,7 +195,7 @@ def test_a_study_without_a_paper_has_no_column_for_one(tmp_path: Path) -> None:
     result.rows = [Row(quantity="reached", ours=95.6, unit="%", note="closed loop")]
     write_result(result, tmp_path)
     write_results.write_page(tmp_path, tmp_path / "RESULTS.md")
-    text = (tmp_path / "RESULTS.md").read_text()
+    text = (tmp_path / "tables.md").read_text()
     assert (
         "| quantity | ours, full | note |\n| --- | --- | --- |\n| reached, % | 95.6 | closed loop |" in text
     )
@@ -167,7 +204,7 @@ def test_a_study_without_a_paper_has_no_column_for_one(tmp_path: Path) -> None:
 def test_a_study_that_the_page_does_not_know_is_shown(tmp_path: Path) -> None:
     write_result(made("of_a_user"), tmp_path)
     write_results.write_page(tmp_path, tmp_path / "RESULTS.md")
-    assert "### A | title: `of_a_user`" in (tmp_path / "RESULTS.md").read_text()
+    assert "### A | title: `of_a_user`" in (tmp_path / "tables.md").read_text()
 
 
 def test_the_same_files_give_the_same_bytes(tmp_path: Path) -> None:
@@ -182,7 +219,7 @@ def test_the_same_files_give_the_same_bytes(tmp_path: Path) -> None:
             for file in sorted((tmp_path / "a" / setting).iterdir(), reverse=True):
                 (home / setting / file.name).write_bytes(file.read_bytes())
         write_results.write_page(home, home / "RESULTS.md")
-        pages.append((home / "RESULTS.md").read_bytes())
+        pages.append([(home / name).read_bytes() for name in ("RESULTS.md", "tables.md")])
     assert pages[0] == pages[1]
 
 
@@ -232,7 +269,7 @@ def test_all_others_are_run_when_one_fails(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setattr("sys.argv", ["run_all", "--quick", "--results", str(tmp_path), "--out", str(page)])
     assert run_all.main() == 1
     assert ran == [(name, "quick", 1) for name in run_all.STUDIES]
-    assert page.read_text().count("**No result.**") == 1
+    assert (tmp_path / "tables.md").read_text().count("**No result.**") == 1
 
 
 def test_a_quick_study_stores_its_table(

@@ -3,6 +3,9 @@
     .venv/bin/python tests/first_contact/run.py          with the libraries of this Python
     .venv/bin/python tests/first_contact/run.py --fresh  in a virtual environment made from nothing
 
+With --fresh, --wheel, --python and --constraints say what is installed where; --first does only the tasks up
+to the demonstration, as packaging/release.py asks for each version of Python.
+
 The package is built and installed as a user would get it, so that a file that was forgotten is missed.
 Without --fresh, its compiled kernels are copied from the checkout, if they are there, and the libraries are
 those of the Python that runs this: a user's first minute of compiling is then not part of it.
@@ -47,12 +50,23 @@ def main() -> int:
     options.add_argument(
         "--keep", type=Path, help="do the tasks in this folder, which must be new, and keep it"
     )
+    options.add_argument("--first", action="store_true", help="only the tasks that are marked as first")
+    options.add_argument("--wheel", default=str(ROOT), help="with --fresh: what is installed; the checkout")
+    options.add_argument("--python", default=sys.executable, help="with --fresh: this one if not stated")
+    options.add_argument(
+        "--constraints", default="constraints.txt", help="with --fresh: of the checkout; '' for none"
+    )
     asked = options.parse_args()
     tasks = tomllib.loads((HERE / "tasks.toml").read_text(encoding="utf-8"))["task"]
     faults = unnamed_commands(tasks)
+    if asked.first:
+        tasks = [task for task in tasks if task.get("first")]
     with tempfile.TemporaryDirectory() as temporary:
         home = asked.keep.resolve() if asked.keep else Path(temporary)
-        place = fresh_place(home) if asked.fresh else place_with_these_libraries(home)
+        if asked.fresh:
+            place = fresh_place(home, asked.wheel, asked.python, asked.constraints)
+        else:
+            place = place_with_these_libraries(home)
         alone = next((n for n, task in enumerate(tasks) if task.get("together")), len(tasks))
         for task in tasks[:alone]:
             faults += do_task(task, place)
@@ -74,13 +88,14 @@ def unnamed_commands(tasks: list[dict[str, Any]]) -> list[str]:
     return unnamed
 
 
-def fresh_place(home: Path) -> Place:
-    """Install the package with all its libraries into a new virtual environment."""
-    subprocess.run([sys.executable, "-m", "venv", str(home / "venv")], check=True)
-    python = home / "venv" / "bin" / "python"
-    pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), f"{ROOT}[study]"], check=True)
-    return _place(home, python, {})
+def fresh_place(home: Path, package: str, python: str, constraints: str) -> Place:
+    """Install a wheel or a checkout with all its libraries into a new virtual environment."""
+    subprocess.run([python, "-m", "venv", str(home / "venv")], check=True)
+    inside = home / "venv" / "bin" / "python"
+    pip = [str(inside), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    told = ["-c", str(ROOT / constraints)] if constraints else []
+    subprocess.run([*pip, *told, f"{package}[study]"], check=True)
+    return _place(home, inside, {})
 
 
 def place_with_these_libraries(home: Path) -> Place:

@@ -72,7 +72,7 @@ def med_rad(
     peer : Path
         JSON file of another planner's recorded results, shown beside.
     out : Path
-        File for all runs: .csv or .json.
+        File for all runs: .csv, or .json, which holds the arcs of the paths, too.
     """
     from lungaccess.benchmark import read_peer, summary_rows, write_rows
     from lungaccess.benchmark.export import require_table_file

@@ -23,11 +23,13 @@ from lungaccess.benchmark import (
     read_peer,
     run_query,
     summary_rows,
+    write_rows,
 )
 from lungaccess.benchmark.published import NO_STARTS, patients_of, why_no_query
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage import search_path
+from stages.needle import ArcPath
 
 RUN = {
     "patient": 1, "start": 1, "planner": "rrt", "radius_mm": 50, "threads": 1, "start_exemption_mm": 3,
@@ -205,3 +207,22 @@ def test_a_start_that_names_its_target_is_asked_with_it_alone() -> None:
     )
     asked = [(query.start, query.target) for query in published_queries(patient, "toy")]  # type: ignore[arg-type]
     assert asked == [(1, 1), (2, 2), (3, 1), (3, 2)]
+
+
+def test_files_of_runs_hold_the_paths_where_they_can(tmp_path: Path) -> None:
+    arcs = np.array([[10.0, 0.3, 0.01], [5.0, -1.0, 0.0]])
+    path = ArcPath(lps_from_start=np.eye(4), arcs=arcs)
+    rows = [
+        BenchmarkRow(patient="P", start=1, target=1, solved=True, arcs=tuple(path.arc_records())),
+        BenchmarkRow(patient="P", start=1, target=2, reason="blocked"),
+    ]
+    for name in ("runs.json", "runs.csv"):
+        write_rows(rows, tmp_path / name)
+    solved, blocked = json.loads((tmp_path / "runs.json").read_text())["runs"]
+    kept = [[arc["length_mm"], arc["roll_rad"], arc["curvature_per_mm"]] for arc in solved["arcs"]]
+    assert np.array_equal(ArcPath(lps_from_start=np.eye(4), arcs=np.array(kept)).frames(), path.frames())
+    assert blocked["arcs"] == []
+    with open(tmp_path / "runs.csv", newline="", encoding="utf-8") as stream:
+        table = list(csv.DictReader(stream))
+    assert [row["reason"] for row in table] == ["", "blocked"]
+    assert "arcs" not in table[0]

@@ -13,12 +13,22 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom.branching import Centerlines, centerlines
+from anatomy.phantom.bullae import Bulla
 from anatomy.phantom.chest import make_chest
 from anatomy.phantom.ct import simulate_ct
 from anatomy.phantom.nodules import Nodule
 from anatomy.phantom.plan import plan_patient
-from anatomy.phantom.rasterize import LABELS, Canvas, draw_ball, draw_body, draw_tree, phantom_grid
+from anatomy.phantom.rasterize import (
+    LABELS,
+    Canvas,
+    draw_ball,
+    draw_body,
+    draw_bulla,
+    draw_tree,
+    phantom_grid,
+)
 from anatomy.phantom.territory import make_territory
+from anatomy.phantom.traits import PLAIN, RESECTED_INTO, Traits
 from anatomy.records import frozen_record
 from anatomy.typed import Mask
 
@@ -53,6 +63,9 @@ class Phantom:
     centerlines : mapping of str to Centerlines
         "airway", "artery", "vein": what was drawn, with the radii that were drawn.
     nodules : tuple of Nodule
+    traits : Traits
+    bullae : tuple of Bulla
+        Empty without emphysema; they are not part of the lung mask.
     """
 
     seed: int
@@ -63,6 +76,8 @@ class Phantom:
     lobes: Volume
     nodules: tuple[Nodule, ...]
     centerlines: Mapping[str, Centerlines]
+    traits: Traits = PLAIN
+    bullae: tuple[Bulla, ...] = ()
 
     @property
     def grid(self) -> Grid:
@@ -77,7 +92,12 @@ class Phantom:
 
 
 def make_phantom(
-    seed: int = 0, spacing_mm: float | None = None, size: Size = "adult", *, noise_hu: float = 18.0
+    seed: int = 0,
+    spacing_mm: float | None = None,
+    size: Size = "adult",
+    *,
+    noise_hu: float = 18.0,
+    traits: Traits = PLAIN,
 ) -> Phantom:
     """Make a synthetic patient.
 
@@ -94,6 +114,8 @@ def make_phantom(
         "adult", or "small": 0.7 times an adult, about a child of seven.
     noise_hu : float
         Standard deviation of the noise in the CT.
+    traits : Traits
+        Build, disease and operation.
 
     Returns
     -------
@@ -118,9 +140,14 @@ def make_phantom(
     """
     scale, spacing_mm = _require_settings(seed, spacing_mm, size, noise_hu)
     rng = np.random.default_rng(seed)
-    chest = make_chest(rng, scale)
-    plan = plan_patient(make_territory(chest, rng), scale, spacing_mm, rng)
-    canvas = draw_body(chest, phantom_grid(chest, spacing_mm))
+    scale *= traits.stature
+    resected = traits.resected_lobe
+    fills = (resected, RESECTED_INTO[resected]) if resected else (0, 0)
+    chest = make_chest(rng, scale, fills=fills, emphysema=traits.emphysema)
+    plan = plan_patient(make_territory(chest, rng), scale, spacing_mm, rng, traits)
+    canvas = draw_body(chest, phantom_grid(chest, spacing_mm), traits.open_fissures)
+    for bulla in plan.bullae:
+        draw_bulla(canvas, bulla.centre_lps, bulla.radius_mm)
     for nodule in plan.nodules:
         draw_ball(canvas, nodule.centre_lps, nodule.radius_mm)
     lines, base = {}, 0
@@ -137,6 +164,8 @@ def make_phantom(
         lobes=Volume(grid=canvas.grid, array=canvas.lobes),
         centerlines=MappingProxyType(lines),
         nodules=plan.nodules,
+        traits=traits,
+        bullae=plan.bullae,
     )
 
 
@@ -174,7 +203,7 @@ def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...]) -> PatientIm
         lumen=labelled("lumen"),
         wall=labelled("wall"),
         vessels=labelled("artery", "vein"),
-        lung=Volume(grid=canvas.grid, array=canvas.lobes > 0),
+        lung=Volume(grid=canvas.grid, array=(canvas.lobes > 0) & (canvas.labels != LABELS["bulla"])),
         fissures=labelled("fissure"),
         nodules=labelled("nodule"),
         targets_lps=tuple(n.centre_lps for n in nodules),

@@ -168,7 +168,7 @@ def grow_airways(
     rule = GrowthRule(
         root_diameter_mm=scale * TRACHEA_DIAMETER_MM * (1 + 0.05 * rng.uniform(-1, 1)),
         total_points=len(territory.points_lps),
-        smallest_diameter_mm=scale * SMALLEST_GROWN_MM,
+        smallest_diameter_mm=scale * SMALLEST_GROWN_MM / traits.vessel_calibre,
         flow_exponent=traits.flow_exponent,
         length_per_diameter=traits.slenderness,
         greatest_length_per_diameter=traits.slenderness * GREATEST_SLENDERNESS,

@@ -36,6 +36,8 @@ class Traits:
         [Kitaoka1999]; masks of patients' CTs show 1.6 to 2, since thin airways are lost or drawn too thin.
     slenderness : float
         Lengths of grown branches in diameters that are aimed at: 1 to 10.
+    vessel_calibre : float
+        Diameter of a vessel by that of the airway lumen that supplies as much tissue: 1 to 3.
     vessel_limit_mm : float
         Diameter at which vessels end, in an adult: at most 4.
     open_fissures : float
@@ -57,6 +59,7 @@ class Traits:
     stature: float = 1.0
     flow_exponent: float = 2.8
     slenderness: float = 3.0
+    vessel_calibre: float = 1.0
     vessel_limit_mm: float = 1.3
     open_fissures: float = 0.0
     resected: str = ""
@@ -67,6 +70,7 @@ class Traits:
             ("stature", LEAST_STATURE, GREATEST_STATURE),
             ("flow_exponent", LEAST_EXPONENT, GREATEST_EXPONENT),
             ("slenderness", 1.0, 10.0),
+            ("vessel_calibre", 1.0, 3.0),
             ("vessel_limit_mm", 0.5, GREATEST_VESSEL_LIMIT_MM),
             ("open_fissures", 0.0, 1.0),
             ("emphysema", 0.0, 1.0),

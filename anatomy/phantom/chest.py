@@ -104,8 +104,8 @@ class Side:
 class Chest:
     """A chest of `scale` times adult size.
 
-    Every method takes LPS mm arrays x, y, z that broadcast together.  `fills` are the number of a lobe that was
-    resected and of the one in its place; (0, 0) where none was.
+    Every method takes LPS mm arrays x, y, z that broadcast together.  `fills` are the number of a lobe that
+    was resected and of the one in its place; (0, 0) where none was.
     """
 
     scale: float

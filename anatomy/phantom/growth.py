@@ -124,7 +124,9 @@ def _chord(
     direction = limit_turn(unit(to_middle), heading, rule.least_turn_rad, rule.greatest_turn_rad)
     by_diameter = rule.length_per_diameter * diameter_mm * rng.uniform(0.8, 1.2)
     length = DIAMETER_WEIGHT * by_diameter + DISTANCE_WEIGHT * distance
-    return np.asarray(direction * np.clip(length, 1.6 * diameter_mm, rule.greatest_length_per_diameter * diameter_mm))
+    return np.asarray(
+        direction * np.clip(length, 1.6 * diameter_mm, rule.greatest_length_per_diameter * diameter_mm)
+    )
 
 
 def _free_line(

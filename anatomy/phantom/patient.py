@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
@@ -54,8 +56,8 @@ class Phantom:
         "adult" or "small".
     images : PatientImages
         The masks as a segmentation would give them, of kind "phantom".
-    ct : Volume
-        int16, Hounsfield units.
+    render : callable
+        Makes the CT; `ct` calls it once.
     labels : Volume
         uint8, one of `LABELS` for every voxel.
     lobes : Volume
@@ -71,13 +73,18 @@ class Phantom:
     seed: int
     size: str
     images: PatientImages
-    ct: Volume
+    render: Callable[[], Volume]
     labels: Volume
     lobes: Volume
     nodules: tuple[Nodule, ...]
     centerlines: Mapping[str, Centerlines]
     traits: Traits = PLAIN
     bullae: tuple[Bulla, ...] = ()
+
+    @cached_property
+    def ct(self) -> Volume:
+        """The CT, int16 in Hounsfield units, rendered when it is first asked for."""
+        return self.render()
 
     @property
     def grid(self) -> Grid:
@@ -159,7 +166,8 @@ def make_phantom(
         seed=seed,
         size=size,
         images=_images(canvas, f"phantom {size} {seed}", plan.nodules),
-        ct=simulate_ct(canvas, noise_hu, rng),
+        # The noise comes last of all draws, and from a copy, so that it is the same whenever it is asked for.
+        render=lambda: simulate_ct(canvas, noise_hu, deepcopy(rng)),
         labels=Volume(grid=canvas.grid, array=canvas.labels),
         lobes=Volume(grid=canvas.grid, array=canvas.lobes),
         centerlines=MappingProxyType(lines),

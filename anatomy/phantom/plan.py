@@ -79,11 +79,7 @@ class PatientPlan:
 
 
 def plan_patient(
-    territory: Territory,
-    scale: float,
-    spacing_mm: float,
-    rng: np.random.Generator,
-    traits: Traits = PLAIN,
+    territory: Territory, scale: float, spacing_mm: float, rng: np.random.Generator, traits: Traits = PLAIN
 ) -> PatientPlan:
     """Plan trees and nodules for a territory of `scale` times adult size and voxels of `spacing_mm`.
 
@@ -94,7 +90,9 @@ def plan_patient(
     """
     bullae = place_bullae(territory, traits.emphysema, scale, rng)
     vessels = VesselRule(
-        calibre=traits.vessel_calibre, limit_mm=_vessel_limit_mm(scale, spacing_mm, traits), spacing_mm=spacing_mm
+        calibre=traits.vessel_calibre,
+        limit_mm=_vessel_limit_mm(scale, spacing_mm, traits),
+        spacing_mm=spacing_mm,
     )
     sprouts, rule = grow_airways(territory, scale, rng, traits)
     airways = _plan_airways(sprouts, spacing_mm)

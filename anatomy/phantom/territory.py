@@ -89,7 +89,9 @@ def make_territory(chest: Chest, rng: np.random.Generator) -> Territory:
     counts = np.bincount(lobes.ravel(), minlength=len(LOBES) + 1)
     if (np.delete(counts, [0, chest.fills[0]]) == 0).any():
         raise AnatomyError(
-            "A lobe of the synthetic lungs is empty", expected="every lobe that was not resected", remedy="Use another seed"
+            "A lobe of the synthetic lungs is empty",
+            expected="every lobe that was not resected",
+            remedy="Use another seed",
         )
     anisotropy = (spacing,) * 3
     points, lobe_of_point = _spread_points(lobes, low, spacing, rng)

@@ -16,7 +16,7 @@ RESECTED_INTO = {
 }
 """Which lobe expands into the room of one that was resected: one beside it."""
 LEAST_STATURE, GREATEST_STATURE = 0.85, 1.2
-"""The model's proportions are those of an adult; farther away the fixed sizes in it, such as walls, mislead."""
+"""The model has the proportions of an adult: farther away its fixed sizes, such as walls, mislead."""
 LEAST_EXPONENT, GREATEST_EXPONENT = 1.5, 3.2
 """Below, segments would have no airway; above, twigs are nearly as wide as bronchi."""
 GREATEST_VESSEL_LIMIT_MM = 4.0
@@ -43,8 +43,8 @@ class Traits:
     open_fissures : float
         Share of each lung's fissures that is missing, from the hilum outwards: 0 to 1.
     resected : str
-        A lobe of `anatomy.phantom.LOBES` that was taken out: its bronchus ends in a stump, its neighbour fills
-        the room, and the diaphragm stands higher; "" for none.
+        A lobe of `anatomy.phantom.LOBES` that was taken out: its bronchus ends in a stump, its neighbour
+        fills the room, and the diaphragm stands higher; "" for none.
     emphysema : float
         0 for none to 1 for severe: a deeper chest with a flat diaphragm, fewer thin vessels, and bullae below
         the pleura, into which no vessel grows.  Bullae are not part of the lung mask: a needle must not enter
@@ -77,10 +77,13 @@ class Traits:
         ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise SettingsError(f"The trait {name} of the phantom is {value}", expected=f"{low:g} to {high:g}")
+                raise SettingsError(
+                    f"The trait {name} of the phantom is {value}", expected=f"{low:g} to {high:g}"
+                )
         if self.resected and self.resected not in LOBES:
             raise SettingsError(
-                f"The resected lobe of the phantom is {self.resected!r}", expected=f"one of {', '.join(LOBES)}"
+                f"The resected lobe of the phantom is {self.resected!r}",
+                expected=f"one of {', '.join(LOBES)}",
             )
 
     @property

@@ -35,8 +35,8 @@ class Likeness:
     length_mm, diameter_mm, angle_deg : mapping of int to tuple of 3 float
         By generation, quartiles and median of the branches that end in a fork (length) or of all (others):
         arc length, inner diameter, and angle to the parent branch.
-    vessel_share, airway_share : tuple of float
-        Share of the lung's volume that vessels and airways take up, by the shells of `DEPTHS_MM`.
+    vessel_share : tuple of float
+        Share of the lung's volume that vessels take up, by the shells of `DEPTHS_MM`.
     clearance_mm : tuple of 3 float
         Quartiles of the distance of free tissue, 5 to 25 mm from the pleura, from vessels and airways.
     """
@@ -49,7 +49,6 @@ class Likeness:
     diameter_mm: dict[int, tuple[float, ...]]
     angle_deg: dict[int, tuple[float, ...]]
     vessel_share: tuple[float, ...]
-    airway_share: tuple[float, ...]
     clearance_mm: tuple[float, ...]
 
 
@@ -72,7 +71,6 @@ def likeness_of(lung: Lung) -> Likeness:
         diameter_mm=diameters,
         angle_deg=angles,
         vessel_share=tuple(_share(labels, VESSEL, shell) for shell in shells),
-        airway_share=tuple(_share(labels, AIRWAY, shell) for shell in shells),
         clearance_mm=_quartiles(nearest[free]),
     )
 
@@ -87,8 +85,7 @@ def _quartiles(values: Array) -> tuple[float, ...]:
 
 def _corner_distance(lung: Lung, name: str) -> Array:
     """Return the distance stored at the low corner of every voxel, mm: as good as that of its centre here."""
-    field = lung.fields[name]
-    stored = np.asarray(field.corners if hasattr(field, "corners") else field.array)
+    stored = lung.fields[name].corners
     ni, nj, nk = lung.grid.shape
     return np.asarray(stored[:ni, :nj, :nk], dtype=np.float32) / np.float32(256.0)
 

@@ -50,7 +50,9 @@ class Entry:
 def masks_sha256(images: PatientImages) -> str:
     """Return the SHA-256 (hex) of grid and masks: what is written to files, whatever compresses them."""
     digest = hashlib.sha256()
-    digest.update(json.dumps([list(images.grid.shape), images.grid.lps_from_ijk.round(9).tolist()]).encode())
+    # NIfTI keeps the grid in single precision: what was read from files has the hash of what was written.
+    grid = np.asarray(images.grid.lps_from_ijk, dtype="<f4") + np.float32(0.0)
+    digest.update(json.dumps([list(images.grid.shape), grid.tolist()]).encode())
     for name in MASKS:
         volume = getattr(images, name)
         digest.update(name.encode())

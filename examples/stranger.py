@@ -5,8 +5,8 @@
     lungaccess benchmark synthetic-v1 score answers.json SYNTHETIC --only-answered
 
 It reads the files of a case alone: masks, scope tips, device, targets.  From every published tip it lets the
-inner tube out alone, which is an arc of known curvature, and tries one arc of the needle from its end to the
-target; the arc with the largest clearance is handed in.  Clearances are looked up in distance maps of the masks.
+inner tube out alone, an arc of known curvature, and tries one arc of the needle from its end to the target; the
+arc with the largest clearance is handed in.  Clearances are looked up in distance maps of the masks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
+import SimpleITK
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 ROTATIONS = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
@@ -29,10 +29,10 @@ MOST_TRIED = 3000
 
 def read_mask(path):
     """Return a mask `[i, j, k]`, its spacing, and the function from LPS mm to indices."""
-    image = sitk.ReadImage(str(path))
+    image = SimpleITK.ReadImage(str(path))
     lps_from_ijk = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     origin, inverse = np.array(image.GetOrigin()), np.linalg.inv(lps_from_ijk)
-    array = sitk.GetArrayFromImage(image).transpose(2, 1, 0) > 0
+    array = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0) > 0
     return array, image.GetSpacing(), lambda points: (points - origin) @ inverse.T
 
 
@@ -47,7 +47,9 @@ def distance_maps(case):
     def lookup(mask):
         distance = distance_transform_edt(~mask, sampling=spacing).astype(np.float32)
         # The distance to a voxel's centre overstates that to its corner by up to half a diagonal.
-        return lambda points: map_coordinates(distance, ijk(points).T, order=1, mode="nearest") - half_diagonal
+        return lambda points: (
+            map_coordinates(distance, ijk(points).T, order=1, mode="nearest") - half_diagonal
+        )
 
     return lookup(airway), lookup(others)
 

@@ -42,7 +42,7 @@ TIP_DIGITS = 7
 """Of states in mm and rad: a micrometre at the tip is what the check allows."""
 RULES = (
     "A query is a phantom, a device and a target; a planner may use all files of FOLDER but no other answer.",
-    "The needle ends at the target, within the tolerance of the check of a micrometre; fissures and bullae may "
+    "The needle ends at the target, within the check's tolerance of a micrometre; fissures and bullae may "
     "not be crossed; the device's own margins are kept.",
     "A query is solved if the independent check of lungaccess accepts the answer; nothing else counts.",
     "Time is the processor time of one query on one thread, without reading the patient and without what "

@@ -45,6 +45,7 @@ from lungaccess.plans.plan import Plan
 
 NAMES = [each.name for each in benchmark_phantoms()]
 CHEAP = ("child-01", "child-02")
+NAN = float("nan")
 POSE = np.eye(4).tolist()
 ANSWER = {
     "query": "child-01/ultrathin/01",
@@ -134,7 +135,7 @@ def test_a_submission_is_read_without_loss(tmp_path: Path) -> None:
         ({"needle": None}, "scope, tubes, needle"),
         ({"needle": {"arcs": []}}, "arcs"),
         ({"needle": {"arcs": [{"length_mm": -1.0, "roll_rad": 0.0, "curvature_per_mm": 0.0}]}}, "length_mm"),
-        ({"needle": {"arcs": [{"length_mm": float("nan"), "roll_rad": 0.0, "curvature_per_mm": 0.0}]}}, "length"),
+        ({"needle": {"arcs": [{"length_mm": NAN, "roll_rad": 0.0, "curvature_per_mm": 0.0}]}}, "length"),
         ({"tubes": {**ANSWER["tubes"], "lps_from_tip": [[1.0, 0.0], [0.0, 1.0]]}}, "lps_from_tip"),
         ({"tubes": {**ANSWER["tubes"], "colour": 1}}, "colour"),
         ({"scope": {}}, "tip"),

@@ -1,4 +1,4 @@
-"""Bare motions of somebody else's planner: completed by the check, accepted if sound, refused if tampered with."""
+"""Bare motions of another planner: completed by the check, accepted if sound, refused if tampered with."""
 
 from __future__ import annotations
 
@@ -35,8 +35,12 @@ TAMPERED: dict[str, tuple[Change, str]] = {
     ),
     "longer arc": (_longer, "target.reached"),
     "turned tubes": (lambda m: replace(m, rotation_rad=m.rotation_rad + 1.0), "tube.tip"),
-    "tubes out too far": (lambda m: replace(m, inner_insertion_mm=m.inner_insertion_mm + 70.0), "tube.extension"),
-    "outer beyond inner": (lambda m: replace(m, outer_insertion_mm=m.inner_insertion_mm + 5.0), "record.lengths"),
+    "tubes out too far": (
+        lambda m: replace(m, inner_insertion_mm=m.inner_insertion_mm + 70.0), "tube.extension",
+    ),
+    "outer beyond inner": (
+        lambda m: replace(m, outer_insertion_mm=m.inner_insertion_mm + 5.0), "record.lengths",
+    ),
     "entry elsewhere": (lambda m: replace(m, lps_from_entry=_moved(m.lps_from_entry, 9.0)), "scope.start"),
 }  # fmt: skip
 

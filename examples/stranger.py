@@ -5,8 +5,8 @@
     lungaccess benchmark synthetic-v1 score answers.json SYNTHETIC --only-answered
 
 It reads the files of a case alone: masks, scope tips, device, targets.  From every published tip it lets the
-inner tube out alone, an arc of known curvature, and tries one arc of the needle from its end to the target; the
-arc with the largest clearance is handed in.  Clearances are looked up in distance maps of the masks.
+inner tube out alone, an arc of known curvature, and tries one arc of the needle from its end to the target.
+The arc with the largest clearance is handed in.  Clearances are looked up in distance maps of the masks.
 """
 
 from __future__ import annotations

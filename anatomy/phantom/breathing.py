@@ -50,7 +50,7 @@ class PhantomBreathing:
     def of(cls, phantom: Phantom) -> Self:
         """Return the breathing of a phantom."""
         z = phantom.grid.lps(np.argwhere(phantom.images.lung.array))[:, 2]
-        motion = MOTION_MM * SCALES[phantom.size]
+        motion = MOTION_MM * SCALES[phantom.size] * phantom.traits.stature
         apex, base = float(z.max()), float(z.min())
         # At end-inhale, which the masks show, the height is longer by A.
         return cls(

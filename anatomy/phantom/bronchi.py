@@ -19,6 +19,7 @@ from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.chest import LOBES
 from anatomy.phantom.growth import STEP_MM, GrowthRule, grow, limit_turn
 from anatomy.phantom.territory import Territory
+from anatomy.phantom.traits import PLAIN, Traits
 from anatomy.records import frozen_value
 from anatomy.typed import Float, Int
 
@@ -30,6 +31,10 @@ SMALLEST_GROWN_MM = 1.25
 """Below what any CT shows, so that the drawing decides where airways end."""
 MIDDLE_WEIGHT = 0.4
 """Segmental bronchi turn partly towards what they supply: wholly would lose the template."""
+GREATEST_SLENDERNESS = 4.2 / 3.0
+"""Branches are at most so many times as long as is aimed at."""
+STUMP_SHARE, STUMP_DIAMETER_MM = 0.45, 7.0
+"""What an operation leaves of a lobar bronchus."""
 BALANCE_ROUNDS = 25
 """Shares need only be about equal: each round moves the weights half-way."""
 DIRECTION_JITTER = 0.07
@@ -125,10 +130,12 @@ def _share_out(cloud: Float, starts: Float, directions: Float) -> Int:
     return np.asarray(owner)
 
 
-def _segment_clouds(ends: dict[str, tuple[Float, Float]], territory: Territory) -> dict[str, Float]:
+def _segment_clouds(
+    ends: dict[str, tuple[Float, Float]], territory: Territory, resected: int
+) -> dict[str, Float]:
     """Return the points that every segment supplies."""
     clouds: dict[str, Float] = {}
-    for lobe in LOBES.values():
+    for lobe in sorted(set(LOBES.values()) - {resected}):
         segments = [b for b in TEMPLATE if b.segment and b.lobe == lobe]
         cloud = territory.points_lps[territory.lobe_of_point == lobe]
         starts = np.array([ends[b.name][0] for b in segments])
@@ -142,38 +149,53 @@ def _supplied(clouds: dict[str, Float]) -> dict[str, int]:
     """Return how many points each bronchus of the template supplies."""
     counts = {name: len(cloud) for name, cloud in clouds.items()}
     for bronchus in reversed(TEMPLATE):
-        counts[bronchus.parent] = counts.get(bronchus.parent, 0) + counts[bronchus.name]
+        counts[bronchus.parent] = counts.get(bronchus.parent, 0) + counts.get(bronchus.name, 0)
     return counts
 
 
-def grow_airways(territory: Territory, scale: float, rng: np.random.Generator) -> tuple[Sprouts, GrowthRule]:
+def grow_airways(
+    territory: Territory, scale: float, rng: np.random.Generator, traits: Traits = PLAIN
+) -> tuple[Sprouts, GrowthRule]:
     """Grow the airway tree that supplies the points of a territory.
 
     Returns the tree, whose `diameter_mm` is the lumen's, and the rule it follows.  Branch 0 is the
     trachea, 1 and 2 are the right and the left main bronchus.
     """
     ends = _skeleton(scale, rng)
-    clouds = _segment_clouds(ends, territory)
+    resected = traits.resected_lobe
+    clouds = _segment_clouds(ends, territory, resected)
     counts = _supplied(clouds)
     rule = GrowthRule(
         root_diameter_mm=scale * TRACHEA_DIAMETER_MM * (1 + 0.05 * rng.uniform(-1, 1)),
         total_points=len(territory.points_lps),
-        smallest_diameter_mm=scale * SMALLEST_GROWN_MM,
+        smallest_diameter_mm=scale * SMALLEST_GROWN_MM / traits.vessel_calibre,
+        flow_exponent=traits.flow_exponent,
+        length_per_diameter=traits.slenderness,
+        greatest_length_per_diameter=traits.slenderness * GREATEST_SLENDERNESS,
     )
     sprouts, index = Sprouts(), {"trachea": 0}
     trachea = np.linspace(*ends["trachea"], int(scale * TRACHEA_LENGTH_MM / STEP_MM))
     sprouts.add(-1, trachea, rule.root_diameter_mm, 0, "trachea")
     for bronchus in TEMPLATE:
+        stump = resected and bronchus.lobe == resected
+        if stump and _lobe_of(bronchus.parent) == resected:
+            continue
         parent = index[bronchus.parent]
         start, end = sprouts.points[parent][-1], ends[bronchus.name][1]
-        if bronchus.segment:
+        if stump:
+            end = start + STUMP_SHARE * (end - start)
+        elif bronchus.segment:
             end = _aim(start, end, clouds[bronchus.name])
         line = bent_line(start, sprouts.direction(parent), end, STEP_MM, bend=0.25)
-        diameter = rule.diameter_mm(counts[bronchus.name])
+        diameter = scale * STUMP_DIAMETER_MM if stump else rule.diameter_mm(counts[bronchus.name])
         index[bronchus.name] = sprouts.add(parent, line, diameter, bronchus.lobe, bronchus.name)
     for name, cloud in clouds.items():
         grow(sprouts, index[name], cloud, rule, territory, rng)
     return sprouts, rule
+
+
+def _lobe_of(name: str) -> int:
+    return next((bronchus.lobe for bronchus in TEMPLATE if bronchus.name == name), 0)
 
 
 def _aim(start: Float, end: Float, cloud: Float) -> Float:

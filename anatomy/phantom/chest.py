@@ -17,8 +17,15 @@ LOBES = {name.removesuffix(" lobe"): number for number, name in NAMED_LOBES.item
 
 CAGE_CENTRE_Z = -95.0
 """Height below the carina at which the rib cage is widest."""
+DOME_CURVE = 44.0
+"""How far a diaphragm falls from its dome to its edge."""
 EDGE_ROUNDING_MM = 9.0
 """Lungs have no sharp edges; rounder ones would lose the recesses beside the heart."""
+EMPHYSEMA_DEPTH, EMPHYSEMA_DESCENT, EMPHYSEMA_FLATTENING = 0.06, 14.0, 0.4
+"""Severe emphysema: a barrel chest and a low, flat diaphragm; within what the imaged box holds."""
+RESECTION_RISE = 18.0
+"""After a lobectomy the diaphragm stands higher on that side."""
+LEFT_LOBES = (LEFT_UPPER, LEFT_LOWER)
 
 
 def _bump(u: Array, centre: float, width: float) -> Array:
@@ -56,6 +63,7 @@ class Side:
     oblique_slope: float
     horizontal_z: float
     wave_phase: float
+    dome_curve: float = DOME_CURVE
 
     def cage(self, x: Array, y: Array, z: Array) -> Array:
         """Return the distance to the inside of the rib cage of this side (negative inside)."""
@@ -77,7 +85,7 @@ class Side:
     def diaphragm(self, x: Array, y: Array) -> Array:
         """Return the height z of the diaphragm's dome."""
         r2 = ((self.sign * x - 66) / 78) ** 2 + ((y + 12) / 100) ** 2
-        return np.asarray(self.dome_z - 44 * r2**1.1 - 5 * np.maximum(y, 0) / 60)
+        return np.asarray(self.dome_z - self.dome_curve * r2**1.1 - 5 * np.maximum(y, 0) / 60)
 
     def oblique(self, x: Array, y: Array) -> Array:
         """Return the height z of the oblique fissure, which rises backwards."""
@@ -96,7 +104,8 @@ class Side:
 class Chest:
     """A chest of `scale` times adult size.
 
-    Every method takes LPS mm arrays x, y, z that broadcast together.
+    Every method takes LPS mm arrays x, y, z that broadcast together.  `fills` are the number of a lobe that
+    was resected and of the one in its place; (0, 0) where none was.
     """
 
     scale: float
@@ -104,6 +113,7 @@ class Chest:
     left: Side
     heart_centre: tuple[float, float, float]
     heart_radii: tuple[float, float, float]
+    fills: tuple[int, int] = (0, 0)
 
     @property
     def sides(self) -> tuple[Side, Side]:
@@ -132,6 +142,11 @@ class Chest:
 
     def lobe(self, side: Side, x: Array, y: Array, z: Array) -> Array:
         """Return the number of the lobe (1 to 5) that a position in this lung belongs to."""
+        found = self._lobe_before_operation(side, x, y, z)
+        resected, into = self.fills
+        return np.where(found == resected, np.uint8(into), found) if resected else found
+
+    def _lobe_before_operation(self, side: Side, x: Array, y: Array, z: Array) -> Array:
         x, y, z = x / self.scale, y / self.scale, z / self.scale
         lower = z < side.oblique(x, y)
         if side.sign > 0:
@@ -145,8 +160,15 @@ class Chest:
         return self.scale * np.array([-160.0, -114.0, -176.0]), self.scale * np.array([160.0, 112.0, 106.0])
 
 
-def make_chest(rng: np.random.Generator, scale: float) -> Chest:
-    """Draw a chest: adult proportions with a few per cent of variation."""
+def make_chest(
+    rng: np.random.Generator, scale: float, *, fills: tuple[int, int] = (0, 0), emphysema: float = 0.0
+) -> Chest:
+    """Draw a chest: adult proportions with a few per cent of variation.
+
+    `fills` is that of `Chest`; the side of a resected lobe has a raised diaphragm.  `emphysema` from 0 to 1
+    deepens the chest and flattens the diaphragm.
+    """
+    operated = 0.0 if not fills[0] else 1.0 if fills[0] in LEFT_LOBES else -1.0
 
     def vary(value: float, fraction: float) -> float:
         return value * (1 + fraction * rng.uniform(-1, 1))
@@ -158,9 +180,13 @@ def make_chest(rng: np.random.Generator, scale: float) -> Chest:
         return Side(
             sign=sign,
             half_width=width - (3 if sign > 0 else 0),
-            half_depth=depth,
+            half_depth=depth * (1 + EMPHYSEMA_DEPTH * emphysema),
             height=height,
-            dome_z=dome - (8 if sign > 0 else 0),
+            dome_z=dome
+            - (8 if sign > 0 else 0)
+            - EMPHYSEMA_DESCENT * emphysema
+            + (RESECTION_RISE if sign == operated else 0),
+            dome_curve=DOME_CURVE * (1 - EMPHYSEMA_FLATTENING * emphysema),
             hilum_width=10.0 if sign > 0 else 5.0,
             oblique_z=-63 + rng.uniform(-4, 4),
             oblique_slope=vary(1.45, 0.06),

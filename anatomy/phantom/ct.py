@@ -10,6 +10,8 @@ from anatomy.typed import Array, Float32
 
 AIR_HU = -1000.0
 """By definition of the scale."""
+BULLA_HU = -985.0
+"""Air with a trace of tissue."""
 PARENCHYMA_HU = -860.0
 """Lung after breathing in."""
 GRAVITY_HU_PER_MM = 0.35
@@ -60,6 +62,7 @@ def _materials(canvas: Canvas) -> Float32:
         lobes = canvas.lobes[:, :, k] > 0
         value: Array = table[labels]
         inside = np.where(labels == LABELS["fissure"], lung + sheet * (FISSURE_HU - lung), lung)
+        inside = np.where(labels == LABELS["bulla"], np.float32(BULLA_HU), inside)
         share = canvas.lung_cover[:, :, k] * np.float32(1 / 255)
         value = np.where(lobes, np.float32(TISSUE_HU["mediastinum"]), value)
         value += share * (inside - value)

@@ -21,13 +21,16 @@ from anatomy.phantom.rasterize import LABELS
 MOTION_FILE = "motion.nrrd"
 
 
-def write_phantom(phantom: Phantom, folder: str | Path, *, breathing: bool = False) -> Path:
+def write_phantom(
+    phantom: Phantom, folder: str | Path, *, breathing: bool = False, with_ct: bool = True
+) -> Path:
     """Write masks, `patient.toml`, CT and the truth of a phantom into `folder`, which is made if needed.
 
     `lumen`, `wall`, `vessels`, `lung`, `fissures`, `nodules`, `ct`, `labels` and `lobes` become NIfTI
     images; `truth.json` holds the centrelines, the nodules and the meaning of the labels (LPS mm).
-    With `breathing` there is `motion.nrrd` as well, and `patient.toml` names it.  `patient.toml` is written
-    last, so that a folder that has it is complete.
+    Without `with_ct` there is no CT, which takes most of the room.  With `breathing` there is `motion.nrrd`
+    as well, and `patient.toml` names it.  `patient.toml` is written last, so that a folder that has it is
+    complete.
 
     Returns
     -------
@@ -48,7 +51,7 @@ def write_phantom(phantom: Phantom, folder: str | Path, *, breathing: bool = Fal
         "lung": images.lung,
         "fissures": images.fissures,
         "nodules": images.nodules,
-        "ct": phantom.ct,
+        "ct": phantom.ct if with_ct else None,
         "labels": phantom.labels,
         "lobes": phantom.lobes,
     }
@@ -83,6 +86,7 @@ def _truth(phantom: Phantom) -> dict[str, Any]:
     return {
         "seed": phantom.seed,
         "size": phantom.size,
+        "traits": asdict(phantom.traits),
         "frame": "lps",
         "labels": LABELS,
         "lobes": LOBES,
@@ -90,6 +94,7 @@ def _truth(phantom: Phantom) -> dict[str, Any]:
             {"centre_lps": n.centre_lps.tolist(), "radius_mm": n.radius_mm, "lobe": n.lobe}
             for n in phantom.nodules
         ],
+        "bullae": [{"centre_lps": b.centre_lps.tolist(), "radius_mm": b.radius_mm} for b in phantom.bullae],
         "centerlines": {kind: _tree(lines) for kind, lines in phantom.centerlines.items()},
     }
 

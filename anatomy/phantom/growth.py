@@ -47,6 +47,7 @@ class GrowthRule:
     smallest_diameter_mm: float
     flow_exponent: float = 2.8
     length_per_diameter: float = 3.0
+    greatest_length_per_diameter: float = 4.2
     least_turn_rad: float = float(np.deg2rad(18))
     greatest_turn_rad: float = float(np.deg2rad(52))
 
@@ -123,7 +124,9 @@ def _chord(
     direction = limit_turn(unit(to_middle), heading, rule.least_turn_rad, rule.greatest_turn_rad)
     by_diameter = rule.length_per_diameter * diameter_mm * rng.uniform(0.8, 1.2)
     length = DIAMETER_WEIGHT * by_diameter + DISTANCE_WEIGHT * distance
-    return np.asarray(direction * np.clip(length, 1.6 * diameter_mm, 4.2 * diameter_mm))
+    return np.asarray(
+        direction * np.clip(length, 1.6 * diameter_mm, rule.greatest_length_per_diameter * diameter_mm)
+    )
 
 
 def _free_line(

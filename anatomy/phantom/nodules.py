@@ -6,6 +6,7 @@ import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import read_only
+from anatomy.phantom.bullae import Bulla
 from anatomy.phantom.territory import Territory
 from anatomy.records import frozen_record
 from anatomy.typed import Float
@@ -35,11 +36,16 @@ class Nodule:
 
 
 def place_nodules(
-    territory: Territory, tube_points: Float, tube_radius_mm: Float, scale: float, rng: np.random.Generator
+    territory: Territory,
+    tube_points: Float,
+    tube_radius_mm: Float,
+    scale: float,
+    rng: np.random.Generator,
+    bullae: tuple[Bulla, ...] = (),
 ) -> tuple[Nodule, ...]:
     """Choose 3 to 6 nodules among the points of a territory.
 
-    They keep clear of the tubes with centres `(M, 3)` LPS mm and radii `(M,)`.
+    They keep clear of the tubes with centres `(M, 3)` LPS mm and radii `(M,)`, and of bullae.
 
     The surface of a nodule is at least 5 mm and its centre at most 30 mm (times `scale`) from the pleura.
 
@@ -66,6 +72,10 @@ def place_nodules(
             and territory.holds(centre, lobe, radius + 2 * map_error)
             and clearance_mm[index] > radius + scale * TUBE_GAP_MM
             and all(np.linalg.norm(n.centre_lps - centre) > scale * NODULE_GAP_MM for n in found)
+            and all(
+                np.linalg.norm(b.centre_lps - centre) > b.radius_mm + radius + scale * LEAST_PLEURA_MM
+                for b in bullae
+            )
         )
         if fits:
             found.append(Nodule(centre_lps=centre, radius_mm=float(radius), lobe=lobe))

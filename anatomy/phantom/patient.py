@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
@@ -13,12 +15,22 @@ from anatomy.errors import SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom.branching import Centerlines, centerlines
+from anatomy.phantom.bullae import Bulla
 from anatomy.phantom.chest import make_chest
 from anatomy.phantom.ct import simulate_ct
 from anatomy.phantom.nodules import Nodule
 from anatomy.phantom.plan import plan_patient
-from anatomy.phantom.rasterize import LABELS, Canvas, draw_ball, draw_body, draw_tree, phantom_grid
+from anatomy.phantom.rasterize import (
+    LABELS,
+    Canvas,
+    draw_ball,
+    draw_body,
+    draw_bulla,
+    draw_tree,
+    phantom_grid,
+)
 from anatomy.phantom.territory import make_territory
+from anatomy.phantom.traits import PLAIN, RESECTED_INTO, Traits
 from anatomy.records import frozen_record
 from anatomy.typed import Mask
 
@@ -44,8 +56,8 @@ class Phantom:
         "adult" or "small".
     images : PatientImages
         The masks as a segmentation would give them, of kind "phantom".
-    ct : Volume
-        int16, Hounsfield units.
+    render : callable
+        Makes the CT; `ct` calls it once.
     labels : Volume
         uint8, one of `LABELS` for every voxel.
     lobes : Volume
@@ -53,16 +65,26 @@ class Phantom:
     centerlines : mapping of str to Centerlines
         "airway", "artery", "vein": what was drawn, with the radii that were drawn.
     nodules : tuple of Nodule
+    traits : Traits
+    bullae : tuple of Bulla
+        Empty without emphysema; they are not part of the lung mask.
     """
 
     seed: int
     size: str
     images: PatientImages
-    ct: Volume
+    render: Callable[[], Volume]
     labels: Volume
     lobes: Volume
     nodules: tuple[Nodule, ...]
     centerlines: Mapping[str, Centerlines]
+    traits: Traits = PLAIN
+    bullae: tuple[Bulla, ...] = ()
+
+    @cached_property
+    def ct(self) -> Volume:
+        """The CT, int16 in Hounsfield units, rendered when it is first asked for."""
+        return self.render()
 
     @property
     def grid(self) -> Grid:
@@ -77,7 +99,12 @@ class Phantom:
 
 
 def make_phantom(
-    seed: int = 0, spacing_mm: float | None = None, size: Size = "adult", *, noise_hu: float = 18.0
+    seed: int = 0,
+    spacing_mm: float | None = None,
+    size: Size = "adult",
+    *,
+    noise_hu: float = 18.0,
+    traits: Traits = PLAIN,
 ) -> Phantom:
     """Make a synthetic patient.
 
@@ -94,6 +121,8 @@ def make_phantom(
         "adult", or "small": 0.7 times an adult, about a child of seven.
     noise_hu : float
         Standard deviation of the noise in the CT.
+    traits : Traits
+        Build, disease and operation.
 
     Returns
     -------
@@ -118,9 +147,14 @@ def make_phantom(
     """
     scale, spacing_mm = _require_settings(seed, spacing_mm, size, noise_hu)
     rng = np.random.default_rng(seed)
-    chest = make_chest(rng, scale)
-    plan = plan_patient(make_territory(chest, rng), scale, spacing_mm, rng)
-    canvas = draw_body(chest, phantom_grid(chest, spacing_mm))
+    scale *= traits.stature
+    resected = traits.resected_lobe
+    fills = (resected, RESECTED_INTO[resected]) if resected else (0, 0)
+    chest = make_chest(rng, scale, fills=fills, emphysema=traits.emphysema)
+    plan = plan_patient(make_territory(chest, rng), scale, spacing_mm, rng, traits)
+    canvas = draw_body(chest, phantom_grid(chest, spacing_mm), traits.open_fissures)
+    for bulla in plan.bullae:
+        draw_bulla(canvas, bulla.centre_lps, bulla.radius_mm)
     for nodule in plan.nodules:
         draw_ball(canvas, nodule.centre_lps, nodule.radius_mm)
     lines, base = {}, 0
@@ -132,11 +166,14 @@ def make_phantom(
         seed=seed,
         size=size,
         images=_images(canvas, f"phantom {size} {seed}", plan.nodules),
-        ct=simulate_ct(canvas, noise_hu, rng),
+        # The noise comes last of all draws, and from a copy, so that it is the same whenever it is asked for.
+        render=lambda: simulate_ct(canvas, noise_hu, deepcopy(rng)),
         labels=Volume(grid=canvas.grid, array=canvas.labels),
         lobes=Volume(grid=canvas.grid, array=canvas.lobes),
         centerlines=MappingProxyType(lines),
         nodules=plan.nodules,
+        traits=traits,
+        bullae=plan.bullae,
     )
 
 
@@ -174,7 +211,7 @@ def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...]) -> PatientIm
         lumen=labelled("lumen"),
         wall=labelled("wall"),
         vessels=labelled("artery", "vein"),
-        lung=Volume(grid=canvas.grid, array=canvas.lobes > 0),
+        lung=Volume(grid=canvas.grid, array=(canvas.lobes > 0) & (canvas.labels != LABELS["bulla"])),
         fissures=labelled("fissure"),
         nodules=labelled("nodule"),
         targets_lps=tuple(n.centre_lps for n in nodules),

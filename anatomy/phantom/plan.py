@@ -8,16 +8,20 @@ import numpy as np
 
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.bronchi import grow_airways
+from anatomy.phantom.bullae import Bulla, place_bullae
 from anatomy.phantom.nodules import Nodule, place_nodules
 from anatomy.phantom.territory import Territory
+from anatomy.phantom.traits import PLAIN, Traits
 from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way
-from anatomy.records import frozen_record
+from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Float, UInt8
 
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
 GAPLESS_RADIUS = 0.87
-AIRWAY_LIMIT_MM, VESSEL_LIMIT_MM = 1.8, 1.3
-"""Thinner lumens and vessels are not to be seen in a usual CT."""
+AIRWAY_LIMIT_MM = 1.8
+"""Thinner lumens are not to be seen in a usual CT."""
+EMPHYSEMA_VESSEL_SHARE = 0.5
+"""Severe emphysema destroys vessels up to half as thick again."""
 THINNEST_WALL_MM = 0.5
 """About the wall of a bronchus of 2 mm."""
 CENTRAL_ARTERY_RADII_MM = (12.5, 9.5, 9.5)
@@ -51,6 +55,18 @@ class PlannedTree:
         return np.vstack(self.sprouts.points)
 
 
+@frozen_value
+class VesselRule:
+    """How vessels follow from a tree: diameters of `calibre` times the tree's, down to `limit_mm`.
+
+    They are drawn in voxels of `spacing_mm`.
+    """
+
+    calibre: float
+    limit_mm: float
+    spacing_mm: float
+
+
 @frozen_record
 class PatientPlan:
     """What a phantom holds besides the chest."""
@@ -59,10 +75,11 @@ class PatientPlan:
     arteries: PlannedTree
     veins: PlannedTree
     nodules: tuple[Nodule, ...]
+    bullae: tuple[Bulla, ...] = ()
 
 
 def plan_patient(
-    territory: Territory, scale: float, spacing_mm: float, rng: np.random.Generator
+    territory: Territory, scale: float, spacing_mm: float, rng: np.random.Generator, traits: Traits = PLAIN
 ) -> PatientPlan:
     """Plan trees and nodules for a territory of `scale` times adult size and voxels of `spacing_mm`.
 
@@ -71,19 +88,27 @@ def plan_patient(
     AnatomyError
         If three nodules do not fit.
     """
-    sprouts, rule = grow_airways(territory, scale, rng)
+    bullae = place_bullae(territory, traits.emphysema, scale, rng)
+    vessels = VesselRule(
+        calibre=traits.vessel_calibre,
+        limit_mm=_vessel_limit_mm(scale, spacing_mm, traits),
+        spacing_mm=spacing_mm,
+    )
+    sprouts, rule = grow_airways(territory, scale, rng, traits)
     airways = _plan_airways(sprouts, spacing_mm)
-    arteries = _plan_arteries(sprouts, scale, spacing_mm)
+    arteries = _plan_arteries(sprouts, scale, vessels)
     tubes = _obstacles(airways, arteries)
     large = tubes.radii > NODULE_NEIGHBOUR_MM * scale
-    nodules = place_nodules(territory, tubes.centres[large], tubes.radii[large], scale, rng)
+    nodules = place_nodules(territory, tubes.centres[large], tubes.radii[large], scale, rng, bullae)
     obstacles = Obstacles(
         centres=np.vstack([tubes.centres, *(n.centre_lps for n in nodules)]),
         radii=np.concatenate([tubes.radii, [n.radius_mm for n in nodules]]),
     )
-    rule = replace(rule, smallest_diameter_mm=_vessel_limit_mm(scale, spacing_mm))
-    veins = _plan_veins(grow_veins(territory, obstacles, rule, scale, rng), obstacles, scale, spacing_mm)
-    return PatientPlan(airways=airways, arteries=arteries, veins=veins, nodules=nodules)
+    root_mm, calibre = rule.root_diameter_mm, vessels.calibre
+    rule = replace(rule, smallest_diameter_mm=vessels.limit_mm, root_diameter_mm=calibre * root_mm)
+    grown = grow_veins(territory, obstacles, rule, scale, rng)
+    veins = _plan_veins(grown, obstacles, scale, replace(vessels, calibre=1.0))
+    return PatientPlan(airways=airways, arteries=arteries, veins=veins, nodules=nodules, bullae=bullae)
 
 
 def wall_thickness_mm(diameter_mm: Float) -> Float:
@@ -106,15 +131,17 @@ def _plan_airways(sprouts: Sprouts, spacing_mm: float) -> PlannedTree:
     return PlannedTree(sprouts=drawn, inner_mm=0.5 * diameter, outer_mm=outer, freedom=_freedom(drawn))
 
 
-def _vessel_limit_mm(scale: float, spacing_mm: float) -> float:
+def _vessel_limit_mm(scale: float, spacing_mm: float, traits: Traits) -> float:
     """Return the diameter at which vessels end: in small patients later, in coarse voxels earlier."""
-    return VESSEL_LIMIT_MM * max(scale, spacing_mm)
+    limit_mm = traits.vessel_limit_mm * (1.0 + EMPHYSEMA_VESSEL_SHARE * traits.emphysema)
+    return limit_mm * max(scale, spacing_mm)
 
 
-def _vessel_part(sprouts: Sprouts, scale: float, spacing_mm: float) -> tuple[Sprouts, Float]:
+def _vessel_part(sprouts: Sprouts, rule: VesselRule) -> tuple[Sprouts, Float]:
     """Return the branches that carry a drawn vessel, and the vessel's radius `(B,)`."""
-    part = sprouts.pruned(np.array(sprouts.diameter_mm) >= _vessel_limit_mm(scale, spacing_mm))
-    return part, np.maximum(0.5 * np.array(part.diameter_mm), GAPLESS_RADIUS * spacing_mm)
+    part = sprouts.pruned(rule.calibre * np.array(sprouts.diameter_mm) >= rule.limit_mm)
+    radius_mm = 0.5 * rule.calibre * np.array(part.diameter_mm)
+    return part, np.maximum(radius_mm, GAPLESS_RADIUS * rule.spacing_mm)
 
 
 def _vessels(
@@ -126,22 +153,22 @@ def _vessels(
     return PlannedTree(sprouts=sprouts, inner_mm=radius, outer_mm=radius, freedom=freedom)
 
 
-def _plan_arteries(sprouts: Sprouts, scale: float, spacing_mm: float) -> PlannedTree:
-    airways, radius = _vessel_part(sprouts, scale, spacing_mm)
+def _plan_arteries(sprouts: Sprouts, scale: float, rule: VesselRule) -> PlannedTree:
+    airways, radius = _vessel_part(sprouts, rule)
     radius[:CENTRAL_BRANCHES] = scale * np.array(CENTRAL_ARTERY_RADII_MM)
     diameter = np.array(airways.diameter_mm)
     outer = 0.5 * diameter + wall_thickness_mm(diameter)
     arteries = copy_arteries(airways, outer, radius, scale)
     obstacles = Obstacles(centres=np.vstack(airways.points), radii=np.repeat(outer, airways.counts))
     fixed = int(arteries.counts[:CENTRAL_BRANCHES].sum())
-    return _vessels(arteries, radius, obstacles, spacing_mm, fixed, _freedom(arteries))
+    return _vessels(arteries, radius, obstacles, rule.spacing_mm, fixed, _freedom(arteries))
 
 
-def _plan_veins(grown: Sprouts, obstacles: Obstacles, scale: float, spacing_mm: float) -> PlannedTree:
-    veins, radius = _vessel_part(grown, scale, spacing_mm)
+def _plan_veins(grown: Sprouts, obstacles: Obstacles, scale: float, rule: VesselRule) -> PlannedTree:
+    veins, radius = _vessel_part(grown, rule)
     freedom = (np.array(veins.diameter_mm) > CENTRAL_VEIN_MM * scale).astype(np.uint8)
     freedom[0] = 2
-    return _vessels(veins, radius, obstacles, spacing_mm, len(veins.points[0]), freedom)
+    return _vessels(veins, radius, obstacles, rule.spacing_mm, len(veins.points[0]), freedom)
 
 
 def _obstacles(*trees: PlannedTree) -> Obstacles:

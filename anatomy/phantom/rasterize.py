@@ -26,6 +26,7 @@ LABELS = {
     "mediastinum": 9,
     "heart": 10,
     "bone": 11,
+    "bulla": 12,
 }
 SLAB = 4
 """Planes that are drawn at once: the arrays of a slab fit into the processor's cache."""
@@ -70,8 +71,8 @@ def phantom_grid(chest: Chest, spacing_mm: float) -> Grid:
     return Grid.from_spacing(shape, (spacing_mm,) * 3, origin)
 
 
-def draw_body(chest: Chest, grid: Grid) -> Canvas:
-    """Draw everything but trees and nodules."""
+def draw_body(chest: Chest, grid: Grid, open_fissures: float = 0.0) -> Canvas:
+    """Draw everything but trees, nodules and bullae; a share of each lung's fissures is left out."""
     shape = grid.shape
     images = [np.zeros(shape, dtype=np.uint8, order="F") for _ in range(6)]
     canvas = Canvas(
@@ -98,7 +99,7 @@ def draw_body(chest: Chest, grid: Grid) -> Canvas:
             canvas.lobes[block] = np.where(inside, chest.lobe(side, x, y, z), np.uint8(0)).T
             share = np.clip(0.5 - level / grid.spacing_mm[0], 0, 1)
             canvas.lung_cover[block] = (255 * share).astype(np.uint8).T
-    _draw_fissures(canvas, chest.scale)
+    _draw_fissures(canvas, chest.scale, open_fissures)
     return canvas
 
 
@@ -129,8 +130,11 @@ def _around(chest: Chest, side: Side, x: Array, y: Array, z: Array) -> UInt8:
     return np.where(bone, np.uint8(LABELS["bone"]), labels)
 
 
-def _draw_fissures(canvas: Canvas, scale: float) -> None:
-    """Label one layer of voxels between neighbouring lobes, open at the hilum as in most people."""
+def _draw_fissures(canvas: Canvas, scale: float, open_share: float) -> None:
+    """Label one layer of voxels between neighbouring lobes, open at the hilum as in most people.
+
+    The share nearest to the hilum of each lung is left out: there fissures are incomplete most often.
+    """
     lobes = canvas.lobes
     found = np.zeros(lobes.shape, dtype=bool, order="F")
     for axis in range(3):
@@ -142,7 +146,12 @@ def _draw_fissures(canvas: Canvas, scale: float) -> None:
     ijk = np.argwhere(found)
     lps = canvas.grid.lps(ijk)
     hila = np.where(lps[:, :1] > 0, np.array(HILUM_LPS[1.0]), np.array(HILUM_LPS[-1.0])) * scale
-    closed = np.linalg.norm(lps - hila, axis=1) > HILUM_WITHOUT_FISSURE_MM * scale
+    distance = np.linalg.norm(lps - hila, axis=1)
+    closed = distance > HILUM_WITHOUT_FISSURE_MM * scale
+    if open_share:
+        for side in (lps[:, 0] > 0, lps[:, 0] <= 0):
+            if (closed & side).any():
+                closed &= ~side | (distance > np.quantile(distance[closed & side], open_share))
     canvas.labels[tuple(ijk[closed].T)] = LABELS["fissure"]
 
 
@@ -189,8 +198,25 @@ def _large_first(tree: Sprouts) -> Int:
     return np.argsort(-np.array(tree.diameter_mm), kind="stable").astype(np.int64)
 
 
+def draw_bulla(canvas: Canvas, centre_lps: Float, radius_mm: float) -> None:
+    """Draw a bulla into the lung alone; later trees must leave it free."""
+    block, distance = _around_ball(canvas, centre_lps, radius_mm)
+    labels = canvas.labels[block]
+    tissue = (labels == LABELS["lung"]) | (labels == LABELS["fissure"])
+    labels[(distance <= radius_mm) & tissue] = LABELS["bulla"]
+
+
 def draw_ball(canvas: Canvas, centre_lps: Float, radius_mm: float) -> None:
     """Draw a nodule, which later trees must leave free."""
+    block, distance = _around_ball(canvas, centre_lps, radius_mm)
+    share = (255 * np.clip((radius_mm - distance) / canvas.spacing_mm + 0.5, 0, 1)).astype(np.uint8)
+    canvas.solid_cover[block] = np.maximum(canvas.solid_cover[block], share)
+    canvas.labels[block][distance <= radius_mm] = LABELS["nodule"]
+    canvas.owner[block][distance <= radius_mm] = NODULE_OWNER
+
+
+def _around_ball(canvas: Canvas, centre_lps: Float, radius_mm: float) -> tuple[tuple[slice, ...], Float]:
+    """Return the voxels around a ball, and the distances of their centres from its centre, mm."""
     middle = canvas.grid.ijk(centre_lps)
     reach = radius_mm / canvas.spacing_mm + 1.5
     low = np.maximum(np.floor(middle - reach).astype(int), 0)
@@ -198,8 +224,4 @@ def draw_ball(canvas: Canvas, centre_lps: Float, radius_mm: float) -> None:
     block = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     ranges = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
     ijk = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1)
-    distance = np.linalg.norm(canvas.grid.lps(ijk) - centre_lps, axis=-1)
-    share = (255 * np.clip((radius_mm - distance) / canvas.spacing_mm + 0.5, 0, 1)).astype(np.uint8)
-    canvas.solid_cover[block] = np.maximum(canvas.solid_cover[block], share)
-    canvas.labels[block][distance <= radius_mm] = LABELS["nodule"]
-    canvas.owner[block][distance <= radius_mm] = NODULE_OWNER
+    return block, np.linalg.norm(canvas.grid.lps(ijk) - centre_lps, axis=-1)

@@ -87,9 +87,11 @@ def make_territory(chest: Chest, rng: np.random.Generator) -> Territory:
         inside = (chest.lung(side, x, y, z) < 0) & (side.sign * x > 0)
         lobes[inside] = np.broadcast_to(chest.lobe(side, x, y, z), lobes.shape)[inside]
     counts = np.bincount(lobes.ravel(), minlength=len(LOBES) + 1)
-    if (counts[1:] == 0).any():
+    if (np.delete(counts, [0, chest.fills[0]]) == 0).any():
         raise AnatomyError(
-            "A lobe of the synthetic lungs is empty", expected="five lobes", remedy="Use another seed"
+            "A lobe of the synthetic lungs is empty",
+            expected="every lobe that was not resected",
+            remedy="Use another seed",
         )
     anisotropy = (spacing,) * 3
     points, lobe_of_point = _spread_points(lobes, low, spacing, rng)

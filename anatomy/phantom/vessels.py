@@ -156,6 +156,8 @@ def grow_veins(
     clearance = obstacles.clearance()
     for lobe, knots in LOBAR_VEINS.items():
         inside = territory.lobe_of_point == lobe
+        if not inside.any():
+            continue
         cloud = territory.points_lps[inside & (away > np.quantile(away[inside], 1 - FAR_SHARE))]
         line = smooth_line(np.vstack([atrium[-1], scale * np.array(knots)]), STEP_MM)
         local = replace(rule, total_points=max(1, round(FAR_SHARE * rule.total_points)))

@@ -8,6 +8,7 @@ from anatomy.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.checking.checker import Checker, check
+    from lungaccess.checking.completion import Motions
     from lungaccess.checking.findings import CheckReport, Finding
     from lungaccess.checking.needle_alone import check_needle_alone
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lungaccess.checking.completion import Motions, completed_plan
 from lungaccess.checking.deployment import check_deployment
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import CheckReport, Findings
@@ -50,6 +51,11 @@ class Checker:
                 check_needle(plan, needle, device, self._environment, tube_tip, found)
             check_window(plan, self._environment, found)
         return found.report()
+
+    def completed(self, motions: Motions, system: System, target_lps: ArrayLike, *, method: str) -> Plan:
+        """Return the plan that bare motions make; see `lungaccess.checking.completion.completed_plan`."""
+        target = np.asarray(target_lps, dtype=np.float64)
+        return completed_plan(motions, self._environment, system, target, method=method)
 
 
 def check(

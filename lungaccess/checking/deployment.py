@@ -122,6 +122,11 @@ def _check_strain(plan: Plan, found: Findings) -> None:
 
 def _replay(plan: Plan, found: Findings) -> float:
     """Replay the deployment and return how far the tubes get from their final shape."""
+    return check_sweep(plan, *replayed_mm(plan), found)
+
+
+def replayed_mm(plan: Plan) -> tuple[float, float, int]:
+    """Return how far planar tubes and their tip get from the final shape, mm, and the steps replayed."""
     tube, tubes = plan.tube, plan.system.tubes
     outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
     final = shapes.planar_shape(shapes.bend_of(tubes, outer, inner), SWEEP_POINT_MM)
@@ -130,7 +135,7 @@ def _replay(plan: Plan, found: Findings) -> float:
     for bend in bends:
         distances = shapes.distance_to_polyline(shapes.planar_shape(bend, SWEEP_POINT_MM), final)
         sweep, leader = max(sweep, float(distances.max())), max(leader, float(distances[-1]))
-    return check_sweep(plan, sweep, leader, len(bends), found)
+    return sweep, leader, len(bends)
 
 
 def _check_containment(plan: Plan, curve: Curve, labels: Labels, way_out: Exit, found: Findings) -> None:

@@ -122,14 +122,7 @@ def _check_system(plan: Plan, found: Findings, system: System | None) -> None:
 
 
 def _check_required(plan: Plan, found: Findings) -> None:
-    tubes, margin = plan.system.tubes, plan.system.margins
-    extra = margin.segmentation_margin_mm + margin.registration_margin_mm
-    wanted = {
-        "outer_tube": 0.5 * tubes.outermost.outer_diameter_mm + extra,
-        **{f"{name}_tube": 0.5 * tube.outer_diameter_mm + extra for name, tube in tubes.named},
-    }
-    if plan.system.needle is not None:
-        wanted["needle"] = 0.5 * plan.system.needle.diameter_mm + extra
+    wanted = wanted_clearance_mm(plan.system)
     names = {name for stage in plan.clearance_mm.values() for name in stage}
     known = set(plan.clearance_mm) == in_tissue(plan.system) and names <= STRUCTURES
     found.true("clearance.names", known, ", ".join(sorted(names)))
@@ -137,6 +130,19 @@ def _check_required(plan: Plan, found: Findings) -> None:
     if found.true("clearance.required.names", set(stated) == set(wanted), ", ".join(stated)):
         for name, value in wanted.items():
             found.agrees(f"clearance.required.{name}", stated[name], value, NUMBER_TOLERANCE, "mm")
+
+
+def wanted_clearance_mm(system: System) -> dict[str, float]:
+    """Return radius and margins of each device in tissue, by its name in a plan."""
+    tubes, margin = system.tubes, system.margins
+    extra = margin.segmentation_margin_mm + margin.registration_margin_mm
+    wanted = {
+        "outer_tube": 0.5 * tubes.outermost.outer_diameter_mm + extra,
+        **{f"{name}_tube": 0.5 * tube.outer_diameter_mm + extra for name, tube in tubes.named},
+    }
+    if system.needle is not None:
+        wanted["needle"] = 0.5 * system.needle.diameter_mm + extra
+    return wanted
 
 
 def in_tissue(system: System) -> set[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.typed import Float
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
@@ -149,18 +150,29 @@ def _check_statements(
     last = int(scope.branches[-1]) if len(scope.branches) else -1
     near = sorted({int(branch) for branch in tree.branch_of_point[nearest]})
     if found.true("scope.branch", last in near, f"{last} against {near} at the tip"):
-        way = [last]
-        while tree.branch_parent[way[0]] >= 0:
-            way.insert(0, int(tree.branch_parent[way[0]]))
+        way = branches_to(tree, last)
         found.true("scope.branches", way == scope.branches.tolist(), "branches from the trachea to the tip")
         generation = int(tree.generation[last])
         detail = f"{scope.generation} against {generation}"
         found.true("scope.generation", scope.generation == generation, detail)
     states, lengths = motion.body_pieces()
     found.agrees("scope.length", scope.length_mm, float(lengths.sum()), POSITION_TOLERANCE_MM, "mm")
-    points, along = motion.body(BODY_STEP_MM)
-    passed = float(along[np.linalg.norm(points - tree.carina_lps, axis=1).argmin()])
-    beyond = float(along[-1]) - passed
+    beyond = beyond_carina_mm(motion, tree)
     found.agrees("scope.length_from_carina", scope.length_from_carina_mm, beyond, CARINA_TOLERANCE_MM, "mm")
     most = float(np.hypot(*motion.bends[states].T).max())
     found.agrees("scope.curvature", scope.max_curvature_per_mm, most, CURVATURE_TOLERANCE_PER_MM, "1/mm")
+
+
+def branches_to(tree: AirwayTree, branch: int) -> list[int]:
+    """Return the branches from the trachea to one of them."""
+    way = [branch]
+    while tree.branch_parent[way[0]] >= 0:
+        way.insert(0, int(tree.branch_parent[way[0]]))
+    return way
+
+
+def beyond_carina_mm(motion: Motion, tree: AirwayTree) -> float:
+    """Return the length of the body beyond the place of it that is nearest to the carina."""
+    points, along = motion.body(BODY_STEP_MM)
+    passed = float(along[np.linalg.norm(points - tree.carina_lps, axis=1).argmin()])
+    return float(along[-1]) - passed

@@ -72,13 +72,13 @@ def _check_motion(
     """Curvature, length and both turning limits; tell whether the needle is as short as the device's."""
     length = float(sum(arc.length_mm for arc in needle.arcs))
     found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
-    turned, angle = _turning(curve)
+    turned, angle = turning(curve)
     found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
     found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
     return check_limits(pieces, device, curve, found)
 
 
-def _turning(curve: Curve) -> tuple[float, float]:
+def turning(curve: Curve) -> tuple[float, float]:
     """Return the sum of all turning and the largest angle from the start, rad."""
     turned = float(angle_between(curve.tangents[:-1], curve.tangents[1:]).sum())
     return turned, float(angle_between(curve.tangents, curve.tangents[0]).max())
@@ -92,7 +92,7 @@ def check_limits(pieces: Sequence[Piece], device: Needle, curve: Curve, found: F
     found.at_most("needle.curvature", max(curvature), bound, "1/mm", detail, LIMIT_TOLERANCE * bound)
     found.at_least("needle.curvature.sign", min(curvature), 0.0, "1/mm", "a bend is turned by its roll")
     found.at_least("needle.arc_length", min(piece.length_mm for piece in pieces), 1e-9, "mm", "shortest arc")
-    turned, angle = _turning(curve)
+    turned, angle = turning(curve)
     limit = float(np.deg2rad(device.max_accumulated_turn_deg))
     found.at_most("needle.turn.limit", turned, limit, "rad", "sum of all turning", ANGLE_TOLERANCE_RAD)
     limit = float(np.deg2rad(device.max_angle_from_start_deg))

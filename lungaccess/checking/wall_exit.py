@@ -99,6 +99,20 @@ def check_exit(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> Exit | 
     return Exit(frame=frame, arc_mm=arc_mm, branch=exemption.branch)
 
 
+def derived_exit(lung: Lung, curve: Curve) -> tuple[Exit, Float] | None:
+    """Return where a curve leaves the lumen for good, and that point `(3,)`; None where it does not.
+
+    Of several places that `check_exit` would accept it is the first.
+    """
+    samples = _samples_of(lung, curve)
+    if not samples.in_lumen[0] or samples.in_lumen[-1]:
+        return None
+    last, _out_mm = _last_in_lumen(samples, 0.0)
+    arc_mm, point = _border(lung, samples, last)
+    frame = int(np.searchsorted(curve.arc_mm, arc_mm, side="right")) - 1
+    return Exit(frame=frame, arc_mm=arc_mm, branch=int(samples.branch[last])), point
+
+
 def _samples_of(lung: Lung, curve: Curve) -> _Samples:
     """Return points along a curve, its end the last of them."""
     share = np.arange(SAMPLES)[:, None] / SAMPLES
@@ -161,13 +175,24 @@ def wall_angle_rad(lung: Lung, point_lps: Float, tangent: Float) -> float:
 def check_wall_run(
     plan: Plan, environment: Environment, curve: Curve, way_out: Exit, found: Findings
 ) -> None:
-    """Beyond the exit no more of the tube's body than allowed lies in the airway that it leaves.
+    """Beyond the exit no more of the tube's body than allowed lies in the airway that it leaves."""
+    stated, limit = plan.tube.exit.wall_run_mm, plan.system.tubes.max_wall_run_mm
+    least, most = wall_run_mm(plan, environment, curve, way_out)
+    found.at_most("tube.wall_run.limit", least, limit, "mm", "body in the wall beyond the exit")
+    found.at_most("tube.wall_run.stated_limit", stated, limit, "mm", "body in the wall, as stated")
+    detail = "not less than recomputed"
+    found.at_least("tube.wall_run.stated", stated, least, "mm", detail, EXIT_TOLERANCE_MM)
+    detail = "not more than recomputed with 0.04 mm more radius"
+    found.at_most("tube.wall_run.stated.most", stated, most, "mm", detail, EXIT_TOLERANCE_MM)
+
+
+def wall_run_mm(plan: Plan, environment: Environment, curve: Curve, way_out: Exit) -> tuple[float, float]:
+    """Return how much of the tube's body lies in the wall beyond the exit, at least and at most, mm.
 
     From the distances of the ends of a step follows how much of it is nearer to the wall than the radius:
     a distance changes no faster than one walks.  Airways of other branches are farther away
     (`tube.clearance.airway`).
     """
-    tubes, stated = plan.system.tubes, plan.tube.exit.wall_run_mm
     behind = np.flatnonzero(curve.arc_mm[1:] > way_out.arc_mm + 1e-9)
     radius = radius_at(plan, curve.arc_mm[behind + 1] - 1e-9)
     walls = environment.boxes(has(structures.AIRWAY), float(radius.max()) + 1.0)
@@ -179,10 +204,4 @@ def check_wall_run(
     farther = [np.clip(each - radius, 0.0, step) for each in (free[:-1], free[1:])]
     least = float(np.minimum(nearer[0] + nearer[1], step).sum())
     most = float((step - np.minimum(farther[0] + farther[1], step)).sum())
-    limit, detail = tubes.max_wall_run_mm, "body in the wall beyond the exit"
-    found.at_most("tube.wall_run.limit", least, limit, "mm", detail)
-    found.at_most("tube.wall_run.stated_limit", stated, limit, "mm", "body in the wall, as stated")
-    detail = "not less than recomputed"
-    found.at_least("tube.wall_run.stated", stated, least, "mm", detail, EXIT_TOLERANCE_MM)
-    detail = "not more than recomputed with 0.04 mm more radius"
-    found.at_most("tube.wall_run.stated.most", stated, most, "mm", detail, EXIT_TOLERANCE_MM)
+    return least, most

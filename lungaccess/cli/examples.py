@@ -41,6 +41,18 @@ EXAMPLES = MappingProxyType(
         "study export": "lungaccess study export results.db --csv tables",
         "study compare": "lungaccess study compare results.db results.db",
         "benchmark med-rad": "lungaccess benchmark med-rad PATIENT --seeds 1 --budget 0.2 --out runs.csv",
+        "benchmark synthetic-v1 make": (
+            "lungaccess benchmark synthetic-v1 make --phantoms child-01 --out SYNTHETIC"
+        ),
+        "benchmark synthetic-v1 run": (
+            "lungaccess benchmark synthetic-v1 run SYNTHETIC --targets 2 --devices ultrathin "
+            "--out synthetic.db --answers answers"
+        ),
+        "benchmark synthetic-v1 score": (
+            "lungaccess benchmark synthetic-v1 score answers/atlas.json SYNTHETIC --out scores.json"
+        ),
+        "benchmark synthetic-v1 sheet": "lungaccess benchmark synthetic-v1 sheet scores.json",
+        "benchmark synthetic-v1 schema": "lungaccess benchmark synthetic-v1 schema",
         "cache": "lungaccess cache",
         "cache prune": "lungaccess cache prune --older-than 30 --max-size 5GB",
         "cache clear": "lungaccess cache clear --cache CACHE",

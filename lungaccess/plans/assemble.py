@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from lungaccess.plans.parts import (
     WallExit,
 )
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.version import software_version
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath
@@ -111,17 +111,6 @@ def stated_costs(task: Task, deployment: Deployment | None, path: ArcPath) -> di
     wall_mm = 0.0 if deployment is None else wall_in_path_mm(task.system, deployment)
     found = path_costs(task.lung, path, with_fissures=task.with_fissures, wall_mm=wall_mm)
     return task.objective.stated(found)
-
-
-@cache
-def software_version() -> str:
-    """Return the version of the installed package."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("lungaccess")
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def _scope(task: Task, tip: ScopeTip) -> ScopeInsertion:

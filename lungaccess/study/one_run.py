@@ -43,6 +43,8 @@ from lungaccess.success.estimate import FRESH_SEED, MEASURED, OPEN_LOOP, chance_
 KEPT_PATIENTS = 2
 """Runs come case by case, so that a worker needs the last patient and sometimes the next."""
 MIB = 2.0**20
+FIRST_CPU, SEARCH_CPU = "first_plan_cpu_s", "search_cpu_s"
+"""What a stored plan says in its `timing`: processor time to the first plan, and of the whole search."""
 ANSWERS = (AnatomyError, PlanFileError, SettingsError, TargetError)
 """Errors that the run would end with on any machine, at any time."""
 
@@ -117,15 +119,18 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     problem, best = run.problem, None
     improvements = []
     target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
+    began, first_s = time.process_time(), 0.0
     for best, cost in _plans(run, opened.lung, target, atlas):
         improvements.append(
             Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=cost)
         )
+        first_s = first_s or time.process_time() - began
         if problem.first_plan:
             break
     if best is None:
         raise NoPlan("The search ended without a plan", reasons={})
-    best = replace(best, chance=_chance(run, best, opened.lung))
+    spent = {FIRST_CPU: first_s, SEARCH_CPU: time.process_time() - began}
+    best = replace(best, chance=_chance(run, best, opened.lung), timing={**best.timing, **spent})
     report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
     return Answer(
         key=run.key,
@@ -158,7 +163,8 @@ def _plans(run: Run, lung: Lung, target: Target, atlas: Atlas) -> Iterator[tuple
         return
     for found in plan(
         lung, problem.system, target, objective=problem.objective, method=run.planner.method,
-        needle_planner=run.planner.needle_planner, **limits,
+        needle_planner=run.planner.needle_planner,
+        counterfactuals=not run.planner.without_counterfactuals, **limits,
     ):  # fmt: skip
         yield found, found.cost
 

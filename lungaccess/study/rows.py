@@ -9,7 +9,7 @@ import sqlite3
 from typing import Any
 
 from anatomy.settings import to_mapping
-from lungaccess.plans.assemble import software_version
+from lungaccess.plans.version import software_version
 from lungaccess.study.answers import Answer
 from lungaccess.study.runs import Problem, Run
 from stages.needle import TERMS

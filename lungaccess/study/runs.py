@@ -15,7 +15,7 @@ from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from anatomy.settings import to_mapping
-from lungaccess.plans.assemble import software_version
+from lungaccess.plans.version import software_version
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target

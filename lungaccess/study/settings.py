@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -11,6 +12,7 @@ from pydantic import Field
 
 from anatomy.errors import LungaccessError, SettingsError
 from anatomy.io.files import read_toml
+from anatomy.records import LEFT_OUT_IF_EMPTY
 from anatomy.settings import impossible, parse, quantity, settings, switch, text
 from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS, Objective
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
@@ -110,6 +112,8 @@ class PlannerChoice:
         Instead of those of the budget.
     own_process : bool
         Whether each run has a fresh process; OMPL's planners have one in any case.
+    without_counterfactuals : bool
+        Whether a run of "plan" that finds nothing goes without the search for a device that would.
     """
 
     name: Annotated[str, text("name of the planner in tables")]
@@ -118,6 +122,9 @@ class PlannerChoice:
     needle_planner: Annotated[str, text("a planner of the needle", may_be_empty=True)] = ""
     iterations: Iterations | None = None
     own_process: Annotated[bool, switch("whether each run has a fresh process")] = False
+    without_counterfactuals: Annotated[bool, switch("whether a failure is left without advice")] = field(
+        default=False, metadata={LEFT_OUT_IF_EMPTY: True}
+    )
 
     def __post_init__(self) -> None:
         known = methods(self.kind)

@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 
 from anatomy.errors import LungaccessError, SettingsError
 from lungaccess.cli import terminal
+from lungaccess.cli.commands.benchmark_synthetic import synthetic
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Seconds
@@ -31,9 +32,10 @@ DEFAULT_PLANNERS = "rrt,optimal,resolution,decide,control.RRT"
 
 benchmark = App(
     name="benchmark",
-    help="Run published queries with several planners.",
+    help="Run published queries with several planners, or a benchmark of synthetic patients.",
     help_epilogue=epilogue("benchmark med-rad"),
 )
+benchmark.command(synthetic)
 
 
 @benchmark.command(name="med-rad", help_epilogue=epilogue("benchmark med-rad"))

@@ -20,6 +20,7 @@ CHECK_MAY_USE = (
     "lungaccess.plans.file",
     "lungaccess.plans.parts",
     "lungaccess.plans.plan",
+    "lungaccess.plans.version",
     "lungaccess.problem.system",
     "lungaccess.checking*",
     "stages.tube.casadi_shape",

@@ -133,13 +133,13 @@ def score_submission(
     done = 0
     for name, of_phantom in groupby(asked, key=lambda query: query.phantom):
         queries = list(of_phantom)
-        judge: _Judge | None = None
+        judge: _Scorer | None = None
         for query in queries:
             (progress or (lambda _words, _share: None))(query.name, done / len(asked))
             done += 1
             answer = answers.get(query.name)
             if answer is not None and (answer.planned or (answer.unreachable and certify_boxes)):
-                judge = judge or _Judge(phantom_named(name), folder, cache, tips, samples, certify_boxes)
+                judge = judge or _Scorer(phantom_named(name), folder, cache, tips, samples, certify_boxes)
                 yield judge.score(query, answer, submission.planner)
             else:
                 yield _unplanned(query, answer, submission.planner)
@@ -174,7 +174,7 @@ def _named(
     )
 
 
-class _Judge:
+class _Scorer:
     """Scores the answers about one phantom."""
 
     def __init__(

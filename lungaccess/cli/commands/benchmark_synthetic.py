@@ -28,8 +28,23 @@ synthetic = App(
 
 
 def names_of(text: str | None) -> tuple[str, ...]:
-    """Return the names in a text that are separated by commas."""
-    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+    """Return the names in a text that are separated by commas; none if there is no text.
+
+    Raises
+    ------
+    SettingsError
+        If a name is empty.
+    """
+    if text is None:
+        return ()
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise SettingsError(
+            f"A name is empty in {text!r}",
+            expected="names separated by commas",
+            remedy="Leave the option out to take all",
+        )
+    return names
 
 
 @synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} make"))
@@ -124,7 +139,7 @@ def run(
             expected="one of them: a scheduler has workers of its own",
             remedy="Leave out --workers",
         )
-    devices_asked = {"systems": names_of(devices)} if devices else {}
+    devices_asked = {"systems": names_of(devices)} if devices is not None else {}
     study = benchmark_study(
         folder, names_of(methods), phantoms=names_of(phantoms), targets=targets, iterations=iterations,
         time_s=time_s, **devices_asked,

@@ -9,15 +9,14 @@ from cyclopts import App
 from lungaccess.cli import app as cli
 
 
-def commands() -> dict[str, Any]:
-    """Return all commands by name, those of a group by its name and theirs."""
+def commands(app: App = cli.app, before: str = "") -> dict[str, Any]:
+    """Return all commands by name, those of a group by the names of its groups and theirs."""
     found: dict[str, Any] = {}
-    for name in (each for each in cli.app if not each.startswith("-")):
-        command = cli.app[name]
+    for name in (each for each in app if not each.startswith("-")):
+        command = app[name]
         if not isinstance(command, App):
             continue
+        found |= commands(command, f"{before}{name} ")
         if command.default_command is not None:
-            found[name] = command.default_command
-            continue
-        found |= {f"{name} {part}": command[part].default_command for part in command if part[0] != "-"}
+            found[before + name] = command.default_command
     return found

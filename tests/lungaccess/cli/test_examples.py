@@ -8,7 +8,6 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
-from cyclopts import App
 
 from anatomy.grid import Grid
 from anatomy.io.frames import read_pose
@@ -23,23 +22,12 @@ from lungaccess.one_stage import load_tubes, read_lesions
 from lungaccess.procedure import load_procedure
 from lungaccess.risk import load_errors
 from lungaccess.study import read_study
+from tests.lungaccess.cli.every_command import commands
 
 QUICK = ("presets", "template", "tubes", "shapes", "doctor", "completion")
 """Examples that need no patient."""
 MAY_SAY_NO = ("advise", "certify", "benchmark med-rad")
 """Commands that end with 1 where a device does not get there, which depends on the patient."""
-
-
-def commands(app: App = cli.app, before: str = "") -> list[str]:
-    """Return the names of all commands, those of a group by its name and theirs."""
-    found: list[str] = []
-    for name in (each for each in app if not each.startswith("-")):
-        command = app[name]
-        inner = commands(command, f"{name} ") if isinstance(command, App) else []
-        found += inner
-        if not inner or command.default_command is not None:
-            found.append(before + name)
-    return found
 
 
 def test_every_command_has_one_example() -> None:

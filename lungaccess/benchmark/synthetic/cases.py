@@ -16,11 +16,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from anatomy.errors import FileError
 from anatomy.io.files import read_json, require_writable_folder, write_json, write_text
-from anatomy.lung import Lung
 from anatomy.phantom import write_phantom
 from anatomy.records import frozen_value
 from anatomy.settings import to_mapping
@@ -32,14 +30,10 @@ from lungaccess.benchmark.synthetic.phantoms import (
     benchmark_phantoms,
     phantom_named,
 )
-from lungaccess.coupled.atlas import motions_of
+from lungaccess.benchmark.synthetic.tips import scope_tips, tips_file
 from lungaccess.problem.system import load_system, preset_text
 
 BENCHMARK, CASE = "benchmark.json", "case.json"
-TIP_SPACING_MM = 5.0
-"""Of the published tips along the airway: a handful in every segmental bronchus."""
-TIP_DIGITS = 7
-"""Of states in mm and rad: a micrometre at the tip is what the check allows."""
 RULES = (
     "A query is a phantom, a device and a target; a planner may use all files of FOLDER but no other answer.",
     "The needle ends at the target, within the check's tolerance of a micrometre; fissures and bullae may "
@@ -129,13 +123,14 @@ def _write_devices(folder: Path) -> None:
 
 def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips: bool) -> None:
     from anatomy.build import build_lung
+    from anatomy.io.patients import load_patient
 
     made = make_benchmark_phantom(case)
     write_phantom(made, home, breathing=case.breathes, with_ct=with_ct)
     if with_tips:
-        lung = build_lung(made.images)
+        lung = build_lung(load_patient(home))
         for name in SYSTEMS:
-            write_json(home / f"tips-{name}.json", scope_tips(lung, name))
+            write_json(home / tips_file(name), scope_tips(lung, name))
     queries = [
         {"name": query.name, "device": query.system, "target_lps": list(query.target_lps)}
         for query in queries_of(case)
@@ -143,21 +138,6 @@ def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips:
     about = {"benchmark": VERSION, "phantom": case.name, "family": case.family, "seed": case.seed}
     hashed = {"masks_sha256": entries()[case.name].masks_sha256, "traits": asdict(case.traits)}
     write_json(home / CASE, {**about, **hashed, "queries": queries})
-
-
-def scope_tips(lung: Lung, system: str) -> dict[str, Any]:
-    """Return places where the scope of a device can stand, each with the motion that leads there.
-
-    `lps_from_entry` is one for all; each of `tips` has `lps_from_tip` (4x4, LPS mm) and `states` of advance
-    in mm, twist and bend in rad; see `lungaccess.plans.parts.ScopeInsertion`.
-    """
-    motions = motions_of(lung, load_system(system), TIP_SPACING_MM)
-    found = []
-    for number in range(motions.count):
-        motion = motions.motion(number)
-        states = motion.states.round(TIP_DIGITS).tolist()
-        found.append({"lps_from_tip": motion.lps_from_tip.tolist(), "states": states})
-    return {"frame": "lps", "lps_from_entry": motions.lps_from_entry.tolist(), "tips": found}
 
 
 def require_cases(folder: Path) -> tuple[BenchmarkPhantom, ...]:

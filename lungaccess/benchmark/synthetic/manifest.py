@@ -11,14 +11,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 
 from anatomy.errors import AnatomyError
 from anatomy.grid import Volume
-from anatomy.lung import Lung
 from anatomy.patient import PatientImages
-from anatomy.phantom import Phantom, make_phantom
+from anatomy.phantom import Phantom, make_phantom, write_phantom
 from anatomy.records import frozen_value
 from lungaccess.benchmark.synthetic.phantoms import TARGETS_A_LUNG, VERSION, BenchmarkPhantom
 from lungaccess.problem.peripheral import peripheral_targets
@@ -108,15 +108,30 @@ def make_benchmark_phantom(case: BenchmarkPhantom) -> Phantom:
     return made
 
 
-def measured_entry(case: BenchmarkPhantom, images: PatientImages, lung: Lung) -> Entry:
-    """Return what a manifest says of a phantom with these masks, and with the lung that is built of them.
+def measured_entry(case: BenchmarkPhantom, folder: Path) -> Entry:
+    """Make a phantom and return what a manifest says of it.
+
+    The phantom goes through files, as it does for every planner and every score: a NIfTI file keeps the grid
+    in single precision, and the targets are drawn from distances on the grid as it is read.
+
+    Parameters
+    ----------
+    folder : Path
+        Where its masks are written.
 
     Raises
     ------
+    FileError
+        If the folder cannot be written to.
     TargetError
         If one of its lungs has no place for a target.
     """
-    points = peripheral_targets(lung, TARGETS_A_LUNG, case.seed).round(DIGITS).tolist()
+    from anatomy.build import build_lung
+    from anatomy.io.patients import load_patient
+
+    write_phantom(unproved_phantom(case), folder, with_ct=False)
+    images = load_patient(folder)
+    points = peripheral_targets(build_lung(images), TARGETS_A_LUNG, case.seed).round(DIGITS).tolist()
     return Entry(masks_sha256=masks_sha256(images), targets_lps=tuple((x, y, z) for x, y, z in points))
 
 

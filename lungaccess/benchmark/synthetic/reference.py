@@ -6,10 +6,17 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from anatomy.errors import SettingsError
-from lungaccess.benchmark.synthetic.cases import all_queries, require_cases
+from lungaccess.benchmark.synthetic.answers import answer_of_plan
+from lungaccess.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
 from lungaccess.benchmark.synthetic.manifest import entries
-from lungaccess.benchmark.synthetic.phantoms import SYSTEMS, VERSION, BenchmarkPhantom, phantom_named
-from lungaccess.benchmark.synthetic.submission import Submission, SubmittedAnswer, answer_of_plan
+from lungaccess.benchmark.synthetic.phantoms import (
+    SYSTEMS,
+    TARGETS_A_LUNG,
+    VERSION,
+    BenchmarkPhantom,
+    phantom_named,
+)
+from lungaccess.benchmark.synthetic.submission import Submission, SubmittedAnswer
 from lungaccess.plans.plan import Plan
 from lungaccess.study.one_run import FIRST_CPU, SEARCH_CPU
 from lungaccess.study.results import ResultsFile
@@ -21,7 +28,7 @@ DEFAULT_METHOD = "atlas"
 JOINT = "+"
 """Between a method and the planner of the needle that it is to use."""
 _QUERY = """
-SELECT p.case_name, p.target, c.name, o.outcome, r.cpu_time, l.plan
+SELECT p.case_name, p.x_lps_mm, p.y_lps_mm, p.z_lps_mm, c.name, r.cpu_time, l.plan
 FROM runs r JOIN outcomes o ON o.runid = r.id JOIN plannerConfigs c ON c.id = r.plannerid
      JOIN problems p ON p.experimentid = r.experimentid LEFT JOIN plans l ON l.runid = r.id
 WHERE NOT o.failed ORDER BY p.case_name, p.target, c.name"""
@@ -63,7 +70,7 @@ def benchmark_study(
     systems : sequence of str
         Among `SYSTEMS`.
     targets : int, optional
-        The first so many of each phantom; all if None.
+        The first so many of each lung of a phantom; all if None.
     iterations, time_s : optional
         Budget of a query; iterations can be repeated exactly.
 
@@ -97,13 +104,14 @@ def benchmark_study(
 
 
 def _case(folder: Path, case: BenchmarkPhantom, system: str, targets: int | None) -> Case:
-    points = entries()[case.name].targets_lps[:targets]
+    points = entries()[case.name].targets_lps
+    chosen = points[:TARGETS_A_LUNG][:targets] + points[TARGETS_A_LUNG:][:targets]
     return Case(
         name=f"{case.name}/{system}",
         anatomy=case.name,
         system=system,
         objective="inverse-clearance",
-        targets=tuple("lps:" + ",".join(repr(x) for x in point) for point in points),
+        targets=tuple("lps:" + ",".join(repr(x) for x in point) for point in chosen),
     )
 
 
@@ -119,26 +127,26 @@ def submissions_of(path: Path, machine: str = "") -> list[Submission]:
     SettingsError
         If they are not of this benchmark.
     """
-    queries = all_queries()
+    queries = {(f"{each.phantom}/{each.system}", each.target_lps): each for each in all_queries().values()}
     answers: dict[str, list[SubmittedAnswer]] = {}
     with ResultsFile(path) as results:
-        for case, target, planner, _outcome, cpu_s, text in results.rows(_QUERY):
-            name = f"{case}/{target:02d}"
-            if name not in queries:
+        for case, x, y, z, planner, cpu_s, text in results.rows(_QUERY):
+            query = queries.get((case, (x, y, z)))
+            if query is None:
                 raise SettingsError(
-                    f"{path} has a run of {name}",
+                    f"{path} has a run of {case} to lps:{x},{y},{z}",
                     expected=f"runs of {VERSION} alone",
                     remedy=f"Make them with: lungaccess benchmark {VERSION} run",
                 )
             answers.setdefault(planner, []).append(
-                SubmittedAnswer(query=name, cpu_s=cpu_s) if not text else _answer(name, text)
+                SubmittedAnswer(query=query.name, cpu_s=cpu_s) if not text else _answer(query, text)
             )
     return [
         Submission(planner=planner, machine=machine, answers=tuple(own)) for planner, own in answers.items()
     ]
 
 
-def _answer(name: str, text: str) -> SubmittedAnswer:
+def _answer(query: BenchmarkQuery, text: str) -> SubmittedAnswer:
     plan = Plan.from_json(text)
     first_s, all_s = (float(plan.timing.get(key, 0.0)) for key in (FIRST_CPU, SEARCH_CPU))
-    return answer_of_plan(all_queries()[name], plan, first_cpu_s=first_s, cpu_s=all_s)
+    return answer_of_plan(query, plan, first_cpu_s=first_s, cpu_s=all_s)

@@ -13,15 +13,12 @@ import numpy as np
 from anatomy.errors import AnatomyError, PlanFileError
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
+from lungaccess.benchmark.synthetic.answers import motions_of_answer
 from lungaccess.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
 from lungaccess.benchmark.synthetic.manifest import entries
 from lungaccess.benchmark.synthetic.phantoms import BenchmarkPhantom, phantom_named
-from lungaccess.benchmark.synthetic.submission import (
-    PublishedTips,
-    Submission,
-    SubmittedAnswer,
-    require_queries,
-)
+from lungaccess.benchmark.synthetic.submission import Submission, SubmittedAnswer, require_queries
+from lungaccess.benchmark.synthetic.tips import PublishedTips
 from lungaccess.breathing.window import with_window
 from lungaccess.checking import Checker
 from lungaccess.plans.plan import Plan
@@ -198,7 +195,7 @@ class _Scorer:
             return _named(query, planner, CERTIFIED if proved else CLAIMED, cpu_s=answer.cpu_s)
         system = load_system(query.system)
         target = np.array(query.target_lps)
-        motions = self._tips.motions(query, answer)
+        motions = motions_of_answer(query, answer, self._tips)
         try:
             plan = self._checker.completed(motions, system, target, method=planner)
             report = self._checker.check(plan, system, target_lps=target)
@@ -217,7 +214,6 @@ class _Scorer:
     def _solved(
         self, query: BenchmarkQuery, answer: SubmittedAnswer, planner: str, plan: Plan, not_checked: str
     ) -> Score:
-
         named = _named(query, planner, SOLVED, first_cpu_s=answer.first_cpu_s, cpu_s=answer.cpu_s)
         return replace(
             named,

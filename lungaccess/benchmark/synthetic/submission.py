@@ -10,18 +10,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import Field, TypeAdapter
 
 from anatomy.errors import FileError, SettingsError
 from anatomy.io.files import read_json, write_text
 from anatomy.settings import impossible, parse, quantity, settings, switch, text, to_mapping
-from anatomy.typed import Float
-from lungaccess.benchmark.synthetic.cases import BenchmarkQuery, all_queries
+from lungaccess.benchmark.synthetic.cases import all_queries
 from lungaccess.benchmark.synthetic.phantoms import VERSION
-from lungaccess.checking.completion import Motions
-from lungaccess.plans.parts import NeedleArc
-from lungaccess.plans.plan import Plan
 
 SCHEMA = "lungaccess-submission/1"
 MOST_STATES, MOST_ARCS = 10_000, 1000
@@ -204,99 +199,6 @@ def write_submission(submission: Submission, path: Path) -> None:
         If the file cannot be written.
     """
     write_text(path, json.dumps(to_mapping(submission), allow_nan=False) + "\n")
-
-
-def answer_of_plan(query: BenchmarkQuery, plan: Plan, *, first_cpu_s: float, cpu_s: float) -> SubmittedAnswer:
-    """Return the answer that a plan of our own makes: its motions, nothing of what it states beside them."""
-    needle = plan.needle
-    if needle is None:
-        raise SettingsError(f"The plan for {query.name} has no needle", expected=f"a plan of {query.system}")
-    return SubmittedAnswer(
-        query=query.name,
-        scope=ScopeAnswer(
-            lps_from_entry=_pose(plan.scope.lps_from_entry),
-            states=tuple((float(a), float(t), float(b)) for a, t, b in plan.scope.states),
-            lps_from_tip=_pose(plan.scope.lps_from_scope_tip),
-        ),
-        tubes=TubesAnswer(
-            rotation_rad=plan.tube.rotation_rad,
-            outer_insertion_mm=plan.tube.outer_insertion_mm,
-            inner_insertion_mm=plan.tube.inner_insertion_mm,
-            lps_from_tip=_pose(plan.tube.lps_from_tip),
-        ),
-        needle=NeedleAnswer(
-            arcs=tuple(
-                ArcAnswer(
-                    length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm
-                )
-                for arc in needle.arcs
-            )
-        ),
-        first_cpu_s=first_cpu_s,
-        cpu_s=cpu_s,
-    )
-
-
-def _pose(matrix: Float) -> Any:
-    return tuple(tuple(float(x) for x in row) for row in matrix)
-
-
-class PublishedTips:
-    """The scope tips of a folder of cases, read when they are first asked for."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._read: dict[tuple[str, str], Mapping[str, Any]] = {}
-
-    def motions(self, query: BenchmarkQuery, answer: SubmittedAnswer) -> Motions:
-        """Return what the devices of an answer do.
-
-        Raises
-        ------
-        FileError
-            If the answer names a published tip and the file of tips cannot be read.
-        SettingsError
-            If there is no tip of that number.
-        """
-        scope, tubes, needle = answer.scope, answer.tubes, answer.needle
-        if scope is None or tubes is None or needle is None:
-            raise SettingsError(f"The answer to {query.name} is no plan", expected="scope, tubes, needle")
-        entry, states, tip = scope.lps_from_entry, scope.states, scope.lps_from_tip
-        if scope.tip is not None:
-            published = self._tip(query, scope.tip)
-            entry, states = published["lps_from_entry"], published["states"]
-            tip = published["lps_from_tip"] if tip is None else tip
-        return Motions(
-            lps_from_entry=np.array(entry, dtype=np.float64),
-            states=np.array(states, dtype=np.float64).reshape(-1, 3),
-            lps_from_scope_tip=np.array(tip, dtype=np.float64),
-            rotation_rad=tubes.rotation_rad,
-            outer_insertion_mm=tubes.outer_insertion_mm,
-            inner_insertion_mm=tubes.inner_insertion_mm,
-            lps_from_tube_tip=np.array(tubes.lps_from_tip, dtype=np.float64),
-            arcs=tuple(
-                NeedleArc(
-                    length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm
-                )
-                for arc in needle.arcs
-            ),
-        )
-
-    def _tip(self, query: BenchmarkQuery, number: int) -> Mapping[str, Any]:
-        key = (query.phantom, query.system)
-        path = self._folder / query.phantom / f"tips-{query.system}.json"
-        if key not in self._read:
-            self._read[key] = read_json(path, expected="published tips", remedy="Make the cases with --tips")
-        content = self._read[key]
-        try:
-            tip = content["tips"][number]
-            return {"lps_from_entry": content["lps_from_entry"], **tip}
-        except (KeyError, IndexError, TypeError) as error:
-            raise SettingsError(
-                f"{query.name}: there is no published tip {number}",
-                expected=f"a number of the list `tips` in {path.name}",
-                remedy=REMEDY,
-            ) from error
 
 
 def require_queries(answers: Iterable[SubmittedAnswer], phantoms: Iterable[str], folder: Path) -> None:

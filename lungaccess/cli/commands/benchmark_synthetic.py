@@ -116,7 +116,7 @@ def run(
     devices : str
         Presets separated by commas; all three if not given.
     targets : int
-        The first so many of each phantom; all if not given.
+        The first so many of each lung of a phantom; all ten if not given.
     iterations : int
         Budget of a query beyond the direct arcs, which can be repeated exactly.
     time_s : float

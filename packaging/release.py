@@ -7,7 +7,8 @@
 
 A release is built from a copy of the files that git lists, so that nothing else gets into it.  An environment
 is made from nothing; there the first tasks of tests/first_contact are done outside the checkout with the
-wheel, and a fast part of the tests is run.
+wheel, and a fast part of the tests is run in a copy of the checkout without the packages, so that the wheel
+is what they test.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import tarfile
 import tempfile
 import tomllib
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +53,13 @@ def tracked() -> list[str]:
     return [name for name in said.split("\0") if name and (ROOT / name).is_file()]
 
 
+def copy_of(names: Iterable[str], tree: Path) -> None:
+    """Copy files of the checkout into a folder, which is made."""
+    for name in names:
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, tree / name)
+
+
 def build(out: Path) -> tuple[Path, Path]:
     """Build wheel and sdist from the files of git, and the wheel once more from the sdist.
 
@@ -62,9 +71,7 @@ def build(out: Path) -> tuple[Path, Path]:
     names = tracked()
     with tempfile.TemporaryDirectory() as temporary:
         tree, direct = Path(temporary, "tree"), Path(temporary, "direct")
-        for name in names:
-            (tree / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, tree / name)
+        copy_of(names, tree)
         python = [sys.executable, "-m", "build", "--outdir"]
         subprocess.run([*python, str(out), str(tree)], check=True, stdout=subprocess.DEVNULL)
         subprocess.run([*python, str(direct), "--wheel", str(tree)], check=True, stdout=subprocess.DEVNULL)
@@ -155,13 +162,15 @@ def import_cost(python: Path, module: str) -> float:
 
 
 def fast_tests(python: Path, dependencies: str) -> bool:
-    """Run the fast part of the tests with the libraries of an environment."""
+    """Run the fast part of the tests with the wheel and the libraries of an environment."""
     constraints = MATRIX["constraints"][dependencies]
     pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     told = ["-c", str(ROOT / constraints)] if constraints else []
     subprocess.run([*pip, *told, *MATRIX["tests"]["packages"]], check=True)
     pytest = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", *MATRIX["tests"]["places"]]
-    return subprocess.run(pytest, cwd=ROOT).returncode == 0
+    with tempfile.TemporaryDirectory() as tree:
+        copy_of((name for name in tracked() if name.split("/")[0] not in PACKAGES), Path(tree))
+        return subprocess.run(pytest, cwd=tree).returncode == 0
 
 
 def try_all(wheel: Path, environments: list[dict[str, str]]) -> int:
